@@ -1,0 +1,50 @@
+"""The errors of this package: each says what failed, on what name, and what to do next."""
+from pharos.private_rospy.host import rospy
+
+
+class PharosError(rospy.ROSException):
+    """Base of all errors of this package; ``except rospy.ROSException`` catches them too."""
+
+
+class MasterUnreachableError(PharosError):
+    """No ROS master answers at the URL."""
+
+
+class NodeNameInUseError(PharosError):
+    """Another running node has the name."""
+
+
+class PortInUseError(PharosError):
+    """The TCPROS or XML-RPC port asked for cannot be bound."""
+
+
+class UnknownNodeError(PharosError):
+    """The master knows no node of that name."""
+
+
+class UnknownTopicError(PharosError):
+    """The master knows no topic of that name, or no type for it."""
+
+
+class UnknownTypeError(PharosError):
+    """No definition of a message or service type was found, or it cannot be read."""
+
+
+class MessageTypeError(PharosError):
+    """A message, field or type does not fit where it was given."""
+
+
+class UnknownServiceError(PharosError):
+    """The master knows no service of that name."""
+
+
+class ServiceTypeError(PharosError):
+    """The md5sum or type of a service is not the provider's."""
+
+
+class ServiceCallError(PharosError):
+    """A service call failed, or its provider did not answer in time."""
+
+
+class NodeStoppedError(PharosError):
+    """The node is not running."""

@@ -1,0 +1,103 @@
+"""Where the types of messages and services are known: found before, installed, in files, or shipped for turtlesim."""
+
+import importlib.util
+import os
+import re
+import reprlib
+import sys
+
+import genpy
+import rospkg
+
+from pharos.errors import UnknownTypeError
+from pharos.turtlesim_types import DEFINITIONS
+
+MAX_TEXT = 1 << 20  # characters of a definition with those nested in it
+NAME = re.compile('[A-Za-z][A-Za-z0-9_]{0,127}')
+_TYPE = re.compile('%s/%s' % (NAME.pattern, NAME.pattern))
+_KINDS = {'msg': 'message', 'srv': 'service'}
+
+found = {}  # (kind, type): class answered before or defined, so that two asks give the same one
+
+
+def check_name(kind, type_):
+    if not isinstance(type_, str) or not _TYPE.fullmatch(type_):
+        hint = _near_types(kind, str(type_)[:99])
+        raise UnknownTypeError(f"malformed {_KINDS[kind]} type {reprlib.repr(type_)}{hint}: give 'package/Type', in "
+                               'ASCII letters, digits and _, or a class')
+
+
+def seek(kind, type_, must=True):
+    """Return the class of a type or, where it has none yet, the text of its definition."""
+    for look in (_found_before, installed, file_text, _shipped):
+        known = look(kind, type_)
+        if known is not None:
+            return known
+    if not must:
+        return None
+    package, _, name = type_.partition('/')
+    raise UnknownTypeError(
+        f'unknown {_KINDS[kind]} type {type_!r}{_near_types(kind, type_)}: Python has no {package}.{kind}.{name}, '
+        f'there is no {package}/{kind}/{name}.{kind} on ROS_PACKAGE_PATH ({os.pathsep.join(rospkg.get_ros_paths())}), '
+        f'and no definition was given; install the package {package} or call define_{_KINDS[kind]}({type_!r}, text)')
+
+
+def _found_before(kind, type_):
+    return found.get((kind, type_))
+
+
+def installed(kind, type_):
+    package = type_.partition('/')[0]
+    if f'{package}.{kind}' not in sys.modules:
+        # The name may come from the network: import no module that is not a package of messages.
+        try:
+            spec = importlib.util.find_spec(package)
+        except ValueError:  # a module without __spec__
+            return None
+        folders = spec and spec.submodule_search_locations or ()
+        if not any(os.path.isdir(os.path.join(folder, kind)) for folder in folders):
+            return None
+    get = genpy.message.get_message_class if kind == 'msg' else genpy.message.get_service_class
+    try:
+        return get(type_)
+    except Exception as error:
+        raise UnknownTypeError(f'{type_}: importing {package}.{kind} failed ({error}): reinstall it') from error
+
+
+def file_text(kind, type_):
+    package, _, name = type_.partition('/')
+    try:
+        path = os.path.join(rospkg.RosPack().get_path(package), kind, f'{name}.{kind}')
+        with open(path, encoding='utf-8', errors='replace') as file:
+            return file.read(MAX_TEXT + 1)
+    except Exception:  # a package.xml that rospkg cannot parse must not hide the types given at run time
+        return None
+
+
+def _shipped(kind, type_):
+    return DEFINITIONS[kind].get(type_)
+
+
+def _near_types(kind, type_):
+    """Return a hint at types with the same last name or one that differs by a slip."""
+    import glob  # rospy does not load it, and most programs never come here
+    rospack = rospkg.RosPack()
+    folders = [os.path.join(glob.escape(folder), '*', kind, '_[A-Za-z]*.py') for folder in sys.path]
+    try:
+        folders += [os.path.join(glob.escape(rospack.get_path(name)), kind, '*.' + kind) for name in rospack.list()]
+    except Exception:  # as in file_text
+        pass
+    paths = [os.path.splitext(path)[0].split(os.sep) for folder in folders for path in glob.iglob(folder)]
+    names = {'%s/%s' % (path[-3], path[-1].lstrip('_')) for path in paths}
+    names.update(DEFINITIONS[kind], (known for known_kind, known in list(found) if known_kind == kind))
+    last = '/' + type_.rpartition('/')[2]
+    return _hint(sorted(name for name in names if name.endswith(last))[:3]) or near(type_, names)
+
+
+def near(name, names):
+    import difflib  # rospy does not load it either
+    return _hint(difflib.get_close_matches(name, names, 2, 0.8))
+
+
+def _hint(names):
+    return names and f" (did you mean {' or '.join(map(repr, names))}?)" or ''

@@ -1,0 +1,95 @@
+"""Message and service classes by type name, made at run time where no generated code is installed.
+
+A class made here works with rospy's topics and services like an installed one. Every function may be called from any
+thread.
+"""
+
+import threading
+
+import genpy
+
+from pharos import known_types, message_definition
+from pharos.errors import MessageTypeError
+from pharos.message_fields import check_fits, describe_fields, explain, fill
+
+__all__ = ['message_class', 'service_class', 'define_message', 'define_service', 'class_from_definition',
+           'describe_fields', 'fill', 'check_fits', 'explain']
+
+_lock = threading.RLock()
+_given = {}  # (kind, type): class from define_message or define_service
+
+
+def message_class(type_or_class):
+    """Return the class of a message type, ``'package/Type'`` or ``'Header'``; a message class is returned as it is.
+
+    Sought in this order: installed Python packages, ``.msg`` files on ROS_PACKAGE_PATH, what :func:`define_message` was
+    given, and what this package ships for turtlesim. Raises `UnknownTypeError`.
+    """
+    if isinstance(type_or_class, type) and issubclass(type_or_class, genpy.Message):
+        return type_or_class
+    return _class('msg', 'std_msgs/Header' if type_or_class == 'Header' else type_or_class)
+
+
+def service_class(type_or_class):
+    """Return the class of a service type, ``'package/Type'``, as :func:`message_class` does with ``.srv`` files."""
+    if isinstance(type_or_class, type) and hasattr(type_or_class, '_request_class'):
+        return type_or_class
+    return _class('srv', type_or_class)
+
+
+def define_message(type_, text):
+    """Define the message type ``'package/Type'`` by the text of a ``.msg`` file and return its class.
+
+    Types that it nests may follow, each after a line of ``=`` and a line ``MSG: package/Type``, as ``gendeps --cat``
+    prints them; those that are not known yet are thereby defined too. Raises `UnknownTypeError` for a text that cannot
+    be read or refers to an unknown type, and `MessageTypeError` if the type is known with other fields.
+    """
+    return _define('msg', type_, text)
+
+
+def define_service(type_, text):
+    """Define the service type ``'package/Type'`` by the text of a ``.srv`` file, as :func:`define_message` does."""
+    return _define('srv', type_, text)
+
+
+def class_from_definition(type_, full_text, md5sum=None):
+    """Return the class for a message type as a peer describes it in its connection header, nested types included.
+
+    The installed class is returned if it is the same. Nothing is defined for later. Raises `UnknownTypeError`
+    for a text that cannot be read, and `MessageTypeError` if the text has not the ``md5sum`` given.
+    """
+    known_types.check_name('msg', type_)
+    with _lock:
+        cls = message_definition.make('msg', type_, full_text)
+        if md5sum not in (None, '*', cls._md5sum):
+            raise MessageTypeError(f'{type_} was announced with md5sum {md5sum}, but its definition has {cls._md5sum} '
+                                   f'({describe_fields(cls)}): build the peer anew, its message code is inconsistent')
+        return cls
+
+
+def _class(kind, type_):
+    known_types.check_name(kind, type_)
+    with _lock:
+        cls = known_types.seek(kind, type_)
+        if isinstance(cls, str):
+            cls = message_definition.make(kind, type_, cls)
+        known_types.found[kind, type_] = cls
+        return cls
+
+
+def _define(kind, type_, text):
+    known_types.check_name(kind, type_)
+    with _lock:
+        cls = message_definition.make(kind, type_, text)
+        before = _given.get((kind, type_)) or known_types.installed(kind, type_) or known_types.file_text(kind, type_)
+        if isinstance(before, str):
+            before = message_definition.make(kind, type_, before)
+        if before not in (None, cls):
+            raise MessageTypeError(f'{type_} is known already, with md5sum {before._md5sum} and other fields or '
+                                   'constants than in the text now given: give the same text, or define another type')
+        _given[kind, type_] = known_types.found[kind, type_] = cls
+        classes = getattr(getattr(cls, '_request_class', cls), '_classes', {})
+        for nested in classes.keys() & message_definition.split(type_, text).keys() - {type_}:
+            if known_types.seek('msg', nested, must=False) is None:
+                _given['msg', nested] = known_types.found['msg', nested] = classes[nested]
+        return cls
