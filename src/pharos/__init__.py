@@ -1,0 +1,24 @@
+"""PhaROS for Python: many ROS nodes in one process, written with blocks."""
+from pharos.channel import InputChannel, OutputChannel
+from pharos.errors import (MasterUnreachableError, MessageTypeError, NodeNameInUseError, NodeStoppedError, PharosError,
+                           PortInUseError, ServiceCallError, ServiceTypeError, UnknownNodeError, UnknownServiceError,
+                           UnknownTopicError, UnknownTypeError)
+from pharos.external_node import ExternalNode
+from pharos.master import Master
+from pharos.message_types import define_message, message_class, service_class
+from pharos.node import BlockNode, Node
+from pharos.parameter import Parameter
+from pharos.ros_process import RosProcess
+from pharos.running import spin
+from pharos.service import Service
+from pharos.topic import Topic
+from pharos.transcript import Transcript
+
+__version__ = '0.1.0'
+__all__ = [
+    'Master', 'Node', 'BlockNode', 'ExternalNode', 'Topic', 'InputChannel', 'OutputChannel', 'Service', 'Parameter',
+    'Transcript', 'RosProcess', 'message_class', 'define_message', 'service_class', 'spin', '__version__',
+    'PharosError', 'MasterUnreachableError', 'NodeNameInUseError', 'PortInUseError', 'UnknownNodeError',
+    'UnknownTopicError', 'UnknownTypeError', 'MessageTypeError', 'UnknownServiceError', 'ServiceTypeError',
+    'ServiceCallError', 'NodeStoppedError',
+]

@@ -1,0 +1,85 @@
+"""Blocks: the callables that a node is made of, and the souls among them that run in threads of their own."""
+import inspect
+import threading
+
+from pharos import running
+from pharos.errors import NodeStoppedError
+
+
+def check_block(block, what, parameters):
+    """``block`` if it can be called with so many arguments (or is None), else TypeError that says how it is called."""
+    if block is None:
+        return None
+    call = '%s(%s)' % (what, ', '.join(parameters))
+    if not callable(block):
+        raise TypeError('a %s is a block, called as %s; %r cannot be called' % (what, call, block))
+    try:
+        signature = inspect.signature(block)
+    except (TypeError, ValueError):
+        return block    # some built-in functions do not tell
+    try:
+        signature.bind(*parameters)
+    except TypeError as error:
+        raise TypeError('a %s is called as %s; %r does not take that: %s' % (what, call, block, error)) from None
+    return block
+
+
+def check_delegate(block):
+    """``block`` if it can be a delegate (or is None), else TypeError."""
+    return check_block(block, 'delegate', ('message', 'channel'))
+
+
+def check_soul(block):
+    """``block`` if it can be a soul (or is None), else TypeError."""
+    return check_block(block, 'soul', ('node',))
+
+
+def name_of(block):
+    """How logs name a block."""
+    return getattr(block, '__qualname__', None) or repr(block)
+
+
+class Souls:
+    """The souls of one node that run: in threads of their own, or in a thread of the user's."""
+
+    def __init__(self, node):
+        self._node = node
+        self._threads = set()
+        self._here = threading.local()    # .depth: how many souls of the node run in this thread
+
+    def run(self, block):
+        """Run a soul in this thread; an exception in it is reported and ends nothing else."""
+        self._here.depth = self._depth() + 1
+        try:
+            return block(self._node)
+        except Exception as error:
+            self._node._report(error, block, 'soul')
+        finally:
+            self._here.depth -= 1
+
+    def fork(self, block, name, start_thread):
+        """Run a soul in a thread of its own, and return the thread."""
+        def run():
+            try:
+                self.run(block)
+            finally:
+                self._threads.discard(threading.current_thread())
+        known = threading.Event()
+        thread = start_thread(lambda: known.wait() and run(), name=name)
+        self._threads.add(thread)
+        known.set()
+        return thread
+
+    def end(self, timeout):
+        """Wait for all but this thread's, up to ``timeout`` seconds; returns the names of those that went on."""
+        threads = [thread for thread in tuple(self._threads) if thread is not threading.current_thread()]
+        running.join(threads, timeout)
+        return [thread.name for thread in threads if thread.is_alive()]
+
+    def end_here(self):
+        """End the soul that runs in this thread, if one does."""
+        if self._depth():
+            raise NodeStoppedError('%s stops, and this soul with it' % self._node.name)
+
+    def _depth(self):
+        return getattr(self._here, 'depth', 0)

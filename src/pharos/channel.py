@@ -1,0 +1,202 @@
+"""Channels: one node's end of a topic."""
+import collections
+import time
+
+import genpy
+
+from pharos import message_types
+from pharos.blocks import check_delegate
+from pharos.errors import MessageTypeError, NodeStoppedError
+from pharos.private_rospy.host import rospy
+from pharos.private_rospy.pubsub import wait_until
+
+ANSWER_TIMEOUT = 0.5      # seconds in which the master has told a live subscriber; then it is asked whether it lives
+BUFFER_SIZE = 1 << 20     # bytes read from a socket at once; rospy's 64 KiB let subscribers of images fall behind
+
+
+class _Channel:
+    """What the two ends have in common."""
+
+    def __init__(self, node, topic, message_class, queue_size):
+        if isinstance(queue_size, bool) or not isinstance(queue_size, int) or queue_size < 1:
+            raise ValueError('queue_size must be a number of messages, 1 or more, not %r' % (queue_size,))
+        self.node = node
+        self.topic = topic
+        self.message_class = message_class
+        self.queue_size = queue_size
+        self._endpoint = None    # rospy's Publisher or Subscriber while the channel is open
+
+    @property
+    def type(self):
+        """The type name, such as 'turtlesim/Velocity'."""
+        return self.message_class._type
+
+    @property
+    def connections(self):
+        """``[(peer node name, transport)]``, transport being 'INTRAPROCESS' or 'TCPROS'."""
+        return self.node._rospy.connections(self._endpoint) if self.is_open else []
+
+    @property
+    def is_open(self):
+        return self._endpoint is not None
+
+    def close(self):
+        """End it: the node no longer publishes, or is interested. Harmless when done twice."""
+        endpoint, self._endpoint = self._endpoint, None
+        if endpoint is not None:
+            self.node._forget_channel(self)
+            self._unregister(endpoint)
+
+    def _unregister(self, endpoint):
+        endpoint.unregister()
+
+    def _stopped(self):
+        """The node stops, and its rospy closes all endpoints."""
+        self._endpoint = None
+
+    def __repr__(self):
+        counts = collections.Counter(transport for _, transport in self.connections)
+        state = ', '.join('%d %s' % (count, transport) for transport, count in sorted(counts.items()))
+        return '<%s %s %s of %s: %s>' % (type(self).__name__, self.topic, self.type, self.node.name,
+                                         (state or 'not connected') if self.is_open else 'closed')
+
+
+class InputChannel(_Channel):
+    """The end at which a node receives: made by :meth:`Node.interested_in`.
+
+    :attr:`delegate` is the channel's own block, or None: then the node's is run. It may be replaced at any time.
+    :attr:`received` counts the messages that the node has taken from the channel.
+    """
+
+    def __init__(self, node, topic, message_class, delegate=None, queue_size=1, inline=False, shared=False,
+                 from_=None):
+        super().__init__(node, topic, message_class, queue_size)
+        self.delegate = delegate
+        self.inline = inline
+        self.shared = shared
+        self.from_ = getattr(from_, 'name', from_)
+        self.received = 0
+        self._arrived = 0
+        self._queue = collections.deque(maxlen=queue_size)
+        self._open()
+
+    def _open(self):
+        self._announce = self.node._dispatcher.announce
+        # queue_size is ours: rospy's would drop without counting
+        self._endpoint = self.node.ros.Subscriber(self.topic, self.message_class, self._offer, tcp_nodelay=True,
+                                                  buff_size=BUFFER_SIZE)
+        self.node._remember_channel(self)
+        self.node._rospy.connect_to_publishers_here(self.topic, self.node.connect_timeout)
+        self.node._dispatcher.run()    # what came while the node did not know the channel yet
+
+    @property
+    def delegate(self):
+        return self._delegate
+
+    @delegate.setter
+    def delegate(self, block):
+        self._delegate = check_delegate(block)
+
+    @property
+    def dropped(self):
+        """How many messages were dropped, the oldest first, because the node was slower than they came."""
+        return self._arrived - self.received - len(self._queue)
+
+    def _offer(self, message):
+        """Take a message from rospy; its delegate runs as soon as the node is free."""
+        if self.from_ is None or message._connection_header.get('callerid') == self.from_:
+            self._arrived += 1
+            self._queue.append(message)    # full, it drops the oldest
+            self._announce(self)
+
+    def run_next(self):
+        """Run the delegate for the oldest message that waits; the dispatcher calls this."""
+        try:
+            message = self._queue.popleft()
+        except IndexError:
+            return    # it was dropped
+        self.received += 1
+        self.node._run_delegate(self._delegate, message, self)
+
+
+class OutputChannel(_Channel):
+    """The end at which a node sends: made by :meth:`Node.output_channel`, or by the first ``send_to``.
+
+    :attr:`sent` counts the messages published.
+    """
+
+    def __init__(self, node, topic, message_class, latch=False, queue_size=1, connect_timeout=None):
+        super().__init__(node, topic, message_class, queue_size)
+        self.latch = latch
+        self.sent = 0
+        self._open(connect_timeout)
+
+    def _open(self, connect_timeout=None):
+        self._endpoint = self.node.ros.Publisher(self.topic, self.message_class, tcp_nodelay=True, latch=self.latch,
+                                                 queue_size=self.queue_size)
+        self.node._remember_channel(self)
+        self.node._rospy.connect_to_subscribers_here(self.topic)
+        self._wait_for_known_subscribers(self.node.connect_timeout if connect_timeout is None else connect_timeout)
+
+    def publish(self, message):
+        """Send ``message`` to all who are interested.
+
+        :raises MessageTypeError: if it is of another type, or a field holds what does not fit
+        :raises NodeStoppedError: if the channel is closed
+        """
+        endpoint = self._endpoint
+        if endpoint is None:
+            raise NodeStoppedError('the channel of %s on %s is closed: open another with output_channel()'
+                                   % (self.node.name, self.topic))
+        if not isinstance(message, genpy.Message) or message._md5sum not in (self.message_class._md5sum, '*'):
+            raise MessageTypeError('%s carries %s (%s), not %s' % (
+                self.topic, self.type, message_types.describe_fields(self.message_class),
+                getattr(message, '_type', None) or repr(message)))
+        try:
+            endpoint.publish(message)
+        except Exception as error:
+            if isinstance(error, rospy.ROSException) and not isinstance(error, rospy.ROSSerializationException):
+                raise NodeStoppedError('%s stopped while it published on %s' % (self.node.name, self.topic)) from error
+            message_types.check_fits(message)
+            raise MessageTypeError('%s cannot be sent on %s: %s' % (self.type, self.topic, error)) from error
+        self.sent += 1
+
+    def send(self, block=None, **fields):
+        """Fill a fresh message with ``block(message)`` and by keywords, publish it, and return it."""
+        message = self.message_class()
+        if block is not None:
+            try:
+                block(message)
+            except AttributeError as error:
+                message_types.explain(error, message)
+                raise
+        if fields:
+            message_types.fill(message, fields)
+        if not self.connections:
+            message_types.check_fits(message)    # with nobody interested, rospy does not look at it
+        self.publish(message)
+        return message
+
+    def wait_for_subscribers(self, count=1, timeout=None):
+        """Wait until ``count`` subscribers are connected, for up to ``timeout`` seconds (None: without limit).
+
+        Returns whether they are; ends early, with False, when the node stops.
+        """
+        wait_until(lambda: len(self.connections) >= count or not self.is_open, timeout)
+        return self.is_open and len(self.connections) >= count
+
+    def _wait_for_known_subscribers(self, timeout):
+        """Wait until those that the master knows are connected, for up to ``timeout`` seconds.
+
+        rospy loses what is published before (ros_comm #176, #286).
+        """
+        missing = set(self.node.master.topic(self.topic).subscribers)
+
+        def connected():
+            missing.difference_update(name for name, _ in self.connections)
+            return not missing or not self.is_open
+        deadline = time.monotonic() + timeout
+        if not wait_until(connected, min(timeout, ANSWER_TIMEOUT)):
+            # those that do not answer any more, killed for example, are not worth the wait
+            missing.intersection_update(filter(self.node.master.answers, tuple(missing)))
+            wait_until(connected, deadline - time.monotonic())

@@ -1,0 +1,214 @@
+"""The proxy of a ROS master."""
+import difflib
+import time
+import urllib.parse
+
+import rosgraph
+
+from pharos import node as nodes_of_ours
+from pharos import ros_process, running
+from pharos.errors import MasterUnreachableError, UnknownNodeError
+from pharos.external_node import ExternalNode
+from pharos.private_rospy.proxies import ServerProxy, master_api
+from pharos.private_rospy.registration import COMMUNICATION_ERRORS
+from pharos.service import Service
+from pharos.topic import Topic
+
+TIMEOUT = 5.0    # seconds that a question to the master may take
+
+
+class Master:
+    """The proxy of a ROS master: creates nodes, and finds others.
+
+    The report (listing 3.2)::
+
+        master := PhaROSMaster url: 'http://127.0.0.1:11311/'
+        master = Master('http://127.0.0.1:11311/')
+
+    :param url: URL of the ROS master; None: ROS_MASTER_URI, else ROS's default. Makes no connection yet.
+    :raises ValueError: if it is no URL
+    """
+
+    def __init__(self, url=None):
+        self.url = _check_url(rosgraph.get_master_uri() if url is None else url)
+
+    def create(self, node_class, named, domain=None, tcp_port=0, xmlrpc_port=0, soul=None, delegate=None, argv=None,
+               **kwargs):
+        """Create, register and start a node; returns it.
+
+        The report (listing 3.7)::
+
+            master create: PhaROSBlockNode named: '/myNode' domain: '127.0.0.1' tcpPort: 9999 xmlRpcPort: 6123 soul: [...]
+            master.create(BlockNode, named='/myNode', domain='127.0.0.1', tcp_port=9999, xmlrpc_port=6123, soul=...)
+
+        :param node_class: Node, BlockNode or a subclass
+        :param named: the node's name, which may carry a namespace: '/robot1/driver'
+        :param domain: the address that the node advertises and, if it is loopback, the only one it listens on; None:
+            what ROS_HOSTNAME, ROS_IP or the host's name say
+        :param tcp_port: TCPROS port, 0 for any free one
+        :param xmlrpc_port: XML-RPC port, 0 for any free one
+        :param soul: block that says what the node does, called as ``soul(node)``
+        :param delegate: block run for each message, called as ``delegate(message, channel)``
+        :param argv: ROS remappings and private parameters for this node (a script passes ``sys.argv``)
+        :param kwargs: for the node's ``__init__``
+        :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: and nothing is left behind
+        :raises ValueError: if a name or port cannot be one
+        """
+        node = nodes_of_ours.make(node_class, self, named, soul, delegate, kwargs, domain=domain, tcp_port=tcp_port,
+                                  xmlrpc_port=xmlrpc_port, argv=argv)
+        try:
+            node.start()
+        except BaseException:
+            node.stop()
+            raise
+        return node
+
+    def run(self, package, executable, *args, on_line=None):
+        """Start a ROS program at this master, as ``rosrun`` does; returns the :class:`RosProcess`.
+
+        :param on_line: block called as ``on_line(text)`` for each line of its output, in a thread of its own
+        :raises UnknownNodeError: if there is no such package or program
+        """
+        return ros_process.run(self.url, package, executable, args, on_line)
+
+    # -- what is there --------------------------------------------------------------------------------------------------
+
+    def nodes(self):
+        """All nodes: a Node where it runs in this process, an ExternalNode elsewhere."""
+        own = {node.name: node for node in self.own_nodes()}
+        names = sorted({name for kind in self.system_state() for users in kind.values() for name in users})
+        return [own.get(name) or ExternalNode(self, name) for name in names]
+
+    def node(self, name):
+        """The node of that name.
+
+        :raises UnknownNodeError: if the master knows none
+        """
+        known = {node.name: node for node in self.nodes()}
+        name = rosgraph.names.resolve_name(name, '/pharos')
+        if name not in known:
+            raise UnknownNodeError('no node %s at %s%s: see rosnode list' % (name, self.url, self.near(name, known)))
+        return known[name]
+
+    def own_nodes(self):
+        """The nodes of this process at this master."""
+        return [node for node in running.nodes() if node.master.url == self.url]
+
+    def topics(self):
+        """All topics that somebody publishes on or is interested in."""
+        publishers, subscribers, _ = self.system_state()
+        return [Topic(self, name) for name in sorted({*publishers, *subscribers})]
+
+    def topic(self, name):
+        """The topic of that name, whether anybody uses it yet or not."""
+        return Topic(self, rosgraph.names.resolve_name(name, '/pharos'))
+
+    def topic_types(self):
+        """``[(topic name, type name)]`` of all topics."""
+        return self._ask('getTopicTypes')
+
+    def services(self):
+        """Names of all services."""
+        return sorted(self.system_state()[2])
+
+    def lookup_service(self, name, caller_id='/pharos'):
+        """The :class:`Service` of that name, to be called in the name of ``caller_id``.
+
+        The report (listing 3.5): ``master lookupService: '/clear' with: '/myID'``.
+
+        :raises UnknownServiceError: if nobody offers it
+        """
+        with self._reached():
+            return Service(self, rosgraph.names.resolve_name(name, caller_id), caller_id)
+
+    def system_state(self):
+        """``(publishers, subscribers, services)``, each ``{name: [node names]}``."""
+        return tuple({name: list(nodes) for name, nodes in kind} for kind in self._ask('getSystemState'))
+
+    # -- the master itself ------------------------------------------------------------------------------------------------
+
+    @property
+    def pid(self):
+        """The process id of the master, on its host."""
+        return self._ask('getPid')
+
+    def is_reachable(self):
+        """Whether a master answers at the URL."""
+        try:
+            self._ask('getPid')
+        except MasterUnreachableError:
+            return False
+        return True
+
+    def wait(self, timeout=None):
+        """Wait until the master answers, for up to ``timeout`` seconds (None: without limit); returns this Master.
+
+        :raises MasterUnreachableError: if it does not in time
+        """
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while True:
+            try:
+                self._ask('getPid')
+                return self
+            except MasterUnreachableError:
+                if deadline is not None and time.monotonic() >= deadline:
+                    raise
+                time.sleep(0.05)    # there is nobody yet who could tell
+
+    def answers(self, name):
+        """Whether the node of that name is registered and its XML-RPC server answers."""
+        try:
+            ServerProxy(self._api().lookupNode(name), 1.0).getPid('/pharos')
+        except (rosgraph.MasterException, *COMMUNICATION_ERRORS):
+            return False
+        return True
+
+    def near(self, name, names):
+        """', did you mean ...' where ``name`` may be a slip for one of ``names``, else nothing."""
+        close = difflib.get_close_matches(name, list(names), 3)
+        return ', did you mean %s' % ' or '.join(close) if close else ''
+
+    def _api(self, caller_id='/pharos', timeout=TIMEOUT):
+        return master_api(self.url, caller_id, timeout)
+
+    def _ask(self, method):
+        with self._reached():
+            return getattr(self._api(), method)()
+
+    def _reached(self):
+        return _Reached(self.url)
+
+    def __eq__(self, other):
+        return isinstance(other, Master) and self.url == other.url
+
+    def __hash__(self):
+        return hash(self.url)
+
+    def __repr__(self):
+        return '<Master %s>' % self.url
+
+
+class _Reached:
+    """Turns a failure to reach the master into an error that names it."""
+
+    def __init__(self, url):
+        self._url = url
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, kind, error, traceback):
+        if isinstance(error, COMMUNICATION_ERRORS):
+            raise MasterUnreachableError('no ROS master answers at %s (%s): start one with roscore, or set '
+                                         'ROS_MASTER_URI' % (self._url, error)) from error
+
+
+def _check_url(url):
+    """``url`` with a closing slash, if it can be a master's."""
+    parts = urllib.parse.urlsplit(url) if isinstance(url, str) else None
+    try:
+        if parts and parts.scheme == 'http' and parts.hostname and parts.port and parts.path in ('', '/'):
+            return 'http://%s/' % parts.netloc
+    except ValueError:
+        pass    # the port is no number
+    raise ValueError('%r is not the URL of a ROS master: it looks like http://127.0.0.1:11311/' % (url,))

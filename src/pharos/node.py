@@ -1,0 +1,421 @@
+"""Nodes: real ROS nodes of this process, written with blocks."""
+import collections
+import contextlib
+import enum
+import threading
+import traceback
+
+from pharos import running
+from pharos.blocks import Souls, check_block, check_delegate, check_soul, name_of
+from pharos.dispatcher import Dispatcher
+from pharos.errors import MessageTypeError, NodeStoppedError, PharosError
+from pharos.parameter import Parameter
+from pharos.private_rospy.host import rospy
+from pharos.private_rospy.instance import PrivateRospy
+from pharos.private_rospy.settings import Settings
+from pharos.service import OfferedService
+from pharos.topic import QUEUE_SIZE
+from pharos.transcript import Transcript
+
+
+class Lifecycle(enum.Enum):
+    """Where a node is in its life; see :attr:`Node.lifecycle`."""
+    NEW = 'new'
+    STARTING = 'starting'
+    RUNNING = 'running'
+    STOPPING = 'stopping'
+    STOPPED = 'stopped'
+
+
+class Node:
+    """A ROS node of this process: made by :meth:`Master.create`, subclassed to override :meth:`start` and :meth:`stop`.
+
+    The report (listing 3.1), a subclass of PhaROSNode, is in Python::
+
+        class TurtleDriver(Node):
+            def start(self):
+                super().start()
+                self.fork(TurtleDriver.publishing_loop)
+
+    A node is configured before its ``__init__`` runs, which gets only the further keywords of ``create``.
+    """
+
+    connect_timeout = 2.0    #: seconds that a topic's first message waits for the subscribers the master knows
+    stop_timeout = 2.0       #: seconds that :meth:`stop` waits for souls, and for messages under way
+
+    def __init__(self):
+        pass
+
+    def _configure(self, master, settings, soul, delegate):
+        self.master = master
+        self.name = settings.name
+        self.soul, self.delegate = soul, delegate
+        #: the exceptions that souls, delegates and services raised, the newest last
+        self.errors = collections.deque(maxlen=100)
+        self._settings = settings
+        self._lifecycle = Lifecycle.NEW
+        self._changing = threading.Condition()    # guards _lifecycle
+        self._dispatcher = Dispatcher()
+        self._rospy = None
+        self._souls = Souls(self)
+        self._channels, self._services = [], []
+
+    # -- blocks -------------------------------------------------------------------------------------------------------
+
+    @property
+    def soul(self):
+        """The block that says what the node does, called as ``soul(node)`` by :meth:`execute` and :meth:`fork`.
+
+        May be replaced while the node runs, and takes effect with the next run.
+        """
+        return self._soul
+
+    @soul.setter
+    def soul(self, block):
+        self._soul = check_soul(block)
+
+    @property
+    def delegate(self):
+        """The block run for each message received, called as ``delegate(message, channel)``.
+
+        The report: ``self receiverDelegate: [:message :channel | ...]``. Delegates of a node run one at a time. It may be
+        replaced while the node runs, and takes effect with the next message.
+        """
+        return self._delegate
+
+    @delegate.setter
+    def delegate(self, block):
+        self._delegate = check_delegate(block)
+
+    def execute(self):
+        """Run the soul once, in the calling thread, and return its value.
+
+        The report (listing 3.7): ``node execute``. An exception in the soul is reported (see :attr:`errors`) and
+        ends only this run, which then returns None.
+        """
+        self._live_rospy()
+        return self._souls.run(self._the_soul())
+
+    def fork(self, block=None, name=None):
+        """Run the soul, or ``block(node)``, in a thread of its own, and return the thread.
+
+        The report (listing 3.8): ``[node execute] fork``. :meth:`stop` ends it at its next :meth:`sleep` or turn of
+        :meth:`every`.
+        """
+        block = check_soul(block) or self._the_soul()
+        return self._souls.fork(block, name or 'soul', self._live_rospy().start_thread)
+
+    def _the_soul(self):
+        if self._soul is None:
+            raise PharosError('%s has no soul to run: give it one with soul= or node.soul =' % self.name)
+        return self._soul
+
+    def _run_delegate(self, block, message, channel):
+        block = block or self._delegate
+        if block is None:
+            return
+        try:
+            block(message, channel)
+        except Exception as error:
+            self._report(error, block, 'delegate', channel)
+
+    def _report(self, error, block, what, channel=None):
+        """Tell of an exception in a block, which ends nothing but that run of it."""
+        if not self.is_running and isinstance(error, (NodeStoppedError, rospy.ROSInterruptException)):
+            return    # that is how the stop of a node ends its souls
+        self.errors.append(error)
+        where = '%s %s of %s%s' % (what, name_of(block), self.name, ' on %s' % channel.topic if channel else '')
+        self.log('%s raised %s: %s\n%s' % (where, type(error).__name__, error, ''.join(
+            traceback.format_exception(type(error), error, error.__traceback__))), level='error')
+        Transcript.show('%s raised %s: %s' % (where, type(error).__name__, error))
+
+    # -- life ---------------------------------------------------------------------------------------------------------
+
+    def start(self):
+        """Register with the master. A subclass overrides this, calls ``super().start()``, then makes its channels.
+
+        Runs in the thread that creates the node. A stopped node starts again, under the same name and ports. Where a
+        class has no ``start`` of its own, the channels and services that it had come back too.
+
+        :raises PharosError: if the node is running already
+        :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: and the node is then as it was
+        """
+        with self._changing:
+            if self._lifecycle not in (Lifecycle.NEW, Lifecycle.STOPPED):
+                raise PharosError('%s is %s already: stop() it before you start it again'
+                                  % (self.name, self._lifecycle.value))
+            before, self._lifecycle = self._lifecycle, Lifecycle.STARTING
+        try:
+            dispatcher = Dispatcher()
+            instance = PrivateRospy(self._settings, self._asked_to_stop, on_received=dispatcher.run)
+            instance.start(self.connect_timeout)
+        except BaseException:
+            self._become(before)
+            raise
+        self._rospy = instance
+        # the same ports next time, also where any free one was asked for
+        self._settings.tcp_port, self._settings.xmlrpc_port = instance.tcp_port, instance.xmlrpc_port
+        self._dispatcher = dispatcher
+        self._become(Lifecycle.RUNNING)
+        running.add(self)
+        kept, self._channels = self._channels, []
+        services, self._services = self._services, []
+        if type(self).start is Node.start:
+            for opened in (*kept, *services):
+                opened._open()
+
+    def stop(self):
+        """End the souls, send what is under way, unregister, close the ports, end the threads.
+
+        A subclass overrides this and calls ``super().stop()``. Harmless when done twice; may be called from any
+        thread, also the node's own, in which case what that thread runs is not waited for.
+        """
+        with self._changing:
+            if self._lifecycle is Lifecycle.STOPPING and not self._is_own_thread():
+                self._changing.wait_for(lambda: self._lifecycle is Lifecycle.STOPPED, 2 * self.stop_timeout)
+            if self._lifecycle is not Lifecycle.RUNNING:
+                return
+            self._lifecycle = Lifecycle.STOPPING
+        instance = self._rospy
+        try:
+            instance.end_sleeps()
+            ignoring = self._souls.end(self.stop_timeout)
+            if ignoring:
+                self.log('left behind, for it did not end within %g s of the stop: %s. A soul ends by itself if it '
+                         'waits with node.sleep() or loops over node.every()'
+                         % (self.stop_timeout, ', '.join(ignoring)), level='warning')
+            self._dispatcher.close()
+            left = instance.stop(self.stop_timeout)
+            if left:
+                Transcript.show('%s left behind threads that did not end: %s' % (self.name, ', '.join(left)))
+            for channel in self._channels:
+                channel._stopped()
+        finally:
+            self._become(Lifecycle.STOPPED)
+            running.discard(self)
+
+    def _is_own_thread(self):
+        return self._rospy.owns(threading.current_thread())
+
+    def _become(self, lifecycle):
+        with self._changing:
+            self._lifecycle = lifecycle
+            self._changing.notify_all()
+
+    def _asked_to_stop(self, reason):
+        self.log('stops: %s' % (reason,))
+        self.stop()
+
+    @property
+    def lifecycle(self):
+        """A :class:`Lifecycle`."""
+        return self._lifecycle
+
+    @property
+    def is_running(self):
+        """Whether the node is started and no stop has begun."""
+        return self._lifecycle is Lifecycle.RUNNING
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.stop()
+
+    def sleep(self, seconds):
+        """Wait for ``seconds`` of ROS time, or until the node stops; a soul is ended by that.
+
+        The report: ``(Delay forSeconds: 1) wait``.
+        """
+        with running.waiting(), contextlib.suppress(rospy.ROSInterruptException):
+            self._live_rospy().rospy.sleep(seconds)
+        if not self.is_running:
+            self._souls.end_here()
+
+    def every(self, seconds):
+        """An iterator that turns at once and then every ``seconds`` of ROS time, without drift, until the node stops.
+
+        A turn that takes longer than ``seconds`` delays the next, which then comes at once.
+        """
+        if not seconds > 0:
+            raise ValueError('a period is a number of seconds above 0, not %r' % (seconds,))
+        return self._turns(self.ros.Rate(1.0 / seconds, reset=True))
+
+    def _turns(self, rate):
+        while self.is_running:
+            yield
+            with running.waiting(), contextlib.suppress(rospy.ROSInterruptException):
+                rate.sleep()
+
+    # -- topics -------------------------------------------------------------------------------------------------------
+
+    def interested_in(self, topic, typed_as=None, delegate=None, queue_size=QUEUE_SIZE, inline=False, shared=False,
+                      from_=None):
+        """Receive the messages of a topic from now on; returns the :class:`InputChannel`.
+
+        The report (listing 3.3)::
+
+            self interestedIn: '/turtle1/command_velocity' typedAs: 'turtlesim/Velocity'
+            self.interested_in('/turtle1/command_velocity', typed_as='turtlesim/Velocity')
+
+        :param typed_as: type name or message class; None: the master's type for the topic
+        :param delegate: block for this channel only, instead of the node's
+        :param queue_size: messages kept while the node is busy; the oldest are dropped and counted
+        :param inline: run the delegate in the publisher's thread, where that is a node of this process
+        :param shared: get the very message that a node of this process published, and promise not to change it
+        :param from_: only messages of that node: a name, Node or ExternalNode
+        :raises UnknownTopicError, UnknownTypeError, MessageTypeError: if there is no type, or another
+        """
+        return self._topic(topic).input_channel(self, typed_as, delegate, queue_size, inline, shared, from_)
+
+    def output_channel(self, topic, typed_as=None, latch=False, queue_size=QUEUE_SIZE):
+        """Publish on a topic from now on; returns the :class:`OutputChannel`.
+
+        :param typed_as: type name or message class; None: the master's type for the topic
+        :param latch: send the last message to those who become interested later
+        :param queue_size: messages kept for each slow receiver; the oldest are dropped
+        """
+        return self._topic(topic).output_channel(self, typed_as, latch, queue_size)
+
+    def send_to(self, topic, block=None, *, typed_as=None, connect_timeout=None, **fields):
+        """Send one message, filled by ``block(message)``, by keywords, or both; returns it.
+
+        The report (listing 3.1)::
+
+            self sendTo: '/turtle1/command_velocity' a: [:message | message angular: 1.0. message linear: 2.0]
+            self.send_to('/turtle1/command_velocity', angular=1.0, linear=2.0)
+
+        The first message on a topic waits for the subscribers that the master knows, for up to ``connect_timeout``
+        seconds (None: the node's), so that it is not lost.
+
+        :raises MessageTypeError: if a field does not exist or does not fit
+        :raises UnknownTopicError, UnknownTypeError: if there is no type
+        """
+        if block is not None:
+            check_block(block, 'block', ('message',))
+        topic = self._topic(topic)
+        channel = next((channel for channel in self.channels if channel.topic == topic.name
+                        and hasattr(channel, 'publish')), None)
+        if channel is None:
+            channel = topic.output_channel(self, typed_as, connect_timeout=connect_timeout)
+        elif typed_as is not None:
+            topic.message_class(self, typed_as)    # refuses another type
+        return channel.send(block, **fields)
+
+    @property
+    def channels(self):
+        """The channels that the node has open."""
+        return [channel for channel in self._channels if channel.is_open]
+
+    def _topic(self, name):
+        return self.master.topic(self._live_rospy().rospy.resolve_name(_check_topic_name(name)))
+
+    def _remember_channel(self, channel):
+        self._channels = [*self._channels, channel]    # replaced, so that others may iterate meanwhile
+
+    def _forget_channel(self, channel):
+        self._channels = [other for other in self._channels if other is not channel]
+
+    # -- services, parameters, log --------------------------------------------------------------------------------------
+
+    def serve(self, name, typed_as, block):
+        """Offer a service; returns a handle with ``close()``.
+
+        ``block(request)`` runs in a thread of the caller's connection and returns a response, a dict of its fields, or
+        its only field. An exception in it goes to the caller, and is reported as a delegate's.
+
+        :param typed_as: service type name, such as 'std_srvs/Empty', or class
+        """
+        return OfferedService(self, self._live_rospy().rospy.resolve_name(_check_topic_name(name)), typed_as, block)
+
+    def parameter(self, name, initialized=None):
+        """The :class:`Parameter` of that name ('~rate' is private); set to ``initialized`` where it has no value."""
+        return Parameter(self, self._live_rospy().rospy.resolve_name(_check_topic_name(name)), initialized)
+
+    def log(self, text, level='info'):
+        """Log a line on /rosout, the node's log file and the screen, with the file and line of the caller.
+
+        :param level: 'debug', 'info', 'warning' (or 'warn'), 'error' or 'fatal'
+        """
+        try:
+            level = _LEVELS[level]
+        except KeyError:
+            raise ValueError('no log level %r: there are %s' % (level, ', '.join(_LEVELS))) from None
+        if self._rospy is not None:
+            log = self._rospy.log
+            log('%s', (text,), {}, level=level)    # no wrapper between: rospy looks for the caller of this method
+
+    # -- what rospy offers beyond -----------------------------------------------------------------------------------------
+
+    @property
+    def ros(self):
+        """The node's own rospy, whole: ``node.ros.Timer``, ``node.ros.Time.now()``. It is for this run of the node."""
+        return self._live_rospy().rospy
+
+    def ros_import(self, name):
+        """A library written on rospy ('actionlib', 'message_filters', 'tf2_ros'), bound to this run of the node."""
+        return self._live_rospy().import_library(name)
+
+    def _live_rospy(self):
+        if self._lifecycle not in (Lifecycle.RUNNING, Lifecycle.STOPPING):
+            raise NodeStoppedError('%s is %s: start() it first' % (self.name, self._lifecycle.value))
+        return self._rospy
+
+    @property
+    def uri(self):
+        """The URI of the node's XML-RPC server, None before the first start."""
+        return self._rospy and self._rospy.uri
+
+    @property
+    def tcp_port(self):
+        """The TCPROS port; the one asked for, before the first start."""
+        return self._settings.tcp_port
+
+    @property
+    def xmlrpc_port(self):
+        """The XML-RPC port; the one asked for, before the first start."""
+        return self._settings.xmlrpc_port
+
+    @property
+    def domain(self):
+        """The address that the node advertises, None before the first start."""
+        return self._rospy and self._rospy.domain
+
+    def __repr__(self):
+        return '<%s %s %s, %d channels%s>' % (type(self).__name__, self.name, self._lifecycle.value, len(self.channels),
+                                              ', %d errors' % len(self.errors) if self.errors else '')
+
+
+class BlockNode(Node):
+    """A node made of blocks alone, for tests and prototypes.
+
+    The report (listing 3.7)::
+
+        node := master create: PhaROSBlockNode named: '/myNode' ... soul: [:myNode | ...]. node execute
+        node = master.create(BlockNode, named='/myNode', soul=lambda me: ...); node.execute()
+    """
+
+
+def make(node_class, master, named, soul, delegate, init, **settings):
+    """A new node of ``node_class``, configured and not yet started."""
+    if not (isinstance(node_class, type) and issubclass(node_class, Node)):
+        raise TypeError('a node is made of a subclass of Node, or BlockNode; not %r' % (node_class,))
+    node = node_class.__new__(node_class)
+    node._configure(master, Settings(named, master.url, **settings), soul, delegate)
+    node.__init__(**init)
+    return node
+
+
+_LEVELS = {'debug': 'debug', 'info': 'info', 'warning': 'warning', 'warn': 'warning', 'error': 'error',
+           'err': 'error', 'fatal': 'critical', 'critical': 'critical'}
+
+
+def _check_topic_name(name):
+    if not isinstance(name, str) or not name or name.startswith('/') and not name.strip('/'):
+        raise ValueError('a topic, service or parameter needs a name such as /turtle1/pose, not %r' % (name,))
+    illegal = next((char for char in name if not (char.isalnum() and char.isascii() or char in '_/~')), None)
+    if illegal or name[0].isdigit():
+        at = name.index(illegal) if illegal else 0
+        raise ValueError('%r is no ROS name (letters, digits, _ and /, after an optional ~ or /):\n  %s\n  %s^'
+                         % (name, name, ' ' * at))
+    return name

@@ -1,0 +1,232 @@
+"""One node's rospy: loaded, started and stopped."""
+import atexit
+import errno
+import logging.config
+import os
+import socket
+import sys
+import threading
+import time
+import weakref
+import xmlrpc
+import xmlrpc.client
+import _thread
+
+from pharos.errors import MasterUnreachableError, PortInUseError
+from pharos.private_rospy import host, logs, pubsub, registration, servers
+from pharos.private_rospy.lifetime import Lifetime
+from pharos.private_rospy.loader import PrivateImports, Substitute
+from pharos.private_rospy.proxies import ServerProxy, master_api
+
+_running = weakref.WeakValueDictionary()    # URI -> the PrivateRospy that runs there, in this process
+
+POLL = 0.001    # seconds between rospy's own looks at whether it is registered; it takes 0.1 s
+
+
+class PrivateRospy:
+    """A rospy of one node, for one run of it: a stopped one is thrown away.
+
+    :param settings: the :class:`~.settings.Settings` of the node
+    :param on_stop_request: called as ``on_stop_request(reason)``, in a thread of its own, when ROS or a user of
+        ``rospy.signal_shutdown`` asks the node to stop
+    :param on_received: called after the callbacks of a batch of messages, in the thread that received it
+    """
+
+    def __init__(self, settings, on_stop_request, on_received):
+        self.settings = settings
+        self.on_received = on_received
+        self.name = settings.name
+        self._on_stop_request = on_stop_request
+        self._lifetime = Lifetime(self.name)
+        self._stopping = threading.Lock()
+        self._modules = self._load()
+        self.rospy = self._modules.load('rospy')
+
+    def _load(self):
+        lifetime, logging_module = self._lifetime, logs.private_logging()
+        proxies = Substitute(xmlrpc.client, ServerProxy=ServerProxy)
+        private_os = Substitute(os, environ=self.settings.environ)
+        hooks = {'rospy.service': _share_service_exception, 'rospy.impl.init': self._poll_quickly,
+                 'rospy.core': self._shut_down_early,
+                 **servers.hooks(lifetime), **registration.hooks(self), **pubsub.hooks(self)}
+        modules = PrivateImports(hooks=hooks, substitutes={
+            'os': private_os,
+            'sys': Substitute(sys, argv=self.settings.argv),
+            'logging': logging_module,
+            'atexit': Substitute(atexit, register=lambda function, *args, **kwargs: function),    # nodes.py does that
+            'threading': Substitute(threading, Thread=lifetime.Thread),
+            '_thread': Substitute(_thread, start_new_thread=lifetime.start_thread),
+            'time': Substitute(time, sleep=lifetime.sleep),
+            'socket': Substitute(socket, setdefaulttimeout=lambda timeout: None),    # rospy sets the whole process's
+            'xmlrpc': Substitute(xmlrpc, client=proxies),
+            'xmlrpc.client': proxies})
+        logging_module.os = private_os    # the configuration file is evaluated with this
+        logging_module.config = modules.load_apart('logging.config', logging.__path__)
+        self._logging = logging_module
+        return modules
+
+    def _poll_quickly(self, module):
+        """rospy.impl.init: waits in steps of 0.1 s, for as long as the master takes."""
+        def sleep(seconds):
+            if time.monotonic() > self._deadline:
+                raise MasterUnreachableError('the ROS master %s stopped answering while %s registered'
+                                             % (self.settings.master_url, self.name))
+            time.sleep(min(seconds, POLL))
+        module.time = Substitute(time, sleep=sleep)
+
+    def _shut_down_early(self, module):
+        """rospy.core: is_shutdown() holds from the beginning of the stop, so that what loops until then ends first.
+
+        rospy.topics keeps the real one: the last messages of a soul that is ending are still sent.
+        """
+        is_shutdown = module.is_shutdown
+        module.is_shutdown = lambda: is_shutdown() or self._lifetime.ended.is_set()
+        self.is_shut_down = is_shutdown
+
+    def import_library(self, name):
+        """A library written on rospy, such as 'actionlib', bound to this node."""
+        return self._modules.load(name)
+
+    # -- life ---------------------------------------------------------------------------------------------------------
+
+    def start(self, timeout):
+        """Open the ports, claim the name, register. On an error, nothing is left behind.
+
+        :param timeout: seconds that the master may take
+        :raises MasterUnreachableError, NodeNameInUseError, PortInUseError:
+        """
+        settings = self.settings
+        self._deadline = time.monotonic() + timeout
+        try:
+            master_api(settings.master_url, self.name, timeout).getPid()
+        except registration.COMMUNICATION_ERRORS as error:
+            raise MasterUnreachableError(
+                'no ROS master answers at %s (%s): start one with roscore, or set ROS_MASTER_URI'
+                % (settings.master_url, error)) from error
+        registration.claim_name(settings.master_url, self.name, timeout)
+        core = self._modules.load('rospy.core')
+        try:
+            with _ports_checked('tcp_port', settings.tcp_port):
+                self.tcp_port = servers.listen(self._modules.load('rospy.impl.tcpros_base'), settings.tcp_port)
+            with _ports_checked('xmlrpc_port', settings.xmlrpc_port):
+                self.rospy.init_node(settings.base_name, argv=settings.argv, disable_signals=True,
+                                     xmlrpc_port=settings.xmlrpc_port, tcpros_port=settings.tcp_port)
+        except BaseException:
+            self.stop(0)
+            raise
+        self.uri = core.get_node_uri()
+        _running[self.uri] = self
+        self.xmlrpc_port = self._lifetime.xmlrpc.port
+        self.domain = self._modules.load('rosgraph.network').get_host_name()
+        core.add_preshutdown_hook(self.request_stop)    # rospy.signal_shutdown called by the node's own code
+
+    def request_stop(self, reason):
+        """Have the node stopped, from a thread that the stop need not wait for."""
+        if not self._stopping.locked():
+            threading.Thread(target=self._on_stop_request, args=(reason,), name=self.name + ' stop', daemon=True).start()
+
+    def end_sleeps(self):
+        """Begin the stop: sleeps end, ``is_shutdown()`` holds, and nothing more is received."""
+        self._lifetime.ended.set()
+        changed = self._modules.load('rospy.rostime').get_rostime_cond()
+        with changed:
+            changed.notify_all()    # simulated time may stand still
+
+    def stop(self, flush_timeout):
+        """Send what is under way (for up to ``flush_timeout`` seconds), unregister, close the ports, end the threads.
+
+        Returns the names of threads that did not end in time. Harmless when done twice.
+        """
+        if not self._stopping.acquire(blocking=False):
+            return []
+        _running.pop(getattr(self, 'uri', None), None)
+        core = self._modules.load('rospy.core')
+        pubsub.flush(self._topic_manager(), flush_timeout)
+        core._shutdown_hooks.insert(0, self._wake)    # before rospy waits for its threads
+        core.signal_shutdown('stop')
+        for proxy in core._xmlrpc_cache.values():
+            proxy('close')()
+        left = self._lifetime.end()
+        logs.close_handlers(self._logging)
+        return [thread.name for thread in left]
+
+    def _wake(self, reason):
+        self._lifetime.ended.set()
+        if self._lifetime.xmlrpc and self._lifetime.xmlrpc.handler:
+            changed = self._lifetime.xmlrpc.handler.reg_man.cond
+            with changed:
+                changed.notify_all()
+
+    def _topic_manager(self):
+        return self._modules.load('rospy.impl.registration').get_topic_manager()
+
+    # -- what the facade needs of rospy's inside -----------------------------------------------------------------------
+
+    @property
+    def log(self):
+        """rospy's ``_base_logger``: it reports the caller of its caller, so ``node.log`` must call it itself."""
+        return self._modules.load('rospy.core')._base_logger
+
+    @property
+    def start_thread(self):
+        """``start_thread(target, args=(), name=None)``: a thread that the stop waits for."""
+        return self._lifetime.start_thread
+
+    @property
+    def ended(self):
+        """The event set when the stop begins."""
+        return self._lifetime.ended
+
+    def owns(self, thread):
+        """Whether the thread is one of this node's."""
+        return thread in self._lifetime.threads
+
+    def connections(self, endpoint):
+        """``[(peer node name, transport)]`` of a rospy Publisher or Subscriber."""
+        return pubsub.connections(endpoint, {uri: other.name for uri, other in _running.copy().items()})
+
+    def connect_to_publishers_here(self, topic, timeout):
+        """Connect a new subscription to the publishers in this process now; the master's word takes its time."""
+        publishers = [other for other in self._nodes_here() if other._topic_manager().has_publication(topic)]
+        for other in publishers:
+            self.connect(topic, other.uri)
+        pubsub.wait_until(lambda: all(other._sends_to(self.name, topic) for other in publishers), timeout)
+
+    def connect_to_subscribers_here(self, topic):
+        """Have the subscribers in this process connect to a new publication now; rosmaster tells in steps of 0.1 s."""
+        for other in self._nodes_here():
+            if other._topic_manager().has_subscription(topic):
+                other.connect(topic, self.uri)
+
+    def _sends_to(self, name, topic):
+        publisher = self._topic_manager().get_publisher_impl(topic)
+        return publisher is None or any(connection.endpoint_id == name for connection in publisher.connections)
+
+    def _nodes_here(self):
+        return [other for other in _running.copy().values() if other.settings.master_url == self.settings.master_url]
+
+    def connect(self, topic, uri):
+        """Connect the subscription to the publisher at that URI, unless it is connected."""
+        handler = self._lifetime.xmlrpc.handler
+        if handler is not None:    # None: it is stopping
+            handler._connect_topic(topic, uri)
+
+
+class _ports_checked:
+    """Turns the failure to bind a port into an error that names it."""
+
+    def __init__(self, what, port):
+        self._what, self._port = what, port
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, kind, error, traceback):
+        if isinstance(error, OSError) and error.errno in (errno.EADDRINUSE, errno.EACCES):
+            raise PortInUseError('%s %d cannot be bound (%s): choose another port, or 0 for any free one'
+                                 % (self._what, self._port, error.strerror)) from error
+
+
+def _share_service_exception(module):
+    """rospy.service: one ServiceException for all nodes, so that ``except rospy.ServiceException`` catches it."""
+    module.ServiceException = host.rospy.ServiceException

@@ -1,0 +1,69 @@
+"""What a node's rospy holds while it runs, so that its stop leaves nothing behind: threads and sockets."""
+import socket
+import threading
+import time
+import weakref
+
+JOIN_TIMEOUT = 2.0    # seconds that a thread is waited for
+
+
+class Lifetime:
+    """The threads and accepted sockets of one run of a node, and the event that ends it.
+
+    :attr:`ended` is set when the node stops: sleeps inside rospy end with it.
+    """
+
+    def __init__(self, name):
+        self.ended = threading.Event()
+        self.threads = weakref.WeakSet()
+        self.xmlrpc = None    # the node's XML-RPC server, once it is bound
+        self._sockets = weakref.WeakSet()
+        lifetime = self
+
+        class Thread(threading.Thread):
+            """A thread that is named after its node, ends with the process, and can be waited for."""
+
+            def start(self):
+                self.daemon = True
+                self.name = '%s %s' % (name, self.name)
+                lifetime.threads.add(self)
+                super().start()
+
+        self.Thread = Thread
+
+    def start_thread(self, target, args=(), name=None):
+        """Run ``target`` in a thread of this lifetime; the same as ``_thread.start_new_thread``."""
+        thread = self.Thread(target=target, args=args, name=name)
+        thread.start()
+        return thread
+
+    def sleep(self, seconds):
+        """``time.sleep`` that ends with the node; ``sleep(0)`` yields, as rospy's publishers mean it to."""
+        if seconds > 0:
+            self.ended.wait(seconds)
+        else:
+            time.sleep(0)
+
+    def hold(self, sock):
+        """Shut this socket down at the end, at the latest."""
+        self._sockets.add(sock)
+
+    def end(self):
+        """Shut the sockets, wait for the threads; returns those that did not end in time."""
+        self.ended.set()
+        for sock in list(self._sockets):
+            shut(sock)
+        me = threading.current_thread()
+        threads = [thread for thread in list(self.threads) if thread is not me]
+        deadline = time.monotonic() + JOIN_TIMEOUT
+        for thread in threads:
+            thread.join(max(0.0, deadline - time.monotonic()))
+        return [thread for thread in threads if thread.is_alive()]
+
+
+def shut(sock):
+    """Shut a socket down: unlike ``close`` alone, this wakes a thread that waits on it."""
+    try:
+        sock.shutdown(socket.SHUT_RDWR)
+    except OSError:
+        pass    # not connected, or closed already

@@ -1,0 +1,139 @@
+"""How a node registers with the master and hears from it."""
+import http.client
+import threading
+import xmlrpc.client
+
+import rosgraph
+
+from pharos.errors import NodeNameInUseError
+from pharos.private_rospy.proxies import ServerProxy, master_api
+
+PING_TIMEOUT = 1.0          # seconds in which a running node answers getPid
+UNREGISTER_TIMEOUT = 2.0    # seconds that a stop waits for the master
+COMMUNICATION_ERRORS = (OSError, xmlrpc.client.Error, http.client.HTTPException)
+
+
+def hooks(instance):
+    """The load hooks of this module, for the :class:`~.instance.PrivateRospy` given."""
+
+    def obey_only_the_master_of_the_name(module):
+        """rospy.impl.masterslave: who may end the node, and one connection per publisher."""
+        handler = module.ROSHandler
+        connect, lock = handler._connect_topic, threading.Lock()
+        connecting = {}    # (topic, URI) -> whether it was asked for again meanwhile
+
+        def _connect_topic(self, topic, uri):
+            """rospy looks for a connection long before it adds one, and so may connect twice to one publisher."""
+            with lock:
+                if (topic, uri) in connecting:
+                    connecting[topic, uri] = True
+                    return 1, 'connecting to %s already' % uri, 0
+                connecting[topic, uri] = False
+            again = True
+            while again:
+                answer = 0, 'failed', 0
+                try:
+                    answer = connect(self, topic, uri)
+                finally:
+                    with lock:
+                        # asked for again: what was no publisher a moment ago may be one now
+                        again = connecting[topic, uri] and answer[0] != 1
+                        connecting[topic, uri] = False
+                        if not again:
+                            del connecting[topic, uri]
+            return answer
+        handler._connect_topic = _connect_topic
+
+        @module.apivalidate(0, (None,))
+        def shutdown(self, caller_id, msg=''):
+            if 'new node registered with same name' in str(msg) and not _name_is_anothers(self):
+                # the master meant an earlier owner of this URI (ros_comm #2241)
+                return 1, 'the name %s is still this node\'s' % self.name, 0
+            instance.request_stop('%s asked for it: %s' % (caller_id, msg))
+            return 1, 'shutdown', 0
+        handler.shutdown = shutdown
+
+    def register_once(module):
+        """rospy.impl.registration: retries while it holds the topic lock, so that nothing can stop it."""
+        manager = module.RegManager
+
+        def reg_added(self, name, type_or_uri, kind):
+            master, me = module.xmlrpcapi(self.master_uri), module.get_caller_id()
+            call = {'pub': master.registerPublisher, 'sub': master.registerSubscriber,
+                    'srv': master.registerService}[kind]
+            try:
+                code, message, value = call(me, name, type_or_uri, self.uri)
+            except COMMUNICATION_ERRORS as error:
+                code, message = 0, error
+            if code != 1:
+                module.logerr('cannot register %s %s with the master %s: %s' % (kind, name, self.master_uri, message))
+            elif kind == 'sub':
+                self.publisher_update(name, value)
+        manager.reg_added = reg_added
+
+        def cleanup(self, reason):
+            """rospy's version trips over a time-out and then closes nothing."""
+            with self.cond:
+                self.cond.notify_all()
+            if not self.master_uri:
+                return
+            module.get_registration_listeners().clear()
+            topics, services, me = module.get_topic_manager(), module.get_service_manager(), module.get_caller_id()
+            calls = xmlrpc.client.MultiCall(ServerProxy(self.master_uri, UNREGISTER_TIMEOUT))
+            for name, _ in topics.get_subscriptions():
+                calls.unregisterSubscriber(me, name, self.uri)
+            for name, _ in topics.get_publications():
+                calls.unregisterPublisher(me, name, self.uri)
+            for name, uri in services.get_services():
+                calls.unregisterService(me, name, uri)
+            try:
+                calls()
+            except COMMUNICATION_ERRORS as error:
+                self.logger.warning('cannot unregister from the master %s: %s', self.master_uri, error)
+            topics.close_all()
+            services.unregister_all()
+        manager.cleanup = cleanup
+
+    return {'rospy.impl.masterslave': obey_only_the_master_of_the_name, 'rospy.impl.registration': register_once}
+
+
+def _name_is_anothers(handler):
+    """Whether the master gives the node's name to another node than this one."""
+    try:
+        return master_api(handler.masterUri, handler.name, PING_TIMEOUT).lookupNode(handler.name) != handler.uri
+    except Exception:    # MasterError: the name is unknown; or no master, which then did not call either
+        return False
+
+
+def claim_name(master_url, name, timeout):
+    """Make sure that no running node has ``name``; what a dead one left with the master goes.
+
+    :raises NodeNameInUseError: if a running node has the name, or one that cannot be told from it
+    """
+    master = master_api(master_url, name, timeout)
+    try:
+        uri = master.lookupNode(name)
+    except rosgraph.MasterError:    # unknown to the master, as it should be
+        return
+    try:
+        ServerProxy(uri, PING_TIMEOUT).getPid(name)
+    except ConnectionRefusedError:
+        _unregister_all(master, name, uri)    # nobody is left at that URI
+    except OSError as error:
+        raise NodeNameInUseError('the node name %s is taken by a node at %s that does not answer (%s): choose another '
+                                 'name, or run rosnode cleanup if that node is gone' % (name, uri, error)) from error
+    else:
+        raise NodeNameInUseError('the node name %s is taken by a running node at %s: choose another name, or stop '
+                                 'that node (rosnode kill %s)' % (name, uri, name))
+
+
+def _unregister_all(master, name, uri):
+    """Remove the registrations of a node that is gone; rosnode's own function asks the environment's master."""
+    publishers, subscribers, services = master.getSystemState()
+    for names, unregister in (publishers, master.unregisterPublisher), (subscribers, master.unregisterSubscriber):
+        for topic, nodes in names:
+            if name in nodes:
+                unregister(topic, uri)
+    for service, nodes in services:
+        if name in nodes:
+            master.unregisterService(service, master.lookupService(service))

@@ -1,0 +1,68 @@
+"""What one node is to be: name, master, address, ports and remappings, as rospy reads them.
+
+rospy takes them from ``os.environ`` and ``sys.argv``; a node gets private ones, so that no rospy function need be
+overridden and the process's own stay untouched.
+"""
+import os
+
+import rosgraph.names
+from rosgraph.rosenv import ROS_HOSTNAME, ROS_IP, ROS_MASTER_URI, ROS_NAMESPACE
+
+
+class Settings:
+    """The settings of one node.
+
+    :param name: node name; '/robot1/driver' carries a namespace, 'driver' is in ROS_NAMESPACE or '/'
+    :param master_url: URL of the ROS master
+    :param domain: address to advertise and, if it is loopback, the only one to listen on; None: what
+        ROS_HOSTNAME, ROS_IP or the host's name say
+    :param tcp_port: TCPROS port, 0 for any free one
+    :param xmlrpc_port: XML-RPC port, 0 for any free one
+    :param argv: ROS remappings and private parameters; what is no remapping is ignored
+    :raises ValueError: if a name or port cannot be one
+    """
+
+    def __init__(self, name, master_url, domain=None, tcp_port=0, xmlrpc_port=0, argv=None):
+        mappings = [arg for arg in argv or () if rosgraph.names.REMAP in arg and not arg.startswith('__master:=')]
+        special = rosgraph.names.load_mappings(mappings)
+        self.environ = dict(os.environ)
+        self.environ[ROS_MASTER_URI] = master_url
+        if domain is not None:
+            self.environ.pop(ROS_IP, None)
+            self.environ[ROS_HOSTNAME] = domain
+        namespace, _, base = check_name(name).rpartition('/')
+        if name.startswith('/'):
+            self.environ[ROS_NAMESPACE] = namespace or '/'
+        elif namespace:
+            self.environ[ROS_NAMESPACE] = rosgraph.names.ns_join(rosgraph.names.get_ros_namespace(argv=[]), namespace)
+        self.base_name = check_name(special.get('__name', base), base=True)
+        self.namespace = rosgraph.names.get_ros_namespace(self.environ, mappings)
+        self.name = self.namespace + self.base_name
+        self.argv = [self.base_name, *mappings]
+        self.master_url = master_url
+        self.tcp_port = check_port('tcp_port', tcp_port)
+        self.xmlrpc_port = check_port('xmlrpc_port', xmlrpc_port)
+
+
+def check_name(name, base=False):
+    """``name`` if it can be a node's, else ValueError with a caret under the first bad character."""
+    legal = rosgraph.names.is_legal_base_name if base else rosgraph.names.is_legal_name
+    if not isinstance(name, str):
+        raise ValueError('a node name is a string, not %r' % (name,))
+    stem = name.rstrip('/')
+    if name and stem == name and legal(name) and not name.startswith('~'):
+        return name
+    if not stem:
+        raise ValueError("a node needs a name, for example named='/driver'; got %r" % name)
+    allowed = 'letters, digits and _%s, beginning with a letter' % ('' if base else ', parts joined by /')
+    for end in range(1, len(name) + 1):
+        if not legal(name[:end].rstrip('/') or 'a') or name[:end].startswith('~'):
+            break
+    raise ValueError('%r cannot be a node name (%s):\n  %s\n  %s^' % (name, allowed, name, ' ' * (end - 1)))
+
+
+def check_port(what, port):
+    """``port`` if it is one, else ValueError."""
+    if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port <= 65535:
+        raise ValueError('%s must be a port number, 0 (any free one) to 65535, not %r' % (what, port))
+    return port

@@ -1,0 +1,99 @@
+"""ROS programs run as processes of their own."""
+import collections
+import os
+import subprocess
+import threading
+
+from pharos.errors import UnknownNodeError
+
+
+class RosProcess:
+    """A running ROS program; made by :meth:`Master.run`. Ends with its ``with`` block."""
+
+    def __init__(self, command, environ, on_line=None):
+        self.command = command
+        self._on_line = on_line
+        self._lines = collections.deque(maxlen=10000)
+        self._process = subprocess.Popen(command, env=environ, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+                                         stderr=subprocess.STDOUT, text=True, errors='replace')
+        self._reader = threading.Thread(target=self._read, name='output of %s' % command[0], daemon=True)
+        self._reader.start()
+
+    def _read(self):
+        with self._process.stdout as output:
+            for line in output:
+                line = line.rstrip('\n')
+                self._lines.append(line)
+                if self._on_line:
+                    self._on_line(line)
+
+    @property
+    def pid(self):
+        return self._process.pid
+
+    @property
+    def output(self):
+        """What it has printed so far, standard output and errors together."""
+        return '\n'.join(self._lines)
+
+    def poll(self):
+        """Its exit status, None while it runs."""
+        return self._process.poll()
+
+    def wait(self, timeout=None):
+        """Wait until it ends; returns its exit status.
+
+        :raises subprocess.TimeoutExpired: after ``timeout`` seconds
+        """
+        status = self._process.wait(timeout)
+        self._reader.join(1.0)
+        return status
+
+    def terminate(self, timeout=5.0):
+        """Ask it to end, and end it after ``timeout`` seconds; returns its exit status."""
+        if self.poll() is None:
+            self._process.terminate()
+            try:
+                return self.wait(timeout)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+        return self.wait()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.terminate()
+
+    def __repr__(self):
+        return '<RosProcess %s, %s>' % (' '.join(self.command),
+                                        'pid %d' % self.pid if self.poll() is None else 'ended with %d' % self.poll())
+
+
+def run(master_url, package, executable, args, on_line=None):
+    """Start a program as ``rosrun`` would, at the master given.
+
+    :raises UnknownNodeError: if there is no such package or program
+    """
+    paths = _find(package, executable)
+    if not paths:
+        raise UnknownNodeError('the ROS package %s has no program %r: see what it has with rosrun %s <Tab>'
+                               % (package, executable, package))
+    return RosProcess([paths[0], *args], dict(os.environ, ROS_MASTER_URI=master_url), on_line)
+
+
+def _find(package, executable):
+    """The paths of a program, as rosrun looks it up."""
+    import roslib.packages    # only here: they are slow to import
+    import rospkg
+    from catkin.find_in_workspaces import find_in_workspaces
+    try:
+        return roslib.packages.find_node(package, executable)
+    except rospkg.ResourceNotFound:
+        # Debian's topic_tools and others have no package.xml, but catkin knows their folder
+        folders = find_in_workspaces(['libexec'], project=package)
+        if not folders:
+            raise UnknownNodeError('no ROS package %r on ROS_PACKAGE_PATH: install it, or source its workspace\'s '
+                                   'setup.bash' % package) from None
+        paths = [os.path.join(folder, executable) for folder in folders]
+        return [path for path in paths if os.access(path, os.X_OK)]

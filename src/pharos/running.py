@@ -1,0 +1,86 @@
+"""The running nodes of this process, and how they end with it."""
+import atexit
+import contextlib
+import signal
+import threading
+import time
+
+_nodes = {}    # a dict, for its order
+_none_left = threading.Condition()
+_waiting = 0   # how deep the main thread is in a wait of ours, which ends with the nodes
+
+
+def add(node):
+    with _none_left:
+        _nodes[node] = None
+    _handle_signals()
+
+
+def discard(node):
+    with _none_left:
+        _nodes.pop(node, None)
+        if not _nodes:
+            _none_left.notify_all()
+
+
+def nodes():
+    """The running nodes, in the order of their starts."""
+    with _none_left:
+        return list(_nodes)
+
+
+def spin():
+    """Block until every node of the process has stopped, or Ctrl-C or SIGTERM, which stops them."""
+    with waiting():
+        try:
+            with _none_left:
+                _none_left.wait_for(lambda: not _nodes)
+        except KeyboardInterrupt:    # where the host program has a handler of its own
+            stop_all()
+
+
+def stop_all():
+    """Stop all nodes of the process, side by side."""
+    threads = [threading.Thread(target=node.stop, name=node.name + ' stop', daemon=True) for node in nodes()]
+    for thread in threads:
+        thread.start()
+    join(threads, 10.0)
+
+
+def join(threads, timeout):
+    """Wait until the threads have ended, for up to ``timeout`` seconds in all."""
+    deadline = time.monotonic() + timeout
+    for thread in threads:
+        thread.join(max(0.0, deadline - time.monotonic()))
+
+
+@contextlib.contextmanager
+def waiting():
+    """Within this, a signal raises nothing in the main thread: the wait ends because the nodes stop."""
+    global _waiting
+    main = threading.current_thread() is threading.main_thread()
+    _waiting += main
+    try:
+        yield
+    finally:
+        _waiting -= main
+
+
+def _handle_signals():
+    """Let Ctrl-C and SIGTERM stop the nodes: once per process, and only where the host program does nothing itself."""
+    if threading.current_thread() is threading.main_thread():
+        for number, default in (signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL):
+            if signal.getsignal(number) is default:
+                signal.signal(number, _on_signal)
+
+
+def _on_signal(number, frame):
+    stop = threading.Thread(target=stop_all, name='stop on signal', daemon=True)
+    stop.start()    # not here: the main thread may hold any lock just now
+    if not _waiting:
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
+        raise SystemExit(128 + number)    # as the shell reports a process that SIGTERM ended
+
+
+atexit.register(stop_all)

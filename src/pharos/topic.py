@@ -1,0 +1,86 @@
+"""Topics: named buses, and the dispatchers that hand a node its channel."""
+import rosgraph
+
+from pharos import message_types
+from pharos.channel import InputChannel, OutputChannel
+from pharos.errors import MessageTypeError, UnknownTopicError
+
+QUEUE_SIZE = 1000    # messages kept for a slow receiver, where nothing else is said
+
+
+class Topic:
+    """A topic of one master.
+
+    The report: "When a node asks for information or publishes information, it asks the right instance of PhaROSTopic
+    to give it the correct channel." Topics hold no state: ask :meth:`Master.topic <pharos.Master.topic>` as you like.
+    """
+
+    def __init__(self, master, name):
+        self.master = master
+        self.name = name
+
+    @property
+    def type(self):
+        """The type name, such as 'turtlesim/Velocity'.
+
+        :raises UnknownTopicError: if the master knows no such topic, or nobody has given its type yet
+        """
+        types = dict(self.master.topic_types())
+        name = types.get(self.name)
+        if name is None:
+            raise UnknownTopicError('no node of %s publishes or subscribes to %s%s: name its type with typed_as=, or '
+                                    'start the other node first'
+                                    % (self.master.url, self.name, self.master.near(self.name, types)))
+        if name == rosgraph.names.ANYTYPE:
+            raise UnknownTopicError('the type of %s is not known yet, for only subscribers of any type are there: '
+                                    'name it with typed_as=' % self.name)
+        return name
+
+    @property
+    def publishers(self):
+        """Names of the nodes that publish on it."""
+        return self.master.system_state()[0].get(self.name, [])
+
+    @property
+    def subscribers(self):
+        """Names of the nodes that are interested in it."""
+        return self.master.system_state()[1].get(self.name, [])
+
+    @property
+    def channels(self):
+        """The channels that nodes of this process have open on it."""
+        return [channel for node in self.master.own_nodes() for channel in node.channels if channel.topic == self.name]
+
+    def input_channel(self, node, typed_as=None, delegate=None, queue_size=QUEUE_SIZE, inline=False, shared=False,
+                      from_=None):
+        """A new :class:`~pharos.InputChannel` of ``node``; see :meth:`Node.interested_in`."""
+        return InputChannel(node, self.name, self.message_class(node, typed_as), delegate=delegate,
+                            queue_size=queue_size, inline=inline, shared=shared, from_=from_)
+
+    def output_channel(self, node, typed_as=None, latch=False, queue_size=QUEUE_SIZE, connect_timeout=None):
+        """A new :class:`~pharos.OutputChannel` of ``node``; see :meth:`Node.output_channel`."""
+        return OutputChannel(node, self.name, self.message_class(node, typed_as), latch=latch, queue_size=queue_size,
+                             connect_timeout=connect_timeout)
+
+    def message_class(self, node, typed_as=None):
+        """The message class of the topic for ``node``: ``typed_as``, else what the node knows, else the master's.
+
+        :raises MessageTypeError: if the node uses the topic with another type already
+        """
+        known = next((channel.message_class for channel in node.channels if channel.topic == self.name), None)
+        if typed_as is None:
+            return known or message_types.message_class(self.type)
+        asked = message_types.message_class(typed_as)
+        if known and asked._md5sum != known._md5sum:
+            raise MessageTypeError('%s uses %s with the type %s already and cannot use it as %s too: close that '
+                                   'channel first' % (node.name, self.name, known._type, asked._type))
+        return asked
+
+    def __eq__(self, other):
+        return isinstance(other, Topic) and (self.master.url, self.name) == (other.master.url, other.name)
+
+    def __hash__(self):
+        return hash((self.master.url, self.name))
+
+    def __repr__(self):
+        return '<Topic %s of %s>' % (self.name, self.master.url)

@@ -1,0 +1,90 @@
+"""Fixtures: a real ROS master in this process, on a free port and loopback, so that runs go side by side."""
+import os
+import pathlib
+import queue
+import sys
+import tempfile
+import threading
+
+# before pharos is imported: logs and addresses of the tests are their own
+os.environ['ROS_HOSTNAME'] = '127.0.0.1'
+os.environ['ROS_LOG_DIR'] = tempfile.mkdtemp(prefix='pharos-test-log-')
+for name in ('ROS_IP', 'ROS_NAMESPACE', 'ROS_MASTER_URI'):
+    os.environ.pop(name, None)
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parent.parent / 'src'))
+
+import pytest  # noqa: E402
+import rosmaster.master  # noqa: E402
+
+import pharos  # noqa: E402
+from pharos import running  # noqa: E402
+
+TIMEOUT = 20.0    # seconds; a bound on waits for events, never reached in a test that passes
+
+
+class Mailbox:
+    """A delegate that keeps what it gets, and lets the test wait for it."""
+
+    def __init__(self):
+        self._messages = queue.SimpleQueue()
+
+    def __call__(self, message, channel):
+        self._messages.put((message, channel))
+
+    def get(self):
+        """The next message; fails after TIMEOUT."""
+        return self.get_with_channel()[0]
+
+    def get_with_channel(self):
+        return self._messages.get(timeout=TIMEOUT)
+
+    def take(self, count):
+        return [self.get() for _ in range(count)]
+
+    def empty(self):
+        return self._messages.empty()
+
+
+class InProcessMaster:
+    """rosmaster's own master, in this process."""
+
+    def __init__(self, port=0):
+        self._master = rosmaster.master.Master(port=port)
+        self._master.start()
+        ready = threading.Event()
+        while not self._master.uri:
+            ready.wait(0.001)    # rosmaster has no event for it
+        self.url = 'http://127.0.0.1:%d/' % self._master.master_node.port
+
+    def stop(self):
+        self._master.stop()
+
+
+@pytest.fixture(scope='session')
+def ros_master():
+    """One ROS master for the whole run; a test leaves nothing on it."""
+    master = InProcessMaster()
+    yield master
+    master.stop()
+
+
+@pytest.fixture
+def master(ros_master, monkeypatch):
+    """A pharos.Master; every node that the test leaves running is stopped, and nothing may stay registered."""
+    monkeypatch.setenv('ROS_MASTER_URI', ros_master.url)
+    yield pharos.Master(ros_master.url)
+    running.stop_all()
+
+
+@pytest.fixture
+def mailbox():
+    return Mailbox()
+
+
+@pytest.fixture
+def transcript():
+    """What the Transcript shows, as a list."""
+    lines = []
+    before = pharos.Transcript.on_show(lines.append)
+    yield lines
+    pharos.Transcript.on_show(before)

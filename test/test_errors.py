@@ -1,0 +1,185 @@
+"""Bad input: each its own error, which names the thing and the remedy, and leaves nothing behind."""
+import socket
+import threading
+
+import pytest
+
+import pharos
+from pharos import BlockNode, Master
+from pharos.private_rospy.host import rospy
+
+
+def create(master, name='/node', **kwargs):
+    return master.create(BlockNode, named=name, **{'domain': '127.0.0.1', **kwargs})
+
+
+@pytest.fixture
+def busy_port():
+    with socket.socket() as sock:
+        sock.bind(('127.0.0.1', 0))
+        sock.listen()
+        yield sock.getsockname()[1]
+
+
+@pytest.fixture
+def nothing_left(master):
+    """After the test, no thread and no registration more than before."""
+    before = set(threading.enumerate()), master.system_state()
+    yield
+    left = [thread.name for thread in set(threading.enumerate()) - before[0] if '/node' in thread.name]
+    assert (left, master.system_state()) == ([], before[1])
+
+
+@pytest.mark.parametrize('which', ['tcp_port', 'xmlrpc_port'])
+def test_a_busy_port(master, busy_port, nothing_left, which):
+    with pytest.raises(pharos.PortInUseError, match='%s %d cannot be bound .*: choose another' % (which, busy_port)):
+        create(master, **{which: busy_port})
+
+
+def test_a_taken_name(master):
+    owner = create(master, '/taken')
+    with pytest.raises(pharos.NodeNameInUseError, match='/taken is taken by a running node .*rosnode kill /taken'):
+        create(master, '/taken')
+    assert owner.is_running and master.answers('/taken')
+
+
+def test_a_name_left_by_a_dead_node_is_free(master):
+    with socket.socket() as sock:
+        sock.bind(('127.0.0.1', 0))
+        dead = 'http://127.0.0.1:%d/' % sock.getsockname()[1]
+    master._api('/dead').registerPublisher('/left_behind', 'std_msgs/Empty', dead)
+    create(master, '/dead')
+    assert '/left_behind' not in master.system_state()[0]
+
+
+def test_no_master():
+    with socket.socket() as sock:
+        sock.bind(('127.0.0.1', 0))
+        nobody = Master('http://127.0.0.1:%d' % sock.getsockname()[1])
+    with pytest.raises(pharos.MasterUnreachableError, match=nobody.url + '.*roscore'):
+        create(nobody)
+    with pytest.raises(pharos.MasterUnreachableError, match=nobody.url):
+        nobody.nodes()
+    assert not nobody.is_reachable()
+
+
+def test_a_master_that_never_answers_is_given_up(monkeypatch):
+    monkeypatch.setattr(BlockNode, 'connect_timeout', 0.2)
+    with socket.socket() as silent:
+        silent.bind(('127.0.0.1', 0))
+        silent.listen()
+        with pytest.raises(pharos.MasterUnreachableError, match='timed out'):
+            create(Master('http://127.0.0.1:%d' % silent.getsockname()[1]))
+
+
+@pytest.mark.parametrize('url', ['', 'localhost:11311', 'http://', 'http://host', 'http://host:port', 'ftp://host:1',
+                                 'http://host:1/path', 7, b'http://host:1'])
+def test_a_malformed_url(url):
+    with pytest.raises(ValueError, match='looks like http://127.0.0.1:11311/'):
+        Master(url)
+
+
+@pytest.mark.parametrize('name', ['', '/', '//', '/a b', '/1st', '~private', '/ends/', 'é', None, '/a-b'])
+def test_a_name_that_cannot_be_a_nodes(master, nothing_left, name):
+    with pytest.raises(ValueError, match='node'):
+        create(master, name)
+
+
+def test_a_bad_name_has_a_caret_under_its_first_bad_character(master):
+    with pytest.raises(ValueError) as error:
+        create(master, '/robot/dri ver')
+    line, caret = str(error.value).split('\n')[-2:]
+    assert line[caret.index('^')] == ' ' and line.strip() == '/robot/dri ver'
+
+
+@pytest.mark.parametrize('port', [-1, 65536, '80', 1.5, None, True])
+def test_a_port_that_is_none(master, port):
+    with pytest.raises(ValueError, match='tcp_port must be a port number'):
+        create(master, tcp_port=port)
+
+
+def test_a_node_class_that_is_none(master):
+    with pytest.raises(TypeError, match='subclass of Node'):
+        master.create(dict, named='/node')
+
+
+@pytest.mark.parametrize('block', [7, 'text', lambda: None, lambda message: None])
+def test_a_delegate_that_cannot_be_called_as_one(master, block):
+    with pytest.raises(TypeError, match=r'delegate\(message, channel\)'):
+        create(master, delegate=block)
+
+
+def test_an_unknown_type(master):
+    with pytest.raises(pharos.UnknownTypeError, match="unknown message type 'turtlesim/Speed'.*define_message"):
+        create(master).send_to('/t', typed_as='turtlesim/Speed')
+
+
+def test_an_unknown_topic(master):
+    node = create(master)
+    with pytest.raises(pharos.UnknownTopicError, match='no node of .* publishes or subscribes to /t.*typed_as='):
+        node.send_to('/t', data=1)
+    node.output_channel('/turtle1/pose', 'turtlesim/Pose')
+    with pytest.raises(pharos.UnknownTopicError, match='did you mean /turtle1/pose'):
+        create(master, '/other').interested_in('/turtle1/poes')
+
+
+def test_another_type_for_a_topic_in_use(master):
+    node = create(master)
+    node.interested_in('/t', 'std_msgs/String')
+    with pytest.raises(pharos.MessageTypeError, match='std_msgs/String already .* std_msgs/Bool'):
+        node.send_to('/t', data=True, typed_as='std_msgs/Bool')
+
+
+def fills_by_setattr(message):
+    message.liner = 1.0
+
+
+def fills_with_text(message):
+    message.linear = 'fast'
+
+
+@pytest.mark.parametrize('block, fields, said', [
+    (None, {'liner': 1.0}, 'turtlesim/Velocity has no field .liner. .*did you mean .linear.*linear: float32, angular'),
+    (fills_by_setattr, {}, 'turtlesim/Velocity has no field .liner.'),
+    (None, {'linear': 'fast'}, 'turtlesim/Velocity.linear = .fast. does not fit float32: give a number'),
+    (fills_with_text, {}, 'turtlesim/Velocity.linear = .fast. does not fit float32'),
+])
+@pytest.mark.parametrize('interested', [False, True])
+def test_a_field_that_does_not_exist_or_does_not_fit(master, mailbox, block, fields, said, interested):
+    node = create(master)
+    if interested:
+        create(master, '/other', delegate=mailbox).interested_in('/t', 'turtlesim/Velocity')
+    with pytest.raises(pharos.MessageTypeError, match=said):
+        node.send_to('/t', block, typed_as='turtlesim/Velocity', **fields)
+    node.send_to('/t', linear=2)    # and the next one goes through
+    assert not interested or mailbox.get().linear == 2.0
+
+
+def test_a_message_of_another_type(master):
+    channel = create(master).output_channel('/t', 'turtlesim/Velocity')
+    for wrong in pharos.message_class('std_msgs/String')(), {'linear': 1.0}, None:
+        with pytest.raises(pharos.MessageTypeError, match='/t carries turtlesim/Velocity .linear: float32'):
+            channel.publish(wrong)
+
+
+def test_a_closed_channel(master):
+    channel = create(master).output_channel('/t', 'std_msgs/Empty')
+    channel.close()
+    channel.close()
+    with pytest.raises(pharos.NodeStoppedError, match='closed.*output_channel'):
+        channel.send()
+
+
+def test_an_exception_in_start_stops_the_node(master, nothing_left):
+    class Broken(pharos.Node):
+        def start(self):
+            super().start()
+            raise RuntimeError('broken')
+    with pytest.raises(RuntimeError, match='broken'):
+        master.create(Broken, named='/node')
+
+
+def test_all_errors_are_ros_exceptions():
+    errors = [getattr(pharos, name) for name in pharos.__all__ if name.endswith('Error')]
+    assert len(errors) == 12
+    assert all(issubclass(error, (pharos.PharosError, rospy.ROSException)) for error in errors)

@@ -1,0 +1,294 @@
+"""Nodes: real ROS nodes, many in one process."""
+import subprocess
+import sys
+import threading
+
+import pytest
+
+import pharos
+from conftest import TIMEOUT, Mailbox
+from pharos import BlockNode, Node
+from pharos.node import Lifecycle
+
+
+def create(master, name, **kwargs):
+    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
+
+
+def registered(master):
+    """The node names that the master knows."""
+    return {name for kind in master.system_state() for names in kind.values() for name in names}
+
+
+def run(*command):
+    return subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=60).stdout
+
+
+def test_ten_nodes_of_one_process_are_ten_ros_nodes(master):
+    names = ['/ten/n%d' % i for i in range(10)]
+    nodes = [create(master, name) for name in names]
+    assert set(names) <= set(run('rosnode', 'list').split())
+    assert 'xmlrpc reply' in run('rosnode', 'ping', '-c', '1', names[3])
+    assert '/rosout' in run('rosnode', 'info', names[7])
+    nodes[4].stop()
+    assert registered(master) & set(names) == set(names) - {names[4]}
+    assert len({node.tcp_port for node in nodes} | {node.xmlrpc_port for node in nodes}) == 20
+
+
+def test_a_message_goes_from_node_to_node(master, mailbox):
+    receiver = create(master, '/receiver', delegate=mailbox)
+    receiver.interested_in('/chat', 'std_msgs/String')
+    create(master, '/sender').send_to('/chat', data='hello')
+    message, channel = mailbox.get_with_channel()
+    assert message.data == 'hello'
+    assert (channel.topic, channel.type, channel.node) == ('/chat', 'std_msgs/String', receiver)
+
+
+def test_the_first_message_to_an_external_node_is_not_lost(master):
+    with subprocess.Popen([sys.executable, '-c', RECEIVE_ONE, '/first'], stdout=subprocess.PIPE, text=True) as echo:
+        wait_for_subscriber(master, '/first')
+        create(master, '/sender').send_to('/first', data='not lost')
+        assert 'not lost' in echo.communicate(timeout=60)[0]
+
+
+RECEIVE_ONE = """
+import sys, rospy, std_msgs.msg
+rospy.init_node('external_receiver')
+print(rospy.wait_for_message(sys.argv[1], std_msgs.msg.String).data)
+"""
+
+
+def wait_for_subscriber(master, topic):
+    ready = threading.Event()
+    while not master.topic(topic).subscribers:
+        ready.wait(0.01)    # another process: the master is all there is to ask
+
+
+def test_rostopic_publishes_to_a_node(master, mailbox):
+    node = create(master, '/listener', delegate=mailbox)
+    node.interested_in('/from_outside', 'std_msgs/Int32')
+    run('rostopic', 'pub', '-1', '/from_outside', 'std_msgs/Int32', '42')
+    assert mailbox.get().data == 42
+
+
+def test_a_roscpp_relay_passes_messages_between_two_nodes(master, mailbox):
+    receiver = create(master, '/receiver', delegate=mailbox)
+    receiver.interested_in('/relayed', 'std_msgs/String')
+    with master.run('topic_tools', 'relay', '/direct', '/relayed'):
+        sender = create(master, '/sender')
+        wait_for_subscriber(master, '/direct')
+        # relay advertises only once it has received something, so its own first messages are lost
+        sender.fork(lambda me: [me.send_to('/direct', data='through C++', typed_as='std_msgs/String')
+                                for _ in me.every(0.02)])
+        assert mailbox.get().data == 'through C++'
+
+
+def test_a_node_starts_again_under_the_same_name_and_ports(master, mailbox):
+    node = create(master, '/phoenix', delegate=mailbox)
+    node.interested_in('/ashes', 'std_msgs/String')
+    ports = node.tcp_port, node.xmlrpc_port
+    sender = create(master, '/sender')
+    for turn in range(3):
+        node.stop()
+        assert node.lifecycle is Lifecycle.STOPPED and '/phoenix' not in registered(master)
+        node.start()
+        assert node.lifecycle is Lifecycle.RUNNING and (node.tcp_port, node.xmlrpc_port) == ports
+        sender.stop()
+        sender.start()    # its channels come back as well, and wait for who is interested
+        sender.send_to('/ashes', data=str(turn), typed_as='std_msgs/String')
+        assert mailbox.get().data == str(turn)
+
+
+def test_a_subclass_makes_its_channels_in_start(master, mailbox):
+    class Logger(Node):
+        def start(self):
+            super().start()
+            self.delegate = mailbox
+            self.interested_in('/log_me', typed_as='std_msgs/String')
+
+    logger = master.create(Logger, named='/logger')
+    logger.stop()
+    logger.start()
+    assert len(logger.channels) == 1
+    create(master, '/sender').send_to('/log_me', data='once')
+    assert mailbox.get().data == 'once' and mailbox.empty()
+
+
+def test_further_keywords_go_to_the_nodes_init(master):
+    class Driver(Node):
+        def __init__(self, speed, turn=0.5):
+            super().__init__()
+            self.speed, self.turn = speed, turn
+
+    driver = master.create(Driver, named='/driver', speed=3)
+    assert (driver.speed, driver.turn, driver.name) == (3, 0.5, '/driver')
+
+
+def test_stop_twice_is_harmless_and_start_twice_is_not(master):
+    node = create(master, '/twice')
+    with pytest.raises(pharos.PharosError, match='running already: stop'):
+        node.start()
+    node.stop()
+    node.stop()
+    with pytest.raises(pharos.NodeStoppedError, match='/twice is stopped: start'):
+        node.send_to('/x', data='', typed_as='std_msgs/String')
+
+
+def test_the_end_of_a_with_block_stops_the_node(master):
+    with create(master, '/within') as node:
+        assert node.is_running
+    assert not node.is_running
+
+
+def test_rosnode_kill_stops_that_node_and_no_other(master):
+    victim, other = create(master, '/victim'), create(master, '/other')
+    stopped = threading.Event()
+    victim.fork(lambda me: [None for _ in me.every(0.01)] and stopped.set())
+    run('rosnode', 'kill', '/victim')
+    assert stopped.wait(TIMEOUT)
+    with victim._changing:
+        assert victim._changing.wait_for(lambda: victim.lifecycle is Lifecycle.STOPPED, TIMEOUT)
+    assert other.is_running and '/victim' not in registered(master) and '/other' in registered(master)
+
+
+def test_a_shutdown_meant_for_an_earlier_owner_of_the_uri_does_not_reach_a_node(master):
+    """ros_comm #2241: the master tells the old URI of a name to shut down, where another node lives by now."""
+    node = create(master, '/heir')
+    code, reason, _ = pharos.private_rospy.proxies.ServerProxy(node.uri).shutdown(
+        '/master', '[/old] Reason: new node registered with same name')
+    assert node.is_running and 'still this node' in reason
+
+
+def test_a_node_stops_from_its_own_delegate(master):
+    done = threading.Event()
+
+    def stop(message, channel):
+        channel.node.stop()
+        done.set()
+    node = create(master, '/suicide', delegate=stop)
+    node.interested_in('/poison', 'std_msgs/Empty')
+    create(master, '/sender').send_to('/poison')
+    assert done.wait(TIMEOUT) and node.lifecycle is Lifecycle.STOPPED
+
+
+def test_what_was_sent_before_the_stop_arrives(master, mailbox):
+    create(master, '/receiver', delegate=mailbox).interested_in('/late', 'std_msgs/String')
+    with create(master, '/sender') as sender:
+        for number in range(200):
+            sender.send_to('/late', data=str(number) + 'x' * 20000, typed_as='std_msgs/String')
+    assert [message.data.rstrip('x') for message in mailbox.take(200)] == [str(number) for number in range(200)]
+
+
+def test_a_soul_says_farewell(master, mailbox):
+    """A robot is to be halted when its driver stops."""
+    create(master, '/wheels', delegate=mailbox).interested_in('/speed', 'std_msgs/Float32')
+
+    def drive(me):
+        try:
+            while True:
+                me.send_to('/speed', data=1.0)
+                me.sleep(3600)
+        finally:
+            me.send_to('/speed', data=0.0)
+    driver = create(master, '/driver', soul=drive)
+    driver.fork()
+    assert mailbox.get().data == 1.0
+    driver.stop()
+    assert mailbox.get().data == 0.0 and not driver.errors
+
+
+def test_a_soul_that_ignores_the_stop_is_named_and_left_behind(master, capfd):
+    release = threading.Event()
+    node = create(master, '/stubborn')
+    node.stop_timeout = 0.1
+    node.fork(lambda me: release.wait(), name='deaf')
+    node.stop()
+    release.set()
+    assert 'left behind' in capfd.readouterr().err
+
+
+def test_an_exception_in_a_delegate_ends_only_that_run(master, transcript, mailbox):
+    def delegate(message, channel):
+        if message.data == 'bad':
+            raise ValueError('this one is bad')
+        mailbox(message, channel)
+    node = create(master, '/careful', delegate=delegate)
+    node.interested_in('/mixed', 'std_msgs/String')
+    sender = create(master, '/sender')
+    sender.send_to('/mixed', data='bad')
+    sender.send_to('/mixed', data='good')
+    assert mailbox.get().data == 'good'
+    assert [str(error) for error in node.errors] == ['this one is bad']
+    assert '/careful' in transcript[0] and '/mixed' in transcript[0] and 'ValueError: this one is bad' in transcript[0]
+
+
+def test_execute_runs_the_soul_here_and_returns_its_value(master):
+    node = create(master, '/soul', soul=lambda me: (me.name, threading.current_thread()))
+    assert node.execute() == ('/soul', threading.current_thread())
+    node.soul = lambda me: 1 / 0
+    assert node.execute() is None and isinstance(node.errors[-1], ZeroDivisionError)
+    node.soul = None
+    with pytest.raises(pharos.PharosError, match='no soul'):
+        node.execute()
+
+
+def test_every_turns_until_the_node_stops(master):
+    node = create(master, '/metronome')
+    turns = []
+    for _ in node.every(0.001):
+        turns.append(1)
+        if len(turns) == 20:
+            node.stop()
+    assert len(turns) == 20
+
+
+def test_sleep_ends_when_the_node_stops(master):
+    node = create(master, '/sleeper')
+    slept = threading.Event()
+    threading.Thread(target=lambda: (node.sleep(3600), slept.set()), daemon=True).start()
+    node.stop()
+    assert slept.wait(TIMEOUT)
+
+
+def test_every_and_sleep_follow_simulated_time(master):
+    master._api().setParam('/use_sim_time', True)
+    try:
+        clock = create(master, '/clock_server').output_channel('/clock', 'rosgraph_msgs/Clock')
+        node, turns, ticks = create(master, '/simulated'), Mailbox(), Mailbox()
+        node.interested_in('/clock', delegate=ticks)
+        clock.send(clock={'secs': 100})
+        ticks.get()
+
+        def soul(me):
+            for _ in me.every(10):
+                turns(me.ros.Time.now().secs, None)
+        node.fork(soul)
+        for seconds in (100, 110, 120, 130):
+            clock.send(clock={'secs': seconds})
+            assert turns.get() == seconds
+        node.stop()    # time stands still, the soul ends all the same
+    finally:
+        master._api().deleteParam('/use_sim_time')
+
+
+def test_delegates_of_a_node_run_one_at_a_time(master, mailbox):
+    busy = threading.Lock()
+    overlaps = []
+
+    def delegate(message, channel):
+        if not busy.acquire(blocking=False):
+            overlaps.append(message)
+        else:
+            busy.release()
+        mailbox(message, channel)
+    node = create(master, '/single', delegate=delegate)
+    senders = [create(master, '/sender%d' % i) for i in range(4)]
+    for i in range(4):
+        node.interested_in('/lane%d' % i, 'std_msgs/Int32')
+    for number in range(50):
+        for i, sender in enumerate(senders):
+            sender.send_to('/lane%d' % i, data=number)
+    received = [mailbox.get_with_channel() for _ in range(200)]
+    assert not overlaps
+    for i in range(4):
+        assert [m.data for m, channel in received if channel.topic == '/lane%d' % i] == list(range(50))
