@@ -8,7 +8,7 @@ import pytest
 import pharos
 from conftest import TIMEOUT, Mailbox
 from pharos import BlockNode, Node
-from pharos.node import Lifecycle
+from pharos.life import Lifecycle
 
 
 def create(master, name, **kwargs):

@@ -1,14 +1,15 @@
 """Channels: one node's end of a topic."""
 import collections
+import threading
 import time
 
 import genpy
 
 from pharos import message_types
 from pharos.blocks import check_delegate
+from pharos.dispatcher import Inbox
 from pharos.errors import MessageTypeError, NodeStoppedError
-from pharos.private_rospy.host import rospy
-from pharos.private_rospy.pubsub import wait_until
+from pharos.private_rospy.publishing import wait_until
 
 ANSWER_TIMEOUT = 0.5      # seconds in which the master has told a live subscriber; then it is asked whether it lives
 BUFFER_SIZE = 1 << 20     # bytes read from a socket at once; rospy's 64 KiB let subscribers of images fall behind
@@ -34,7 +35,7 @@ class _Channel:
     @property
     def connections(self):
         """``[(peer node name, transport)]``, transport being 'INTRAPROCESS' or 'TCPROS'."""
-        return self.node._rospy.connections(self._endpoint) if self.is_open else []
+        return self.node._rospy.wiring.connections(self._endpoint) if self.is_open else []
 
     @property
     def is_open(self):
@@ -46,9 +47,6 @@ class _Channel:
         if endpoint is not None:
             self.node._forget_channel(self)
             self._unregister(endpoint)
-
-    def _unregister(self, endpoint):
-        endpoint.unregister()
 
     def _stopped(self):
         """The node stops, and its rospy closes all endpoints."""
@@ -76,18 +74,22 @@ class InputChannel(_Channel):
         self.shared = shared
         self.from_ = getattr(from_, 'name', from_)
         self.received = 0
-        self._arrived = 0
-        self._queue = collections.deque(maxlen=queue_size)
+        self._offering = threading.Lock()    # TCPROS connections offer side by side
+        self._inboxes, self._dropped_before = [], 0
         self._open()
 
     def _open(self):
-        self._announce = self.node._dispatcher.announce
-        # queue_size is ours: rospy's would drop without counting
-        self._endpoint = self.node.ros.Subscriber(self.topic, self.message_class, self._offer, tcp_nodelay=True,
-                                                  buff_size=BUFFER_SIZE)
+        dispatcher = self.node._dispatcher
+        if not self.inline:
+            dispatcher.need_thread()
+        self._tcpros = self._add_inbox(Inbox(self, dispatcher, inline=True))
+        # rospy's queue_size would drop without counting; the inbox has ours
+        self._endpoint = self.node._rospy.wiring.subscribe(self, tcp_nodelay=True, buff_size=BUFFER_SIZE)
         self.node._remember_channel(self)
-        self.node._rospy.connect_to_publishers_here(self.topic, self.node.connect_timeout)
-        self.node._dispatcher.run()    # what came while the node did not know the channel yet
+        dispatcher.run()    # what came latched
+
+    def _unregister(self, endpoint):
+        self.node._rospy.wiring.unsubscribe(self, endpoint)
 
     @property
     def delegate(self):
@@ -100,23 +102,38 @@ class InputChannel(_Channel):
     @property
     def dropped(self):
         """How many messages were dropped, the oldest first, because the node was slower than they came."""
-        return self._arrived - self.received - len(self._queue)
+        return self._dropped_before + sum(inbox.dropped for inbox in self._inboxes)
+
+    def _new_inbox(self, thaw, header):
+        """An inbox for what a node of this process sends."""
+        return self._add_inbox(Inbox(self, self.node._dispatcher, self.inline, None if self.shared else thaw, header,
+                                     self.shared))
+
+    def _add_inbox(self, inbox):
+        over = [inbox for inbox in self._inboxes if inbox.closed and inbox.is_empty]
+        self._dropped_before += sum(inbox.dropped for inbox in over)
+        self._inboxes = [inbox for inbox in self._inboxes if inbox not in over] + [inbox]
+        return inbox
 
     def _offer(self, message):
-        """Take a message from rospy; its delegate runs as soon as the node is free."""
+        """Take a message from rospy, which runs the dispatcher after a batch of them."""
         if self.from_ is None or message._connection_header.get('callerid') == self.from_:
-            self._arrived += 1
-            self._queue.append(message)    # full, it drops the oldest
-            self._announce(self)
+            with self._offering:
+                self._tcpros.put(message)
 
-    def run_next(self):
-        """Run the delegate for the oldest message that waits; the dispatcher calls this."""
-        try:
-            message = self._queue.popleft()
-        except IndexError:
-            return    # it was dropped
+    def _receive(self, value, thaw, header):
+        """Run the delegate for a message; the dispatcher calls this, for one message of the node at a time."""
         self.received += 1
-        self.node._run_delegate(self._delegate, message, self)
+        block = self._delegate or self.node._delegate
+        if block is None:
+            return
+        try:
+            message = value if thaw is None else thaw(value)
+            if header is not None:
+                message._connection_header = header
+            block(message, self)
+        except Exception as error:
+            self.node._report(error, block, 'delegate', self)
 
 
 class OutputChannel(_Channel):
@@ -132,36 +149,44 @@ class OutputChannel(_Channel):
         self._open(connect_timeout)
 
     def _open(self, connect_timeout=None):
-        self._endpoint = self.node.ros.Publisher(self.topic, self.message_class, tcp_nodelay=True, latch=self.latch,
-                                                 queue_size=self.queue_size)
+        self._endpoint, self._send = self.node._rospy.wiring.advertise(self, tcp_nodelay=True, queue_size=self.queue_size)
         self.node._remember_channel(self)
-        self.node._rospy.connect_to_subscribers_here(self.topic)
         self._wait_for_known_subscribers(self.node.connect_timeout if connect_timeout is None else connect_timeout)
 
-    def publish(self, message):
-        """Send ``message`` to all who are interested.
+    def publish(self, message, to=None):
+        """Send ``message`` to all who are interested, or to the node ``to`` alone.
 
+        :param to: a name, Node or ExternalNode
         :raises MessageTypeError: if it is of another type, or a field holds what does not fit
         :raises NodeStoppedError: if the channel is closed
         """
-        endpoint = self._endpoint
-        if endpoint is None:
-            raise NodeStoppedError('the channel of %s on %s is closed: open another with output_channel()'
-                                   % (self.node.name, self.topic))
+        if message.__class__ is not self.message_class:
+            self._check_type(message)
+        try:
+            self._send(message, getattr(to, 'name', to))
+        except Exception as error:
+            self._explain(error, message)
+        self.sent += 1
+
+    def _check_type(self, message):
         if not isinstance(message, genpy.Message) or message._md5sum not in (self.message_class._md5sum, '*'):
             raise MessageTypeError('%s carries %s (%s), not %s' % (
                 self.topic, self.type, message_types.describe_fields(self.message_class),
                 getattr(message, '_type', None) or repr(message)))
-        try:
-            endpoint.publish(message)
-        except Exception as error:
-            if isinstance(error, rospy.ROSException) and not isinstance(error, rospy.ROSSerializationException):
-                raise NodeStoppedError('%s stopped while it published on %s' % (self.node.name, self.topic)) from error
-            message_types.check_fits(message)
-            raise MessageTypeError('%s cannot be sent on %s: %s' % (self.type, self.topic, error)) from error
-        self.sent += 1
 
-    def send(self, block=None, **fields):
+    def _explain(self, error, message):
+        """Raise our error for one that publishing raised."""
+        if not self.is_open:
+            raise NodeStoppedError('the channel of %s on %s is closed: open another with output_channel()'
+                                   % (self.node.name, self.topic)) from error
+        message_types.check_fits(message)
+        raise MessageTypeError('%s cannot be sent on %s: %s' % (self.type, self.topic, error)) from error
+
+    def _unregister(self, endpoint):
+        self._send = _closed
+        self.node._rospy.wiring.unadvertise(self, endpoint)
+
+    def send(self, block=None, *, to=None, **fields):
         """Fill a fresh message with ``block(message)`` and by keywords, publish it, and return it."""
         message = self.message_class()
         if block is not None:
@@ -174,7 +199,7 @@ class OutputChannel(_Channel):
             message_types.fill(message, fields)
         if not self.connections:
             message_types.check_fits(message)    # with nobody interested, rospy does not look at it
-        self.publish(message)
+        self.publish(message, to)
         return message
 
     def wait_for_subscribers(self, count=1, timeout=None):
@@ -200,3 +225,12 @@ class OutputChannel(_Channel):
             # those that do not answer any more, killed for example, are not worth the wait
             missing.intersection_update(filter(self.node.master.answers, tuple(missing)))
             wait_until(connected, deadline - time.monotonic())
+
+    def _stopped(self):
+        super()._stopped()
+        self._send = _closed
+
+
+def _closed(message, to):
+    """Instead of a closed channel's way."""
+    raise NodeStoppedError('closed')

@@ -1,32 +1,143 @@
-"""Runs the delegates of one node, one at a time, in whichever thread has the message."""
+"""Runs the delegates of one node, one at a time, and hands messages to it quickly.
+
+A node's delegates run in one of two threads: in the thread that brings the message (a TCPROS connection's, or the
+publisher's where a channel is inline), or in the node's dispatcher thread. Nobody ever waits for a busy node: what comes
+meanwhile waits in its inbox for whoever is running the node. So no wiring deadlocks or recurses.
+"""
+import _thread
 import collections
 import threading
+import time
+
+BURST = 100e-6    # seconds; a publisher that comes again within them does not give way to the receiver
+GIVE_WAY = 1e-3   # seconds that a publisher at the most gives way, until the dispatcher thread has woken up
+
+
+class Inbox:
+    """The messages on their way to one channel, through one connection: bounded, drops the oldest, counts.
+
+    One thread at a time puts (it holds the publisher's lock), one at a time runs (it holds the node's).
+
+    :param channel: has ``_receive(message)``, which runs the delegate
+    :param thaw: makes the receiver's message of what was put; None where that is the message itself
+    :param header: the ``_connection_header`` of the messages; None where they have one already
+    """
+
+    def __init__(self, channel, dispatcher, inline, thaw=None, header=None, shared=False):
+        self.channel, self.dispatcher, self.inline, self.shared = channel, dispatcher, inline, shared
+        self.arrived = self.taken = 0
+        self.closed = False    # nothing more arrives
+        self._thaw, self._header = thaw, header
+        self._queue = collections.deque(maxlen=channel.queue_size)
+        self._limit = channel.queue_size
+        self._announce = dispatcher.inline.append if inline else dispatcher.announced.append
+        self._announced = False
+        self._seen = -1
+
+    @property
+    def dropped(self):
+        return self.arrived - self.taken - len(self._queue)
+
+    @property
+    def is_empty(self):
+        return not self._queue
+
+    def put(self, value):
+        """Add a message; the dispatcher is to be told afterwards."""
+        queue = self._queue
+        if len(queue) == self._limit and self._seen != self.taken:
+            # Full, but the receiver is getting on. A publisher that never lets go of the interpreter would starve it.
+            self._seen = self.taken
+            time.sleep(1e-6)
+        queue.append(value)
+        self.arrived += 1
+        if not self._announced:
+            self._announced = True
+            self._announce(self)
+
+    def run_next(self):
+        """Run the delegate for the oldest message, if there is one still."""
+        self._announced = False    # before looking at the queue: what is put from now on announces itself
+        try:
+            value = self._queue.popleft()
+        except IndexError:
+            return
+        self.taken += 1
+        if self._queue and not self._announced:
+            self._announced = True
+            self._announce(self)
+        self.channel._receive(value, self._thaw, self._header)
 
 
 class Dispatcher:
-    """Sees to it that a node's delegates run one at a time, whatever their messages came through.
+    """Whoever has messages for a node puts them into inboxes, then calls :meth:`run` or :meth:`wake`."""
 
-    Channels put messages into their own queues and :meth:`announce` them. Whoever then calls :meth:`run` runs the
-    delegates of all that waits, unless another thread is doing so already: that one goes on with it. So nobody
-    waits for a busy node, and a delegate that causes a message to its own node neither deadlocks nor recurses.
-    """
-
-    def __init__(self):
+    def __init__(self, start_thread):
+        self.inline = collections.deque()       # inboxes that whoever comes by may run
+        self.announced = collections.deque()    # inboxes for the dispatcher thread
+        self.idle = False                       # whether that thread waits for inboxes
         self._running = threading.Lock()        # held by the thread that runs delegates
-        self._announced = collections.deque()   # a channel for each message, in the order of arrival
-        self.announce = self._announced.append
+        self._start_thread, self._started, self._closed = start_thread, threading.Lock(), False
+        # bare locks as signals: every other primitive costs several of them
+        self._woken, self._awake = _thread.allocate_lock(), _thread.allocate_lock()
+        self._woken.acquire()
+        self._awake.acquire()
 
     def run(self):
-        """Run the delegates for all announced messages, unless another thread is about it."""
-        announced, running = self._announced, self._running
-        while announced and running.acquire(blocking=False):
+        """Run the delegates of the inline inboxes in this thread, unless another thread is running the node."""
+        inline, running = self.inline, self._running
+        while inline and running.acquire(False):
             try:
-                while announced:
-                    announced.popleft().run_next()
+                while inline:
+                    inline.popleft().run_next()
+            except IndexError:
+                pass    # close() cleared it
             finally:
                 running.release()
-            # looked at again: a message announced just before the release found the node busy
+            # looked at again: what was announced just before the release found the node busy
+
+    def need_thread(self):
+        """Have the dispatcher thread, from the first channel on that is neither inline nor TCPROS."""
+        if self._started.acquire(blocking=False):
+            self._start_thread(self._loop, name='dispatcher')
+
+    def wake(self):
+        """Wake the dispatcher thread, which is idle."""
+        self.idle = False
+        self._awake.acquire(False)    # a stale acknowledgement
+        _release(self._woken)
+
+    def give_way(self):
+        """Let the woken dispatcher thread have the interpreter: it would get it 5 ms later from a busy publisher."""
+        self._awake.acquire(True, GIVE_WAY)
+
+    def _loop(self):
+        announced, inline, running = self.announced, self.inline, self._running
+        while not self._closed:
+            try:
+                inbox = announced.popleft()
+            except IndexError:
+                self.idle = True
+                if not announced and not self._closed:
+                    self._woken.acquire()
+                    _release(self._awake)
+                self.idle = False
+                continue
+            with running:
+                inbox.run_next()
+            if inline:
+                self.run()
 
     def close(self):
-        """Forget what has not run."""
-        self._announced.clear()
+        """Forget what has not run, and end the thread."""
+        self._closed = True
+        self.inline.clear()
+        self.announced.clear()
+        _release(self._woken)
+
+
+def _release(lock):
+    try:
+        lock.release()
+    except RuntimeError:
+        pass    # it was free already: two had the same to say

@@ -1,33 +1,19 @@
 """Nodes: real ROS nodes of this process, written with blocks."""
 import collections
-import contextlib
-import enum
-import threading
 import traceback
 
-from pharos import running
-from pharos.blocks import Souls, check_block, check_delegate, check_soul, name_of
-from pharos.dispatcher import Dispatcher
-from pharos.errors import MessageTypeError, NodeStoppedError, PharosError
+from pharos.blocks import check_block, check_delegate, check_soul, name_of
+from pharos.errors import NodeStoppedError, PharosError
+from pharos.life import Life
 from pharos.parameter import Parameter
 from pharos.private_rospy.host import rospy
-from pharos.private_rospy.instance import PrivateRospy
 from pharos.private_rospy.settings import Settings
 from pharos.service import OfferedService
 from pharos.topic import QUEUE_SIZE
 from pharos.transcript import Transcript
 
 
-class Lifecycle(enum.Enum):
-    """Where a node is in its life; see :attr:`Node.lifecycle`."""
-    NEW = 'new'
-    STARTING = 'starting'
-    RUNNING = 'running'
-    STOPPING = 'stopping'
-    STOPPED = 'stopped'
-
-
-class Node:
+class Node(Life):
     """A ROS node of this process: made by :meth:`Master.create`, subclassed to override :meth:`start` and :meth:`stop`.
 
     The report (listing 3.1), a subclass of PhaROSNode, is in Python::
@@ -40,25 +26,14 @@ class Node:
     A node is configured before its ``__init__`` runs, which gets only the further keywords of ``create``.
     """
 
-    connect_timeout = 2.0    #: seconds that a topic's first message waits for the subscribers the master knows
-    stop_timeout = 2.0       #: seconds that :meth:`stop` waits for souls, and for messages under way
-
     def __init__(self):
         pass
 
     def _configure(self, master, settings, soul, delegate):
-        self.master = master
-        self.name = settings.name
+        super()._configure(master, settings)
         self.soul, self.delegate = soul, delegate
         #: the exceptions that souls, delegates and services raised, the newest last
         self.errors = collections.deque(maxlen=100)
-        self._settings = settings
-        self._lifecycle = Lifecycle.NEW
-        self._changing = threading.Condition()    # guards _lifecycle
-        self._dispatcher = Dispatcher()
-        self._rospy = None
-        self._souls = Souls(self)
-        self._channels, self._services = [], []
 
     # -- blocks -------------------------------------------------------------------------------------------------------
 
@@ -110,15 +85,6 @@ class Node:
             raise PharosError('%s has no soul to run: give it one with soul= or node.soul =' % self.name)
         return self._soul
 
-    def _run_delegate(self, block, message, channel):
-        block = block or self._delegate
-        if block is None:
-            return
-        try:
-            block(message, channel)
-        except Exception as error:
-            self._report(error, block, 'delegate', channel)
-
     def _report(self, error, block, what, channel=None):
         """Tell of an exception in a block, which ends nothing but that run of it."""
         if not self.is_running and isinstance(error, (NodeStoppedError, rospy.ROSInterruptException)):
@@ -128,124 +94,6 @@ class Node:
         self.log('%s raised %s: %s\n%s' % (where, type(error).__name__, error, ''.join(
             traceback.format_exception(type(error), error, error.__traceback__))), level='error')
         Transcript.show('%s raised %s: %s' % (where, type(error).__name__, error))
-
-    # -- life ---------------------------------------------------------------------------------------------------------
-
-    def start(self):
-        """Register with the master. A subclass overrides this, calls ``super().start()``, then makes its channels.
-
-        Runs in the thread that creates the node. A stopped node starts again, under the same name and ports. Where a
-        class has no ``start`` of its own, the channels and services that it had come back too.
-
-        :raises PharosError: if the node is running already
-        :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: and the node is then as it was
-        """
-        with self._changing:
-            if self._lifecycle not in (Lifecycle.NEW, Lifecycle.STOPPED):
-                raise PharosError('%s is %s already: stop() it before you start it again'
-                                  % (self.name, self._lifecycle.value))
-            before, self._lifecycle = self._lifecycle, Lifecycle.STARTING
-        try:
-            dispatcher = Dispatcher()
-            instance = PrivateRospy(self._settings, self._asked_to_stop, on_received=dispatcher.run)
-            instance.start(self.connect_timeout)
-        except BaseException:
-            self._become(before)
-            raise
-        self._rospy = instance
-        # the same ports next time, also where any free one was asked for
-        self._settings.tcp_port, self._settings.xmlrpc_port = instance.tcp_port, instance.xmlrpc_port
-        self._dispatcher = dispatcher
-        self._become(Lifecycle.RUNNING)
-        running.add(self)
-        kept, self._channels = self._channels, []
-        services, self._services = self._services, []
-        if type(self).start is Node.start:
-            for opened in (*kept, *services):
-                opened._open()
-
-    def stop(self):
-        """End the souls, send what is under way, unregister, close the ports, end the threads.
-
-        A subclass overrides this and calls ``super().stop()``. Harmless when done twice; may be called from any
-        thread, also the node's own, in which case what that thread runs is not waited for.
-        """
-        with self._changing:
-            if self._lifecycle is Lifecycle.STOPPING and not self._is_own_thread():
-                self._changing.wait_for(lambda: self._lifecycle is Lifecycle.STOPPED, 2 * self.stop_timeout)
-            if self._lifecycle is not Lifecycle.RUNNING:
-                return
-            self._lifecycle = Lifecycle.STOPPING
-        instance = self._rospy
-        try:
-            instance.end_sleeps()
-            ignoring = self._souls.end(self.stop_timeout)
-            if ignoring:
-                self.log('left behind, for it did not end within %g s of the stop: %s. A soul ends by itself if it '
-                         'waits with node.sleep() or loops over node.every()'
-                         % (self.stop_timeout, ', '.join(ignoring)), level='warning')
-            self._dispatcher.close()
-            left = instance.stop(self.stop_timeout)
-            if left:
-                Transcript.show('%s left behind threads that did not end: %s' % (self.name, ', '.join(left)))
-            for channel in self._channels:
-                channel._stopped()
-        finally:
-            self._become(Lifecycle.STOPPED)
-            running.discard(self)
-
-    def _is_own_thread(self):
-        return self._rospy.owns(threading.current_thread())
-
-    def _become(self, lifecycle):
-        with self._changing:
-            self._lifecycle = lifecycle
-            self._changing.notify_all()
-
-    def _asked_to_stop(self, reason):
-        self.log('stops: %s' % (reason,))
-        self.stop()
-
-    @property
-    def lifecycle(self):
-        """A :class:`Lifecycle`."""
-        return self._lifecycle
-
-    @property
-    def is_running(self):
-        """Whether the node is started and no stop has begun."""
-        return self._lifecycle is Lifecycle.RUNNING
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        self.stop()
-
-    def sleep(self, seconds):
-        """Wait for ``seconds`` of ROS time, or until the node stops; a soul is ended by that.
-
-        The report: ``(Delay forSeconds: 1) wait``.
-        """
-        with running.waiting(), contextlib.suppress(rospy.ROSInterruptException):
-            self._live_rospy().rospy.sleep(seconds)
-        if not self.is_running:
-            self._souls.end_here()
-
-    def every(self, seconds):
-        """An iterator that turns at once and then every ``seconds`` of ROS time, without drift, until the node stops.
-
-        A turn that takes longer than ``seconds`` delays the next, which then comes at once.
-        """
-        if not seconds > 0:
-            raise ValueError('a period is a number of seconds above 0, not %r' % (seconds,))
-        return self._turns(self.ros.Rate(1.0 / seconds, reset=True))
-
-    def _turns(self, rate):
-        while self.is_running:
-            yield
-            with running.waiting(), contextlib.suppress(rospy.ROSInterruptException):
-                rate.sleep()
 
     # -- topics -------------------------------------------------------------------------------------------------------
 
@@ -277,7 +125,7 @@ class Node:
         """
         return self._topic(topic).output_channel(self, typed_as, latch, queue_size)
 
-    def send_to(self, topic, block=None, *, typed_as=None, connect_timeout=None, **fields):
+    def send_to(self, topic, block=None, *, typed_as=None, to=None, connect_timeout=None, **fields):
         """Send one message, filled by ``block(message)``, by keywords, or both; returns it.
 
         The report (listing 3.1)::
@@ -287,6 +135,8 @@ class Node:
 
         The first message on a topic waits for the subscribers that the master knows, for up to ``connect_timeout``
         seconds (None: the node's), so that it is not lost.
+
+        :param to: send it to that node alone: a name, Node or ExternalNode
 
         :raises MessageTypeError: if a field does not exist or does not fit
         :raises UnknownTopicError, UnknownTypeError: if there is no type
@@ -300,7 +150,7 @@ class Node:
             channel = topic.output_channel(self, typed_as, connect_timeout=connect_timeout)
         elif typed_as is not None:
             topic.message_class(self, typed_as)    # refuses another type
-        return channel.send(block, **fields)
+        return channel.send(block, to=to, **fields)
 
     @property
     def channels(self):
@@ -355,11 +205,6 @@ class Node:
     def ros_import(self, name):
         """A library written on rospy ('actionlib', 'message_filters', 'tf2_ros'), bound to this run of the node."""
         return self._live_rospy().import_library(name)
-
-    def _live_rospy(self):
-        if self._lifecycle not in (Lifecycle.RUNNING, Lifecycle.STOPPING):
-            raise NodeStoppedError('%s is %s: start() it first' % (self.name, self._lifecycle.value))
-        return self._rospy
 
     @property
     def uri(self):

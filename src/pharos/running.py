@@ -1,10 +1,14 @@
 """The running nodes of this process, and how they end with it."""
 import atexit
 import contextlib
+import gc
+import itertools
 import signal
 import threading
 import time
 
+COLLECT_EVERY = 20    # stops; a stopped node's rospy is a web of cycles of 0.7 MB, which only the collector frees
+_stops = itertools.count(1)
 _nodes = {}    # a dict, for its order
 _none_left = threading.Condition()
 _waiting = 0   # how deep the main thread is in a wait of ours, which ends with the nodes
@@ -21,6 +25,8 @@ def discard(node):
         _nodes.pop(node, None)
         if not _nodes:
             _none_left.notify_all()
+    if next(_stops) % COLLECT_EVERY == 0:
+        gc.collect()
 
 
 def nodes():

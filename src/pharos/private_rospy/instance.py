@@ -1,5 +1,6 @@
 """One node's rospy: loaded, started and stopped."""
 import atexit
+import collections
 import errno
 import logging.config
 import os
@@ -7,7 +8,6 @@ import socket
 import sys
 import threading
 import time
-import weakref
 import xmlrpc
 import xmlrpc.client
 import _thread
@@ -17,8 +17,7 @@ from pharos.private_rospy import host, logs, pubsub, registration, servers
 from pharos.private_rospy.lifetime import Lifetime
 from pharos.private_rospy.loader import PrivateImports, Substitute
 from pharos.private_rospy.proxies import ServerProxy, master_api
-
-_running = weakref.WeakValueDictionary()    # URI -> the PrivateRospy that runs there, in this process
+from pharos.private_rospy.wiring import Wiring
 
 POLL = 0.001    # seconds between rospy's own looks at whether it is registered; it takes 0.1 s
 
@@ -29,16 +28,17 @@ class PrivateRospy:
     :param settings: the :class:`~.settings.Settings` of the node
     :param on_stop_request: called as ``on_stop_request(reason)``, in a thread of its own, when ROS or a user of
         ``rospy.signal_shutdown`` asks the node to stop
-    :param on_received: called after the callbacks of a batch of messages, in the thread that received it
     """
 
-    def __init__(self, settings, on_stop_request, on_received):
+    def __init__(self, settings, on_stop_request):
         self.settings = settings
-        self.on_received = on_received
         self.name = settings.name
         self._on_stop_request = on_stop_request
         self._lifetime = Lifetime(self.name)
         self._stopping = threading.Lock()
+        self.on_received = lambda: None    # called after the callbacks of a batch of messages, in its thread
+        self.uri = None
+        self.wiring = Wiring(self)
         self._modules = self._load()
         self.rospy = self._modules.load('rospy')
 
@@ -46,9 +46,12 @@ class PrivateRospy:
         lifetime, logging_module = self._lifetime, logs.private_logging()
         proxies = Substitute(xmlrpc.client, ServerProxy=ServerProxy)
         private_os = Substitute(os, environ=self.settings.environ)
-        hooks = {'rospy.service': _share_service_exception, 'rospy.impl.init': self._poll_quickly,
-                 'rospy.core': self._shut_down_early,
-                 **servers.hooks(lifetime), **registration.hooks(self), **pubsub.hooks(self)}
+        hooks = collections.defaultdict(list)
+        for part in ({'rospy.service': _share_service_exception, 'rospy.impl.init': self._poll_quickly,
+                      'rospy.core': self._shut_down_early},
+                     servers.hooks(lifetime), registration.hooks(self), pubsub.hooks(self)):
+            for name, hook in part.items():
+                hooks[name].append(hook)
         modules = PrivateImports(hooks=hooks, substitutes={
             'os': private_os,
             'sys': Substitute(sys, argv=self.settings.argv),
@@ -115,7 +118,7 @@ class PrivateRospy:
             self.stop(0)
             raise
         self.uri = core.get_node_uri()
-        _running[self.uri] = self
+        self.wiring.open()
         self.xmlrpc_port = self._lifetime.xmlrpc.port
         self.domain = self._modules.load('rosgraph.network').get_host_name()
         core.add_preshutdown_hook(self.request_stop)    # rospy.signal_shutdown called by the node's own code
@@ -139,7 +142,7 @@ class PrivateRospy:
         """
         if not self._stopping.acquire(blocking=False):
             return []
-        _running.pop(getattr(self, 'uri', None), None)
+        self.wiring.close()
         core = self._modules.load('rospy.core')
         pubsub.flush(self._topic_manager(), flush_timeout)
         core._shutdown_hooks.insert(0, self._wake)    # before rospy waits for its threads
@@ -177,33 +180,32 @@ class PrivateRospy:
         """The event set when the stop begins."""
         return self._lifetime.ended
 
+    @property
+    def ended(self):
+        """The event set when the stop begins."""
+        return self._lifetime.ended
+
+    def warn(self, text):
+        """A warning in the node's log."""
+        self.rospy.logwarn('%s', text)
+
     def owns(self, thread):
         """Whether the thread is one of this node's."""
         return thread in self._lifetime.threads
 
-    def connections(self, endpoint):
-        """``[(peer node name, transport)]`` of a rospy Publisher or Subscriber."""
-        return pubsub.connections(endpoint, {uri: other.name for uri, other in _running.copy().items()})
 
-    def connect_to_publishers_here(self, topic, timeout):
-        """Connect a new subscription to the publishers in this process now; the master's word takes its time."""
-        publishers = [other for other in self._nodes_here() if other._topic_manager().has_publication(topic)]
-        for other in publishers:
-            self.connect(topic, other.uri)
-        pubsub.wait_until(lambda: all(other._sends_to(self.name, topic) for other in publishers), timeout)
+    def publisher(self, topic):
+        """rospy's _PublisherImpl of the topic, None if there is none."""
+        return self._topic_manager().get_publisher_impl(topic)
 
-    def connect_to_subscribers_here(self, topic):
-        """Have the subscribers in this process connect to a new publication now; rosmaster tells in steps of 0.1 s."""
-        for other in self._nodes_here():
-            if other._topic_manager().has_subscription(topic):
-                other.connect(topic, self.uri)
+    def subscriber(self, topic):
+        """rospy's _SubscriberImpl of the topic, None if there is none."""
+        return self._topic_manager().get_subscriber_impl(topic)
 
-    def _sends_to(self, name, topic):
-        publisher = self._topic_manager().get_publisher_impl(topic)
-        return publisher is None or any(connection.endpoint_id == name for connection in publisher.connections)
-
-    def _nodes_here(self):
-        return [other for other in _running.copy().values() if other.settings.master_url == self.settings.master_url]
+    def connection_header(self, publisher):
+        """What a subscriber of rospy's _PublisherImpl gets as its messages' ``_connection_header``."""
+        return self._modules.load('rospy.impl.tcpros_pubsub').TCPROSPub(
+            publisher.resolved_name, publisher.data_class, publisher.is_latch, publisher.headers).get_header_fields()
 
     def connect(self, topic, uri):
         """Connect the subscription to the publisher at that URI, unless it is connected."""

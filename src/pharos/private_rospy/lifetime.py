@@ -57,7 +57,8 @@ class Lifetime:
         threads = [thread for thread in list(self.threads) if thread is not me]
         deadline = time.monotonic() + JOIN_TIMEOUT
         for thread in threads:
-            thread.join(max(0.0, deadline - time.monotonic()))
+            if thread.ident is not None:    # None: it is only just being started, and will see that all has ended
+                thread.join(max(0.0, deadline - time.monotonic()))
         return [thread for thread in threads if thread.is_alive()]
 
 

@@ -64,7 +64,7 @@ class PrivateImports:
     """A set of private modules: rospy, rosgraph, and whatever they or :meth:`load` import that is written on rospy.
 
     :param substitutes: ``{module name: object}`` that private modules get when they import that name
-    :param hooks: ``{module name: function(module)}`` run right after a private module's code, before any other
+    :param hooks: ``{module name: [function(module)]}`` run right after a private module's code, before any other
         module can import names from it
     """
 
@@ -96,8 +96,7 @@ class PrivateImports:
             module = self.modules[name] = _SHARED[name]
         else:
             module = self._run(*_find(name, parent.__path__ if parent else None), into=self.modules)
-            hook = self._hooks.get(name)
-            if hook:
+            for hook in self._hooks.get(name, ()):
                 hook(module)
         if parent:
             setattr(parent, leaf, module)

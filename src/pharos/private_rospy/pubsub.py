@@ -1,10 +1,11 @@
-"""What a node publishes and hears: mended where rospy loses messages."""
+"""What a node publishes and hears: mended where rospy loses messages or links."""
 import threading
 import time
 
+from pharos.private_rospy.intraprocess import protocol_handler
+from pharos.private_rospy.publishing import mend_publisher
 
 RECONNECT_DELAY = 0.05    # seconds; a publisher that accepts and closes at once is not to be stormed
-_changed = threading.Condition()    # notified whenever a publisher of this process gains or loses a connection
 
 
 def hooks(instance):
@@ -13,37 +14,18 @@ def hooks(instance):
     def mend_topics(module):
         """rospy.topics."""
         module.is_shutdown = instance.is_shut_down
-        publisher, subscriber = module._PublisherImpl, module._SubscriberImpl
-        publish, receive = publisher.publish, subscriber.receive_callback
+        mend_publisher(module)
+        _mend_subscriber(module._SubscriberImpl, instance)
 
-        def publish_or_reset(self, message, connection_override=None):
-            """After a message that does not serialize, rospy's buffer keeps its part, which corrupts the stream."""
-            try:
-                return publish(self, message, connection_override)
-            except BaseException:
-                if self.buff is not None and not self.buff.closed:
-                    self.buff.seek(0)
-                    self.buff.truncate()
-                raise
-        publisher.publish = publish_or_reset
+    def offer_intraprocess(module):
+        """rospy.impl.masterslave: of the protocols that a node supports, the first that its peer does too is taken."""
+        handler = module.ROSHandler
+        init = handler.__init__
 
-        def receive_callback(self, messages, connection):
-            """Channels only queue in their callbacks, so that of a batch the newest are kept; delegates run then."""
-            receive(self, messages, connection)
-            instance.on_received()
-        subscriber.receive_callback = receive_callback
-
-        remove = subscriber.remove_connection
-
-        def remove_connection(self, connection):
-            """rospy lets a link that broke go, though its publisher may be there, or there again under its old URI."""
-            remove(self, connection)
-            if connection.header and not self.closed:    # without a header, it never was a link
-                instance.start_thread(_reconnect, (instance, self, connection.endpoint_id), 'reconnect')
-        subscriber.remove_connection = remove_connection
-
-        for method in 'add_connection', 'remove_connection', 'close':
-            _notify_after(publisher, method)
+        def __init__(self, *args):
+            init(self, *args)
+            self.protocol_handlers.insert(0, protocol_handler(instance))
+        handler.__init__ = __init__
 
     def know_what_is_under_way(module):
         """rospy.impl.tcpros_pubsub: a queue knows nothing of the messages it has taken out and not yet sent."""
@@ -82,48 +64,40 @@ def hooks(instance):
             self._idle.wait(max(0.0, timeout))
         queued.flush = flush
 
-    return {'rospy.topics': mend_topics, 'rospy.impl.tcpros_pubsub': know_what_is_under_way}
+    return {'rospy.topics': mend_topics, 'rospy.impl.masterslave': offer_intraprocess,
+            'rospy.impl.tcpros_pubsub': know_what_is_under_way}
+
+
+def _mend_subscriber(subscriber, instance):
+    """rospy.topics._SubscriberImpl."""
+    receive, remove, add = subscriber.receive_callback, subscriber.remove_connection, subscriber.add_callback
+
+    def receive_callback(self, messages, connection):
+        """Channels only queue in their callbacks, so that of a batch the newest are kept; delegates run then."""
+        receive(self, messages, connection)
+        instance.on_received()
+    subscriber.receive_callback = receive_callback
+
+    def remove_connection(self, connection):
+        """rospy lets a link that broke go, though its publisher may be there, or there again under its old URI."""
+        remove(self, connection)
+        if connection.header and not self.closed:    # without a header, it never was a link
+            instance.start_thread(_reconnect, (instance, self, connection.endpoint_id), 'reconnect')
+    subscriber.remove_connection = remove_connection
+
+    def add_callback(self, callback, arguments):
+        """A plain rospy callback beside channels: links know channels only, so all come through TCPROS from now on."""
+        add(self, callback, arguments)
+        if not instance.wiring.only_channels(self):
+            for connection in self.connections:
+                if connection.transport_type == 'INTRAPROCESS':
+                    connection.close()
+    subscriber.add_callback = add_callback
 
 
 def _reconnect(instance, subscriber, uri):
     if not instance.ended.wait(RECONNECT_DELAY) and not subscriber.closed:
         instance.connect(subscriber.resolved_name, uri)
-
-
-def _notify_after(publisher, method):
-    original = getattr(publisher, method)
-
-    def notifying(self, *args):
-        result = original(self, *args)
-        with _changed:
-            _changed.notify_all()
-        return result
-    setattr(publisher, method, notifying)
-
-
-def wait_until(predicate, timeout):
-    """Wait until ``predicate()``, which speaks of connections of publishers of this process, holds.
-
-    :param timeout: seconds, None: no limit
-    """
-    with _changed:
-        return _changed.wait_for(predicate, None if timeout is None else max(0.0, timeout))
-
-
-def connections(endpoint, names):
-    """``[(peer node name, transport name)]`` of a rospy Publisher or Subscriber.
-
-    :param names: ``{URI: node name}`` of nodes that need not be asked
-    """
-    impl = endpoint.impl
-    return [(_peer(connection, names), connection.transport_type) for connection in (impl.connections if impl else ())]
-
-
-def _peer(connection, names):
-    # a publisher's end is called after the subscriber's node; a subscriber's after the publisher's URI, and it
-    # knows the name once the handshake is through
-    name = getattr(connection, 'callerid_pub', 'unknown')
-    return name if name != 'unknown' else names.get(connection.endpoint_id, connection.endpoint_id)
 
 
 def flush(topic_manager, timeout):

@@ -33,6 +33,7 @@ def hooks(instance):
             while again:
                 answer = 0, 'failed', 0
                 try:
+                    instance.wiring.connecting.topic = topic
                     answer = connect(self, topic, uri)
                 finally:
                     with lock:

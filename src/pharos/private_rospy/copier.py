@@ -1,0 +1,299 @@
+"""Copies of ROS messages in two halves: frozen once by the publisher, thawed by each receiver.
+
+What a receiver gets equals, in value and in the Python type of every field, what the wire would have delivered::
+
+    copier = copier_for(PointStamped)
+    frozen = copier.freeze(message)     # a snapshot: a tuple of immutable values
+    message = copier.thaw(frozen)       # a fresh message, as often as there are receivers
+
+The work is done by two functions generated for each class, as genpy generates its serializers (``copier.source``)::
+
+    def freeze_fields(message):
+        header_0 = message.header
+        frame_id_7 = header_0.frame_id
+        if type(frame_id_7) is not str or not frame_id_7.isascii(): frame_id_7 = text(frame_id_7)
+        point_8 = message.point
+        x_10 = point_8.x
+        ...
+        seq_2, secs_5, nsecs_6, = unpack(pack(header_0.seq, stamp_3.secs, stamp_3.nsecs))
+        if not (type(x_10) is type(y_11) is type(z_12) is float):
+            x_10, y_11, z_12, = unpack_floats(pack_floats(x_10, y_11, z_12))
+        return (seq_2, secs_5, nsecs_6, frame_id_7, x_10, y_11, z_12, )
+
+    def thaw_fields(frozen):
+        seq_2, secs_5, nsecs_6, frame_id_7, x_10, y_11, z_12, = frozen
+        message = new(PointStamped_13)
+        header_0 = message.header = new(Header_1)
+        ...
+
+The copies equal the wire's by three rules. Numbers pass through the struct codes of the wire, which round, convert
+and refuse alike; only what is of the very type that arrives (float, str, bytes) is shared as it is. A message with
+anything else in it is serialized: what is frozen then is bytes, and the errors are the wire's own. So is every message
+of a class that genpy did not make in the usual way (AnyMsg, numpy_msg, one written by hand).
+"""
+import functools
+import io
+import itertools
+import struct
+import sys
+from typing import Callable, NamedTuple, Optional
+
+import genpy
+from genmsg.msgs import parse_type
+from genpy.base import SIMPLE_TYPES_DICT as STRUCT_CODES    # primitive type -> its code on the wire
+
+ARRIVAL_CODES = {**STRUCT_CODES, 'bool': '?'}   # genpy sends a bool as a number: 7 goes out, True arrives
+
+
+class Copier(NamedTuple):
+    """The functions that copy the messages of one class. Where it is always serialized, the last three are missing."""
+
+    freeze: Callable    # message -> tuple or bytes; raises what message.serialize() raises
+    thaw: Callable      # tuple or bytes -> fresh message
+    freeze_fields: Optional[Callable] = None    # message -> tuple; raises where freeze would serialize
+    thaw_fields: Optional[Callable] = None      # tuple -> message, its times not canonized
+    source: str = ''    # of these two, to be read when debugging
+
+
+def copier_for(cls):
+    """The Copier of a message class, made at the first call."""
+    copier = vars(cls).get('_pharos_copier')
+    if copier is None:
+        try:
+            copier = _copier(cls, *_generate(cls))
+        except Exception:   # a class not understood costs time, never a wrong copy
+            copier = Copier(serialized, lambda frozen: cls().deserialize(frozen))
+        # Kept in the class itself: a registry here would keep classes made at run time alive for ever.
+        cls._pharos_copier = copier
+    return copier
+
+
+def _copier(cls, freeze_fields, thaw_fields, source):
+    # The wire canonizes the times that are the message's own, not those of its header or of other messages in it.
+    times = [name for name, type_name in _fields(cls) if type_name in ('time', 'duration')]
+
+    def freeze(message):
+        if type(message) is cls:
+            try:
+                return freeze_fields(message)
+            except Exception:
+                pass    # the wire knows what arrives, or what is wrong
+        return serialized(message)
+
+    def thaw(frozen):
+        if type(frozen) is bytes:
+            return cls().deserialize(frozen)
+        message = thaw_fields(frozen)
+        for name in times:
+            getattr(message, name).canon()
+        return message
+
+    return Copier(freeze, thaw, freeze_fields, thaw_fields, source)
+
+
+def thawer(publisher_cls, receiver_cls):
+    """The function that thaws, as a receiver_cls, what the copier of publisher_cls has frozen."""
+    copier = copier_for(publisher_cls)
+    if receiver_cls is publisher_cls:
+        return copier.thaw
+
+    def thaw_as_receiver(frozen):
+        data = frozen if type(frozen) is bytes else serialized(copier.thaw_fields(frozen))
+        return receiver_cls().deserialize(data)
+    return thaw_as_receiver
+
+
+def serialized(message):
+    """The message's bytes on the wire, without the length that precedes them there."""
+    buffer = io.BytesIO()
+    message.serialize(buffer)
+    return buffer.getvalue()
+
+
+class Odd(Exception):
+    """Only the wire knows what to make of this. It never leaves this module."""
+
+
+def text(value):
+    """The value itself, if it is a str that UTF-8 has a form for, as it has none for a lone surrogate."""
+    if type(value) is not str:
+        raise Odd
+    value.encode('utf-8')
+    return value
+
+
+def sequence(value):
+    """The value itself, if it is a list or tuple."""
+    if type(value) not in (list, tuple):
+        raise Odd
+    return value
+
+
+def octets(value):
+    """The bytes that arrive in a uint8[] or char[]."""
+    # bytes() itself would take more than the wire does, even an int.
+    return value if type(value) is bytes else bytes(value if type(value) is bytearray else sequence(value))
+
+
+def _numbers_of(base):
+    """The function that turns the value of an array of this primitive type into the tuple that arrives."""
+    sent, arriving = STRUCT_CODES[base], ARRIVAL_CODES[base]
+
+    @functools.lru_cache(maxsize=128)
+    def structs(count):
+        return struct.Struct(f'<{count}{sent}').pack, struct.Struct(f'<{count}{arriving}').unpack
+
+    def numbers(value):
+        if type(value) in (list, tuple):
+            value = tuple(value)    # a snapshot: a list could change its length between two looks at it
+            if sent == 'd' and set(map(type, value)) == {float}:
+                return value
+        else:
+            value, code = _from_numpy(value)
+            if code == arriving:
+                return tuple(value)
+        pack, unpack = structs(len(value))
+        return unpack(pack(*value))
+    return numbers
+
+
+def _from_numpy(array):
+    """The list of a numpy array's numbers, which are plain ints or floats then, and the struct code of its type."""
+    numpy = sys.modules.get('numpy')    # not imported here: unless someone did, this is no array of it
+    # Of other kinds, tolist() may give what the wire refuses in the array itself: an int for a datetime64.
+    if numpy is None or type(array) is not numpy.ndarray or array.ndim != 1 or array.dtype.kind not in 'iuf':
+        raise Odd
+    return array.tolist(), array.dtype.char
+
+
+# What generated code calls; to convert an array: the function named after the type of its elements.
+_HELPERS = {'Odd': Odd, 'new': object.__new__, 'text': text, 'sequence': sequence}
+_HELPERS.update((base + '_array', _numbers_of(base)) for base in STRUCT_CODES)
+_HELPERS.update(string_array=lambda value: tuple(map(text, sequence(value))), uint8_array=octets, char_array=octets)
+
+
+def _generate(cls):
+    """(freeze_fields, thaw_fields, their source) of a class that genpy made; any exception for another."""
+    writer = _Writer()
+    writer.add_object(cls, 'message')
+    source = '\n'.join(['def freeze_fields(message):', *('    ' + line for line in writer.freeze_lines()), '',
+                        'def thaw_fields(frozen):', *('    ' + line for line in writer.thaw_lines(cls)), ''])
+    exec(compile(source, '<copier of %s>' % cls.__name__, 'exec'), writer.scope)
+    return writer.scope['freeze_fields'], writer.scope['thaw_fields'], source
+
+
+def _fields(cls):
+    """The (name, type) pairs of a class that genpy made, or of Time or Duration."""
+    if cls in (genpy.Time, genpy.Duration):
+        number = 'uint32' if cls is genpy.Time else 'int32'     # as genmsg has it; their _slot_types say int32 for both
+        return [('secs', number), ('nsecs', number)]
+    # A numpy_msg derives from another message, AnyMsg has no types: neither serializes as its fields would say.
+    made_by_genpy = {'__slots__', '_slot_types', 'serialize', 'serialize_numpy'} <= vars(cls).keys()
+    if not made_by_genpy or cls.__bases__ != (genpy.Message,) or len(cls.__slots__) != len(cls._slot_types):
+        raise Odd
+    return list(zip(cls.__slots__, cls._slot_types))
+
+
+def _nested_class(cls, type_name):
+    """The class that the code generated for cls means by the name of a nested type."""
+    if type_name in ('time', 'duration'):
+        return genpy.Time if type_name == 'time' else genpy.Duration
+    package, name = ('std_msgs/Header' if type_name == 'Header' else type_name).split('/')
+    names = cls.deserialize.__globals__
+    made_together = names.get('_%s__%s' % (package, name))      # genpy.dynamic puts its classes into one module
+    return made_together or getattr(names[package].msg, name)
+
+
+class _Writer:
+    """Writes the bodies of freeze_fields and thaw_fields, field by field.
+
+    Objects and values are in local variables, named alike in both; in between, the values are the frozen tuple.
+    """
+
+    def __init__(self):
+        self.scope = dict(_HELPERS)     # the globals of the generated code
+        self._count = itertools.count()
+        self._reads = []                # lines of freeze_fields
+        self._builds = []               # lines of thaw_fields
+        self._values = []               # the variables in the frozen tuple
+        self._floats = []               # those of them that are float64
+        self._numbers = []              # other numbers: (primitive type, where it is read, variable)
+
+    def add_object(self, cls, owner):
+        """Add the fields of the object of class cls that is in the variable owner."""
+        for name, type_name in _fields(cls):
+            base, is_array, length = parse_type(type_name)
+            field, local = f'{owner}.{name}', self._unique(name)
+            if is_array:
+                self._add_array(cls, base, length, field, local)
+            elif base in STRUCT_CODES or base == 'string':
+                self._add_scalar(base, field, local)
+            else:
+                nested = _nested_class(cls, base)
+                self._reads.append(f'{local} = {field}')
+                self._builds.append(f'{local} = {field} = new({self._refer(nested)})')
+                self.add_object(nested, local)
+
+    def _add_scalar(self, base, field, local):
+        self._add_value(field, local, fresh=local)
+        if base == 'float64':
+            self._reads.append(f'{local} = {field}')
+            self._floats.append(local)
+        elif base == 'string':
+            self._reads += [f'{local} = {field}',
+                            f'if type({local}) is not str or not {local}.isascii(): {local} = text({local})']
+        else:
+            self._numbers.append((base, field, local))
+
+    def _add_array(self, cls, base, length, field, local):
+        if base in STRUCT_CODES or base == 'string':
+            self._reads.append(f'{local} = {base}_array({field})')
+            self._add_value(field, local, fresh=f'list({local})' if base in ('bool', 'string') else local)
+        else:
+            element = copier_for(_nested_class(cls, base))
+            if element.freeze_fields is None:
+                raise Odd
+            freeze, thaw = self._refer(element.freeze_fields), self._refer(element.thaw_fields)
+            self._reads.append(f'{local} = tuple(map({freeze}, sequence({field})))')
+            self._add_value(field, local, fresh=f'list(map({thaw}, {local}))')
+        if length is not None:
+            self._reads.append(f'if len({local}) != {length}: raise Odd')
+
+    def _add_value(self, field, local, fresh):
+        self._values.append(local)
+        self._builds.append(f'{field} = {fresh}')
+
+    def _unique(self, name):
+        """A variable named after what is in it. Whatever is not ours in the generated code comes through here."""
+        if not name.isidentifier():
+            raise Odd
+        return f'{name}_{next(self._count)}'
+
+    def _refer(self, thing):
+        """A name by which the generated code can use a class or function."""
+        name = self._unique(thing.__name__)
+        self.scope[name] = thing
+        return name
+
+    def freeze_lines(self):
+        """The body of freeze_fields."""
+        yield from self._reads
+        if self._numbers:
+            bases, fields, variables = zip(*self._numbers)
+            sent, arriving = (''.join(map(codes.get, bases)) for codes in (STRUCT_CODES, ARRIVAL_CODES))
+            self.scope.update(pack=struct.Struct('<' + sent).pack, unpack=struct.Struct('<' + arriving).unpack)
+            yield f'{", ".join(variables)}, = unpack(pack({", ".join(fields)}))'
+        if self._floats:
+            floats, variables = struct.Struct(f'<{len(self._floats)}d'), ', '.join(self._floats)
+            self.scope.update(pack_floats=floats.pack, unpack_floats=floats.unpack)
+            yield f'if not ({" is ".join(f"type({local})" for local in self._floats)} is float):'
+            yield f'    {variables}, = unpack_floats(pack_floats({variables}))'
+        yield f'return ({"".join(f"{local}, " for local in self._values)})'
+
+    def thaw_lines(self, cls):
+        """The body of thaw_fields."""
+        if self._values:
+            yield f'{", ".join(self._values)}, = frozen'
+        yield f'message = new({self._refer(cls)})'
+        yield from self._builds
+        yield 'return message'

@@ -1,0 +1,119 @@
+"""INTRAPROCESS: messages between nodes of one process without a socket, as a transport that ROS negotiates.
+
+A subscriber offers its protocols to the publisher, which picks the first that it supports. This one is named for the
+process and offered before TCPROS: another process does not know the name and falls back to TCPROS. Discovery stays the
+master's, and getBusInfo shows the connections.
+"""
+import uuid
+
+import rospy.impl.transport
+
+from pharos.private_rospy import copier
+
+PROTOCOL = 'INTRAPROCESS-%s' % uuid.uuid4().hex
+
+
+class Link:
+    """A connection between a publisher and a subscription of two nodes of this process."""
+
+    def __init__(self, publisher, subscriber, instance, other):
+        self._publisher, self._subscriber = publisher, subscriber    # rospy's _PublisherImpl and _SubscriberImpl
+        self._instance, self._other = instance, other                # the subscriber's and the publisher's PrivateRospy
+        self.header = other.connection_header(publisher)
+        self.publisher_name = other.name
+        self.thaw = copier.thawer(publisher.data_class, subscriber.data_class)
+        self.inboxes = {}    # channel of the subscription -> its Inbox for this link
+        self.sending = _End(self, rospy.impl.transport.OUTBOUND, publisher.resolved_name, instance.name)
+        self.receiving = _End(self, rospy.impl.transport.INBOUND, subscriber.resolved_name, other.uri)
+        self.receiving.callerid_pub = other.name
+
+    def open(self):
+        """Add the ends to the subscription and the publisher; returns whether both are open still."""
+        self.match_channels()
+        return self._subscriber.add_connection(self.receiving) and self._publisher.add_connection(self.sending)
+
+    def match_channels(self):
+        """Have an inbox for each channel of the subscription; returns the new ones."""
+        channels = [channel for channel in self._instance.wiring.channels_on(self._subscriber.resolved_name)
+                    if channel.from_ in (None, self.publisher_name)]
+        new = {channel: channel._new_inbox(self.thaw, self.header) for channel in channels
+               if channel not in self.inboxes}
+        self.inboxes = {**{channel: inbox for channel, inbox in self.inboxes.items() if channel in channels}, **new}
+        return list(new.values())
+
+    def channels_changed(self):
+        """The subscription has other channels now."""
+        self._publisher.channels_changed(self)
+
+    def close(self, end):
+        """One end was closed: the other goes too.
+
+        In a thread of its own, for rospy closes ends under the lock of their topic, and the other's topic has its own.
+        """
+        for inbox in self.inboxes.values():
+            inbox.closed = True
+        other, instance = ((self.receiving, self._instance) if end is self.sending else (self.sending, self._other))
+        if not other.done:
+            instance.start_thread(other.close, name='closing')
+
+
+class _End(rospy.impl.transport.Transport):
+    """One end of a link, as rospy's topics keep it among their connections."""
+
+    transport_type = 'INTRAPROCESS'
+    latch = None    # late channels get latched messages from the publisher itself
+
+    def __init__(self, link, direction, topic, peer):
+        super().__init__(direction, topic)
+        self.link, self.endpoint_id, self.header = link, peer, link.header
+
+    def get_transport_info(self):
+        return 'INTRAPROCESS connection to [%s]' % self.endpoint_id
+
+    def close(self):
+        if not self.done:
+            self.done = True    # before any lock is taken: nothing more is sent through it
+            super().close()
+            self.link.close(self)
+
+
+def protocol_handler(instance):
+    """The handler of this transport for a node; a rospy ProtocolHandler."""
+
+    class Handler(rospy.impl.transport.ProtocolHandler):
+        def supports(self, protocol):
+            return protocol == PROTOCOL
+
+        def get_supported(self):
+            return [[PROTOCOL]] if instance.wiring.connects_in_process() else []
+
+        def init_publisher(self, topic, protocol):
+            return 1, 'ready', [PROTOCOL]
+
+        def create_transport(self, topic, uri, parameters):
+            other = instance.wiring.neighbour(uri)
+            publisher = other and other.publisher(topic)
+            subscriber = instance.subscriber(topic)
+            if publisher is None or subscriber is None:
+                return 0, '%s has gone from %s' % (topic, uri), 0
+            refusal = _refusal(publisher, subscriber, other, instance)
+            if refusal:
+                other.warn(refusal)
+                instance.warn(refusal)
+                return 0, refusal, 0
+            link = Link(publisher, subscriber, instance, other)
+            if link.open():
+                return 1, 'connected to %s' % other.name, 0
+            link.receiving.close()
+            return 0, '%s was closed meanwhile' % topic, 0
+
+    return Handler()
+
+
+def _refusal(publisher, subscriber, other, instance):
+    """Why the two cannot be connected, None if they can: the rule of rospy's TCPROS."""
+    offered, asked = publisher.data_class, subscriber.data_class
+    if asked._md5sum in ('*', offered._md5sum):
+        return None
+    return '%s wants %s as %s [%s], but %s publishes %s [%s]: not connected' % (
+        instance.name, publisher.resolved_name, asked._type, asked._md5sum, other.name, offered._type, offered._md5sum)

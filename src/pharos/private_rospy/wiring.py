@@ -1,0 +1,117 @@
+"""How the channels of a node are wired to its rospy, and to the nodes of this process."""
+import threading
+
+from pharos.private_rospy import publishing
+
+_running = {}    # URI -> the PrivateRospy that runs there, in this process
+
+
+class Wiring:
+    """The channels of one :class:`~.instance.PrivateRospy`."""
+
+    def __init__(self, instance):
+        self._instance = instance
+        self._channels = {}                    # topic -> the channels that receive from it
+        self.connecting = threading.local()    # .topic: of the connection that this thread negotiates
+
+    def open(self):
+        """The node runs: its neighbours may connect to it."""
+        _running[self._instance.uri] = self._instance
+
+    def close(self):
+        """The node stops."""
+        if _running.get(self._instance.uri) is self._instance:
+            del _running[self._instance.uri]
+
+    # -- channels -----------------------------------------------------------------------------------------------------
+
+    def subscribe(self, channel, **options):
+        """rospy's Subscriber for an InputChannel, connected to the publishers in this process.
+
+        The master's word of them takes its time.
+        """
+        topic = channel.topic
+        self._channels[topic] = (*self.channels_on(topic), channel)
+        endpoint = self._instance.rospy.Subscriber(topic, channel.message_class, channel._offer, **options)
+        self._channels_changed(topic)
+        publishers = [other for other in self._neighbours() if other.publisher(topic)]
+        for other in publishers:
+            self._instance.connect(topic, other.uri)
+        publishing.wait_until(lambda: all(other.wiring.sends_to(self._instance.name, topic) for other in publishers),
+                              channel.node.connect_timeout)
+        return endpoint
+
+    def unsubscribe(self, channel, endpoint):
+        """End what :meth:`subscribe` began."""
+        self._channels[channel.topic] = tuple(c for c in self.channels_on(channel.topic) if c is not channel)
+        self._channels_changed(channel.topic)
+        endpoint.unregister()
+
+    def advertise(self, channel, **options):
+        """rospy's Publisher for an OutputChannel, and its ``send``; subscribers in this process are told at once.
+
+        rosmaster tells them in steps of 0.1 s.
+        """
+        endpoint = self._instance.rospy.Publisher(channel.topic, channel.message_class, latch=channel.latch, **options)
+        for other in self._neighbours():
+            if other.subscriber(channel.topic):
+                other.connect(channel.topic, self._instance.uri)
+        return endpoint, publishing.sender(endpoint, channel)
+
+    def unadvertise(self, channel, endpoint):
+        """End what :meth:`advertise` began."""
+        publishing.forget_latch(endpoint, channel)
+        endpoint.unregister()
+
+    @staticmethod
+    def connections(endpoint):
+        """``[(peer node name, transport)]`` of a rospy Publisher or Subscriber."""
+        return [(_peer(connection), connection.transport_type)
+                for connection in (endpoint.impl.connections if endpoint.impl else ()) if not connection.done]
+
+    # -- links --------------------------------------------------------------------------------------------------------
+
+    def channels_on(self, topic):
+        """The channels of the node that receive from the topic."""
+        return self._channels.get(topic, ())
+
+    def connects_in_process(self):
+        """Whether the connection that this thread negotiates may be INTRAPROCESS: only channels know that."""
+        topic = self.connecting.topic
+        subscriber = self._instance.subscriber(topic)
+        return bool(self.channels_on(topic)) and subscriber is not None and self.only_channels(subscriber)
+
+    def only_channels(self, subscriber):
+        """Whether a rospy subscription has no callbacks but our channels'."""
+        channels = self.channels_on(subscriber.resolved_name)
+        return all(getattr(callback, '__self__', None) in channels for callback, _ in subscriber.callbacks or ())
+
+    def sends_to(self, name, topic):
+        """Whether the node, if it publishes on the topic at all, is connected to the subscriber of that name."""
+        publisher = self._instance.publisher(topic)
+        return publisher is None or any(connection.endpoint_id == name for connection in publisher.connections)
+
+    @staticmethod
+    def neighbour(uri):
+        """The PrivateRospy of this process at that URI, None if there is none."""
+        return _running.get(uri)
+
+    def _neighbours(self):
+        """The nodes of this process at the same master, this one among them."""
+        master = self._instance.settings.master_url
+        return [other for other in list(_running.values()) if other.settings.master_url == master]
+
+    def _channels_changed(self, topic):
+        for connection in self._instance.subscriber(topic).connections:
+            if connection.transport_type == 'INTRAPROCESS':
+                connection.link.channels_changed()
+
+
+def _peer(connection):
+    # a publisher's end is called after the subscriber's node; a subscriber's after the publisher's URI, and it
+    # knows the name once the handshake is through
+    name = getattr(connection, 'callerid_pub', 'unknown')
+    if name == 'unknown':
+        other = _running.get(connection.endpoint_id)
+        name = other.name if other else connection.endpoint_id
+    return name

@@ -1,0 +1,103 @@
+"""Logging: each line once, under the node's name, with the caller's file and line; the host's logging untouched."""
+import inspect
+import logging
+import os
+import pathlib
+import subprocess
+import sys
+
+import pharos
+from conftest import Mailbox
+from pharos import BlockNode
+
+
+def create(master, name, **kwargs):
+    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
+
+
+def hear(master):
+    """What goes to /rosout, as the node that listens hears it, without the chatter about itself."""
+    lines = Mailbox()
+    create(master, '/auditor', delegate=lines).interested_in('/rosout', 'rosgraph_msgs/Log', from_=None)
+    return lines
+
+
+def test_each_line_is_on_rosout_once_with_name_file_and_line(master):
+    lines = hear(master)
+    nodes = [create(master, '/robot%d/talker' % i) for i in range(3)]
+    for node in nodes:
+        node.log('%s says 100%% hello' % node.name, level='warn')
+        line = inspect.currentframe().f_lineno - 1
+        node.ros.loginfo('and through rospy')
+    heard = [lines.get() for _ in range(6)]
+    for node in nodes:
+        own, through_rospy = [log for log in heard if log.name == node.name]
+        assert own.msg == '%s says 100%% hello' % node.name and own.level == own.WARN
+        assert (os.path.basename(own.file), own.line) == (os.path.basename(__file__), line)
+        assert own.function.endswith('test_each_line_is_on_rosout_once_with_name_file_and_line')
+        assert (through_rospy.msg, through_rospy.line) == ('and through rospy', line + 2)
+    assert lines.empty()
+
+
+def test_a_log_level_is_set_per_node(master):
+    lines = hear(master)
+    quiet, normal = create(master, '/quiet'), create(master, '/normal')
+    levels = master.lookup_service('/quiet/set_logger_level').call(logger='rosout', level='error', timeout=10)
+    assert levels is not None
+    for node in quiet, normal:
+        node.log('a detail')
+    assert lines.get().name == '/normal' and lines.empty()
+
+
+def test_each_node_has_a_log_file(master):
+    create(master, '/robot1/filed').log('to the file')
+    path = pathlib.Path(os.environ['ROS_LOG_DIR']) / 'robot1_filed.log'
+    assert 'to the file' in path.read_text()
+
+
+def test_the_hosts_logging_is_untouched(master):
+    root = logging.getLogger()
+    before = list(root.handlers), root.level, logging.getLoggerClass(), set(logging._handlers)
+    node = create(master, '/guest')
+    node.log('not for the host')
+    assert (list(root.handlers), root.level, logging.getLoggerClass()) == before[:3]
+    node.stop()
+    assert (list(root.handlers), root.level, logging.getLoggerClass()) == before[:3]
+
+
+def test_a_host_that_is_a_rospy_node_itself_stays_one(master):
+    """Its name, its log lines and its subscription are its own, beside two nodes of ours."""
+    program = r'''
+import logging, sys
+logging.getLogger().addHandler(logging.StreamHandler(sys.stdout))
+import rospy, std_msgs.msg
+import pharos
+rospy.init_node('host', argv=[])
+master = pharos.Master()
+a, b = (master.create(pharos.BlockNode, named=name) for name in ('/a', '/b'))
+import threading
+heard = threading.Event()
+rospy.Subscriber('/t', std_msgs.msg.String, lambda message: heard.set())
+a.send_to('/t', data='hello', typed_as='std_msgs/String')
+assert heard.wait(20)
+log = rospy.Publisher('/t', std_msgs.msg.String, queue_size=1)
+rospy.loginfo('the host speaks')
+a.log('node a speaks')
+assert rospy.get_name() == '/host' and a.ros.get_name() == '/a'
+try:
+    a.ros.get_param('/none')
+except KeyError:
+    pass
+try:
+    a.ros.wait_for_message('/nothing', std_msgs.msg.String, timeout=0.01)
+except rospy.ROSException:
+    print('caught')
+a.stop(); b.stop()
+assert not rospy.is_shutdown() and a.lifecycle.value == 'stopped'
+'''
+    result = subprocess.run([sys.executable, '-c', program], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+                            env=dict(os.environ, PYTHONPATH=str(pathlib.Path(pharos.__file__).parent.parent)),
+                            timeout=60, check=False)
+    assert result.returncode == 0, result.stdout
+    assert result.stdout.count('the host speaks') == 1 and result.stdout.count('node a speaks') == 1
+    assert 'caught' in result.stdout
