@@ -141,4 +141,4 @@ def _what_fits(cls, field_type):
         bits = 8 * struct.calcsize(code) - code.islower()
         return f'an integer from {-2 ** bits if code.islower() else 0} to {2 ** bits - 1}'
     nested = _nested_class(cls, base)
-    return f'a {nested.__name__} ({describe_fields(nested)})'
+    return f'a {nested.__name__} ({describe_fields(nested)})' if nested else f'a {base}'  # None: made elsewhere

@@ -1,0 +1,42 @@
+"""What a delegate gets through INTRAPROCESS is what it gets through TCPROS; what one refuses, the other does too."""
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import pharos
+from conftest import TIMEOUT, Mailbox
+from pharos import BlockNode
+from test_copier import CLASSES, messages, told
+
+pytestmark = pytest.mark.filterwarnings('ignore')    # numpy warns of some of the wrong values
+
+
+def send(channel, message, mailbox):
+    """What arrives, or the error that it raises at the publisher instead."""
+    try:
+        channel.publish(message)
+    except pharos.MessageTypeError as error:
+        return type(error)
+    return mailbox.get()
+
+
+@pytest.mark.parametrize('message_class', CLASSES, ids=lambda cls: cls._type)
+def test_a_message_arrives_alike(master, message_class):
+    nodes = [master.create(BlockNode, named=name, domain='127.0.0.1') for name in ('/receiver', '/sender')]
+    in_process, through_tcpros = Mailbox(), Mailbox()
+    nodes[0].interested_in('/in_process', message_class, delegate=in_process)
+    nodes[0].ros.Subscriber('/through_tcpros', message_class, lambda message: through_tcpros(message, None))
+    channels = [nodes[1].output_channel(topic, message_class) for topic in ('/in_process', '/through_tcpros')]
+    for channel, transport in zip(channels, ('INTRAPROCESS', 'TCPROS')):
+        assert channel.wait_for_subscribers(1, TIMEOUT) and channel.connections == [('/receiver', transport)]
+
+    @settings(max_examples=10, deadline=None, suppress_health_check=list(HealthCheck), database=None)
+    @given(st.booleans().flatmap(lambda wrong: messages(message_class, wrong)))
+    def arrives_alike(message):
+        ours, theirs = send(channels[0], message, in_process), send(channels[1], message, through_tcpros)
+        if isinstance(ours, type) or isinstance(theirs, type):
+            assert ours is theirs
+        else:
+            del ours._connection_header, theirs._connection_header    # which name different topics
+            assert told(ours) == told(theirs)
+    arrives_alike()
