@@ -51,19 +51,20 @@ class Life:
                 raise PharosError('%s is %s already: stop() it before you start it again'
                                   % (self.name, self._lifecycle.value))
             before, self._lifecycle = self._lifecycle, Lifecycle.STARTING
-        try:
-            instance = PrivateRospy(self._settings, self._asked_to_stop)
-            instance.start(self.connect_timeout)
-        except BaseException:
-            self._become(before)
-            raise
-        self._rospy = instance
-        # the same ports next time, also where any free one was asked for
-        self._settings.tcp_port, self._settings.xmlrpc_port = instance.tcp_port, instance.xmlrpc_port
-        self._dispatcher = Dispatcher(instance.start_thread)
-        instance.on_received = self._dispatcher.run
-        self._become(Lifecycle.RUNNING)
-        running.add(self)
+        with running.signals_deferred():
+            try:
+                instance = PrivateRospy(self._settings, self._asked_to_stop)
+                instance.start(self.connect_timeout)
+            except BaseException:
+                self._become(before)
+                raise
+            self._rospy = instance
+            # the same ports next time, also where any free one was asked for
+            self._settings.tcp_port, self._settings.xmlrpc_port = instance.tcp_port, instance.xmlrpc_port
+            self._dispatcher = Dispatcher(instance.start_thread)
+            instance.on_received = self._dispatcher.run
+            self._become(Lifecycle.RUNNING)
+            running.add(self)
         kept, self._channels = self._channels, []
         services, self._services = self._services, []
         if type(self).start is Life.start:

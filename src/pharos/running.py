@@ -7,17 +7,19 @@ import signal
 import threading
 import time
 
+from pharos.private_rospy.lifetime import SIGNAL_LATENCY
+
 COLLECT_EVERY = 20    # stops; a stopped node's rospy is a web of cycles of 0.7 MB, which only the collector frees
 _stops = itertools.count(1)
 _nodes = {}    # a dict, for its order
 _none_left = threading.Condition()
+_deferred = None    # the signals that came while the main thread started a node; None: it starts none
 _waiting = 0   # how deep the main thread is in a wait of ours, which ends with the nodes
 
 
 def add(node):
     with _none_left:
         _nodes[node] = None
-    _handle_signals()
 
 
 def discard(node):
@@ -40,8 +42,9 @@ def spin():
     with waiting():
         try:
             with _none_left:
-                _none_left.wait_for(lambda: not _nodes)
-        except KeyboardInterrupt:    # where the host program has a handler of its own
+                while _nodes:
+                    _none_left.wait(SIGNAL_LATENCY)
+        except KeyboardInterrupt:    # the host program has a handler of its own
             stop_all()
 
 
@@ -64,23 +67,42 @@ def join(threads, timeout):
 def waiting():
     """Within this, a signal raises nothing in the main thread: the wait ends because the nodes stop."""
     global _waiting
-    main = threading.current_thread() is threading.main_thread()
-    _waiting += main
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    _waiting += 1
     try:
         yield
     finally:
-        _waiting -= main
+        _waiting -= 1
 
 
-def _handle_signals():
-    """Let Ctrl-C and SIGTERM stop the nodes: once per process, and only where the host program does nothing itself."""
-    if threading.current_thread() is threading.main_thread():
-        for number, default in (signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL):
-            if signal.getsignal(number) is default:
-                signal.signal(number, _on_signal)
+@contextlib.contextmanager
+def signals_deferred():
+    """Within this, signals wait: a start that is torn up half way leaves registrations behind.
+
+    From the first time on, Ctrl-C and SIGTERM stop the nodes, where the host program does nothing itself.
+    """
+    global _deferred
+    if threading.current_thread() is not threading.main_thread() or _deferred is not None:
+        yield
+        return
+    for number, default in (signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL):
+        if signal.getsignal(number) is default:
+            signal.signal(number, _on_signal)
+    _deferred = []
+    try:
+        yield
+    finally:
+        came, _deferred = _deferred, None
+        if came:
+            _on_signal(came[0], None)
 
 
 def _on_signal(number, frame):
+    if _deferred is not None:
+        _deferred.append(number)
+        return
     stop = threading.Thread(target=stop_all, name='stop on signal', daemon=True)
     stop.start()    # not here: the main thread may hold any lock just now
     if not _waiting:

@@ -4,6 +4,8 @@ import threading
 import time
 import weakref
 
+# A signal that the kernel gives to another thread does not end the main thread's wait, in which Python would handle it.
+SIGNAL_LATENCY = 0.2  # seconds that such a wait lasts at the most
 JOIN_TIMEOUT = 2.0    # seconds that a thread is waited for
 
 
@@ -39,10 +41,14 @@ class Lifetime:
 
     def sleep(self, seconds):
         """``time.sleep`` that ends with the node; ``sleep(0)`` yields, as rospy's publishers mean it to."""
-        if seconds > 0:
+        if seconds <= 0:
+            time.sleep(0)
+        elif threading.current_thread() is not threading.main_thread():
             self.ended.wait(seconds)
         else:
-            time.sleep(0)
+            until = time.monotonic() + seconds
+            while seconds > 0 and not self.ended.wait(min(seconds, SIGNAL_LATENCY)):
+                seconds = until - time.monotonic()
 
     def hold(self, sock):
         """Shut this socket down at the end, at the latest."""

@@ -139,7 +139,10 @@ def mend_publisher(module):
         link = getattr(connection, 'link', None)
         if link is None and self.queue_size is not None:
             connection = module.QueuedConnection(connection, self.queue_size)
-        with self.publock or _changed:    # so that the latched messages come before what is published now
+        lock = self.publock
+        if lock is None:
+            return False    # closed meanwhile
+        with lock:    # so that the latched messages come before what is published now
             if not base.add_connection(self, connection):
                 return False
             if link:
@@ -158,7 +161,10 @@ def mend_publisher(module):
 
     def channels_changed(self, link):
         """The subscription at the other end of a link has other channels now."""
-        with self.publock or _changed:
+        lock = self.publock
+        if lock is None:
+            return
+        with lock:
             send_latched(self, link.match_channels())
             self.refresh()
         for dispatcher in self._inline:
