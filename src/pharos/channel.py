@@ -39,6 +39,7 @@ class _Channel:
 
     @property
     def is_open(self):
+        """Whether it is neither closed nor its node stopped."""
         return self._endpoint is not None
 
     def close(self):
@@ -62,7 +63,6 @@ class _Channel:
 class InputChannel(_Channel):
     """The end at which a node receives: made by :meth:`Node.interested_in`.
 
-    :attr:`delegate` is the channel's own block, or None: then the node's is run. It may be replaced at any time.
     :attr:`received` counts the messages that the node has taken from the channel.
     """
 
@@ -93,6 +93,7 @@ class InputChannel(_Channel):
 
     @property
     def delegate(self):
+        """The channel's own block, called as ``delegate(message, channel)``; None: the node's is run."""
         return self._delegate
 
     @delegate.setter
@@ -188,15 +189,7 @@ class OutputChannel(_Channel):
 
     def send(self, block=None, *, to=None, **fields):
         """Fill a fresh message with ``block(message)`` and by keywords, publish it, and return it."""
-        message = self.message_class()
-        if block is not None:
-            try:
-                block(message)
-            except AttributeError as error:
-                message_types.explain(error, message)
-                raise
-        if fields:
-            message_types.fill(message, fields)
+        message = message_types.build(self.message_class, block, fields)
         if not self.connections:
             message_types.check_fits(message)    # with nobody interested, rospy does not look at it
         self.publish(message, to)

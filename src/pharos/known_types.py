@@ -21,6 +21,7 @@ found = {}  # (kind, type): class answered before or defined, so that two asks g
 
 
 def check_name(kind, type_):
+    """Raise UnknownTypeError unless it can be the name of a type, such as 'std_msgs/String'."""
     if not isinstance(type_, str) or not _TYPE.fullmatch(type_):
         hint = _near_types(kind, str(type_)[:99])
         raise UnknownTypeError(f"malformed {_KINDS[kind]} type {reprlib.repr(type_)}{hint}: give 'package/Type', in "
@@ -47,6 +48,7 @@ def _found_before(kind, type_):
 
 
 def installed(kind, type_):
+    """Return the class that an installed Python package has for a type, None if there is none."""
     package = type_.partition('/')[0]
     if f'{package}.{kind}' not in sys.modules:
         # The name may come from the network: import no module that is not a package of messages.
@@ -65,6 +67,7 @@ def installed(kind, type_):
 
 
 def file_text(kind, type_):
+    """Return the text of the type's file on ROS_PACKAGE_PATH, None if there is none."""
     package, _, name = type_.partition('/')
     try:
         path = os.path.join(rospkg.RosPack().get_path(package), kind, f'{name}.{kind}')
@@ -95,6 +98,7 @@ def _near_types(kind, type_):
 
 
 def near(name, names):
+    """Return ' (did you mean ...?)' where ``name`` may be a slip for one of ``names``, else nothing."""
     import difflib  # rospy does not load it either
     return _hint(difflib.get_close_matches(name, names, 2, 0.8))
 

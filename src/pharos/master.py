@@ -111,15 +111,16 @@ class Master:
         """Names of all services."""
         return sorted(self.system_state()[2])
 
-    def lookup_service(self, name, caller_id='/pharos'):
+    def lookup_service(self, name, caller_id='/pharos', persistent=False):
         """The :class:`Service` of that name, to be called in the name of ``caller_id``.
 
         The report (listing 3.5): ``master lookupService: '/clear' with: '/myID'``.
 
+        :param persistent: keep connections between calls; they are opened again when the provider comes back
         :raises UnknownServiceError: if nobody offers it
         """
         with self._reached():
-            return Service(self, rosgraph.names.resolve_name(name, caller_id), caller_id)
+            return Service(self, rosgraph.names.resolve_name(name, caller_id), caller_id, persistent)
 
     def system_state(self):
         """``(publishers, subscribers, services)``, each ``{name: [node names]}``."""

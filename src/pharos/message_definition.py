@@ -27,6 +27,7 @@ _made = {}  # classes made here, by what they are made of
 
 
 def make(kind, type_, text):
+    """Return the class for a definition; ``kind`` is 'msg' or 'srv'."""
     context, spec, parts = _read(kind, type_, text)
     sizes = {}
     for part in parts:

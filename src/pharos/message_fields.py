@@ -18,6 +18,21 @@ def describe_fields(cls):
     return ', '.join('%s: %s' % field for field in _fields(cls)) or 'no fields'
 
 
+def build(cls, block, fields):
+    """Return a new message that ``block(message)``, if there is one, and then ``fields`` by name have filled.
+
+    Raises `MessageTypeError` for a field that does not exist, and for a value in ``fields`` that does not fit.
+    """
+    message = cls()
+    if block is not None:
+        try:
+            block(message)
+        except AttributeError as error:
+            explain(error, message)
+            raise
+    return fill(message, fields) if fields else message
+
+
 def fill(message, fields):
     """Set fields of a message by name and return the message.
 
@@ -61,6 +76,7 @@ def _nested_class(cls, type_):
 
 
 def nested_classes(cls):
+    """Return the classes of the messages that a message class nests."""
     return [_nested_class(cls, t) for t in map(bare_msg_type, cls._slot_types) if not is_builtin(t)]
 
 

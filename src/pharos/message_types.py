@@ -10,10 +10,10 @@ import genpy
 
 from pharos import known_types, message_definition
 from pharos.errors import MessageTypeError
-from pharos.message_fields import check_fits, describe_fields, explain, fill
+from pharos.message_fields import build, check_fits, describe_fields, explain, fill
 
 __all__ = ['message_class', 'service_class', 'define_message', 'define_service', 'class_from_definition',
-           'describe_fields', 'fill', 'check_fits', 'explain']
+           'describe_fields', 'build', 'fill', 'check_fits', 'explain']
 
 _lock = threading.RLock()
 _given = {}  # (kind, type): class from define_message or define_service

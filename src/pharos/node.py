@@ -5,10 +5,10 @@ import traceback
 from pharos.blocks import check_block, check_delegate, check_soul, name_of
 from pharos.errors import NodeStoppedError, PharosError
 from pharos.life import Life
+from pharos.offered_service import OfferedService
 from pharos.parameter import Parameter
 from pharos.private_rospy.host import rospy
 from pharos.private_rospy.settings import Settings
-from pharos.service import OfferedService
 from pharos.topic import QUEUE_SIZE
 from pharos.transcript import Transcript
 
@@ -98,7 +98,7 @@ class Node(Life):
     # -- topics -------------------------------------------------------------------------------------------------------
 
     def interested_in(self, topic, typed_as=None, delegate=None, queue_size=QUEUE_SIZE, inline=False, shared=False,
-                      from_=None):
+                      from_=None, wait=0):
         """Receive the messages of a topic from now on; returns the :class:`InputChannel`.
 
         The report (listing 3.3)::
@@ -106,15 +106,20 @@ class Node(Life):
             self interestedIn: '/turtle1/command_velocity' typedAs: 'turtlesim/Velocity'
             self.interested_in('/turtle1/command_velocity', typed_as='turtlesim/Velocity')
 
-        :param typed_as: type name or message class; None: the master's type for the topic
+        :param typed_as: type name or message class; None: the master's type for the topic, whose definition comes from
+            a publisher where no package here has it
         :param delegate: block for this channel only, instead of the node's
         :param queue_size: messages kept while the node is busy; the oldest are dropped and counted
         :param inline: run the delegate in the publisher's thread, where that is a node of this process
         :param shared: get the very message that a node of this process published, and promise not to change it
         :param from_: only messages of that node: a name, Node or ExternalNode
+        :param wait: without ``typed_as``, seconds to wait until somebody has given the topic a type
         :raises UnknownTopicError, UnknownTypeError, MessageTypeError: if there is no type, or another
         """
-        return self._topic(topic).input_channel(self, typed_as, delegate, queue_size, inline, shared, from_)
+        topic = self._topic(topic)
+        if wait and typed_as is None:
+            topic.wait_for_type(wait, self._rospy.ended)
+        return topic.input_channel(self, typed_as, delegate, queue_size, inline, shared, from_)
 
     def output_channel(self, topic, typed_as=None, latch=False, queue_size=QUEUE_SIZE):
         """Publish on a topic from now on; returns the :class:`OutputChannel`.

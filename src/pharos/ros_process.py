@@ -29,6 +29,7 @@ class RosProcess:
 
     @property
     def pid(self):
+        """Its process id."""
         return self._process.pid
 
     @property

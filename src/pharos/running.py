@@ -18,11 +18,13 @@ _waiting = 0   # how deep the main thread is in a wait of ours, which ends with 
 
 
 def add(node):
+    """The node runs from now on."""
     with _none_left:
         _nodes[node] = None
 
 
 def discard(node):
+    """The node has stopped."""
     with _none_left:
         _nodes.pop(node, None)
         if not _nodes:

@@ -1,10 +1,13 @@
 """Topics: named buses, and the dispatchers that hand a node its channel."""
+import time
+
 import rosgraph
 
-from pharos import message_types
+from pharos import graph_types, message_types
 from pharos.channel import InputChannel, OutputChannel
-from pharos.errors import MessageTypeError, UnknownTopicError
+from pharos.errors import MessageTypeError, UnknownTopicError, UnknownTypeError
 
+POLL = 0.05          # seconds between two looks at the master's types
 QUEUE_SIZE = 1000    # messages kept for a slow receiver, where nothing else is said
 
 
@@ -69,12 +72,28 @@ class Topic:
         """
         known = next((channel.message_class for channel in node.channels if channel.topic == self.name), None)
         if typed_as is None:
-            return known or message_types.message_class(self.type)
-        asked = message_types.message_class(typed_as)
+            return known or self._class_of(self.type)
+        asked = self._class_of(typed_as)
         if known and asked._md5sum != known._md5sum:
             raise MessageTypeError('%s uses %s with the type %s already and cannot use it as %s too: close that '
                                    'channel first' % (node.name, self.name, known._type, asked._type))
         return asked
+
+    def _class_of(self, type_or_class):
+        """The class of a type: known here, or as the topic's publishers define it."""
+        try:
+            return message_types.message_class(type_or_class)
+        except UnknownTypeError:
+            return graph_types.class_from_publishers(self, type_or_class) or message_types.message_class(type_or_class)
+
+    def wait_for_type(self, timeout, ended):
+        """Wait until somebody has given the topic a type, for up to ``timeout`` seconds or until ``ended`` is set."""
+        deadline = time.monotonic() + timeout
+        while time.monotonic() < deadline and not ended.is_set():
+            try:
+                return self.type
+            except UnknownTopicError:
+                ended.wait(POLL)    # a master tells nobody of new types
 
     def __eq__(self, other):
         return isinstance(other, Topic) and (self.master.url, self.name) == (other.master.url, other.name)

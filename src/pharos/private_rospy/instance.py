@@ -16,7 +16,9 @@ from pharos.errors import MasterUnreachableError, PortInUseError
 from pharos.private_rospy import host, logs, pubsub, registration, servers
 from pharos.private_rospy.lifetime import Lifetime
 from pharos.private_rospy.loader import PrivateImports, Substitute
+from pharos.private_rospy.parameters import WatchedParameters
 from pharos.private_rospy.proxies import ServerProxy, master_api
+from pharos.private_rospy.services import Workers
 from pharos.private_rospy.wiring import Wiring
 
 POLL = 0.001    # seconds between rospy's own looks at whether it is registered; it takes 0.1 s
@@ -39,6 +41,8 @@ class PrivateRospy:
         self.on_received = lambda: None    # called after the callbacks of a batch of messages, in its thread
         self.uri = None
         self.wiring = Wiring(self)
+        self.parameters = WatchedParameters(self)
+        self.workers = Workers(self._lifetime.start_thread)
         self._modules = self._load()
         self.rospy = self._modules.load('rospy')
 
@@ -49,7 +53,7 @@ class PrivateRospy:
         hooks = collections.defaultdict(list)
         for part in ({'rospy.service': _share_service_exception, 'rospy.impl.init': self._poll_quickly,
                       'rospy.core': self._shut_down_early},
-                     servers.hooks(lifetime), registration.hooks(self), pubsub.hooks(self)):
+                     servers.hooks(lifetime), registration.hooks(self), pubsub.hooks(self), self.parameters.hooks()):
             for name, hook in part.items():
                 hooks[name].append(hook)
         modules = PrivateImports(hooks=hooks, substitutes={
@@ -143,6 +147,7 @@ class PrivateRospy:
         if not self._stopping.acquire(blocking=False):
             return []
         self.wiring.close()
+        self.workers.close()
         core = self._modules.load('rospy.core')
         pubsub.flush(self._topic_manager(), flush_timeout)
         core._shutdown_hooks.insert(0, self._wake)    # before rospy waits for its threads
@@ -201,6 +206,14 @@ class PrivateRospy:
     def subscriber(self, topic):
         """rospy's _SubscriberImpl of the topic, None if there is none."""
         return self._topic_manager().get_subscriber_impl(topic)
+
+    def service(self, name):
+        """The rospy Service of that name that the node offers, None if it offers none."""
+        return self._modules.load('rospy.impl.registration').get_service_manager().get_service(name)
+
+    def as_response(self, value, response_class):
+        """What the handler of a rospy Service returned, as a response."""
+        return self._modules.load('rospy.impl.tcpros_service').convert_return_to_response(value, response_class)
 
     def connection_header(self, publisher):
         """What a subscriber of rospy's _PublisherImpl gets as its messages' ``_connection_header``."""

@@ -6,6 +6,11 @@ from pharos.private_rospy import publishing
 _running = {}    # URI -> the PrivateRospy that runs there, in this process
 
 
+def running_here():
+    """The PrivateRospys of the running nodes of this process."""
+    return list(_running.values())
+
+
 class Wiring:
     """The channels of one :class:`~.instance.PrivateRospy`."""
 
@@ -99,7 +104,7 @@ class Wiring:
     def _neighbours(self):
         """The nodes of this process at the same master, this one among them."""
         master = self._instance.settings.master_url
-        return [other for other in list(_running.values()) if other.settings.master_url == master]
+        return [other for other in running_here() if other.settings.master_url == master]
 
     def _channels_changed(self, topic):
         for connection in self._instance.subscriber(topic).connections:

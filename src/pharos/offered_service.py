@@ -1,0 +1,59 @@
+"""Services that a node offers."""
+import genpy
+
+from pharos import message_types
+from pharos.blocks import check_block
+from pharos.errors import PharosError
+from pharos.private_rospy.host import rospy
+
+
+class OfferedService:
+    """A service of a node; made by :meth:`Node.serve`."""
+
+    def __init__(self, node, name, typed_as, block):
+        self.node, self.name = node, name
+        self.service_class = message_types.service_class(typed_as)
+        self.block = check_block(block, 'service block', ('request',))
+        if any(other.name == name for other in node._services):
+            raise PharosError('%s offers %s already: close that one first' % (node.name, name))
+        self._open()
+
+    def _open(self):
+        self._service = self.node.ros.Service(self.name, self.service_class, self._answer)
+        self.node._services = [*self.node._services, self]
+
+    @property
+    def type(self):
+        """The type name, such as 'std_srvs/Empty'."""
+        return self.service_class._type
+
+    def _answer(self, request):
+        try:
+            return self._as_response(self.block(request))
+        except Exception as error:
+            self.node._report(error, self.block, 'service %s' % self.name)
+            raise rospy.ServiceException('%s: %s' % (type(error).__name__, error)) from error
+
+    def _as_response(self, value):
+        """The response that the block meant: itself, its fields, or its only field."""
+        response = self.service_class._response_class
+        if isinstance(value, genpy.Message) and value._type == response._type:
+            return value
+        if isinstance(value, dict):
+            return message_types.fill(response(), value)
+        if not response.__slots__:
+            return response()
+        if len(response.__slots__) == 1 and value is not None:
+            return message_types.fill(response(), {response.__slots__[0]: value})
+        raise TypeError('the block of %s must return a response, a dict of its fields (%s)%s; it returned %r'
+                        % (self.name, message_types.describe_fields(response),
+                           ' or its only field' if len(response.__slots__) == 1 else '', value))
+
+    def close(self):
+        """Offer it no longer. Harmless when done twice."""
+        if self in self.node._services:
+            self.node._services = [other for other in self.node._services if other is not self]
+            self._service.shutdown('closed')
+
+    def __repr__(self):
+        return '<OfferedService %s %s of %s>' % (self.name, self.type, self.node.name)
