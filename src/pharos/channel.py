@@ -91,6 +91,11 @@ class InputChannel(_Channel):
     def _unregister(self, endpoint):
         self.node._rospy.wiring.unsubscribe(self, endpoint)
 
+    def _stopped(self):
+        super()._stopped()
+        # an inbox holds on to the run of the node that it was made for
+        self._dropped_before, self._inboxes = self.dropped, []
+
     @property
     def delegate(self):
         """The channel's own block, called as ``delegate(message, channel)``; None: the node's is run."""

@@ -5,6 +5,7 @@ import rosgraph
 
 from pharos.errors import UnknownNodeError
 from pharos.private_rospy.proxies import ServerProxy
+from pharos.private_rospy.registration import COMMUNICATION_ERRORS
 
 TIMEOUT = 2.0    # seconds that a node may take to answer
 
@@ -39,13 +40,18 @@ class ExternalNode:
 
     @property
     def publications(self):
-        """``{topic: type}`` that it publishes."""
-        return dict(self._ask('getPublications'))
+        """``{topic: type}`` that it publishes, as the master knows it."""
+        return self._topics(0)
 
     @property
     def subscriptions(self):
-        """``{topic: type}`` that it is interested in."""
-        return dict(self._ask('getSubscriptions'))
+        """``{topic: type}`` that it is interested in, as the master knows it."""
+        return self._topics(1)
+
+    def _topics(self, kind):
+        types = dict(self.master.topic_types())
+        return {topic: types.get(topic) for topic, nodes in self.master.system_state()[kind].items()
+                if self.name in nodes}
 
     @property
     def services(self):
@@ -57,8 +63,12 @@ class ExternalNode:
         self._ask('shutdown', 'asked for by pharos')
 
     def _ask(self, method, *args):
-        code, message, value = getattr(ServerProxy(self.uri, TIMEOUT), method)('/pharos', *args)
-        return value
+        uri = self.uri
+        try:
+            return getattr(ServerProxy(uri, TIMEOUT), method)('/pharos', *args)[2]
+        except COMMUNICATION_ERRORS as error:
+            raise UnknownNodeError('%s is registered at %s but does not answer (%s): if it is gone, rosnode cleanup '
+                                   'removes it' % (self.name, uri, error)) from error
 
     def __eq__(self, other):
         return isinstance(other, ExternalNode) and (self.master, self.name) == (other.master, other.name)

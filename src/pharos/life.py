@@ -10,6 +10,7 @@ from pharos.errors import NodeStoppedError, PharosError
 from pharos.private_rospy.host import rospy
 from pharos.private_rospy.instance import PrivateRospy
 from pharos.transcript import Transcript
+from pharos.watcher import watcher_of
 
 
 class Lifecycle(enum.Enum):
@@ -65,6 +66,7 @@ class Life:
             instance.on_received = self._dispatcher.run
             self._become(Lifecycle.RUNNING)
             running.add(self)
+            watcher_of(self.master).check()
         kept, self._channels = self._channels, []
         services, self._services = self._services, []
         if type(self).start is Life.start:
@@ -100,6 +102,7 @@ class Life:
         finally:
             self._become(Lifecycle.STOPPED)
             running.discard(self)
+            watcher_of(self.master).check()
 
     def _is_own_thread(self):
         return self._rospy.owns(threading.current_thread())

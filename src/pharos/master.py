@@ -7,12 +7,15 @@ import rosgraph
 
 from pharos import node as nodes_of_ours
 from pharos import ros_process, running
-from pharos.errors import MasterUnreachableError, UnknownNodeError
+from pharos.errors import MasterUnreachableError, PharosError, UnknownNodeError
 from pharos.external_node import ExternalNode
+from pharos.parameters import Parameters
 from pharos.private_rospy.proxies import ServerProxy, master_api
 from pharos.private_rospy.registration import COMMUNICATION_ERRORS
+from pharos.private_rospy.settings import check_port
 from pharos.service import Service
 from pharos.topic import Topic
+from pharos.watcher import watcher_of
 
 TIMEOUT = 5.0    # seconds that a question to the master may take
 
@@ -31,6 +34,43 @@ class Master:
 
     def __init__(self, url=None):
         self.url = _check_url(rosgraph.get_master_uri() if url is None else url)
+        self._child = None    # the process of an embedded master
+
+    @classmethod
+    def embedded(cls, port=0):
+        """A ROS master of one's own, with /rosout, as a child of this process; ``roscore`` is not needed.
+
+        It ends with :meth:`stop`, its ``with`` block, or this process, however that ends. It is for this host alone
+        unless ROS_IP or ROS_HOSTNAME say otherwise.
+
+        :param port: its port, 0 for any free one
+        :raises PortInUseError: if the port is taken
+        """
+        from pharos import embedded_master    # only here: most programs have a master
+        child, url = embedded_master.start(check_port('port', port))
+        master = cls(url)
+        master._child = child
+        return master
+
+    def stop(self):
+        """Stop this process's nodes at an embedded master, and end it. Harmless when done twice.
+
+        :raises PharosError: if it is not embedded: other nodes need it
+        """
+        from pharos import embedded_master
+        if self._child is None:
+            raise PharosError('%s is not embedded in this program: stop it where it was started' % self)
+        for node in self.own_nodes():
+            node.stop()
+        if self._child.returncode is None:
+            embedded_master.end(self._child)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        if self._child is not None:
+            self.stop()
 
     def create(self, node_class, named, domain=None, tcp_port=0, xmlrpc_port=0, soul=None, delegate=None, argv=None,
                **kwargs):
@@ -63,13 +103,29 @@ class Master:
             raise
         return node
 
-    def run(self, package, executable, *args, on_line=None):
+    def run(self, package, executable, *args, name=None, remap=None, params=None, on_line=None):
         """Start a ROS program at this master, as ``rosrun`` does; returns the :class:`RosProcess`.
 
+        :param args: its further arguments
+        :param name: the name of its node, for ``__name:=``
+        :param remap: ``{name: name}`` of remappings
+        :param params: ``{name: value}`` of private parameters
         :param on_line: block called as ``on_line(text)`` for each line of its output, in a thread of its own
         :raises UnknownNodeError: if there is no such package or program
         """
-        return ros_process.run(self.url, package, executable, args, on_line)
+        mappings = {**(remap or {}), **{'_' + key: value for key, value in (params or {}).items()}}
+        if name is not None:
+            mappings['__name'] = name
+        arguments = [*map(str, args), *('%s:=%s' % mapping for mapping in mappings.items())]
+        return ros_process.run(self.url, package, executable, arguments, on_line)
+
+    def launch(self, package, file, on_line=None, **args):
+        """Start a launch file at this master, as ``roslaunch`` does; returns the :class:`RosProcess`.
+
+        :param args: the launch file's arguments
+        :param on_line: block called as ``on_line(text)`` for each line of its output, in a thread of its own
+        """
+        return ros_process.launch(self.url, package, file, args, on_line)
 
     # -- what is there --------------------------------------------------------------------------------------------------
 
@@ -89,6 +145,32 @@ class Master:
         if name not in known:
             raise UnknownNodeError('no node %s at %s%s: see rosnode list' % (name, self.url, self.near(name, known)))
         return known[name]
+
+    def wait_for_node(self, name, timeout=None):
+        """Wait until a node of that name is there; returns it.
+
+        :param timeout: seconds, None: without limit
+        :raises UnknownNodeError: if it does not come in time
+        """
+        name = rosgraph.names.resolve_name(name, '/pharos')
+        if not watcher_of(self).wait_for_node(name, timeout):
+            raise UnknownNodeError('no node %s came to %s within %g s' % (name, self.url, timeout))
+        return self.node(name)
+
+    def on_change(self, block):
+        """Run ``block(kind, name, is_there)`` for each node, topic and service that comes or goes.
+
+        ``kind`` is 'node', 'topic' or 'service'. It runs in the thread that watches the master, within a second.
+        Returns a function that ends it.
+        """
+        watcher = watcher_of(self)
+        watcher.listen(block)
+        return lambda: watcher.unlisten(block)
+
+    @property
+    def parameters(self):
+        """The parameter server as a mapping: ``master.parameters['/rosdistro']``."""
+        return Parameters(self)
 
     def own_nodes(self):
         """The nodes of this process at this master."""
@@ -200,8 +282,8 @@ class _Reached:
 
     def __exit__(self, kind, error, traceback):
         if isinstance(error, COMMUNICATION_ERRORS):
-            raise MasterUnreachableError('no ROS master answers at %s (%s): start one with roscore, or set '
-                                         'ROS_MASTER_URI' % (self._url, error)) from error
+            raise MasterUnreachableError('no ROS master answers at %s (%s): start one with roscore or '
+                                         'Master.embedded(), or set ROS_MASTER_URI' % (self._url, error)) from error
 
 
 def _check_url(url):

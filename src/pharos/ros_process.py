@@ -1,6 +1,8 @@
 """ROS programs run as processes of their own."""
+import atexit
 import collections
 import os
+import signal
 import subprocess
 import threading
 
@@ -14,8 +16,10 @@ class RosProcess:
         self.command = command
         self._on_line = on_line
         self._lines = collections.deque(maxlen=10000)
+        # a session of its own, so that what it starts ends with it, and Ctrl-C is the program's to handle
         self._process = subprocess.Popen(command, env=environ, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-                                         stderr=subprocess.STDOUT, text=True, errors='replace')
+                                         stderr=subprocess.STDOUT, text=True, errors='replace', start_new_session=True)
+        atexit.register(self.terminate)
         self._reader = threading.Thread(target=self._read, name='output of %s' % command[0], daemon=True)
         self._reader.start()
 
@@ -51,14 +55,25 @@ class RosProcess:
         return status
 
     def terminate(self, timeout=5.0):
-        """Ask it to end, and end it after ``timeout`` seconds; returns its exit status."""
+        """Ask it, and what it has started, to end, and end them after ``timeout`` seconds; returns its exit status.
+
+        Done at the end of this program, too.
+        """
+        atexit.unregister(self.terminate)
         if self.poll() is None:
-            self._process.terminate()
+            self._signal(signal.SIGTERM)
             try:
-                return self.wait(timeout)
+                self._process.wait(timeout)
             except subprocess.TimeoutExpired:
-                self._process.kill()
+                pass
+        self._signal(signal.SIGKILL)    # whatever it left behind, too
         return self.wait()
+
+    def _signal(self, number):
+        try:
+            os.killpg(self.pid, number)
+        except ProcessLookupError:
+            pass    # all of them have ended
 
     def __enter__(self):
         return self
@@ -98,3 +113,24 @@ def _find(package, executable):
                                    'setup.bash' % package) from None
         paths = [os.path.join(folder, executable) for folder in folders]
         return [path for path in paths if os.access(path, os.X_OK)]
+
+
+def launch(master_url, package, file, args, on_line=None):
+    """Start a launch file as ``roslaunch`` would, at the master given.
+
+    A process of its own, although roslaunch has a Python API: that works in the main thread alone, and sets the
+    logging and the signal handlers of the program that calls it.
+
+    :raises UnknownNodeError: if there is no such package or launch file
+    """
+    import roslib.packages
+    import rospkg
+    try:
+        found = roslib.packages.find_resource(package, file)
+    except rospkg.ResourceNotFound:
+        raise UnknownNodeError('no ROS package %r on ROS_PACKAGE_PATH: install it, or source its workspace\'s '
+                               'setup.bash' % package) from None
+    if not found:
+        raise UnknownNodeError('the ROS package %s has no launch file %r' % (package, file))
+    command = ['roslaunch', '--skip-log-check', found[0], *('%s:=%s' % arg for arg in args.items())]
+    return RosProcess(command, dict(os.environ, ROS_MASTER_URI=master_url), on_line)

@@ -12,6 +12,8 @@ import xmlrpc
 import xmlrpc.client
 import _thread
 
+import rosgraph
+
 from pharos.errors import MasterUnreachableError, PortInUseError
 from pharos.private_rospy import host, logs, pubsub, registration, servers
 from pharos.private_rospy.lifetime import Lifetime
@@ -108,7 +110,7 @@ class PrivateRospy:
             master_api(settings.master_url, self.name, timeout).getPid()
         except registration.COMMUNICATION_ERRORS as error:
             raise MasterUnreachableError(
-                'no ROS master answers at %s (%s): start one with roscore, or set ROS_MASTER_URI'
+                'no ROS master answers at %s (%s): start one with roscore or Master.embedded(), or set ROS_MASTER_URI'
                 % (settings.master_url, error)) from error
         registration.claim_name(settings.master_url, self.name, timeout)
         core = self._modules.load('rospy.core')
@@ -164,6 +166,19 @@ class PrivateRospy:
             changed = self._lifetime.xmlrpc.handler.reg_man.cond
             with changed:
                 changed.notify_all()
+
+    def repair(self, state):
+        """Register with the master what it has forgotten; see :func:`.registration.repair`. Raises nothing."""
+        handler = self._lifetime.xmlrpc.handler
+        if handler is None or self.ended.is_set():
+            return
+        try:
+            services = self._modules.load('rospy.impl.registration').get_service_manager()
+            if registration.repair(self, handler, self._topic_manager(), services, state):
+                self.rospy.logwarn('the master %s had forgotten this node: registered again', self.settings.master_url)
+                self.parameters.put_back()
+        except (rosgraph.MasterException, *registration.COMMUNICATION_ERRORS) as error:
+            self.rospy.logdebug('cannot register with the master %s: %s', self.settings.master_url, error)
 
     def _topic_manager(self):
         return self._modules.load('rospy.impl.registration').get_topic_manager()

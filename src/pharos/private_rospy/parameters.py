@@ -30,8 +30,21 @@ class WatchedParameters:
             listeners = self._listeners.setdefault(name, [])
             if listener not in listeners:
                 listeners.append(listener)
+        self._subscribe(name)
+
+    def _subscribe(self, name):
         instance = self._instance
         master_api(instance.settings.master_url, instance.name).subscribeParam(instance.uri, name)
+
+    def put_back(self):
+        """A restarted master has no parameters: set the node's private ones from its argv, and watch again."""
+        client = self._instance.rospy.client
+        for name, value in client.load_command_line_node_params(self._instance.settings.argv).items():
+            self._instance.rospy.set_param('~' + name, value)
+        with self._lock:
+            watched = list(self._listeners)
+        for name in watched:
+            self._subscribe(name)
 
     def tell(self, key, value):
         """Tell the listeners of a parameter, also where the master names one that is nested in theirs, or around."""

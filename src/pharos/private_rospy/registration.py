@@ -35,6 +35,8 @@ def hooks(instance):
                 try:
                     instance.wiring.connecting.topic = topic
                     answer = connect(self, topic, uri)
+                except UnboundLocalError:    # rospy's, where it never asked or gave up because the node stops
+                    answer = 0, '%s stops' % self.name, 0
                 finally:
                     with lock:
                         # asked for again: what was no publisher a moment ago may be one now
@@ -138,3 +140,29 @@ def _unregister_all(master, name, uri):
     for service, nodes in services:
         if name in nodes:
             master.unregisterService(service, master.lookupService(service))
+
+
+def repair(instance, handler, topics, services, state):
+    """Register again what the master has forgotten of a node: a restarted one knows nothing, another a part.
+
+    :param state: ``(publishers, subscribers, services)`` of the master, each ``{name: [node names]}``
+    :returns: whether it had forgotten the node altogether
+    """
+    name, uri, master = instance.name, instance.uri, master_api(instance.settings.master_url, instance.name)
+    kinds = [(topics.get_publications, state[0], master.registerPublisher, master.unregisterPublisher),
+             (topics.get_subscriptions, state[1], master.registerSubscriber, master.unregisterSubscriber)]
+    forgotten = not any(name in nodes for kind in state for nodes in kind.values())
+    for ours, theirs, register, unregister in kinds:
+        for topic, type_ in ours():
+            if name not in theirs.get(topic, ()):
+                publishers = register(topic, type_, uri)
+                if instance.ended.is_set() or topic not in dict(ours()):
+                    unregister(topic, uri)    # closed while we registered it
+                elif ours == topics.get_subscriptions:
+                    handler.reg_man.publisher_update(topic, publishers)
+    for service, service_uri in services.get_services():
+        if name not in state[2].get(service, ()):
+            master.registerService(service, service_uri, uri)
+            if instance.ended.is_set() or services.get_service(service) is None:
+                master.unregisterService(service, service_uri)
+    return forgotten

@@ -1,0 +1,45 @@
+"""The parameter server of a master as a mapping."""
+import collections.abc
+
+import rosgraph
+
+
+class Parameters(collections.abc.MutableMapping):
+    """``{global name: value}`` of a master's parameter server; made by :attr:`Master.parameters`.
+
+    A name may be a namespace, whose value is a dict of what it holds. Iteration gives all full names.
+    """
+
+    def __init__(self, master):
+        self._master = master
+
+    def __getitem__(self, name):
+        return self._call('getParam', name)
+
+    def __setitem__(self, name, value):
+        self._call('setParam', name, value)
+
+    def __delitem__(self, name):
+        self._call('deleteParam', name)
+
+    def __iter__(self):
+        return iter(sorted(self._master._ask('getParamNames')))
+
+    def __len__(self):
+        return len(self._master._ask('getParamNames'))
+
+    def __contains__(self, name):
+        with self._master._reached():
+            return self._master._api().hasParam(rosgraph.names.resolve_name(name, '/pharos'))
+
+    def _call(self, method, name, *args):
+        name = rosgraph.names.resolve_name(name, '/pharos')
+        with self._master._reached():
+            try:
+                return getattr(self._master._api(), method)(name, *args)
+            except rosgraph.MasterError:
+                raise KeyError('no parameter %s at %s%s' % (name, self._master.url,
+                                                            self._master.near(name, self))) from None
+
+    def __repr__(self):
+        return '<Parameters of %s>' % self._master.url

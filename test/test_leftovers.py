@@ -1,0 +1,199 @@
+"""What a stopped node leaves behind: nothing, however often it was started.
+
+The counting is done in a process of its own, whose threads, descriptors and memory are those of its nodes alone; the
+master and the peers are elsewhere.
+"""
+import gc
+import json
+import subprocess
+import sys
+import weakref
+
+import pytest
+
+import pharos
+from conftest import Mailbox
+from pharos import BlockNode
+from programs import environment
+
+COUNTED = r'''
+import gc, json, os, sys, threading, time
+import pharos
+from pharos import BlockNode, Master
+
+def resident():
+    """Memory of this process in MB."""
+    with open('/proc/self/statm') as file:
+        return int(file.read().split()[1]) * os.sysconf('SC_PAGESIZE') / 1e6
+
+def count():
+    """What a node may leave behind; threads are the kernel's, not only those that Python knows."""
+    gc.collect()
+    open_files = []
+    for descriptor in os.listdir('/proc/self/fd'):
+        try:
+            open_files.append(os.readlink('/proc/self/fd/' + descriptor).partition(':')[0])
+        except FileNotFoundError:
+            pass    # that of the listing
+    return {'threads': len(os.listdir('/proc/self/task')), 'sockets': open_files.count('socket'),
+            'descriptors': len(open_files), 'registrations': registrations()}
+
+def registrations():
+    return sum(nodes.count(name) for kind in master.system_state() for nodes in kind.values() for name in ours)
+
+def cpu_share():
+    """The share of a core that is used while nothing happens."""
+    begin = time.process_time(), time.monotonic()
+    threading.Event().wait(0.5)
+    return (time.process_time() - begin[0]) / (time.monotonic() - begin[1])
+
+def timed(block):
+    begin = time.monotonic()
+    block()
+    return time.monotonic() - begin
+
+master = Master()
+'''
+
+ROUNDS = COUNTED + r'''
+import queue
+ours = ['/round']
+received, turned = queue.SimpleQueue(), threading.Event()
+node = master.create(BlockNode, named='/round', domain='127.0.0.1', delegate=lambda message, channel: received.put(message.data))
+ports = node.tcp_port, node.xmlrpc_port
+
+def soul(me):
+    for _ in me.every(0.01):
+        turned.set()
+
+node.interested_in('/in', 'std_msgs/Int32')
+node.serve('/double', 'roscpp/GetLoggers', lambda request: [])
+node.output_channel('/out', 'std_msgs/Int32')
+stops, counts, memory = [], [], []
+for number in range(ROUNDS):
+    turned.clear()
+    node.fork(soul)
+    node.send_to('/out', data=number)
+    assert received.get(timeout=20) == 7    # from the other process, latched
+    assert turned.wait(20)
+    master.lookup_service('/double', '/round').call(timeout=20)
+    stops.append(timed(node.stop))
+    assert not node.errors, node.errors
+    counts.append(count())
+    memory.append(resident())
+    assert (node.tcp_port, node.xmlrpc_port) == ports
+    if number < ROUNDS - 1:
+        node.start()
+stopped_cpu = cpu_share()
+node.start()
+running_cpu = cpu_share()
+node.stop()
+print(json.dumps({'counts': counts, 'stops': stops, 'memory': memory, 'cpu': [stopped_cpu, running_cpu]}))
+'''
+
+HUNDRED = COUNTED + r'''
+ours = ['/many/n%d' % number for number in range(100)]
+master.create(BlockNode, named='/first', domain='127.0.0.1').stop()    # what is loaded once per process
+before = count()
+nodes = []
+started = timed(lambda: nodes.extend(master.create(BlockNode, named=name, domain='127.0.0.1') for name in ours))
+running = count()
+stopped = timed(lambda: [node.stop() for node in nodes])
+nodes.clear()
+after = count()
+print(json.dumps({'before': before, 'running': running, 'after': after, 'started': started, 'stopped': stopped}))
+'''
+
+
+def run(master, code, **constants):
+    """Run a program, and return what it found out."""
+    lines = ['%s = %r\n' % constant for constant in constants.items()]
+    done = subprocess.run([sys.executable, '-c', ''.join(lines) + code], env=environment(master.url), timeout=120,
+                          stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+@pytest.fixture(scope='module')
+def rounds(ros_master):
+    """What fifty rounds of start and stop of one node on fixed ports left, with peers in this process."""
+    master, heard = pharos.Master(ros_master.url), Mailbox()
+    with master.create(BlockNode, named='/peer', domain='127.0.0.1', delegate=heard) as peer:
+        peer.output_channel('/in', 'std_msgs/Int32', latch=True).send(data=7)
+        peer.interested_in('/out', 'std_msgs/Int32')
+        found = run(master, ROUNDS, ROUNDS=50)
+        assert [message.data for message in heard.take(50)] == list(range(50))
+    return found
+
+
+# the second round, for what is made once per process is there then
+
+
+def test_fifty_rounds_of_stop_and_start_leave_nothing(rounds):
+    assert rounds['counts'][-1] == rounds['counts'][1]
+    assert rounds['counts'][-1]['registrations'] == 0
+
+
+def test_memory_does_not_grow_from_round_to_round(rounds):
+    assert rounds['memory'][-1] - rounds['memory'][9] < 8    # MB; a run of a node that stayed would be 0.7 each
+
+
+def test_a_stop_is_quick(rounds):
+    assert sorted(rounds['stops'])[25] < 0.1    # s; 6 ms where nothing else goes on
+
+
+def test_a_node_that_was_stopped_or_has_nothing_to_do_uses_no_cpu(rounds):
+    """ros_comm #2238: a closed XML-RPC server spun on its socket, 100 % of a core."""
+    stopped, running = rounds['cpu']
+    assert stopped < 0.2 and running < 0.2
+
+
+def test_a_hundred_nodes_start_and_stop(master):
+    found = run(master, HUNDRED)
+    assert found['running']['registrations'] >= 100
+    assert found['after'] == found['before']
+    assert found['started'] < 30 and found['stopped'] < 10    # s; the benchmark looks closer
+
+
+def test_what_a_stopped_node_held_is_freed(master):
+    node = master.create(BlockNode, named='/mortal', domain='127.0.0.1')
+    node.interested_in('/a', 'std_msgs/String')
+    node.send_to('/a', data='to itself', typed_as='std_msgs/String')
+    node.serve('/b', 'std_srvs/Empty', lambda request: None)
+    held = [weakref.ref(thing) for thing in (node._rospy, node.ros, node.ros.Publisher)]
+    node.stop()
+    node.start()    # under the same name, another rospy
+    gc.collect()
+    assert [ref() for ref in held] == [None] * 3
+    node.stop()
+    last = weakref.ref(node), weakref.ref(node._rospy)
+    del node
+    gc.collect()
+    assert [ref() for ref in last] == [None] * 2
+
+
+@pytest.mark.parametrize('library', ['actionlib', 'tf2_ros', 'message_filters'])
+def test_a_library_of_a_stopped_node_is_freed(master, library):
+    held = []
+    for name in '/mortal', '/survivor':
+        node = master.create(BlockNode, named=name, domain='127.0.0.1')
+        held += weakref.ref(node.ros_import(library)), weakref.ref(node._rospy)
+        node.stop()
+        del node
+    gc.collect()
+    # not the last one: actionlib hangs a function of its own on the class GoalStatus, which all nodes share
+    assert [ref() for ref in held[:2]] == [None] * 2
+
+
+@pytest.mark.parametrize('broken', ['tcp_port', 'xmlrpc_port', 'named'])
+def test_a_node_that_could_not_start_is_freed(master, broken):
+    class Mortal(BlockNode):
+        def __init__(self):
+            made.append(weakref.ref(self))
+    made = []
+    other = master.create(BlockNode, named='/taken', domain='127.0.0.1')
+    taken = {'tcp_port': other.tcp_port, 'xmlrpc_port': other.xmlrpc_port, 'named': other.name}
+    with pytest.raises(pharos.PharosError):
+        master.create(Mortal, domain='127.0.0.1', **{'named': '/mortal', broken: taken[broken]})
+    gc.collect()
+    assert [ref() for ref in made] == [None]

@@ -1,0 +1,211 @@
+"""How programs with nodes end: by Ctrl-C, by SIGTERM, or by themselves; nothing stays registered."""
+import signal
+import sys
+
+import pytest
+
+from conftest import Mailbox
+from pharos import BlockNode
+from programs import Program
+
+SIGNALS = pytest.mark.parametrize('with_signal', [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
+
+PREPARED = '''
+import signal, sys, threading
+import pharos
+from pharos import BlockNode, Master
+
+def node(name='/program', **kwargs):
+    return Master().create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
+
+def ready():
+    print('ready', flush=True)
+
+def ready_in_wait():
+    """Tell when the main thread waits in something of ours; before that, it runs code of its own."""
+    def tell():
+        while not pharos.running._waiting:
+            threading.Event().wait(0.001)
+        ready()
+    threading.Thread(target=tell, daemon=True).start()
+'''
+
+
+@pytest.fixture
+def program(master):
+    """Runs the code given as a program; afterwards, nothing of it may be registered."""
+    started = []
+
+    def start(code, wait_for='ready'):
+        started.append(Program(master.url, sys.executable, '-c', PREPARED + code))
+        if wait_for:
+            started[-1].wait_for(wait_for)
+        return started[-1]
+    yield start
+    for each in started:
+        each.end(signal.SIGKILL)
+    assert [name for kind in master.system_state() for names in kind.values() for name in names
+            if name.startswith('/program')] == []
+
+
+def ended_by(with_signal):
+    """The exit status of a program that the signal ended while it did something of its own."""
+    return {signal.SIGINT: -signal.SIGINT, signal.SIGTERM: 128 + signal.SIGTERM}[with_signal]
+
+
+# -- signals -------------------------------------------------------------------------------------------------------------
+
+WAITS = {
+    'spin': 'pharos.spin()',
+    'every': 'for _ in me.every(3600): pass',
+    'sleep': 'me.sleep(3600)',
+    'a soul': 'me.soul = lambda me: me.sleep(3600); me.execute()',
+}
+
+
+@SIGNALS
+@pytest.mark.parametrize('wait', WAITS.values(), ids=WAITS)
+def test_a_wait_of_ours_ends_and_the_program_goes_on(program, with_signal, wait):
+    running = program('me, other = node(), node("/program_too")\nready_in_wait()\n' + wait
+                      + '\npharos.spin()\nprint("went on", me.lifecycle.value, other.lifecycle.value)')
+    assert running.end(with_signal) == 0
+    assert 'went on stopped stopped' in running.read_to_the_end()
+
+
+@SIGNALS
+@pytest.mark.parametrize('busy', ['threading.Event().wait(60)', 'while True: pass'])
+def test_plain_code_is_ended_as_without_nodes(program, with_signal, busy):
+    running = program('me = node()\nready()\n' + busy)
+    assert running.end(with_signal) == ended_by(with_signal)
+
+
+@SIGNALS
+def test_a_signal_before_the_first_node_is_pythons(program, with_signal):
+    running = program('ready(); threading.Event().wait(60)')
+    assert running.end(with_signal) == -with_signal
+
+
+@SIGNALS
+def test_a_soul_says_farewell(program, master, with_signal):
+    heard = Mailbox()
+    with master.create(BlockNode, named='/wheels', domain='127.0.0.1', delegate=heard) as wheels:
+        wheels.interested_in('/speed', 'std_msgs/Float32')
+        running = program("""
+def drive(me):
+    try:
+        for _ in me.every(3600):
+            me.send_to('/speed', data=1.0)
+    finally:
+        me.send_to('/speed', data=0.0)
+node(soul=drive).fork()
+pharos.spin()
+""", wait_for=None)
+        assert heard.get().data == 1.0
+        assert running.end(with_signal) == 0
+        assert heard.get().data == 0.0
+
+
+def test_a_handler_that_the_program_had_before_is_kept(program):
+    running = program("""
+asked = threading.Event()
+signal.signal(signal.SIGINT, lambda *signal: asked.set())
+me = node()
+ready()
+assert asked.wait(60)
+print('asked', me.lifecycle.value)
+""")
+    assert running.end(signal.SIGINT) == 0
+    assert 'asked running' in running.read_to_the_end()
+
+
+def test_a_handler_that_the_program_sets_afterwards_is_kept(program):
+    running = program("""
+me, asked = node(), threading.Event()
+signal.signal(signal.SIGTERM, lambda *signal: asked.set())
+node('/program_too')
+ready()
+assert asked.wait(60)
+print('asked', me.lifecycle.value)
+""")
+    assert running.end(signal.SIGTERM) == 0
+    assert 'asked running' in running.read_to_the_end()
+
+
+def test_a_signal_that_the_program_ignores_stays_ignored(program):
+    """As nohup and a shell's & have it."""
+    running = program("""
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+me = node()
+ready_in_wait()
+pharos.spin()
+""")
+    running.process.send_signal(signal.SIGINT)
+    assert running.end(signal.SIGTERM) == 0
+
+
+def test_a_node_of_another_thread_leaves_the_signals_alone(program):
+    """Only the main thread may set handlers; spin() stops the nodes all the same on Ctrl-C."""
+    running = program("""
+thread = threading.Thread(target=node)
+thread.start()
+thread.join()
+assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+ready_in_wait()
+pharos.spin()
+""")
+    assert running.end(signal.SIGINT) == 0
+
+
+def test_a_second_ctrl_c_while_the_nodes_stop_does_no_harm(program):
+    running = program("""
+me = node(soul=lambda me: threading.Event().wait(60))
+me.stop_timeout = 0.5
+me.fork()
+threading.Thread(target=lambda: (me._rospy.ended.wait(), print('stopping', flush=True)), daemon=True).start()
+ready_in_wait()
+pharos.spin()
+""")
+    running.process.send_signal(signal.SIGINT)
+    running.wait_for('stopping')
+    assert running.end(signal.SIGINT) == 0
+
+
+# -- ends without a signal -----------------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize('code, status', [
+    ('', 0),
+    ('sys.exit(3)', 3),
+    ('1 / 0', 1),
+    ('pharos.Transcript.show("done")', 0),
+    ('me.stop()', 0),
+    ('me.fork(lambda me: [None for _ in me.every(3600)])', 0),
+    ('me.fork(lambda me: me.send_to("/a", data="x", typed_as="std_msgs/String"))', 0),
+    ('me.ros_import("actionlib")', 0),
+    ('me.ros.Timer(me.ros.Duration(0.001), lambda event: None)', 0),
+    ('threading.Thread(target=me.sleep, args=(3600,), daemon=True).start()', 0),
+])
+def test_a_script_ends_with_its_nodes_running(program, code, status):
+    running = program("""
+me, other = node(), node('/program_too')
+me.interested_in('/a', 'std_msgs/String')
+other.serve('/b', 'std_srvs/Empty', lambda request: None)
+ready()
+""" + code)
+    printed = running.read_to_the_end()
+    assert running.process.wait(60) == status
+    assert ('Traceback' in printed) == (status == 1)
+
+
+def test_spin_without_nodes_returns_at_once(program):
+    assert program('pharos.spin(); ready()').process.wait(60) == 0
+
+
+def test_spin_returns_when_the_last_node_has_stopped(program):
+    running = program("""
+me, other = node(), node('/program_too')
+me.stop()
+other.fork(lambda other: (ready(), other.ros.signal_shutdown('done')))
+pharos.spin()
+""")
+    running.read_to_the_end()
+    assert running.process.wait(60) == 0
