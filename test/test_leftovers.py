@@ -29,6 +29,9 @@ def resident():
 def count():
     """What a node may leave behind; threads are the kernel's, not only those that Python knows."""
     gc.collect()
+    for thread in threading.enumerate():
+        if thread.name.startswith('watcher') and not pharos.running.nodes():
+            thread.join(20)    # it watches the master while there are nodes, and ends once it sees that there are none
     open_files = []
     for descriptor in os.listdir('/proc/self/fd'):
         try:
@@ -59,7 +62,8 @@ ROUNDS = COUNTED + r'''
 import queue
 ours = ['/round']
 received, turned = queue.SimpleQueue(), threading.Event()
-node = master.create(BlockNode, named='/round', domain='127.0.0.1', delegate=lambda message, channel: received.put(message.data))
+node = master.create(BlockNode, named='/round', domain='127.0.0.1',
+                     delegate=lambda message, channel: received.put(message.data))
 ports = node.tcp_port, node.xmlrpc_port
 
 def soul(me):

@@ -182,7 +182,7 @@ class OutputChannel(_Channel):
 
     def _explain(self, error, message):
         """Raise our error for one that publishing raised."""
-        if not self.is_open:
+        if not self.is_open or self.node._rospy.wiring.is_closed(self._endpoint):
             raise NodeStoppedError('the channel of %s on %s is closed: open another with output_channel()'
                                    % (self.node.name, self.topic)) from error
         message_types.check_fits(message)
@@ -217,6 +217,7 @@ class OutputChannel(_Channel):
 
         def connected():
             missing.difference_update(name for name, _ in self.connections)
+            missing.difference_update(node.name for node in self.node.master.own_nodes() if not node.is_running)
             return not missing or not self.is_open
         deadline = time.monotonic() + timeout
         if not wait_until(connected, min(timeout, ANSWER_TIMEOUT)):

@@ -1,9 +1,11 @@
 """A ROS master of one's own, as a child process that ends with the program: see :meth:`Master.embedded`.
 
 Run as a module, this is that child: ``python3 -m pharos.embedded_master PORT``. It prints its URL, and ends when its
-standard input does, which also a parent that is killed closes.
+standard input does, or its parent, whose forks may hold the other end of that.
 """
+import logging
 import os
+import select
 import socket
 import subprocess
 import sys
@@ -52,6 +54,8 @@ def main():
     from pharos.master import Master
     from pharos.node import BlockNode
     answers, sys.stdout = sys.stdout, sys.stderr    # rospy prints log lines on standard output
+    logging.getLogger('rosmaster').addHandler(logging.NullHandler())    # it tells of every node that just stopped
+    ends = [sys.stdin, os.pidfd_open(os.getppid())]
     port = int(sys.argv[1])
     try:
         with socket.socket() as probe:    # rosmaster waits for ever where its port is taken
@@ -67,9 +71,10 @@ def main():
     rosout = master.create(BlockNode, named='/rosout')
     aggregate = rosout.output_channel('/rosout_agg', 'rosgraph_msgs/Log')
     rosout.interested_in('/rosout', 'rosgraph_msgs/Log', delegate=lambda message, channel: aggregate.publish(message))
+    master.parameters['/rosdistro'] = os.environ.get('ROS_DISTRO', 'Debian')    # roscore tells it, too
     print(master.url, file=answers, flush=True)
     try:
-        sys.stdin.read()
+        select.select(ends, [], [])
     except KeyboardInterrupt:
         pass
     rosout.stop()

@@ -19,10 +19,11 @@ class ExternalNode:
     @property
     def uri(self):
         """The URI of its XML-RPC server."""
-        try:
-            return self.master._api().lookupNode(self.name)
-        except rosgraph.MasterError:
-            raise UnknownNodeError('no node %s at %s: see rosnode list' % (self.name, self.master.url)) from None
+        with self.master._reached():
+            try:
+                return self.master._api().lookupNode(self.name)
+            except rosgraph.MasterError:
+                raise UnknownNodeError('no node %s at %s: see rosnode list' % (self.name, self.master.url)) from None
 
     @property
     def host(self):
@@ -40,12 +41,12 @@ class ExternalNode:
 
     @property
     def publications(self):
-        """``{topic: type}`` that it publishes, as the master knows it."""
+        """``{topic: type}`` that it publishes, as the master knows it; the type is None where nobody has named it."""
         return self._topics(0)
 
     @property
     def subscriptions(self):
-        """``{topic: type}`` that it is interested in, as the master knows it."""
+        """``{topic: type}`` that it is interested in, as :attr:`publications`."""
         return self._topics(1)
 
     def _topics(self, kind):
@@ -60,7 +61,11 @@ class ExternalNode:
 
     def shutdown(self):
         """Ask it to stop, as ``rosnode kill`` does."""
-        self._ask('shutdown', 'asked for by pharos')
+        self._ask('getPid')    # tells whether it is there to be asked
+        try:
+            self._ask('shutdown', 'asked for by pharos')
+        except UnknownNodeError:
+            pass    # it was gone before its answer was through
 
     def _ask(self, method, *args):
         uri = self.uri

@@ -2,7 +2,6 @@
 import time
 
 import rosgraph
-import rosgraph.network
 
 from pharos import message_types
 from pharos.private_rospy.proxies import ServerProxy
@@ -22,7 +21,7 @@ def class_from_publishers(topic, type_=None):
     for name in topic.publishers:
         try:
             header = _header(topic, topic.master._api().lookupNode(name))
-        except (rosgraph.MasterException, rosgraph.network.ROSHandshakeException, *COMMUNICATION_ERRORS):
+        except (rosgraph.MasterException, *COMMUNICATION_ERRORS):
             continue    # the next one may answer
         if header.get('message_definition') and type_ in (None, header.get('type')):
             return message_types.class_from_definition(header['type'], header['message_definition'],

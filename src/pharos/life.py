@@ -42,7 +42,7 @@ class Life:
         """Register with the master. A subclass overrides this, calls ``super().start()``, then makes its channels.
 
         Runs in the thread that creates the node. A stopped node starts again, under the same name and ports. Where a
-        class has no ``start`` of its own, the channels and services that it had come back too.
+        class has no ``start`` of its own, the channels, services and parameters that it had come back too.
 
         :raises PharosError: if the node is running already
         :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: and the node is then as it was
@@ -59,7 +59,7 @@ class Life:
             except BaseException:
                 self._become(before)
                 raise
-            self._rospy = instance
+            former, self._rospy = self._rospy, instance
             # the same ports next time, also where any free one was asked for
             self._settings.tcp_port, self._settings.xmlrpc_port = instance.tcp_port, instance.xmlrpc_port
             self._dispatcher = Dispatcher(instance.start_thread)
@@ -72,6 +72,8 @@ class Life:
         if type(self).start is Life.start:
             for opened in (*kept, *services):
                 opened._open()
+            if former:
+                instance.parameters.take_over(former.parameters)
 
     def stop(self):
         """End the souls, send what is under way, unregister, close the ports, end the threads.

@@ -1,18 +1,19 @@
 """The proxy of a ROS master."""
+import atexit
 import difflib
 import time
-import urllib.parse
 
 import rosgraph
 
 from pharos import node as nodes_of_ours
 from pharos import ros_process, running
+from pharos.blocks import check_block
 from pharos.errors import MasterUnreachableError, PharosError, UnknownNodeError
 from pharos.external_node import ExternalNode
 from pharos.parameters import Parameters
 from pharos.private_rospy.proxies import ServerProxy, master_api
 from pharos.private_rospy.registration import COMMUNICATION_ERRORS
-from pharos.private_rospy.settings import check_port
+from pharos.private_rospy.settings import check_port, check_url
 from pharos.service import Service
 from pharos.topic import Topic
 from pharos.watcher import watcher_of
@@ -33,7 +34,7 @@ class Master:
     """
 
     def __init__(self, url=None):
-        self.url = _check_url(rosgraph.get_master_uri() if url is None else url)
+        self.url = check_url(rosgraph.get_master_uri() if url is None else url)
         self._child = None    # the process of an embedded master
 
     @classmethod
@@ -50,6 +51,7 @@ class Master:
         child, url = embedded_master.start(check_port('port', port))
         master = cls(url)
         master._child = child
+        atexit.register(master.stop)    # the child would end by itself, but perhaps after us, and keep its port till then
         return master
 
     def stop(self):
@@ -60,6 +62,7 @@ class Master:
         from pharos import embedded_master
         if self._child is None:
             raise PharosError('%s is not embedded in this program: stop it where it was started' % self)
+        atexit.unregister(self.stop)
         for node in self.own_nodes():
             node.stop()
         if self._child.returncode is None:
@@ -151,21 +154,23 @@ class Master:
 
         :param timeout: seconds, None: without limit
         :raises UnknownNodeError: if it does not come in time
+        :raises MasterUnreachableError: if the master has not answered in that time either
         """
         name = rosgraph.names.resolve_name(name, '/pharos')
-        if not watcher_of(self).wait_for_node(name, timeout):
+        watcher = watcher_of(self)
+        if not watcher.wait_for_node(name, timeout):
+            self._ask('getPid')
             raise UnknownNodeError('no node %s came to %s within %g s' % (name, self.url, timeout))
-        return self.node(name)
+        return next((node for node in self.own_nodes() if node.name == name), None) or ExternalNode(self, name)
 
     def on_change(self, block):
         """Run ``block(kind, name, is_there)`` for each node, topic and service that comes or goes.
 
-        ``kind`` is 'node', 'topic' or 'service'. It runs in the thread that watches the master, within a second.
-        Returns a function that ends it.
+        ``kind`` is 'node', 'topic' or 'service'. It runs in the thread that watches the master, within a second, and
+        may raise: that ends nothing. Returns a function that ends it. What is there by now has not come; a master that
+        is away is taken for one that has nothing yet.
         """
-        watcher = watcher_of(self)
-        watcher.listen(block)
-        return lambda: watcher.unlisten(block)
+        return watcher_of(self).listen(check_block(block, 'block', ('kind', 'name', 'is_there')))
 
     @property
     def parameters(self):
@@ -230,11 +235,12 @@ class Master:
         """
         deadline = None if timeout is None else time.monotonic() + timeout
         while True:
+            left = TIMEOUT if deadline is None else deadline - time.monotonic()
             try:
-                self._ask('getPid')
+                self._ask('getPid', min(TIMEOUT, max(left, 0.1)))
                 return self
             except MasterUnreachableError:
-                if deadline is not None and time.monotonic() >= deadline:
+                if left <= 0:
                     raise
                 time.sleep(0.05)    # there is nobody yet who could tell
 
@@ -254,9 +260,9 @@ class Master:
     def _api(self, caller_id='/pharos', timeout=TIMEOUT):
         return master_api(self.url, caller_id, timeout)
 
-    def _ask(self, method):
+    def _ask(self, method, timeout=TIMEOUT):
         with self._reached():
-            return getattr(self._api(), method)()
+            return getattr(self._api(timeout=timeout), method)()
 
     def _reached(self):
         return _Reached(self.url)
@@ -284,14 +290,3 @@ class _Reached:
         if isinstance(error, COMMUNICATION_ERRORS):
             raise MasterUnreachableError('no ROS master answers at %s (%s): start one with roscore or '
                                          'Master.embedded(), or set ROS_MASTER_URI' % (self._url, error)) from error
-
-
-def _check_url(url):
-    """``url`` with a closing slash, if it can be a master's."""
-    parts = urllib.parse.urlsplit(url) if isinstance(url, str) else None
-    try:
-        if parts and parts.scheme == 'http' and parts.hostname and parts.port and parts.path in ('', '/'):
-            return 'http://%s/' % parts.netloc
-    except ValueError:
-        pass    # the port is no number
-    raise ValueError('%r is not the URL of a ROS master: it looks like http://127.0.0.1:11311/' % (url,))

@@ -4,6 +4,7 @@ import genpy
 from pharos import message_types
 from pharos.blocks import check_block
 from pharos.errors import PharosError
+from pharos.private_rospy import services
 from pharos.private_rospy.host import rospy
 
 
@@ -13,6 +14,8 @@ class OfferedService:
     def __init__(self, node, name, typed_as, block):
         self.node, self.name = node, name
         self.service_class = message_types.service_class(typed_as)
+        if block is None:
+            raise TypeError('%s needs a block that answers, called as service block(request)' % name)
         self.block = check_block(block, 'service block', ('request',))
         if any(other.name == name for other in node._services):
             raise PharosError('%s offers %s already: close that one first' % (node.name, name))
@@ -38,6 +41,8 @@ class OfferedService:
         """The response that the block meant: itself, its fields, or its only field."""
         response = self.service_class._response_class
         if isinstance(value, genpy.Message) and value._type == response._type:
+            if not services.serializes(value):
+                message_types.check_fits(value)    # tells what of it does not
             return value
         if isinstance(value, dict):
             return message_types.fill(response(), value)

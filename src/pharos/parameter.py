@@ -1,4 +1,8 @@
 """Parameters of the parameter server, bound to a node both ways."""
+import xmlrpc.client
+
+import rosgraph
+
 from pharos.blocks import check_block
 
 
@@ -6,55 +10,94 @@ class Parameter:
     """A parameter as a node sees it; made by :meth:`Node.parameter`.
 
     PhaROS 2018: ``parameter: name initialized: value``. :attr:`name` is its global name. Initialized with None it may
-    hold anything, otherwise only values of that type (a float also takes integers).
+    hold anything, otherwise only values of that type (a float also takes integers). A namespace is a parameter, too,
+    whose value is a dict of what it holds.
+
+    The blocks of :meth:`on_change` outlive a restart of the node as its channels do, and one of the master, after which
+    the parameter has its initial value again.
     """
 
     def __init__(self, node, name, initialized=None):
-        self.node, self.name, self._kind = node, name, type(initialized)
-        self._block = None
-        if initialized is not None and not node.ros.has_param(name):
-            node.ros.set_param(name, initialized)
+        self.node, self.name = node, name
+        self._initialized = self._carried(initialized)
+        self._kind = type(self._initialized)
+        self._blocks = []
+        if self._initialized is not None:
+            watched = node._live_rospy().parameters
+            with node.master._reached():
+                watched.initialize(name, self._initialized)
 
     @property
     def value(self):
         """Its value on the parameter server now; None where it has none.
 
         :raises ValueError: if somebody has set it to a value of another type
+        :raises MasterUnreachableError: if there is no answer
         """
-        value = self.node.ros.get_param(self.name, None)
-        return None if value is None else self._checked(value)
+        return self._checked(self._get())
+
+    def _get(self):
+        self.node._live_rospy()
+        with self.node.master._reached():
+            try:
+                return self.node.master._api(self.node.name).getParam(self.name)
+            except rosgraph.MasterError:
+                return None
 
     def set(self, value):
         """Set it on the parameter server.
 
-        :raises ValueError: if it was initialized with a value of another type
+        :raises ValueError: if it was initialized with a value of another type, or the server can hold no such value
+        :raises MasterUnreachableError: if there is no answer
         """
-        value = self._checked(value)
-        self.node.ros.set_param(self.name, value)
-        self.node._rospy.parameters.tell(self.name, value)    # the master tells all but the one who sets
+        if value is None:
+            raise ValueError('%s cannot be set to None: no parameter can' % self.name)
+        value = self._checked(self._carried(value))
+        watched = self.node._live_rospy().parameters
+        with self.node.master._reached():
+            self.node.master._api(self.node.name).setParam(self.name, value)
+            watched.tell_of_own(self.name, value)
 
     def on_change(self, block):
-        """Run ``block(value)`` whenever somebody, this node too, sets the parameter; returns the block.
+        """Run ``block(value)`` whenever somebody sets the parameter, by :meth:`set` this node too; returns the block.
 
-        It runs in a thread of the node's XML-RPC server. An exception in it is reported as a delegate's.
+        It gets None when the parameter is deleted. It runs in a thread of the node's XML-RPC server, or where
+        :meth:`set` is called. An exception in it is reported as a delegate's, as is a value of another type.
         """
-        self._block = check_block(block, 'parameter block', ('value',))
-        self.node._rospy.parameters.watch(self.name, self._changed)
+        if block is None:
+            raise TypeError('%s needs a block to run when it changes, called as block(value)' % self.name)
+        self._blocks.append(check_block(block, 'parameter block', ('value',)))
+        watched = self.node._live_rospy().parameters
+        with self.node.master._reached():
+            watched.watch(self.name, self._changed)
         return block
 
     def _changed(self, value):
+        for block in tuple(self._blocks):
+            try:
+                if value == {}:
+                    value = self._get()    # a master says so of a deleted one, too
+                block(self._checked(value))
+            except Exception as error:
+                self.node._report(error, block, 'parameter %s' % self.name)
+
+    def _carried(self, value):
+        """The value as the parameter server brings it back: with lists for tuples."""
+        if value is None:
+            return None
         try:
-            self._block(self._checked(value))
-        except Exception as error:
-            self.node._report(error, self._block, 'parameter %s' % self.name)
+            return xmlrpc.client.loads(xmlrpc.client.dumps((value,)))[0][0]
+        except Exception as error:    # of several kinds; text with characters that XML has not, for one
+            raise ValueError('%s cannot be %r: the parameter server holds booleans, numbers (integers of 32 bits), '
+                             'strings, and lists and dicts of them (%s)' % (self.name, value, error)) from error
 
     def _checked(self, value):
-        fits = (self._kind is type(None) or type(value) is self._kind
-                or self._kind is float and type(value) is int)
-        if not fits:
-            raise ValueError('%s holds %s, and %r is none: set another value, or initialize it with None to allow any '
-                             'type' % (self.name, self._kind.__name__, value))
-        return float(value) if self._kind is float else value
+        if value is None or self._kind in (type(None), type(value)):
+            return value
+        if self._kind is float and type(value) is int:
+            return float(value)
+        raise ValueError('%s holds %s, and %r is none: set another value, or initialize it with None to allow any type'
+                         % (self.name, self._kind.__name__, value))
 
     def __repr__(self):
         return '<Parameter %s of %s>' % (self.name, self.node.name)

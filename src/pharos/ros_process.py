@@ -1,21 +1,33 @@
 """ROS programs run as processes of their own."""
 import atexit
 import collections
+import contextlib
+import glob
 import os
 import signal
 import subprocess
+import sys
 import threading
 
+from pharos.blocks import check_block, name_of
 from pharos.errors import UnknownNodeError
+from pharos.transcript import Transcript
+
+# What they print is wanted line by line, as on a terminal, and not in blocks of 4 KiB
+LINE_BY_LINE = {'PYTHONUNBUFFERED': '1', 'ROSCONSOLE_STDOUT_LINE_BUFFERED': '1'}
 
 
 class RosProcess:
-    """A running ROS program; made by :meth:`Master.run`. Ends with its ``with`` block."""
+    """A running ROS program; made by :meth:`Master.run` or :meth:`Master.launch`. Ends with its ``with`` block.
 
-    def __init__(self, command, environ, on_line=None):
+    What the program has started ends with it.
+    """
+
+    def __init__(self, command, master_url, on_line=None):
         self.command = command
-        self._on_line = on_line
+        self._on_line = check_block(on_line, 'on_line', ('text',))
         self._lines = collections.deque(maxlen=10000)
+        environ = {**LINE_BY_LINE, **os.environ, 'ROS_MASTER_URI': master_url}
         # a session of its own, so that what it starts ends with it, and Ctrl-C is the program's to handle
         self._process = subprocess.Popen(command, env=environ, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
                                          stderr=subprocess.STDOUT, text=True, errors='replace', start_new_session=True)
@@ -29,7 +41,17 @@ class RosProcess:
                 line = line.rstrip('\n')
                 self._lines.append(line)
                 if self._on_line:
-                    self._on_line(line)
+                    self._show(line)
+        self._process.wait()
+        self._signal(signal.SIGKILL)    # what it left behind; not later, when its number may be another's
+        atexit.unregister(self.terminate)
+
+    def _show(self, line):
+        try:
+            self._on_line(line)
+        except Exception as error:    # the program's output goes on
+            Transcript.show('block %s for the output of %s raised %s: %s' % (
+                name_of(self._on_line), self.command[0], type(error).__name__, error))
 
     @property
     def pid(self):
@@ -57,16 +79,22 @@ class RosProcess:
     def terminate(self, timeout=5.0):
         """Ask it, and what it has started, to end, and end them after ``timeout`` seconds; returns its exit status.
 
-        Done at the end of this program, too.
+        It is asked as by Ctrl-C, for at SIGTERM a roscpp node ends without unregistering; half way by SIGTERM. Done at
+        the end of this program, too.
         """
         atexit.unregister(self.terminate)
         if self.poll() is None:
-            self._signal(signal.SIGTERM)
-            try:
-                self._process.wait(timeout)
-            except subprocess.TimeoutExpired:
-                pass
-        self._signal(signal.SIGKILL)    # whatever it left behind, too
+            started = _descendants(self.pid)    # roslaunch gives each node a session of its own
+            for number in signal.SIGINT, signal.SIGTERM:
+                self._signal(number)
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    self._process.wait(timeout / 2)
+                    break
+            for process in started:
+                with process:
+                    process.kill()
+        if self._reader.is_alive():    # else it has done so
+            self._signal(signal.SIGKILL)
         return self.wait()
 
     def _signal(self, number):
@@ -95,7 +123,7 @@ def run(master_url, package, executable, args, on_line=None):
     if not paths:
         raise UnknownNodeError('the ROS package %s has no program %r: see what it has with rosrun %s <Tab>'
                                % (package, executable, package))
-    return RosProcess([paths[0], *args], dict(os.environ, ROS_MASTER_URI=master_url), on_line)
+    return RosProcess([paths[0], *args], master_url, on_line)
 
 
 def _find(package, executable):
@@ -132,5 +160,42 @@ def launch(master_url, package, file, args, on_line=None):
                                'setup.bash' % package) from None
     if not found:
         raise UnknownNodeError('the ROS package %s has no launch file %r' % (package, file))
-    command = ['roslaunch', '--skip-log-check', found[0], *('%s:=%s' % arg for arg in args.items())]
-    return RosProcess(command, dict(os.environ, ROS_MASTER_URI=master_url), on_line)
+    command = [sys.executable, '-c', 'import roslaunch; roslaunch.main()', '--skip-log-check', found[0]]
+    return RosProcess([*command, *('%s:=%s' % arg for arg in args.items())], master_url, on_line)
+
+
+class _Started:
+    """A process that a program has started, held by a descriptor: its number may be another's later."""
+
+    def __init__(self, pid):
+        self._descriptor = os.pidfd_open(pid)
+
+    def kill(self):
+        """End it, if it has not ended."""
+        try:
+            signal.pidfd_send_signal(self._descriptor, signal.SIGKILL)
+        except ProcessLookupError:
+            pass
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        os.close(self._descriptor)
+
+
+def _descendants(pid):
+    """What the process has started, and those in turn, as :class:`_Started`."""
+    children = collections.defaultdict(list)
+    for stat in glob.glob('/proc/[0-9]*/stat'):
+        with contextlib.suppress(OSError), open(stat) as file:    # it may end meanwhile
+            number, _, rest = file.read().partition(' (')
+            children[int(rest.rpartition(') ')[2].split()[1])].append(int(number))
+    found, left = [], [pid]
+    while left:
+        started = children[left.pop()]
+        left += started
+        for child in started:
+            with contextlib.suppress(OSError):
+                found.append(_Started(child))
+    return found

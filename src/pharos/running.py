@@ -2,15 +2,16 @@
 import atexit
 import contextlib
 import gc
-import itertools
 import signal
 import threading
 import time
 
 from pharos.private_rospy.lifetime import SIGNAL_LATENCY
 
-COLLECT_EVERY = 20    # stops; a stopped node's rospy is a web of cycles of 0.7 MB, which only the collector frees
-_stops = itertools.count(1)
+# A stopped node's rospy is a web of cycles of 0.7 MB, which only the collector frees. It looks at the running nodes,
+# too, so it runs after as many stops as there are nodes left, and at least so many:
+COLLECT_EVERY = 20
+_stops = 0     # since it ran
 _nodes = {}    # a dict, for its order
 _none_left = threading.Condition()
 _deferred = None    # the signals that came while the main thread started a node; None: it starts none
@@ -25,11 +26,16 @@ def add(node):
 
 def discard(node):
     """The node has stopped."""
+    global _stops
     with _none_left:
         _nodes.pop(node, None)
         if not _nodes:
             _none_left.notify_all()
-    if next(_stops) % COLLECT_EVERY == 0:
+        _stops += 1
+        collect = _stops >= max(COLLECT_EVERY, len(_nodes))
+        if collect:
+            _stops = 0
+    if collect:
         gc.collect()
 
 

@@ -1,16 +1,18 @@
 """Services of any node, called by name alone."""
-import io
 import socket
 import time
 
-import rosgraph.network
-import rosservice
+import genpy
+import rosgraph
 
 from pharos import message_types
+from pharos.blocks import check_block
 from pharos.errors import ServiceCallError, ServiceTypeError, UnknownServiceError, UnknownTypeError
 from pharos.private_rospy import services
 from pharos.private_rospy.host import rospy
 from pharos.tcpros_connection import TcprosConnection
+
+TIMEOUT = 5.0    # seconds in which the master, and a provider asked for its type, must answer
 
 
 class Service:
@@ -27,28 +29,44 @@ class Service:
 
     def __init__(self, master, name, caller_id, persistent=False):
         self.master, self.name, self.caller_id, self.persistent = master, name, caller_id, persistent
-        self.response = None
-        self._idle = []    # persistent connections that nobody uses just now
-        self._look_up()
+        self.uri = self.type = self.md5sum = self.response = self._found_md5sum = None
+        self._calls = 0
+        self._class = None
+        self._here = None    # the provider, where it is a node of this process
+        self._idle = []      # persistent connections that nobody uses just now
+        self._look_up(None)
         header = self._ask()
         self.type = header.get('type')
         self.md5sum = self._found_md5sum = header.get('md5sum')
 
-    def _look_up(self):
-        """Find the provider, which may have moved."""
-        try:
-            self.uri = self.master._api(self.caller_id).lookupService(self.name)
-        except rosgraph.MasterError:
-            raise UnknownServiceError('no node of %s offers the service %s%s: see rosservice list' % (
-                self.master.url, self.name, self.master.near(self.name, self.master.services()))) from None
+    def _look_up(self, deadline):
+        """Find the provider, which may have moved; returns whether it has."""
+        before = self.uri
+        timeout = TIMEOUT if deadline is None else min(TIMEOUT, max(0.001, deadline - time.monotonic()))
+        with self.master._reached():
+            try:
+                self.uri = self.master._api(self.caller_id, timeout).lookupService(self.name)
+            except rosgraph.MasterError:
+                raise UnknownServiceError('no node of %s offers the service %s%s: see rosservice list' % (
+                    self.master.url, self.name, self.master.near(self.name, self.master.services()))) from None
+        return self.uri != before
 
     def _ask(self):
-        """The provider's own description of the service: the header it answers a probe with, as rosservice does."""
+        """The provider's own description of the service: the header that it answers a probe with.
+
+        As ``rosservice.get_service_headers`` asks for it, which hides why there is none, and waits for ever for a
+        provider that sends a byte every four seconds.
+        """
         try:
-            return rosservice.get_service_headers(self.name, self.uri)
-        except (rosservice.ROSServiceException, rosgraph.network.ROSHandshakeException, OSError) as error:
+            connection = self._connect(time.monotonic() + TIMEOUT, probe='1', md5sum='*')
+        except OSError as error:
             raise ServiceCallError('the provider of %s at %s does not answer (%s): is it still running? '
                                    'rosnode cleanup removes it if not' % (self.name, self.uri, error)) from error
+        connection.close()
+        if 'error' in connection.header:
+            raise ServiceCallError('the node at %s says of %s: %s. Its provider is gone: rosnode cleanup removes it'
+                                   % (self.uri, self.name, connection.header['error']))
+        return connection.header
 
     @property
     def service_class(self):
@@ -56,7 +74,9 @@ class Service:
 
         :raises UnknownTypeError: if there is no definition of it here
         """
-        return message_types.service_class(self.type)
+        if self._class is None:
+            self._class = message_types.service_class(self.type)
+        return self._class
 
     def call(self, block=None, *, timeout=None, **fields):
         """Call the service: ``block(request)`` and keywords fill the request. Returns the response.
@@ -65,37 +85,50 @@ class Service:
         no wiring deadlocks, and with one in a thread of that node.
 
         :param timeout: seconds that the whole call may take; None: no limit
-        :raises ServiceTypeError: if the md5sum set by hand does not fit
+        :raises ServiceTypeError: if the md5sum set by hand does not fit, or the provider changed the type
         :raises MessageTypeError: if a field does not exist or does not fit
+        :raises UnknownServiceError: if it is no longer offered
         :raises ServiceCallError: if the provider fails, goes away or does not answer in time
         """
-        service_class = self.service_class
-        request = message_types.build(service_class._request_class, block, fields)
-        message_types.check_fits(request)
+        deadline = None if timeout is None else time.monotonic() + timeout
         self.response = None
-        here = services.find(self.name, self.uri)
+        request = message_types.build(self.service_class._request_class, check_block(block, 'block', ('request',)), fields)
+        self._calls += 1
+        services.number(request, self._calls)
         try:
-            if here is not None and self.md5sum == self._found_md5sum:
-                self.response = services.call(here, request, self.caller_id, timeout)
-            else:
-                self.response = self._call_over_tcp(service_class, request, timeout)
+            try:
+                self.response = self._exchange(request, deadline)
+            except (ConnectionRefusedError, _NotShakenHands) as error:
+                if not self._look_up(deadline):
+                    raise self._refused(error) from error
+                self.response = self._exchange(request, deadline)
         except services.Failed as error:
-            raise ServiceCallError('%s failed: %s' % (self.name, error)) from error
+            raise ServiceCallError('%s failed: %s' % (self.name, error)) from error.__cause__
         except socket.timeout as error:
-            raise ServiceCallError('%s did not answer in time: is its provider %s busy? Call it with a longer timeout='
-                                   % (self.name, self.uri)) from error
-        except (OSError, rosgraph.network.ROSHandshakeException) as error:
+            raise ServiceCallError('%s did not answer in time (%s s): is its provider at %s busy? Call it with a longer '
+                                   'timeout=' % (self.name, timeout, self.uri)) from error
+        except (OSError, _NotShakenHands, genpy.DeserializationError) as error:
             raise ServiceCallError('the connection to %s at %s broke (%s): is its provider still running?'
                                    % (self.name, self.uri, error)) from error
         return self.response
 
-    def _call_over_tcp(self, service_class, request, timeout):
-        deadline = None if timeout is None else time.monotonic() + timeout
-        buffer = io.BytesIO()
-        request.serialize(buffer)
+    def _exchange(self, request, deadline):
+        """Send the request to where the provider is thought to be; returns the response."""
+        here = self._here
+        if here is None or not here.is_offered(self.uri):
+            here = self._here = services.find(self.name, self.uri, self.service_class)
+        here = here if here and here.md5sum == self._md5sum_sent == self._found_md5sum else None
+        try:
+            data = here.freeze(request) if here else services.serialize(request)
+        except Exception:
+            message_types.check_fits(request)    # tells what of it does not
+            raise
+        return here.call(data, self._header(), deadline) if here else self._send_over_tcp(data, deadline)
+
+    def _send_over_tcp(self, data, deadline):
         connection = self._connection(deadline)
         try:
-            ok, answer = connection.exchange(buffer.getvalue(), deadline)
+            ok, answer = connection.exchange(data, deadline)
         except BaseException:
             connection.close()
             raise
@@ -105,45 +138,59 @@ class Service:
             connection.close()
         if not ok:
             raise services.Failed(answer.decode(errors='replace'))
-        return service_class._response_class().deserialize(answer)
+        response = self.service_class._response_class().deserialize(answer)
+        response._connection_header = connection.header
+        return response
+
+    @property
+    def _md5sum_sent(self):
+        return self.md5sum or self._found_md5sum
+
+    def _header(self):
+        header = {'service': self.name, 'md5sum': self._md5sum_sent or '*', 'callerid': self.caller_id}
+        if self.persistent:
+            header['persistent'] = '1'
+        return header
 
     def _connection(self, deadline):
-        """An idle connection that lives, or a new one; a provider that has moved is looked up again."""
+        """An idle connection that lives, or a new one."""
         while self._idle:
             connection = self._idle.pop()
             if connection.is_alive():
                 return connection
             connection.close()
-        try:
-            return self._connect(deadline)
-        except (ConnectionRefusedError, rosgraph.network.ROSHandshakeException, _Refused):
-            before = self.uri
-            self._look_up()
-            if self.uri == before:
-                raise
-            return self._connect(deadline)
-
-    def _connect(self, deadline):
-        connection = TcprosConnection(rospy.parse_rosrpc_uri(self.uri), {
-            'service': self.name, 'callerid': self.caller_id, 'md5sum': self.md5sum or '',
-            'persistent': '1' if self.persistent else '0'}, deadline)
+        connection = self._connect(deadline)
         if 'error' in connection.header:
             connection.close()
-            raise self._refused(connection.header['error'])
+            raise _NotShakenHands(connection.header['error'])
         return connection
 
-    def _refused(self, reason):
-        """The error of a provider that refuses the handshake: the report's "error message provides all information"."""
-        if self.md5sum == self._found_md5sum:
-            return _Refused('the provider of %s refused the call: %s' % (self.name, reason))
+    def _connect(self, deadline, **fields):
+        return TcprosConnection(rospy.parse_rosrpc_uri(self.uri), {**self._header(), **fields}, deadline)
+
+    def _refused(self, error):
+        """The error of a provider that refuses, by what it says of itself now.
+
+        The report: the "error message provides all information about the service including the md5sum".
+        """
+        if isinstance(error, OSError):
+            return error
+        header = self._ask()
+        type_, md5sum, sent = header.get('type'), header.get('md5sum'), self._md5sum_sent
+        if sent == md5sum:
+            return ServiceCallError('the provider of %s at %s refused the call: %s' % (self.name, self.uri, error))
         try:
-            request, response = self.service_class._request_class, self.service_class._response_class
-            fields = 'request: %s; response: %s' % (message_types.describe_fields(request),
-                                                    message_types.describe_fields(response))
+            service_class = message_types.service_class(type_)
+            fields = 'request: %s; response: %s' % (message_types.describe_fields(service_class._request_class),
+                                                    message_types.describe_fields(service_class._response_class))
         except UnknownTypeError:
             fields = 'its fields are not known here'
-        return ServiceTypeError('the md5sum %r is not that of %s, which is of type %s with md5sum %s (%s): set that '
-                                'one, or none' % (self.md5sum, self.name, self.type, self._found_md5sum, fields))
+        if sent == self._found_md5sum:
+            advice = 'it was %s when it was looked up: look it up again' % self.type
+        else:
+            advice = 'set that one, or none'
+        return ServiceTypeError('the md5sum %r is not that of %s, which is of type %s with md5sum %s (%s): %s'
+                                % (sent, self.name, type_, md5sum, fields, advice))
 
     def close(self):
         """Close the connections of a persistent service; a later call opens them again."""
@@ -154,5 +201,5 @@ class Service:
         return '<Service %s %s at %s>' % (self.name, self.type, self.uri)
 
 
-class _Refused(ServiceCallError):
-    """Refused with the right md5sum: another node may be at the provider's old address by now."""
+class _NotShakenHands(Exception):
+    """Refused in the handshake: the md5sum does not fit, or another node is at the provider's old address by now."""

@@ -1,16 +1,16 @@
 """A TCPROS connection of our own, with a time limit.
 
 rospy's ServiceProxy has none and asks the environment's master, and nothing in ROS's Python asks a publisher for its
-message definition, so the exchange is ours; the handshake is rosgraph's.
+message definition, so the exchange is ours; the coding of the handshake is rosgraph's.
 """
-import io
 import socket
 import struct
 import time
 
 import rosgraph.network
 
-_LIMIT = 1 << 30    # bytes of a response; a length beyond is a broken stream
+_HEADER_LIMIT = 1 << 22    # bytes of a connection header; it holds a message definition
+_LIMIT = 1 << 30           # bytes of a response; a length beyond is a broken stream
 
 
 class TcprosConnection:
@@ -18,41 +18,44 @@ class TcprosConnection:
 
     :param address: (host, port)
     :param header: ours
-    :param deadline: by ``time.monotonic()``, for each ``recv``; None: no limit
-    :raises OSError, rosgraph.network.ROSHandshakeException: if there is no answer (socket.timeout: not in time)
+    :param deadline: by ``time.monotonic()``, for the whole handshake; None: no limit
+    :raises OSError: if there is no answer, or none that can be read (socket.timeout: not in time)
     """
 
     def __init__(self, address, header, deadline):
         self._deadline = deadline
+        self._received = bytearray()
         self._socket = socket.create_connection(address, self._left())
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             rosgraph.network.write_ros_handshake_header(self._socket, header)
-            rest = io.BytesIO()
-            self.header = rosgraph.network.read_ros_handshake_header(self, rest, 4096)
-            self._received = bytearray(rest.getvalue())
+            size = self._read(4)
+            self.header = rosgraph.network.decode_ros_handshake_header(size + self._read_sized(size, _HEADER_LIMIT))
+        except (rosgraph.network.ROSHandshakeException, struct.error, UnicodeError) as error:
+            self.close()
+            raise ConnectionError('no connection header: %s' % error) from error
         except BaseException:
             self.close()
             raise
-
-    def recv(self, size):
-        """As a socket's, within the deadline; the handshake reads through this, too."""
-        self._socket.settimeout(self._left())
-        return self._socket.recv(size)
 
     def exchange(self, request, deadline):
         """Send a serialized request to a service; returns ``(ok, serialized response or error text)``."""
         self._deadline = deadline
         self._socket.settimeout(self._left())
         self._socket.sendall(struct.pack('<I', len(request)) + request)
-        ok, length = struct.unpack('<BI', self._read(5))
-        if length > _LIMIT:
-            raise ConnectionError('a response of %d bytes was announced' % length)
-        return ok, self._read(length)
+        ok = self._read(1) != b'\0'
+        return ok, self._read_sized(self._read(4), _LIMIT)
+
+    def _read_sized(self, size, limit):
+        size, = struct.unpack('<I', size)
+        if size > limit:
+            raise ConnectionError('%d bytes were announced' % size)
+        return self._read(size)
 
     def _read(self, size):
         while len(self._received) < size:
-            data = self.recv(min(1 << 20, max(4096, size - len(self._received))))
+            self._socket.settimeout(self._left())
+            data = self._socket.recv(min(1 << 20, max(4096, size - len(self._received))))
             if not data:
                 raise ConnectionError('closed after %d of %d bytes' % (len(self._received), size))
             self._received += data
@@ -72,6 +75,7 @@ class TcprosConnection:
         return False    # closed, or it says something unasked
 
     def close(self):
+        """Close it."""
         self._socket.close()
 
     def _left(self):

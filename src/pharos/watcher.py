@@ -6,7 +6,10 @@ getSystemState once a second costs 2 to 4 ms, and shows both.
 import threading
 import time
 
+from pharos.blocks import name_of
 from pharos.errors import MasterUnreachableError
+from pharos.private_rospy.lifetime import SIGNAL_LATENCY
+from pharos.transcript import Transcript
 
 PERIOD = 1.0        # seconds between two looks at the master
 IMPATIENT = 0.1     # seconds between them while somebody waits for a node
@@ -30,7 +33,8 @@ class Watcher:
         self._changed = threading.Condition()    # guards all below
         self._listeners = []
         self._waiting = 0                        # how many wait for a node
-        self._seen = None                        # the graph at the last look: a set of (kind, name)
+        self._looks = 0                          # how many looks have begun
+        self._seen = frozenset(), 0              # the graph at the last look that was answered, and which one it was
         self._thread = None
         self.reachable_since = None              # by time.time(); None while the master does not answer
 
@@ -45,62 +49,72 @@ class Watcher:
                 self._changed.notify_all()
 
     def listen(self, block):
-        """Have ``block(kind, name, is_there)`` called for each node, topic and service that comes or goes."""
+        """Have ``block(kind, name, is_there)`` called for each node, topic and service that comes or goes from now on.
+
+        Returns a function that ends it.
+        """
+        try:
+            listener = _Listener(block, _graph(self._master.system_state()))
+        except MasterUnreachableError:
+            listener = _Listener(block, frozenset())
         with self._changed:
-            self._listeners.append(block)
+            self._listeners.append(listener)
         self.check()
 
-    def unlisten(self, block):
-        with self._changed:
-            if block in self._listeners:
-                self._listeners.remove(block)
-        self.check()
+        def end():
+            listener.ended = True
+            with self._changed:
+                self._listeners = [other for other in self._listeners if other is not listener]
+            self.check()
+        return end
 
     def wait_for_node(self, name, timeout):
         """Wait until a node of that name is there; returns whether it is."""
         deadline = None if timeout is None else time.monotonic() + timeout
         with self._changed:
             self._waiting += 1
+            begun = self._looks    # these may have seen a node that has gone since
         self.check()
         try:
             with self._changed:
-                while ('node', name) not in (self._seen or ()):
-                    left = None if deadline is None else deadline - time.monotonic()
-                    if left is not None and left <= 0:
+                while self._seen[1] <= begun or ('node', name) not in self._seen[0]:
+                    left = SIGNAL_LATENCY if deadline is None else deadline - time.monotonic()
+                    if left <= 0:
                         return False
-                    self._changed.wait(left)
+                    self._changed.wait(min(left, SIGNAL_LATENCY))
                 return True
         finally:
             with self._changed:
                 self._waiting -= 1
+            self.check()
 
     def _is_needed(self):
         return bool(self._listeners or self._waiting or self._master.own_nodes())
 
     def _run(self):
-        # who listens or waits wants to know what is there now; nodes have only just registered
-        looked = not (self._listeners or self._waiting)
+        looked = not self._waiting    # who waits wants to know what is there now; nodes have only just registered
         while True:
             with self._changed:
                 if looked:
                     self._changed.wait(IMPATIENT if self._waiting else PERIOD)
                 looked = True
                 if not self._is_needed():
-                    self._thread = self._seen = self.reachable_since = None
+                    self._thread = self.reachable_since = None
                     return
+                self._looks += 1
+                look, listeners = self._looks, self._listeners[:]    # those who come meanwhile know more than it sees
             graph = self._look()
             if graph is None:
                 continue
             with self._changed:
-                before, self._seen = self._seen, graph
-                listeners = list(self._listeners) if before is not None else ()
+                self._seen = graph, look
                 self._changed.notify_all()
             for listener in listeners:
-                for kind, name in sorted(before ^ graph):
-                    listener(kind, name, (kind, name) in graph)
+                listener.tell(graph)
 
     def _look(self):
         """The graph as a set of (kind, name), None if the master does not answer; and repairs registrations."""
+        nodes = self._master.own_nodes()    # asked for first: the state may lack one that starts meanwhile
         try:
             state = self._master.system_state()
         except MasterUnreachableError:
@@ -108,9 +122,34 @@ class Watcher:
             return None
         if self.reachable_since is None:
             self.reachable_since = time.time()
-        for node in self._master.own_nodes():
+        for node in nodes:
             node._rospy.repair(state)
-        publishers, subscribers, services = state
-        nodes = {node for kind in state for names in kind.values() for node in names}
-        return ({('node', name) for name in nodes} | {('topic', name) for name in (*publishers, *subscribers)}
-                | {('service', name) for name in services})
+        return _graph(state)
+
+
+class _Listener:
+    """A block that is told of changes, and what it knows."""
+
+    def __init__(self, block, graph):
+        self._block, self._known = block, graph
+        self.ended = False
+
+    def tell(self, graph):
+        """Run the block for each difference between the graph and what it knows."""
+        before, self._known = self._known, graph
+        for kind, name in sorted(before ^ graph):
+            if self.ended:
+                return
+            try:
+                self._block(kind, name, (kind, name) in graph)
+            except Exception as error:    # the other listeners go on, and so does the watch over our nodes
+                Transcript.show('block %s for the change of %s %s raised %s: %s' % (
+                    name_of(self._block), kind, name, type(error).__name__, error))
+
+
+def _graph(state):
+    """What there is, as a set of (kind, name)."""
+    publishers, subscribers, services = state
+    nodes = {name for kind in state for users in kind.values() for name in users}
+    return frozenset({('node', name) for name in nodes} | {('topic', name) for name in (*publishers, *subscribers)}
+                     | {('service', name) for name in services})

@@ -150,6 +150,7 @@ class PrivateRospy:
             return []
         self.wiring.close()
         self.workers.close()
+        self.parameters.close()
         core = self._modules.load('rospy.core')
         pubsub.flush(self._topic_manager(), flush_timeout)
         core._shutdown_hooks.insert(0, self._wake)    # before rospy waits for its threads
@@ -222,13 +223,15 @@ class PrivateRospy:
         """rospy's _SubscriberImpl of the topic, None if there is none."""
         return self._topic_manager().get_subscriber_impl(topic)
 
-    def service(self, name):
-        """The rospy Service of that name that the node offers, None if it offers none."""
-        return self._modules.load('rospy.impl.registration').get_service_manager().get_service(name)
+    @property
+    def services(self):
+        """rospy's own ``{name: rospy Service}`` of what the node offers; it changes with that."""
+        return self._modules.load('rospy.impl.registration').get_service_manager().map
 
-    def as_response(self, value, response_class):
-        """What the handler of a rospy Service returned, as a response."""
-        return self._modules.load('rospy.impl.tcpros_service').convert_return_to_response(value, response_class)
+    @property
+    def as_response(self):
+        """``as_response(value, response_class)``: what the handler of a rospy Service returned, as a response."""
+        return self._modules.load('rospy.impl.tcpros_service').convert_return_to_response
 
     def connection_header(self, publisher):
         """What a subscriber of rospy's _PublisherImpl gets as its messages' ``_connection_header``."""

@@ -1,6 +1,7 @@
 """How a node registers with the master and hears from it."""
 import http.client
 import threading
+import xml.parsers.expat
 import xmlrpc.client
 
 import rosgraph
@@ -10,7 +11,8 @@ from pharos.private_rospy.proxies import ServerProxy, master_api
 
 PING_TIMEOUT = 1.0          # seconds in which a running node answers getPid
 UNREGISTER_TIMEOUT = 2.0    # seconds that a stop waits for the master
-COMMUNICATION_ERRORS = (OSError, xmlrpc.client.Error, http.client.HTTPException)
+# the last where something answers that does not speak XML-RPC
+COMMUNICATION_ERRORS = (OSError, xmlrpc.client.Error, http.client.HTTPException, xml.parsers.expat.ExpatError)
 
 
 def hooks(instance):

@@ -2,42 +2,115 @@
 import queue
 import socket
 import sys
+import threading
+import time
 
 from pharos.private_rospy import copier
 from pharos.private_rospy.host import rospy
 from pharos.private_rospy.wiring import running_here
+
+NESTED = 64     # service calls of one thread within one another: a cycle, which would only end with the stack
+IDLE = 1.0      # seconds that a thread with nothing to do is kept
+
+_nested = threading.local()    # .depth: of the calls that run in this thread
 
 
 class Failed(Exception):
     """The provider failed; the text is what TCPROS would bring."""
 
 
-def find(name, uri):
-    """The rospy Service of that name and URI, with its PrivateRospy, if it is of this process; else None."""
+def find(name, uri, service_class):
+    """The :class:`LocalService` of that name and URI, if its provider is of this process; else None."""
     for instance in running_here():
-        service = instance.service(name)
+        service = instance.services.get(name)
         if service is not None and service.uri == uri:
-            return service, instance
+            return LocalService(instance, service, service_class)
     return None
 
 
-def call(found, request, caller_id, timeout):
-    """Call what :func:`find` found; request and response are the receiver's own.
+class LocalService:
+    """A rospy Service of this process, called without a socket.
 
-    :param timeout: seconds; None: no limit, and the service runs in this thread
-    :raises Failed: if the service fails
-    :raises socket.timeout: if it does not answer in time; it goes on in a thread of its node
+    :param service_class: whose requests and responses the caller has; that of the service may be another one
     """
-    service, instance = found
-    request = _copy(request)
-    request._connection_header = {'service': service.resolved_name, 'md5sum': service.service_class._md5sum,
-                                  'callerid': caller_id}
-    if timeout is None:
-        return _answer(service, instance, request)
-    answer = instance.workers.run(lambda: _answer(service, instance, request), timeout)
-    if isinstance(answer, Failed):
-        raise answer
-    return answer
+
+    def __init__(self, instance, service, service_class):
+        self._instance, self._service = instance, service
+        self._offered, self._as_response = instance.services, instance.as_response
+        self._name, self._uri = service.resolved_name, service.uri
+        self.md5sum = service.service_class._md5sum
+        self._header = {'service': self._name, 'type': service.service_class._type, 'md5sum': self.md5sum,
+                        'callerid': instance.name}
+        #: the first half of copying a request; raises what ``request.serialize()`` raises
+        self.freeze = copier.copier_for(service_class._request_class).freeze
+        self._freeze_response = copier.copier_for(service.response_class).freeze
+        self._thaw = copier.thawer(service_class._request_class, service.request_class)
+        self._thaw_response = copier.thawer(service.response_class, service_class._response_class)
+
+    def is_offered(self, uri):
+        """Whether it is still offered, at that URI."""
+        return self._uri == uri and self._offered.get(self._name) is self._service
+
+    def call(self, frozen, header, deadline):
+        """Call it with a request that :attr:`freeze` made; returns the response.
+
+        :param header: the request's ``_connection_header``
+        :param deadline: by ``time.monotonic()``; None: no limit, and the service runs in this thread
+        :raises Failed: if the service fails
+        :raises ConnectionError: if its node stops meanwhile
+        :raises socket.timeout: if it does not answer in time; it goes on in a thread of its node
+        """
+        depth = getattr(_nested, 'depth', 0) + 1
+        if depth > NESTED:
+            raise Failed('%d service calls are under way within one another: do the services call each other in a '
+                         'circle?' % NESTED)
+        request = self._thaw(frozen)
+        request._connection_header = header
+        if deadline is None:
+            answer = self._answer(request, depth)
+        else:
+            answer = self._instance.workers.run(lambda: self._answer(request, depth), deadline)
+        response = self._thaw_response(answer)
+        response._connection_header = dict(self._header)
+        return response
+
+    def _answer(self, request, depth):
+        """What rospy's ServiceImpl._handle_request does, but for the writing: the response, frozen."""
+        service = self._service
+        before, _nested.depth = getattr(_nested, 'depth', 0), depth
+        try:
+            response = self._as_response(service.handler(request), service.response_class)
+            service.seq += 1
+            number(response, service.seq)
+            return self._freeze_response(response)
+        # the caller gets the text alone, as from elsewhere: the reason's traceback is its node's to report
+        except rospy.ServiceException as error:
+            raise Failed('service cannot process request: %s' % error) from None
+        except Exception as error:
+            service.error_handler(error, *sys.exc_info())
+            raise Failed('error processing request: %s' % error) from None
+        finally:
+            _nested.depth = before
+
+
+def serialize(request):
+    """The request's bytes; raises what ``request.serialize()`` raises."""
+    return copier.serialized(request)
+
+
+def serializes(message):
+    """Whether ``message.serialize()`` would raise nothing; cheaper than trying."""
+    try:
+        copier.copier_for(type(message)).freeze(message)
+    except Exception:
+        return False
+    return True
+
+
+def number(message, seq):
+    """Number a message that has a header, as rospy.msg.serialize_message does for services too."""
+    if message._has_header:
+        message.header.seq = seq
 
 
 class Workers:
@@ -45,30 +118,43 @@ class Workers:
 
     def __init__(self, start_thread):
         self._start_thread = start_thread
-        self._idle = []    # a queue of each thread that has nothing to do
+        self._idle = []          # a queue of each thread that has nothing to do
+        self._waited_for = set()    # the queues in which callers expect an outcome
         self._closed = False
 
-    def run(self, job, timeout):
+    def run(self, job, deadline):
         """What ``job()`` returns, or the Failed that it raises.
 
-        :raises socket.timeout: after ``timeout`` seconds
+        :raises socket.timeout: at the deadline
+        :raises ConnectionError: if the node stops
         """
+        outcome = queue.SimpleQueue()
+        self._waited_for.add(outcome)
+        try:
+            if self._closed:
+                raise _stopped()
+            self._give(job, outcome)
+            result = outcome.get(timeout=max(0.0, deadline - time.monotonic()))
+        except queue.Empty:
+            raise socket.timeout('time is up') from None
+        finally:
+            self._waited_for.discard(outcome)
+        if isinstance(result, Exception):
+            raise result
+        return result
+
+    def _give(self, job, outcome):
         try:
             jobs = self._idle.pop()
         except IndexError:
             jobs = queue.SimpleQueue()
             self._start_thread(self._work, (jobs,), 'service')
-        outcome = queue.SimpleQueue()
         jobs.put((job, outcome))
-        try:
-            return outcome.get(timeout=max(0.0, timeout))
-        except queue.Empty:
-            raise socket.timeout('time is up') from None
 
     def _work(self, jobs):
-        while not self._closed:
-            job, outcome = jobs.get()
-            if job is None:
+        while True:
+            job, outcome = self._next(jobs)
+            if job is None or self._closed:
                 return
             try:
                 result = job()
@@ -76,25 +162,26 @@ class Workers:
                 result = failure
             self._idle.append(jobs)    # before the caller goes on, who may call again at once
             outcome.put(result)
+            job = outcome = result = None    # they are not this thread's to keep alive
+
+    def _next(self, jobs):
+        try:
+            return jobs.get(timeout=IDLE)
+        except queue.Empty:
+            try:
+                self._idle.remove(jobs)
+                return None, None
+            except ValueError:
+                return jobs.get()    # somebody has just taken it, to put a job in
 
     def close(self):
-        """End the threads; nothing is run any more."""
+        """End the threads and the waits; nothing is run any more."""
         self._closed = True
+        for outcome in tuple(self._waited_for):
+            outcome.put(_stopped())
         while self._idle:
             self._idle.pop().put((None, None))
 
 
-def _answer(service, instance, request):
-    """What rospy's ServiceImpl._handle_request does, but for the writing."""
-    try:
-        return _copy(instance.as_response(service.handler(request), service.response_class))
-    except rospy.ServiceException as error:
-        raise Failed('service cannot process request: %s' % error) from error
-    except Exception as error:
-        service.error_handler(error, *sys.exc_info())
-        raise Failed('error processing request: %s' % error) from error
-
-
-def _copy(message):
-    each = copier.copier_for(type(message))
-    return each.thaw(each.freeze(message))
+def _stopped():
+    return ConnectionAbortedError('its node stopped')

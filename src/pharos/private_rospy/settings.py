@@ -4,6 +4,7 @@ rospy takes them from ``os.environ`` and ``sys.argv``; a node gets private ones,
 overridden and the process's own stay untouched.
 """
 import os
+import urllib.parse
 
 import rosgraph.names
 from rosgraph.rosenv import ROS_HOSTNAME, ROS_IP, ROS_MASTER_URI, ROS_NAMESPACE
@@ -66,3 +67,14 @@ def check_port(what, port):
     if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port <= 65535:
         raise ValueError('%s must be a port number, 0 (any free one) to 65535, not %r' % (what, port))
     return port
+
+
+def check_url(url):
+    """``url`` with a closing slash if it can be a master's, else ValueError."""
+    parts = urllib.parse.urlsplit(url) if isinstance(url, str) else None
+    try:
+        if parts and parts.scheme == 'http' and parts.hostname and parts.port and parts.path in ('', '/'):
+            return 'http://%s/' % parts.netloc
+    except ValueError:
+        pass    # the port is no number
+    raise ValueError('%r is not the URL of a ROS master: it looks like http://127.0.0.1:11311/' % (url,))

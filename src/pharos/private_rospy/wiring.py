@@ -74,6 +74,11 @@ class Wiring:
         return [(_peer(connection), connection.transport_type)
                 for connection in (endpoint.impl.connections if endpoint.impl else ()) if not connection.done]
 
+    @staticmethod
+    def is_closed(endpoint):
+        """Whether rospy has closed a Publisher or Subscriber, as it does when the node stops."""
+        return endpoint.impl is None or endpoint.impl.closed
+
     # -- links --------------------------------------------------------------------------------------------------------
 
     def channels_on(self, topic):

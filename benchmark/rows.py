@@ -1,0 +1,164 @@
+"""The rows of the table: each is a player, a process of its own, or two where messages go from one to another."""
+import ctypes
+import json
+import os
+import pathlib
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from typing import List, NamedTuple
+
+from player import STAMPS
+
+HERE = pathlib.Path(__file__).resolve().parent
+SOURCE = HERE.parent / 'src'
+BUILD = HERE.parent / 'build' / 'benchmark'
+# Debian package -> what of it is in /usr/include
+CPP_PACKAGES = {'libroscpp-dev': 'ros/ros.h', 'libnodeletlib-dev': 'nodelet/loader.h', 'pluginlib-dev': 'pluginlib',
+                'libgeometry-msgs-dev': 'geometry_msgs/Twist.h', 'libsensor-msgs-dev': 'sensor_msgs/Image.h',
+                'libstd-msgs-dev': 'std_msgs/String.h'}
+CPP_TOOLS = {'catkin': '/usr/share/catkin/cmake', 'cmake': '/usr/bin/cmake', 'g++': '/usr/bin/g++'}
+
+# What stands in the table -> the words for player.py; a row of two processes has '--two'
+PYTHON_ROWS = {
+    'direct call': ['direct'],
+    'SimpleQueue, 2 threads': ['queue'],
+    'pharos inline': ['pharos', '--inline'],
+    'pharos inline, shared': ['pharos', '--inline', '--shared'],
+    'pharos default': ['pharos'],
+    'rospy, 1 process': ['rospy'],
+    'rospy, 1 process, tuned': ['rospy', '--tuned'],
+    'pharos, 2 processes': ['pharos', '--two'],
+    'rospy, 2 processes': ['rospy', '--two'],
+    'rospy, 2 proc., tuned': ['rospy', '--tuned', '--two'],
+}
+CPP_ROWS = {'C++ nodelets': 'nodelets', 'roscpp, 1 process': 'roscpp'}
+
+
+class Slice(NamedTuple):
+    """What was measured in a short while; times in seconds."""
+
+    took: List[float]    # latencies, a sample of them
+    sent: int            # messages to be received, over all receivers
+    received: int
+    duration: float      # from the first message sent to the last received
+    cpu: float           # of the processes
+
+
+class Row:
+    """One way of messages; it runs only within :meth:`measure`, and is stopped by a signal meanwhile."""
+
+    def __init__(self, name, commands, environment, errors):
+        self.name = name
+        self._players = [_Player(command, environment, errors) for command in commands]    # the sender last
+        self._open = set()
+        self._pause()
+
+    def measure(self, message, receivers, queue_size, rate, seconds, busy=False):
+        """Send for so long and return the :class:`Slice`; the first time, connect."""
+        what = (message, receivers, queue_size)
+        for player in self._players:
+            player.signal(signal.SIGCONT)
+        if what not in self._open:
+            self._open.add(what)
+            for player in self._players:
+                player.ask('open', *what)
+        self._slice(what, 100, 0.05, busy)    # what the players put off while they were stopped, and cold caches
+        measured = self._slice(what, rate, seconds, busy)
+        self._pause()
+        return measured
+
+    def _slice(self, what, rate, seconds, busy):
+        for player in self._players:
+            player.ask('begin', *what)
+        sent = self._players[-1].ask('send', rate, seconds, int(busy))
+        expected = sent['sent'] * what[1]
+        receiver = self._players[0].ask('result', expected)
+        cpu = receiver['cpu'] + sum(player.ask('result', 0)['cpu'] for player in self._players[1:])
+        duration = max(receiver['last'] - sent['begun'], sent['took'])
+        return Slice(receiver['took'], expected, receiver['received'], duration, cpu)
+
+    def _pause(self):
+        for player in self._players:
+            player.signal(signal.SIGSTOP)
+
+    def end(self):
+        for player in self._players:
+            player.end()
+
+
+class _Player:
+    def __init__(self, command, environment, errors):
+        self._command, self._errors = command, errors
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True,
+                                         env=environment, preexec_fn=_end_with_parent)
+
+    def ask(self, *words):
+        try:
+            print(*words, file=self._process.stdin, flush=True)
+            answer = self._process.stdout.readline()
+        except BrokenPipeError:
+            answer = ''
+        if not answer:
+            self._errors.seek(0)
+            raise RuntimeError('%s ended at %s:\n%s' % (' '.join(self._command), words, self._errors.read()[-2000:]))
+        return json.loads(answer)
+
+    def signal(self, number):
+        self._process.send_signal(number)
+
+    def end(self):
+        self._process.kill()
+        self._process.wait()
+
+
+def _end_with_parent():
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)    # PR_SET_PDEATHSIG: a stopped player would stay for ever
+
+
+def make(names, environment, folder, beside=()):
+    """The rows of these names.
+
+    :param folder: where they may keep files
+    :param beside: other ``src`` folders of pharos: their rows are there too, marked with ', '' and so on
+    """
+    errors = open(folder / 'errors', 'w+')
+    rows = []
+    for name in names:
+        label = 'row%d' % len(rows)
+        if name in CPP_ROWS:
+            rows.append(Row(name, [[str(BUILD / 'player'), CPP_ROWS[name], label]], environment, errors))
+            continue
+        words = PYTHON_ROWS[name]
+        for number, source in enumerate((SOURCE, *beside) if 'pharos' in name else (SOURCE,)):
+            label = 'row%d' % len(rows)
+            rows.append(Row(name + "'" * number, _commands(words, label, folder), {**environment, 'PYTHONPATH': str(source)}, errors))
+    return rows
+
+
+def _commands(words, label, folder):
+    command = ['/usr/bin/python3', str(HERE / 'player.py'), words[0], label,
+               *(word for word in words[1:] if word != '--two')]
+    if '--two' not in words:
+        return [command]
+    stamps = folder / (label + '.stamps')
+    with open(stamps, 'wb') as file:
+        file.truncate(8 * STAMPS)
+    return [[*command, '--role', role, '--stamps', str(stamps)] for role in ('receive', 'send')]
+
+
+def build_cpp():
+    """Build the C++ player, where its packages are installed; returns the names of those that are missing."""
+    missing = [package for package, file in CPP_PACKAGES.items() if not os.path.exists('/usr/include/' + file)]
+    missing += [package for package, file in CPP_TOOLS.items() if not os.path.exists(file)]
+    if missing:
+        return sorted(missing)
+    BUILD.mkdir(parents=True, exist_ok=True)
+    python = ['-D%s_EXECUTABLE=/usr/bin/python3' % name for name in ('PYTHON', 'Python3')]
+    for command in (['cmake', str(HERE / 'nodelet'), '-DCATKIN_ENABLE_TESTING=OFF', *python], ['cmake', '--build', '.']):
+        done = subprocess.run(command, cwd=BUILD, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        if done.returncode:
+            sys.exit('%s failed in %s:\n%s' % (' '.join(command), BUILD, done.stdout))
+    return []

@@ -1,0 +1,57 @@
+"""What a process listens on, and peers that accept connections and say nothing."""
+import contextlib
+import os
+import select
+import socket
+import struct
+
+LISTEN = '0A'    # the state, in /proc/net/tcp
+
+
+def listening(pid='self'):
+    """``{(address, port)}`` of the TCP sockets on which the process listens."""
+    inodes = set()
+    for descriptor in os.listdir(f'/proc/{pid}/fd'):
+        with contextlib.suppress(OSError):
+            link = os.readlink(f'/proc/{pid}/fd/{descriptor}')
+            if link.startswith('socket:'):
+                inodes.add(link[len('socket:['):-1])
+    found = set()
+    for table, family in ('tcp', socket.AF_INET), ('tcp6', socket.AF_INET6):
+        with open(f'/proc/{pid}/net/{table}') as file:
+            for line in list(file)[1:]:
+                _, local, _, state, *rest = line.split()
+                if state == LISTEN and rest[5] in inodes:
+                    address, port = local.split(':')
+                    words = struct.iter_unpack('=I', bytes.fromhex(address))
+                    packed = b''.join(struct.pack('>I', word) for word, in words)
+                    found.add((socket.inet_ntop(family, packed), int(port, 16)))
+    return found
+
+
+@contextlib.contextmanager
+def silent_peer():
+    """The URL of something that accepts connections and never answers."""
+    with socket.socket() as listener:
+        listener.bind(('127.0.0.1', 0))
+        listener.listen()
+        yield 'http://127.0.0.1:%d/' % listener.getsockname()[1]
+
+
+def refused_url():
+    """A URL at which nobody listens."""
+    with socket.socket() as free:
+        free.bind(('127.0.0.1', 0))
+        return 'http://127.0.0.1:%d/' % free.getsockname()[1]
+
+
+def wait_for_end(pid, timeout):
+    """Wait until the process has ended, whoever's child it is; returns whether it has."""
+    try:
+        descriptor = os.pidfd_open(pid)
+    except ProcessLookupError:
+        return True
+    try:
+        return bool(select.select([descriptor], [], [], timeout)[0])
+    finally:
+        os.close(descriptor)

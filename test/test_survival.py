@@ -1,0 +1,223 @@
+"""What ends or silences a rospy node does not end or silence this one."""
+import socket
+import struct
+import subprocess
+import sys
+import threading
+
+import pytest
+
+import pharos
+from conftest import TIMEOUT, Mailbox
+from pharos import BlockNode, Master, running, watcher
+
+
+def create(master, name, **kwargs):
+    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
+
+
+def registrations(master, name):
+    return [sorted(topic for topic, nodes in kind.items() if name in nodes) for kind in master.system_state()]
+
+
+def until(condition):
+    """Wait for what only another process, or a master, can be asked for."""
+    pause = threading.Event()
+    for _ in range(int(TIMEOUT / 0.02)):
+        if condition():
+            return
+        pause.wait(0.02)
+    raise AssertionError('it did not come to be: %s' % condition)
+
+
+@pytest.fixture
+def mortal_master(monkeypatch):
+    """A master that a test may end and start again at the same URL."""
+    monkeypatch.setattr(watcher, 'PERIOD', 0.1)
+
+    class MortalMaster:
+        def __init__(self):
+            self._embedded = Master.embedded()
+            self.url = self._embedded.url
+            monkeypatch.setenv('ROS_MASTER_URI', self.url)
+
+        def end(self):
+            """kill -9"""
+            self._embedded._child.kill()
+            self._embedded._child.wait()
+
+        def come_back(self):
+            self._embedded = Master.embedded(port=int(self.url.rsplit(':', 1)[1].strip('/')))
+    master = MortalMaster()
+    yield master
+    running.stop_all()
+    master.end()
+
+
+# -- the master restarts ----------------------------------------------------------------------------------------------
+
+def test_everything_is_registered_again_when_the_master_comes_back_empty(mortal_master, mailbox):
+    """With rospy, the node is never registered again."""
+    master = Master(mortal_master.url)
+    receiver = create(master, '/receiver', delegate=mailbox, argv=['_private:=7'])
+    receiver.interested_in('/t', 'std_msgs/String')
+    receiver.serve('/service', 'std_srvs/Empty', lambda request: None)
+    changes = Mailbox()
+    receiver.parameter('~watched', 1).on_change(lambda value: changes(value, None))
+    sender = create(master, '/sender')
+    sent = sender.output_channel('/t', 'std_msgs/String')
+    before = [registrations(master, name) for name in ('/receiver', '/sender')]
+    mortal_master.end()
+    sent.send(data='while the master is away')
+    assert mailbox.get().data == 'while the master is away'
+    mortal_master.come_back()
+    until(lambda: [registrations(master, name) for name in ('/receiver', '/sender')] == before)
+    until(lambda: '/receiver/private' in master.parameters)
+    assert master.parameters['/receiver/private'] == 7
+    late = create(master, '/late')
+    late.send_to('/t', data='from a new peer')
+    sent.send(data='from the old one')
+    assert {message.data for message in mailbox.take(2)} == {'from a new peer', 'from the old one'} and mailbox.empty()
+    master.lookup_service('/service').call(timeout=TIMEOUT)
+    master.parameters['/receiver/watched'] = 2
+    assert changes.get() == 2
+
+
+def test_what_a_node_opens_while_the_master_is_away_is_registered_later(mortal_master, mailbox):
+    master = Master(mortal_master.url)
+    receiver, sender = create(master, '/receiver', delegate=mailbox), create(master, '/sender')
+    mortal_master.end()
+    receiver.interested_in('/t', 'std_msgs/String')
+    mortal_master.come_back()
+    until(lambda: registrations(master, '/receiver')[1] == ['/t'])
+    sender.send_to('/t', data='found')
+    assert mailbox.get().data == 'found'
+
+
+def test_a_node_stops_while_the_master_is_away(mortal_master):
+    node = create(Master(mortal_master.url), '/node')
+    node.interested_in('/t', 'std_msgs/String')
+    mortal_master.end()
+    node.stop()
+    assert node.lifecycle.value == 'stopped'
+
+
+def test_there_is_one_watcher_per_master_and_none_without_a_node(master):
+    watching = 'watcher of %s' % master.url
+
+    def watchers():
+        return [thread.name for thread in threading.enumerate()].count(watching)
+    nodes = [create(master, '/n%d' % i) for i in range(3)]
+    assert watchers() == 1
+    for node in nodes:
+        node.stop()
+    until(lambda: watchers() == 0)
+
+
+# -- bad clients ------------------------------------------------------------------------------------------------------
+
+def connect(port):
+    return socket.create_connection(('127.0.0.1', port), TIMEOUT)
+
+
+def test_silent_slow_and_huge_clients_keep_nobody_from_connecting(master, mailbox):
+    """With rospy, one silent client blocks all that come after it (ros_comm PR #1918)."""
+    sender = create(master, '/sender')
+    sent = sender.output_channel('/t', 'std_msgs/String')
+    clients = [connect(port) for port in (sender.tcp_port, sender.xmlrpc_port) for _ in range(100)]
+    for client in clients[:100:2]:
+        client.sendall(struct.pack('<I', 0xffffffff))
+    node = create(master, '/receiver')
+    node.ros.Subscriber('/t', sent.message_class, lambda message: mailbox(message, None))    # through TCPROS
+    assert sent.wait_for_subscribers(1, TIMEOUT)
+    sent.send(data='through')
+    assert mailbox.get().data == 'through'
+    for client in clients:
+        client.close()
+
+
+@pytest.mark.parametrize('bytes_sent, said', [
+    (struct.pack('<I', 0xffffffff), '4294967299 bytes; the limit is'),
+    (b'GET / HTTP/1.0\r\n\r\n', 'the limit is'),
+    (struct.pack('<I', 4) + struct.pack('<I', 0), '0-length'),
+    (struct.pack('<I', 7) + struct.pack('<I', 3) + b'abc', 'Invalid line'),
+    (b'\x01\x02', 'closed within the handshake'),
+])
+def test_a_bad_handshake_is_refused_and_logged_once(master, bytes_sent, said):
+    lines = Mailbox()
+    node = create(master, '/node')
+    create(master, '/auditor', delegate=lines).interested_in('/rosout', 'rosgraph_msgs/Log')
+    with connect(node.tcp_port) as client:
+        client.sendall(bytes_sent)
+        client.shutdown(socket.SHUT_WR)
+        assert client.recv(1) == b''    # the node closes
+    line = lines.get()
+    assert said in line.msg and 'Traceback' not in line.msg
+    assert lines.empty() and node.is_running
+
+
+def test_a_slow_handshake_ends_after_its_limit(master, monkeypatch):
+    monkeypatch.setattr(pharos.private_rospy.servers, 'HANDSHAKE_TIMEOUT', 0.2)
+    node = create(master, '/node')
+    with connect(node.tcp_port) as client:
+        client.settimeout(TIMEOUT)
+        assert client.recv(1) == b''
+
+
+# -- peers that die ---------------------------------------------------------------------------------------------------
+
+PEER = """
+import rospy, std_msgs.msg
+rospy.init_node('peer')
+rospy.Subscriber('/to_peer', std_msgs.msg.String, lambda message: None)
+publisher = rospy.Publisher('/from_peer', std_msgs.msg.String, latch=True, queue_size=1)
+publisher.publish('hello')
+rospy.spin()
+"""
+
+
+def test_a_peer_killed_outright_is_let_go_and_found_again(master, mailbox):
+    node = create(master, '/node', delegate=mailbox)
+    heard = node.interested_in('/from_peer', 'std_msgs/String')
+    told = node.output_channel('/to_peer', 'std_msgs/String')
+    for _ in range(2):
+        with subprocess.Popen([sys.executable, '-c', PEER]) as peer:
+            assert mailbox.get().data == 'hello' and told.wait_for_subscribers(1, TIMEOUT)
+            peer.kill()
+        until(lambda: not heard.connections and not told.connections)
+        told.send(data='into the void')
+
+
+# -- stop at any moment -----------------------------------------------------------------------------------------------
+
+def test_two_threads_may_stop_a_node_at_once(master):
+    for round_ in range(10):
+        node = create(master, '/node')
+        threads = [threading.Thread(target=node.stop) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(TIMEOUT)
+        assert node.lifecycle.value == 'stopped' and not any(registrations(master, '/node'))
+
+
+def test_a_node_stops_while_it_publishes_receives_and_calls(master):
+    server = create(master, '/server')
+    server.serve('/echo', 'std_srvs/SetBool', lambda request: {'success': request.data})
+    for _ in range(5):
+        node = create(master, '/node')
+        busy = threading.Event()
+        service = master.lookup_service('/echo')
+        channel = node.output_channel('/t', 'std_msgs/String')
+
+        def work(me):
+            while True:
+                channel.send(data='x' * 1000)
+                service.call(data=True)
+                busy.set()
+                me.sleep(0)
+        node.interested_in('/t', delegate=lambda message, channel: service.call(data=True))
+        node.fork(work)
+        assert busy.wait(TIMEOUT)
+        node.stop()
+        assert not [error for error in node.errors if not isinstance(error, pharos.NodeStoppedError)]
