@@ -1,0 +1,268 @@
+"""Master.run and Master.launch: ROS programs as processes of this one."""
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from conftest import TIMEOUT, Mailbox
+from pharos import BlockNode, ExternalNode, RosProcess, UnknownNodeError
+from programs import Program
+from sockets import wait_for_end
+
+MANIFEST = """<package format="2"><name>%s</name><version>0.0.0</version><description>d</description>
+<maintainer email="a@b.org">m</maintainer><license>BSD</license></package>"""
+
+TALKER = """#!/usr/bin/python3
+import rospy, std_msgs.msg
+rospy.init_node('talker')
+sent = rospy.Publisher('talk', std_msgs.msg.String, queue_size=1, latch=True)
+sent.publish(rospy.get_param('~text', 'nothing'))
+print('%s talks' % rospy.get_name())
+rospy.spin()
+"""
+
+
+def write(path, text, mode=0o644):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    path.chmod(mode)
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """A folder of a ROS package, fake_robot, in a workspace's source space."""
+    folder = tmp_path / 'src' / 'fake_robot'
+    write(folder / 'package.xml', MANIFEST % 'fake_robot')
+    write(folder / 'scripts' / 'talker', TALKER, 0o755)
+    monkeypatch.setenv('ROS_PACKAGE_PATH', str(tmp_path / 'src'))
+    return folder
+
+
+def program(package, name, text):
+    """A shell program of the package."""
+    write(package / 'scripts' / name, '#!/bin/sh\n' + text, 0o755)
+    return name
+
+
+# -- finding them -----------------------------------------------------------------------------------------------------
+
+def test_a_program_of_the_source_space_is_run(master, package):
+    with master.run('fake_robot', 'talker') as process:
+        node = master.wait_for_node('/talker', TIMEOUT)
+        assert isinstance(process, RosProcess) and process.poll() is None
+        assert isinstance(node, ExternalNode) and node.pid == process.pid
+    assert process.poll() is not None and not node.is_alive()
+
+
+@pytest.mark.parametrize('space', ['devel', 'install'])
+def test_a_program_of_a_catkin_space_is_run(master, tmp_path, monkeypatch, space):
+    prefix, source = tmp_path / space, tmp_path / 'src' / 'fake_robot'
+    write(source / 'package.xml', MANIFEST % 'fake_robot')
+    write(prefix / '.catkin', str(tmp_path / 'src') if space == 'devel' else '')
+    write(prefix / 'lib' / 'fake_robot' / 'tell', '#!/bin/sh\necho "$0"\n', 0o755)
+    if space == 'install':
+        write(prefix / 'share' / 'fake_robot' / 'package.xml', MANIFEST % 'fake_robot')
+    monkeypatch.setenv('CMAKE_PREFIX_PATH', str(prefix))
+    monkeypatch.setenv('ROS_PACKAGE_PATH', str(tmp_path / 'src' if space == 'devel' else prefix / 'share'))
+    with master.run('fake_robot', 'tell') as process:
+        assert process.wait(TIMEOUT) == 0
+        assert process.output == str(prefix / 'lib' / 'fake_robot' / 'tell')
+
+
+def test_a_program_of_debians_is_run_though_it_has_no_manifest(master):
+    with master.run('topic_tools', 'relay', '/a', '/b', name='passes_on'):
+        while '/passes_on' not in master.topic('/a').subscribers:    # then it heeds Ctrl-C
+            threading.Event().wait(0.01)
+        assert master.node('/passes_on').subscriptions == {'/a': None}
+
+
+def test_an_unknown_package_or_program_is_said(master, package):
+    with pytest.raises(UnknownNodeError, match="no ROS package 'no_such_robot' on ROS_PACKAGE_PATH"):
+        master.run('no_such_robot', 'talker')
+    with pytest.raises(UnknownNodeError, match="fake_robot has no program 'listener'.*rosrun fake_robot <Tab>"):
+        master.run('fake_robot', 'listener')
+    with pytest.raises(UnknownNodeError, match="topic_tools has no program 'relai'"):
+        master.run('topic_tools', 'relai')
+    with pytest.raises(UnknownNodeError, match="no ROS package 'no_such_robot'"):
+        master.launch('no_such_robot', 'a.launch')
+    with pytest.raises(UnknownNodeError, match="fake_robot has no launch file 'b.launch'"):
+        master.launch('fake_robot', 'b.launch')
+
+
+# -- what they are told, and what they tell -------------------------------------------------------------------------------
+
+def test_name_remappings_and_parameters_reach_it(master, package):
+    mailbox = Mailbox()
+    master.create(BlockNode, named='/listener', delegate=mailbox).interested_in('/said', 'std_msgs/String')
+    with master.run('fake_robot', 'talker', name='robot7', remap={'talk': '/said'}, params={'text': 'two words'}):
+        assert mailbox.get().data == 'two words'
+        assert master.wait_for_node('/robot7', TIMEOUT).publications['/said'] == 'std_msgs/String'
+        assert master.parameters.pop('/robot7/text') == 'two words'
+
+
+def test_arguments_reach_it_as_they_are(master, package):
+    show = program(package, 'show', 'for a in "$@"; do echo "<$a>"; done')
+    with master.run('fake_robot', show, 'two words', 3, '--flag') as process:
+        process.wait(TIMEOUT)
+        assert process.output.splitlines() == ['<two words>', '<3>', '<--flag>']
+
+
+def test_it_runs_at_this_master(master, package):
+    tell = program(package, 'tell', 'echo $ROS_MASTER_URI')
+    with master.run('fake_robot', tell) as process:
+        process.wait(TIMEOUT)
+        assert process.output == master.url
+
+
+def test_each_line_goes_to_the_block_as_it_is_printed(master, package):
+    lines = queue.SimpleQueue()
+    with master.run('fake_robot', 'talker', on_line=lines.put):
+        assert lines.get(timeout=TIMEOUT) == '/talker talks'    # while it runs on: not held back for a full block
+
+
+def test_lines_go_to_a_nodes_log(master, package):
+    mailbox = Mailbox()
+    master.create(BlockNode, named='/listener', delegate=mailbox).interested_in('/rosout', 'rosgraph_msgs/Log')
+    node = master.create(BlockNode, named='/starter')
+    while not node._rospy.publisher('/rosout').get_num_connections():
+        node._rospy.ended.wait(0.01)
+    with master.run('fake_robot', program(package, 'grumble', 'echo first; echo second >&2'), on_line=node.log):
+        assert take(mailbox, '/starter', 2) == ['first', 'second']
+
+
+def take(mailbox, name, count):
+    """The next log lines of that node."""
+    lines = []
+    while len(lines) < count:
+        message = mailbox.get()
+        if message.name == name:
+            lines.append(message.msg)
+    return lines
+
+
+def test_a_block_that_raises_does_not_end_the_program_or_its_output(master, package, transcript):
+    def stumble(line):
+        raise RuntimeError('stumbled over ' + line)
+    with master.run('fake_robot', program(package, 'two', 'echo one; echo two'), on_line=stumble) as process:
+        assert process.wait(TIMEOUT) == 0
+        assert process.output == 'one\ntwo'
+    assert len(transcript) == 2 and 'RuntimeError: stumbled over one' in transcript[0]
+    with pytest.raises(TypeError, match='on_line.text.'):
+        master.run('fake_robot', 'two', on_line=lambda: None)
+
+
+def test_its_exit_status_is_told(master, package):
+    with master.run('fake_robot', program(package, 'fail', 'exit 7')) as process:
+        assert process.wait(TIMEOUT) == 7 == process.poll()
+        assert repr(process).endswith('fail, ended with 7>')
+    with master.run('fake_robot', program(package, 'sleep', 'exec sleep 1000')) as process:
+        assert process.poll() is None and repr(process).endswith('sleep, pid %d>' % process.pid)
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(0.01)
+        assert process.terminate() == -signal.SIGINT
+        assert process.terminate() == -signal.SIGINT    # harmless
+
+
+def test_a_roscpp_node_unregisters_when_it_is_ended(master):
+    with master.run('topic_tools', 'relay', '/a', '/b', name='passes_on'):
+        while '/passes_on' not in master.topic('/a').subscribers:    # then it heeds Ctrl-C
+            threading.Event().wait(0.01)
+    with pytest.raises(UnknownNodeError):
+        master.node('/passes_on')
+
+
+def test_a_program_that_ignores_ctrl_c_is_terminated(master, package):
+    lines = queue.SimpleQueue()
+    deaf = program(package, 'deaf', 'trap "" INT; trap "exit 5" TERM; echo up; while :; do sleep 0.1; done')
+    process = master.run('fake_robot', deaf, on_line=lines.put)
+    lines.get(timeout=TIMEOUT)
+    assert process.terminate(timeout=1) == 5
+
+
+# -- the end ------------------------------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize('how', ['sleep 1000 & echo $!; wait',
+                                 'setsid sleep 1000 & echo $!; wait',
+                                 'trap "" INT TERM; sh -c "trap \'\' INT TERM; echo \\$\\$; while :; do sleep 1; done"',
+                                 'sleep 1000 </dev/null >/dev/null 2>&1 & echo $!; exit'],
+                         ids=['a child', 'a child with a session', 'both ignore the signals', 'left behind'])
+def test_what_it_has_started_ends_with_it(master, package, how):
+    lines = queue.SimpleQueue()
+    process = master.run('fake_robot', program(package, 'parent', how), on_line=lines.put)
+    child = int(lines.get(timeout=TIMEOUT))
+    process.terminate(timeout=0.2)
+    assert wait_for_end(child, TIMEOUT)
+
+
+@pytest.mark.parametrize('end', ['', 'raise RuntimeError', 'os.kill(os.getpid(), signal.SIGTERM)'],
+                         ids=['end', 'exception', 'SIGTERM'])
+def test_nothing_is_left_behind_when_the_program_ends(master, package, end):
+    code = """
+import os, queue, signal
+from pharos import BlockNode, Master
+Master().create(BlockNode, named='/n')
+lines = queue.SimpleQueue()
+process = Master().run('fake_robot', %r, on_line=lines.put)
+print('PIDS', process.pid, lines.get(), flush=True)
+%s
+""" % (program(package, 'parent', 'sleep 1000 & echo $!; wait'), end)
+    with Program(master.url, sys.executable, '-c', code) as started:
+        pids = started.wait_for('PIDS').split()[1:]
+        started.process.wait(TIMEOUT)
+        assert all(wait_for_end(int(pid), TIMEOUT) for pid in pids)
+
+
+def test_a_program_that_ended_long_ago_is_not_signalled_again(master, package, monkeypatch):
+    with master.run('fake_robot', program(package, 'ends', 'exit 0')) as process:
+        process.wait(TIMEOUT)
+        process._reader.join(TIMEOUT)
+        monkeypatch.setattr(os, 'killpg', None)    # its number may be another's by now
+
+
+# -- launch files -------------------------------------------------------------------------------------------------------
+
+LAUNCH = """<launch>
+  <arg name="who" /><arg name="text" default="hello" />
+  <node name="$(arg who)" pkg="fake_robot" type="talker" output="screen"><param name="text" value="$(arg text)" /></node>
+  <node name="second" pkg="fake_robot" type="talker"><remap from="talk" to="talk2" /></node>
+</launch>"""
+
+
+def test_a_launch_file_is_started_and_ended_with_all_its_nodes(master, package):
+    write(package / 'launch' / 'robot.launch', LAUNCH)
+    mailbox = Mailbox()
+    master.create(BlockNode, named='/listener', delegate=mailbox).interested_in('/talk', 'std_msgs/String')
+    lines = queue.SimpleQueue()
+    with master.launch('fake_robot', 'robot.launch', on_line=lines.put, who='robot7', text='two words') as process:
+        assert mailbox.get().data == 'two words'
+        nodes = [master.wait_for_node(name, TIMEOUT) for name in ('/robot7', '/second')]
+        pids = [node.pid for node in nodes]
+        while '/robot7 talks' not in lines.get(timeout=TIMEOUT):
+            pass
+    assert process.poll() is not None
+    assert all(wait_for_end(pid, TIMEOUT) for pid in pids)
+    master.parameters.pop('/robot7')
+    assert not any(node.is_alive() for node in nodes)
+
+
+def test_what_a_launch_file_cannot_do_is_told(master, package):
+    write(package / 'launch' / 'robot.launch', LAUNCH)
+    with master.launch('fake_robot', 'robot.launch') as process:
+        assert process.wait(TIMEOUT) != 0
+        assert "requires the 'who' arg" in process.output
+
+
+def test_launched_nodes_that_ignore_the_end_are_ended(master, package):
+    program(package, 'stubborn', 'trap "" INT TERM; echo "pid $$"; while :; do sleep 1; done')
+    write(package / 'stubborn.launch', '<launch><node name="s" pkg="fake_robot" type="stubborn" output="screen"/></launch>')
+    lines = queue.SimpleQueue()
+    process = master.launch('fake_robot', 'stubborn.launch', on_line=lines.put)
+    line = ''
+    while not line.startswith('pid '):
+        line = lines.get(timeout=TIMEOUT)
+    process.terminate(timeout=0.2)
+    assert wait_for_end(int(line.split()[1]), TIMEOUT)
