@@ -57,6 +57,9 @@ class InProcessMaster:
         self.url = 'http://127.0.0.1:%d/' % self._master.master_node.port
 
     def stop(self):
+        node = self._master.master_node
+        node.is_shutdown = True
+        node.server.shutdown()    # rosgraph itself only closes its socket, and its thread spins (ros_comm #2238)
         self._master.stop()
 
 

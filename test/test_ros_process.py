@@ -1,6 +1,7 @@
 """Master.run and Master.launch: ROS programs as processes of this one."""
 import os
 import queue
+import re
 import signal
 import subprocess
 import sys
@@ -74,10 +75,10 @@ def test_a_program_of_a_catkin_space_is_run(master, tmp_path, monkeypatch, space
 
 
 def test_a_program_of_debians_is_run_though_it_has_no_manifest(master):
-    with master.run('topic_tools', 'relay', '/a', '/b', name='passes_on'):
-        while '/passes_on' not in master.topic('/a').subscribers:    # then it heeds Ctrl-C
+    with master.run('topic_tools', 'relay', '/untyped', '/b', name='passes_on'):
+        while '/passes_on' not in master.topic('/untyped').subscribers:    # then it heeds Ctrl-C
             threading.Event().wait(0.01)
-        assert master.node('/passes_on').subscriptions == {'/a': None}
+        assert master.node('/passes_on').subscriptions == {'/untyped': None}    # a master never forgets a type
 
 
 def test_an_unknown_package_or_program_is_said(master, package):
@@ -168,8 +169,8 @@ def test_its_exit_status_is_told(master, package):
 
 
 def test_a_roscpp_node_unregisters_when_it_is_ended(master):
-    with master.run('topic_tools', 'relay', '/a', '/b', name='passes_on'):
-        while '/passes_on' not in master.topic('/a').subscribers:    # then it heeds Ctrl-C
+    with master.run('topic_tools', 'relay', '/untyped', '/b', name='passes_on'):
+        while '/passes_on' not in master.topic('/untyped').subscribers:    # then it heeds Ctrl-C
             threading.Event().wait(0.01)
     with pytest.raises(UnknownNodeError):
         master.node('/passes_on')
@@ -257,12 +258,12 @@ def test_what_a_launch_file_cannot_do_is_told(master, package):
 
 
 def test_launched_nodes_that_ignore_the_end_are_ended(master, package):
-    program(package, 'stubborn', 'trap "" INT TERM; echo "pid $$"; while :; do sleep 1; done')
+    program(package, 'stubborn', 'trap "" INT TERM; echo "stubborn pid $$"; while :; do sleep 1; done')
     write(package / 'stubborn.launch', '<launch><node name="s" pkg="fake_robot" type="stubborn" output="screen"/></launch>')
     lines = queue.SimpleQueue()
     process = master.launch('fake_robot', 'stubborn.launch', on_line=lines.put)
-    line = ''
-    while not line.startswith('pid '):
-        line = lines.get(timeout=TIMEOUT)
+    told = None
+    while not told:    # not at the beginning of the line: roslaunch sets the terminal's title, without a line's end
+        told = re.search(r'stubborn pid (\d+)', lines.get(timeout=TIMEOUT))
     process.terminate(timeout=0.2)
-    assert wait_for_end(int(line.split()[1]), TIMEOUT)
+    assert wait_for_end(int(told.group(1)), TIMEOUT)
