@@ -5,6 +5,7 @@ master and the peers are elsewhere.
 """
 import gc
 import json
+import os
 import subprocess
 import sys
 import weakref
@@ -174,6 +175,21 @@ def test_what_a_stopped_node_held_is_freed(master):
     del node
     gc.collect()
     assert [ref() for ref in last] == [None] * 2
+
+
+def test_closed_channels_hold_no_descriptor(master):
+    """rospy's topics keep an epoll descriptor each until the cycle collector comes."""
+    with master.create(BlockNode, named='/opens_and_closes', domain='127.0.0.1') as node:
+        gc.collect()
+        gc.disable()
+        try:
+            before = len(os.listdir('/proc/self/fd'))
+            for _ in range(20):
+                node.interested_in('/opened_and_closed', 'std_msgs/String').close()
+                node.output_channel('/opened_and_closed', 'std_msgs/String').close()
+            assert len(os.listdir('/proc/self/fd')) < before + 20
+        finally:
+            gc.enable()
 
 
 @pytest.mark.parametrize('library', ['actionlib', 'tf2_ros', 'message_filters'])

@@ -71,10 +71,10 @@ class Souls:
         return thread
 
     def end(self, timeout):
-        """Wait for all but this thread's, up to ``timeout`` seconds; returns the names of those that went on."""
+        """Wait for all but this thread's, up to ``timeout`` seconds; returns the threads that went on."""
         threads = [thread for thread in tuple(self._threads) if thread is not threading.current_thread()]
         running.join(threads, timeout)
-        return [thread.name for thread in threads if thread.is_alive()]
+        return [thread for thread in threads if thread.is_alive()]
 
     def end_here(self):
         """End the soul that runs in this thread, if one does."""

@@ -94,9 +94,9 @@ class Life:
             if ignoring:
                 self.log('left behind, for it did not end within %g s of the stop: %s. A soul ends by itself if it '
                          'waits with node.sleep() or loops over node.every()'
-                         % (self.stop_timeout, ', '.join(ignoring)), level='warning')
+                         % (self.stop_timeout, ', '.join(thread.name for thread in ignoring)), level='warning')
             self._dispatcher.close()
-            left = instance.stop(self.stop_timeout)
+            left = instance.stop(self.stop_timeout, ignoring)
             if left:
                 Transcript.show('%s left behind threads that did not end: %s' % (self.name, ', '.join(left)))
             for channel in self._channels:

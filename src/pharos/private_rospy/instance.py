@@ -114,6 +114,7 @@ class PrivateRospy:
                 % (settings.master_url, error)) from error
         registration.claim_name(settings.master_url, self.name, timeout)
         core = self._modules.load('rospy.core')
+        core._shutdown_hooks.insert(0, self._wake)    # the first, so that the threads that rospy waits for end at once
         try:
             with _ports_checked('tcp_port', settings.tcp_port):
                 self.tcp_port = servers.listen(self._modules.load('rospy.impl.tcpros_base'), settings.tcp_port)
@@ -141,10 +142,11 @@ class PrivateRospy:
         with changed:
             changed.notify_all()    # simulated time may stand still
 
-    def stop(self, flush_timeout):
+    def stop(self, flush_timeout, given_up=()):
         """Send what is under way (for up to ``flush_timeout`` seconds), unregister, close the ports, end the threads.
 
-        Returns the names of threads that did not end in time. Harmless when done twice.
+        Returns the names of threads that did not end in time, but for those ``given_up`` already. Harmless when done
+        twice.
         """
         if not self._stopping.acquire(blocking=False):
             return []
@@ -153,11 +155,12 @@ class PrivateRospy:
         self.parameters.close()
         core = self._modules.load('rospy.core')
         pubsub.flush(self._topic_manager(), flush_timeout)
-        core._shutdown_hooks.insert(0, self._wake)    # before rospy waits for its threads
         core.signal_shutdown('stop')
+        with core._shutdown_lock:
+            pass    # where the node's own code called that, it returned at once
         for proxy in core._xmlrpc_cache.values():
             proxy('close')()
-        left = self._lifetime.end()
+        left = self._lifetime.end(given_up)
         logs.close_handlers(self._logging)
         return [thread.name for thread in left]
 
@@ -201,11 +204,6 @@ class PrivateRospy:
         """The event set when the stop begins."""
         return self._lifetime.ended
 
-    @property
-    def ended(self):
-        """The event set when the stop begins."""
-        return self._lifetime.ended
-
     def warn(self, text):
         """A warning in the node's log."""
         self.rospy.logwarn('%s', text)
@@ -213,7 +211,6 @@ class PrivateRospy:
     def owns(self, thread):
         """Whether the thread is one of this node's."""
         return thread in self._lifetime.threads
-
 
     def publisher(self, topic):
         """rospy's _PublisherImpl of the topic, None if there is none."""

@@ -54,13 +54,13 @@ class Lifetime:
         """Shut this socket down at the end, at the latest."""
         self._sockets.add(sock)
 
-    def end(self):
-        """Shut the sockets, wait for the threads; returns those that did not end in time."""
+    def end(self, given_up=()):
+        """Shut the sockets, wait for the threads but those given up; returns those that did not end in time."""
         self.ended.set()
         for sock in list(self._sockets):
             shut(sock)
         me = threading.current_thread()
-        threads = [thread for thread in list(self.threads) if thread is not me]
+        threads = [thread for thread in list(self.threads) if thread is not me and thread not in given_up]
         deadline = time.monotonic() + JOIN_TIMEOUT
         for thread in threads:
             if thread.ident is not None:    # None: it is only just being started, and will see that all has ended

@@ -14,6 +14,7 @@ def hooks(instance):
     def mend_topics(module):
         """rospy.topics."""
         module.is_shutdown = instance.is_shut_down
+        _close_pollers(module._TopicImpl)
         mend_publisher(module)
         _mend_subscriber(module._SubscriberImpl, instance)
 
@@ -66,6 +67,16 @@ def hooks(instance):
 
     return {'rospy.topics': mend_topics, 'rospy.impl.masterslave': offer_intraprocess,
             'rospy.impl.tcpros_pubsub': know_what_is_under_way}
+
+
+def _close_pollers(topic):
+    """rospy.topics._TopicImpl: a closed topic keeps its epoll descriptor until the cycle collector comes."""
+    close = topic.close
+
+    def close_all(self):
+        close(self)
+        self.connection_poll.poller.close()
+    topic.close = close_all
 
 
 def _mend_subscriber(subscriber, instance):
