@@ -116,11 +116,11 @@ def test_an_unknown_type(master):
 
 def test_an_unknown_topic(master):
     node = create(master)
-    with pytest.raises(pharos.UnknownTopicError, match='no node of .* publishes or subscribes to /t.*typed_as='):
-        node.send_to('/t', data=1)
-    node.output_channel('/turtle1/pose', 'turtlesim/Pose')
-    with pytest.raises(pharos.UnknownTopicError, match='did you mean /turtle1/pose'):
-        create(master, '/other').interested_in('/turtle1/poes')
+    with pytest.raises(pharos.UnknownTopicError, match='no node of .* publishes or subscribes to /untyped_yet.*typed_as='):
+        node.send_to('/untyped_yet', data=1)
+    node.output_channel('/posing_turtle/pose', 'turtlesim/Pose')
+    with pytest.raises(pharos.UnknownTopicError, match='did you mean /posing_turtle/pose'):
+        create(master, '/other').interested_in('/posing_turtle/poes')
 
 
 def test_another_type_for_a_topic_in_use(master):

@@ -127,20 +127,6 @@ class InputChannel(_Channel):
             with self._offering:
                 self._tcpros.put(message)
 
-    def _receive(self, value, thaw, header):
-        """Run the delegate for a message; the dispatcher calls this, for one message of the node at a time."""
-        self.received += 1
-        block = self._delegate or self.node._delegate
-        if block is None:
-            return
-        try:
-            message = value if thaw is None else thaw(value)
-            if header is not None:
-                message._connection_header = header
-            block(message, self)
-        except Exception as error:
-            self.node._report(error, block, 'delegate', self)
-
 
 class OutputChannel(_Channel):
     """The end at which a node sends: made by :meth:`Node.output_channel`, or by the first ``send_to``.
@@ -169,7 +155,7 @@ class OutputChannel(_Channel):
         if message.__class__ is not self.message_class:
             self._check_type(message)
         try:
-            self._send(message, getattr(to, 'name', to))
+            self._send(message, None, self, to if to is None else getattr(to, 'name', to))
         except Exception as error:
             self._explain(error, message)
         self.sent += 1
@@ -230,6 +216,6 @@ class OutputChannel(_Channel):
         self._send = _closed
 
 
-def _closed(message, to):
+def _closed(*arguments):
     """Instead of a closed channel's way."""
     raise NodeStoppedError('closed')

@@ -18,10 +18,13 @@ class Inbox:
 
     One thread at a time puts (it holds the publisher's lock), one at a time runs (it holds the node's).
 
-    :param channel: has ``_receive(message)``, which runs the delegate
+    :param channel: the InputChannel
     :param thaw: makes the receiver's message of what was put; None where that is the message itself
     :param header: the ``_connection_header`` of the messages; None where they have one already
     """
+
+    __slots__ = ('channel', 'dispatcher', 'inline', 'shared', 'arrived', 'taken', 'closed', '_thaw', '_header', '_queue',
+                 '_limit', '_announce', '_announced', '_seen')    # a message that comes alone meets cold caches
 
     def __init__(self, channel, dispatcher, inline, thaw=None, header=None, shared=False):
         self.channel, self.dispatcher, self.inline, self.shared = channel, dispatcher, inline, shared
@@ -66,7 +69,19 @@ class Inbox:
         if self._queue and not self._announced:
             self._announced = True
             self._announce(self)
-        self.channel._receive(value, self._thaw, self._header)
+        channel, thaw, header = self.channel, self._thaw, self._header
+        channel.received += 1
+        node = channel.node
+        block = channel._delegate or node._delegate
+        if block is None:
+            return
+        try:
+            message = value if thaw is None else thaw(value)
+            if header is not None:
+                message._connection_header = header
+            block(message, channel)
+        except Exception as error:
+            node._report(error, block, 'delegate', channel)
 
 
 class Dispatcher:

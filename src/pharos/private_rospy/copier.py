@@ -60,35 +60,12 @@ def copier_for(cls):
     copier = vars(cls).get('_pharos_copier')
     if copier is None:
         try:
-            copier = _copier(cls, *_generate(cls))
+            copier = _generate(cls)
         except Exception:   # a class not understood costs time, never a wrong copy
             copier = Copier(serialized, lambda frozen: cls().deserialize(frozen))
         # Kept in the class itself: a registry here would keep classes made at run time alive for ever.
         cls._pharos_copier = copier
     return copier
-
-
-def _copier(cls, freeze_fields, thaw_fields, source):
-    # The wire canonizes the times that are the message's own, not those of its header or of other messages in it.
-    times = [name for name, type_name in _fields(cls) if type_name in ('time', 'duration')]
-
-    def freeze(message):
-        if type(message) is cls:
-            try:
-                return freeze_fields(message)
-            except Exception:
-                pass    # the wire knows what arrives, or what is wrong
-        return serialized(message)
-
-    def thaw(frozen):
-        if type(frozen) is bytes:
-            return cls().deserialize(frozen)
-        message = thaw_fields(frozen)
-        for name in times:
-            getattr(message, name).canon()
-        return message
-
-    return Copier(freeze, thaw, freeze_fields, thaw_fields, source)
 
 
 def thawer(publisher_cls, receiver_cls):
@@ -173,13 +150,27 @@ _HELPERS.update(string_array=lambda value: tuple(map(text, sequence(value))), ui
 
 
 def _generate(cls):
-    """(freeze_fields, thaw_fields, their source) of a class that genpy made; any exception for another."""
+    """The Copier of a class that genpy made; any exception for another."""
     writer = _Writer()
     writer.add_object(cls, 'message')
-    source = '\n'.join(['def freeze_fields(message):', *('    ' + line for line in writer.freeze_lines()), '',
-                        'def thaw_fields(frozen):', *('    ' + line for line in writer.thaw_lines(cls)), ''])
-    exec(compile(source, '<copier of %s>' % cls.__name__, 'exec'), writer.scope)
-    return writer.scope['freeze_fields'], writer.scope['thaw_fields'], source
+    # The wire canonizes the times that are the message's own, not those of its header or of other messages in it.
+    canon = [f'message.{name}.canon()' for name, type_name in _fields(cls) if type_name in ('time', 'duration')]
+    freeze, build = list(writer.freeze_lines()), list(writer.thaw_lines(cls))
+    source = '\n'.join([
+        'def freeze_fields(message):', *_indented(freeze), '',
+        'def thaw_fields(frozen):', *_indented(build), '    return message', '',
+        # each of these again with all of it in one function: a message that comes alone meets cold caches
+        'def freeze(message):', '    if type(message) is cls:', '        try:', *_indented(_indented(_indented(freeze))),
+        '        except Exception:', '            pass', '    return serialized(message)', '',
+        'def thaw(frozen):', '    if type(frozen) is bytes: return cls().deserialize(frozen)',
+        *_indented([*build, *canon]), '    return message', ''])
+    scope = {**writer.scope, 'cls': cls, 'serialized': serialized}
+    exec(compile(source, '<copier of %s>' % cls.__name__, 'exec'), scope)
+    return Copier(scope['freeze'], scope['thaw'], scope['freeze_fields'], scope['thaw_fields'], source)
+
+
+def _indented(lines):
+    return ['    ' + line for line in lines]
 
 
 def _fields(cls):
@@ -296,4 +287,3 @@ class _Writer:
             yield f'{", ".join(self._values)}, = frozen'
         yield f'message = new({self._refer(cls)})'
         yield from self._builds
-        yield 'return message'

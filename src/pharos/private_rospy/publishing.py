@@ -41,58 +41,62 @@ def mend_publisher(module):
             self._inline = list({inbox.dispatcher for inbox in inboxes if inbox.inline})
     publisher.refresh = refresh
 
-    def publish(self, message, connection_override=None, by=None, to=None, latch=None):
-        """rospy's, under the publisher's lock; ``release`` then runs the delegates that are inline.
+    def publish(self, message, connection_override=None, by=None, to=None):
+        """rospy calls this with the publisher's lock, an OutputChannel without, since each frame costs.
 
-        :param by: whose message it is, for the latch
+        :param by: the channel whose message it is, None: a rospy Publisher's
         :param to: name of the only node that is to get it, None: all
-        :param latch: whether it is latched; None: as rospy's Publisher said
         """
-        if self.closed:
+        lock = self.publock
+        if lock is None or self.closed:
             return write(self, message)    # says so
-        inboxes, remote = self._inboxes, self._remote
-        if connection_override is not None:
-            link = getattr(connection_override, 'link', None)
-            inboxes, remote = (list(link.inboxes.values()), ()) if link else ((), [connection_override])
-        elif to is not None:
-            inboxes = [inbox for inbox in inboxes if inbox.channel.node.name == to]
-            remote = [connection for connection in remote if connection.endpoint_id == to]
-        latch = self.is_latch if latch is None else latch
-        if not (inboxes or remote or latch):
-            return False
-        self.seq += 1
-        if getattr(message.__class__, '_has_header', False):
-            message.header.seq = self.seq
-            if message.header.frame_id is None:
-                message.header.frame_id = '0'
-        if inboxes or latch:
-            try:
-                frozen = self._copier.freeze(message)
-            except struct.error as error:
-                raise module.ROSSerializationException(error) from error
-        data = self._serialized(message, self.seq) if remote else None
-        if latch:
-            self._latched[by] = frozen
-            if self._early is not None:
-                self._early.add(frozen)
-        for inbox in inboxes:
-            inbox.put(message if inbox.shared else frozen)
-        woken = None
-        for dispatcher in self._dispatchers:
-            if dispatcher.idle:
-                dispatcher.wake()
-                woken = dispatcher
-        if woken is not None:
-            last, self._last = self._last, _clock()
-            if self._last - last > BURST:
-                woken.give_way()
-        if remote:
-            self._write(data, remote)
+        with lock:
+            inboxes, remote = self._inboxes, self._remote
+            if connection_override is not None:
+                link = getattr(connection_override, 'link', None)
+                inboxes, remote = (list(link.inboxes.values()), ()) if link else ((), [connection_override])
+            elif to is not None:
+                inboxes = [inbox for inbox in inboxes if inbox.channel.node.name == to]
+                remote = [connection for connection in remote if connection.endpoint_id == to]
+            latch = self.is_latch if by is None else by.latch
+            if not (inboxes or remote or latch):
+                return False
+            self.seq += 1
+            if getattr(message.__class__, '_has_header', False):
+                message.header.seq = self.seq
+                if message.header.frame_id is None:
+                    message.header.frame_id = '0'
+            if inboxes or latch:
+                try:
+                    frozen = self._copier.freeze(message)
+                except struct.error as error:
+                    raise module.ROSSerializationException(error) from error
+            data = self._serialized(message, self.seq) if remote else None
+            if latch:
+                self._latched[by] = frozen
+                if self._early is not None:
+                    self._early.add(frozen)
+            for inbox in inboxes:
+                inbox.put(message if inbox.shared else frozen)
+            woken = None
+            for dispatcher in self._dispatchers:
+                if dispatcher.idle:
+                    dispatcher.wake()
+                    woken = dispatcher
+            if woken is not None:
+                last, self._last = self._last, _clock()
+                if self._last - last > BURST:
+                    woken.give_way()
+            if remote:
+                self._write(data, remote)
+        if by is not None:
+            for dispatcher in self._inline:
+                dispatcher.run()
         return True
     publisher.publish = publish
 
     def release(self):
-        """Called after every publish; a delegate that is inline runs without the lock, which others may wait for."""
+        """rospy calls this after publish; a delegate that is inline runs without the lock, which others may wait for."""
         if self.publock is not None:
             self.publock.release()
         for dispatcher in self._inline:
@@ -204,22 +208,6 @@ class _EarlyLines:
 
     def __bool__(self):
         return bool(self._lines) and time.monotonic() < self._until
-
-
-def sender(endpoint, channel):
-    """The way of a channel's messages: ``send(message, to=None)`` for a rospy Publisher."""
-    publisher, latch = endpoint.impl, channel.latch
-
-    def send(message, to=None):
-        lock = publisher.publock
-        if lock is None:
-            publisher.publish(message)    # says that it is closed
-            return
-        with lock:
-            publisher.publish(message, None, channel, to, latch)
-        for dispatcher in publisher._inline:
-            dispatcher.run()
-    return send
 
 
 def forget_latch(endpoint, channel):

@@ -53,7 +53,7 @@ class Wiring:
         endpoint.unregister()
 
     def advertise(self, channel, **options):
-        """rospy's Publisher for an OutputChannel, and its ``send``; subscribers in this process are told at once.
+        """rospy's Publisher for an OutputChannel, and its way; subscribers in this process are told at once.
 
         rosmaster tells them in steps of 0.1 s.
         """
@@ -61,7 +61,7 @@ class Wiring:
         for other in self._neighbours():
             if other.subscriber(channel.topic):
                 other.connect(channel.topic, self._instance.uri)
-        return endpoint, publishing.sender(endpoint, channel)
+        return endpoint, endpoint.impl.publish
 
     def unadvertise(self, channel, endpoint):
         """End what :meth:`advertise` began."""
