@@ -13,6 +13,10 @@ from pharos.errors import MessageTypeError
 from pharos.known_types import near
 
 
+# Raises where the value of a field of this type would not serialize, and is quick.
+_WRITERS = {'string': str.encode, **{base: struct.Struct('<' + code).pack for base, code in SIMPLE_TYPES_DICT.items()}}
+
+
 def describe_fields(cls):
     """Return the fields of a message class as a text, for example ``'linear: float32, angular: float32'``."""
     return ', '.join('%s: %s' % field for field in _fields(cls)) or 'no fields'
@@ -67,7 +71,7 @@ def explain(error, message):
 def _fields(cls):
     if issubclass(cls, genpy.TVal):
         return [(name, 'uint32' if issubclass(cls, genpy.Time) else 'int32') for name in ('secs', 'nsecs')]
-    return list(zip(cls.__slots__, getattr(cls, '_slot_types', ())))  # rospy.AnyMsg has no _slot_types
+    return zip(cls.__slots__, getattr(cls, '_slot_types', ()))  # rospy.AnyMsg has no _slot_types
 
 
 def _nested_class(cls, type_):
@@ -91,9 +95,13 @@ def _fill(message, fields, path):
     for name, value in fields.items():
         if name not in field_types:
             raise _no_field(type(message), path, name)
-        field_type, field_path = field_types[name], f'{path}.{name}'
-        value = _from_dicts(type(message), field_type, value, field_path, getattr(message, name))
-        _check_value(type(message), field_type, value, field_path)
+        field_type = field_types[name]
+        try:
+            _WRITERS[field_type](value)
+        except Exception:  # it is no single number or string, or does not fit
+            field_path = f'{path}.{name}'
+            value = _from_dicts(type(message), field_type, value, field_path, getattr(message, name))
+            _check_value(type(message), field_type, value, field_path)
         setattr(message, name, value)
     return message
 

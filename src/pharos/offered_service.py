@@ -16,6 +16,7 @@ class OfferedService:
         self.service_class = message_types.service_class(typed_as)
         if block is None:
             raise TypeError('%s needs a block that answers, called as service block(request)' % name)
+        self._check = services.checker(self.service_class._response_class)
         self.block = check_block(block, 'service block', ('request',))
         if any(other.name == name for other in node._services):
             raise PharosError('%s offers %s already: close that one first' % (node.name, name))
@@ -41,8 +42,10 @@ class OfferedService:
         """The response that the block meant: itself, its fields, or its only field."""
         response = self.service_class._response_class
         if isinstance(value, genpy.Message) and value._type == response._type:
-            if not services.serializes(value):
-                message_types.check_fits(value)    # tells what of it does not
+            try:
+                self._check(value)
+            except Exception:
+                message_types.check_fits(value)    # tells what of it does not fit
             return value
         if isinstance(value, dict):
             return message_types.fill(response(), value)

@@ -1,4 +1,5 @@
 """Services of any node, called by name alone."""
+import contextlib
 import socket
 import time
 
@@ -40,8 +41,7 @@ class Service:
         self.md5sum = self._found_md5sum = header.get('md5sum')
 
     def _look_up(self, deadline):
-        """Find the provider, which may have moved; returns whether it has."""
-        before = self.uri
+        """Find the provider, which may have moved; returns its URI."""
         timeout = TIMEOUT if deadline is None else min(TIMEOUT, max(0.001, deadline - time.monotonic()))
         with self.master._reached():
             try:
@@ -49,16 +49,17 @@ class Service:
             except rosgraph.MasterError:
                 raise UnknownServiceError('no node of %s offers the service %s%s: see rosservice list' % (
                     self.master.url, self.name, self.master.near(self.name, self.master.services()))) from None
-        return self.uri != before
+        return self.uri
 
-    def _ask(self):
+    def _ask(self, deadline=None):
         """The provider's own description of the service: the header that it answers a probe with.
 
         As ``rosservice.get_service_headers`` asks for it, which hides why there is none, and waits for ever for a
         provider that sends a byte every four seconds.
         """
+        limit = time.monotonic() + TIMEOUT
         try:
-            connection = self._connect(time.monotonic() + TIMEOUT, probe='1', md5sum='*')
+            connection = self._connect(limit if deadline is None else min(limit, deadline), probe='1', md5sum='*')
         except OSError as error:
             raise ServiceCallError('the provider of %s at %s does not answer (%s): is it still running? '
                                    'rosnode cleanup removes it if not' % (self.name, self.uri, error)) from error
@@ -92,27 +93,40 @@ class Service:
         """
         deadline = None if timeout is None else time.monotonic() + timeout
         self.response = None
-        request = message_types.build(self.service_class._request_class, check_block(block, 'block', ('request',)), fields)
+        if block is not None:
+            check_block(block, 'block', ('request',))
+        request = message_types.build(self.service_class._request_class, block, fields)
         self._calls += 1
         services.number(request, self._calls)
         try:
-            try:
-                self.response = self._exchange(request, deadline)
-            except (ConnectionRefusedError, _NotShakenHands) as error:
-                if not self._look_up(deadline):
-                    raise self._refused(error) from error
-                self.response = self._exchange(request, deadline)
+            self.response = response = self._exchange(request, deadline)
         except services.Failed as error:
-            raise ServiceCallError('%s failed: %s' % (self.name, error)) from error.__cause__
+            raise ServiceCallError('%s failed: %s' % (self.name, error)) from None
         except socket.timeout as error:
             raise ServiceCallError('%s did not answer in time (%s s): is its provider at %s busy? Call it with a longer '
                                    'timeout=' % (self.name, timeout, self.uri)) from error
-        except (OSError, _NotShakenHands, genpy.DeserializationError) as error:
+        except (OSError, genpy.DeserializationError) as error:
             raise ServiceCallError('the connection to %s at %s broke (%s): is its provider still running?'
                                    % (self.name, self.uri, error)) from error
-        return self.response
+        return response    # not self.response, which is another thread's by now
 
     def _exchange(self, request, deadline):
+        """Send the request to the provider, and where that has gone, to where it is now; returns the response."""
+        uri = self.uri
+        try:
+            return self._send(request, deadline)
+        except ConnectionRefusedError:
+            if self._look_up(deadline) == uri:
+                raise
+        except _NotShakenHands as error:
+            if self._look_up(deadline) == uri:
+                raise self._refused(error, deadline) from error
+        try:
+            return self._send(request, deadline)
+        except _NotShakenHands as error:
+            raise self._refused(error, deadline) from error
+
+    def _send(self, request, deadline):
         """Send the request to where the provider is thought to be; returns the response."""
         here = self._here
         if here is None or not here.is_offered(self.uri):
@@ -137,7 +151,7 @@ class Service:
         else:
             connection.close()
         if not ok:
-            raise services.Failed(answer.decode(errors='replace'))
+            raise services.Failed(answer.decode(errors='replace') or 'its provider gives no reason')    # roscpp has none
         response = self.service_class._response_class().deserialize(answer)
         response._connection_header = connection.header
         return response
@@ -154,9 +168,9 @@ class Service:
 
     def _connection(self, deadline):
         """An idle connection that lives, or a new one."""
-        while self._idle:
-            connection = self._idle.pop()
-            if connection.is_alive():
+        header = self._header()
+        for connection in self._take_idle():
+            if connection.sent == header and connection.is_alive():    # not made with an md5sum that was set meanwhile
                 return connection
             connection.close()
         connection = self._connect(deadline)
@@ -165,17 +179,20 @@ class Service:
             raise _NotShakenHands(connection.header['error'])
         return connection
 
+    def _take_idle(self):
+        with contextlib.suppress(IndexError):    # another thread has taken the last one
+            while True:
+                yield self._idle.pop()
+
     def _connect(self, deadline, **fields):
         return TcprosConnection(rospy.parse_rosrpc_uri(self.uri), {**self._header(), **fields}, deadline)
 
-    def _refused(self, error):
+    def _refused(self, error, deadline):
         """The error of a provider that refuses, by what it says of itself now.
 
         The report: the "error message provides all information about the service including the md5sum".
         """
-        if isinstance(error, OSError):
-            return error
-        header = self._ask()
+        header = self._ask(deadline)
         type_, md5sum, sent = header.get('type'), header.get('md5sum'), self._md5sum_sent
         if sent == md5sum:
             return ServiceCallError('the provider of %s at %s refused the call: %s' % (self.name, self.uri, error))
@@ -194,8 +211,8 @@ class Service:
 
     def close(self):
         """Close the connections of a persistent service; a later call opens them again."""
-        while self._idle:
-            self._idle.pop().close()
+        for connection in self._take_idle():
+            connection.close()
 
     def __repr__(self):
         return '<Service %s %s at %s>' % (self.name, self.type, self.uri)

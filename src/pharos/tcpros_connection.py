@@ -9,6 +9,8 @@ import time
 
 import rosgraph.network
 
+from pharos.private_rospy.lifetime import keep_alive
+
 _HEADER_LIMIT = 1 << 22    # bytes of a connection header; it holds a message definition
 _LIMIT = 1 << 30           # bytes of a response; a length beyond is a broken stream
 
@@ -17,17 +19,19 @@ class TcprosConnection:
     """A connection that is shaken hands on: :attr:`header` is the peer's answer, with 'error' where it refuses.
 
     :param address: (host, port)
-    :param header: ours
+    :param header: ours, kept as :attr:`sent`
     :param deadline: by ``time.monotonic()``, for the whole handshake; None: no limit
     :raises OSError: if there is no answer, or none that can be read (socket.timeout: not in time)
     """
 
     def __init__(self, address, header, deadline):
+        self.sent = header
         self._deadline = deadline
         self._received = bytearray()
         self._socket = socket.create_connection(address, self._left())
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            keep_alive(self._socket, while_sending=True)    # an answer may take any time, while its host is there
             rosgraph.network.write_ros_handshake_header(self._socket, header)
             size = self._read(4)
             self.header = rosgraph.network.decode_ros_handshake_header(size + self._read_sized(size, _HEADER_LIMIT))
@@ -55,7 +59,12 @@ class TcprosConnection:
     def _read(self, size):
         while len(self._received) < size:
             self._socket.settimeout(self._left())
-            data = self._socket.recv(min(1 << 20, max(4096, size - len(self._received))))
+            try:
+                data = self._socket.recv(min(1 << 20, max(4096, size - len(self._received))))
+            except TimeoutError as error:
+                if error.errno is None:    # our time limit
+                    raise
+                raise ConnectionError('its host has gone: %s' % error.strerror) from error
             if not data:
                 raise ConnectionError('closed after %d of %d bytes' % (len(self._received), size))
             self._received += data

@@ -7,6 +7,10 @@ import weakref
 # A signal that the kernel gives to another thread does not end the main thread's wait, in which Python would handle it.
 SIGNAL_LATENCY = 0.2  # seconds that such a wait lasts at the most
 JOIN_TIMEOUT = 2.0    # seconds that a thread is waited for
+# A peer that vanishes says nothing: TCP notices that it is gone where it is asked to, here within half a minute.
+KEEPALIVE_IDLE = 10       # seconds of silence after which the peer's host is asked whether it is there
+KEEPALIVE_INTERVAL = 5    # seconds between two such questions
+KEEPALIVE_COUNT = 4       # of them without an answer, and the connection is broken
 
 
 class Lifetime:
@@ -51,7 +55,8 @@ class Lifetime:
                 seconds = until - time.monotonic()
 
     def hold(self, sock):
-        """Shut this socket down at the end, at the latest."""
+        """Shut this accepted socket down at the end, at the latest."""
+        keep_alive(sock)    # rospy waits for ever for a service's client, or in vain for a subscriber's leaving
         self._sockets.add(sock)
 
     def end(self, given_up=()):
@@ -66,6 +71,24 @@ class Lifetime:
             if thread.ident is not None:    # None: it is only just being started, and will see that all has ended
                 thread.join(max(0.0, deadline - time.monotonic()))
         return [thread for thread in threads if thread.is_alive()]
+
+
+def keep_alive(sock, while_sending=False):
+    """Have the connection break when its peer has silently gone, as with a cable pulled out.
+
+    :param while_sending: also where something is under way to the peer, which TCP else goes on sending for a quarter of
+        an hour; not for publishers, since a peer that stops reading is then taken for one that has gone
+    """
+    try:
+        if while_sending:
+            limit = KEEPALIVE_IDLE + KEEPALIVE_INTERVAL * KEEPALIVE_COUNT
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 1000 * limit)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, KEEPALIVE_IDLE)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, KEEPALIVE_INTERVAL)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, KEEPALIVE_COUNT)
+    except OSError:
+        pass    # closed already
 
 
 def shut(sock):

@@ -98,13 +98,9 @@ def serialize(request):
     return copier.serialized(request)
 
 
-def serializes(message):
-    """Whether ``message.serialize()`` would raise nothing; cheaper than trying."""
-    try:
-        copier.copier_for(type(message)).freeze(message)
-    except Exception:
-        return False
-    return True
+def checker(cls):
+    """The function that raises what ``serialize()`` of a message of that class would raise; cheaper than that."""
+    return copier.copier_for(cls).freeze
 
 
 def number(message, seq):
@@ -152,7 +148,7 @@ class Workers:
         jobs.put((job, outcome))
 
     def _work(self, jobs):
-        while True:
+        while not self._closed:
             job, outcome = self._next(jobs)
             if job is None or self._closed:
                 return
