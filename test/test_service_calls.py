@@ -749,3 +749,22 @@ def test_a_master_that_is_away_is_told_when_it_is_needed():
     node.stop()
     with pytest.raises(pharos.MasterUnreachableError):
         service.call(load_namespace='bob', timeout=TIMEOUT)
+
+
+# -- a service of ours, called by a C++ program -------------------------------------------------------------------------
+
+@pytest.mark.parametrize('topic, status, said', [('front', 0, 'switched from back to front'), ('broken', 1, 'failed')])
+def test_a_roscpp_client_calls_a_service_of_ours(master, topic, status, said):
+    """topic_tools's switch_mux is a C++ program."""
+    message_types.define_service(*MUX_TYPES['select'])
+
+    def select(request):
+        if request.topic == 'broken':
+            raise ValueError('no such input')
+        return 'back'
+    node = create(master, '/plays_mux')
+    node.serve('/calls/ours_select', 'topic_tools/MuxSelect', select)
+    with master.run('topic_tools', 'switch_mux', '/calls/ours', topic) as client:
+        assert client.wait(TIMEOUT) == status, client.output
+        assert said in client.output
+    assert [str(error) for error in node.errors] == ['no such input'] * status

@@ -37,10 +37,11 @@ def seek(kind, type_, must=True):
     if not must:
         return None
     package, _, name = type_.partition('/')
+    define = 'define_message' if kind == 'msg' else 'pharos.message_types.define_service'
     raise UnknownTypeError(
         f'unknown {_KINDS[kind]} type {type_!r}{_near_types(kind, type_)}: Python has no {package}.{kind}.{name}, '
         f'there is no {package}/{kind}/{name}.{kind} on ROS_PACKAGE_PATH ({os.pathsep.join(rospkg.get_ros_paths())}), '
-        f'and no definition was given; install the package {package} or call define_{_KINDS[kind]}({type_!r}, text)')
+        f'and no definition was given; install the package {package} or call {define}({type_!r}, text)')
 
 
 def _found_before(kind, type_):

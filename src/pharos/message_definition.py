@@ -102,7 +102,7 @@ def _parse(kind, type_, text, context):
     try:
         return parse(text, context)
     except Exception as error:  # genmsg does not say where: the first line that cannot stand alone, if there is one
-        reason = error
+        reason = str(error)[:200]
         for number, line in enumerate(text.split('\n'), 1):
             try:
                 parse(line, genmsg.MsgContext())

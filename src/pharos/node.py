@@ -4,6 +4,7 @@ import traceback
 
 from pharos.blocks import check_block, check_delegate, check_soul, name_of
 from pharos.errors import NodeStoppedError, PharosError
+from pharos.health import health_of
 from pharos.life import Life
 from pharos.offered_service import OfferedService
 from pharos.parameter import Parameter
@@ -116,21 +117,19 @@ class Node(Life):
         :param wait: without ``typed_as``, seconds to wait until somebody has given the topic a type
         :raises UnknownTopicError, UnknownTypeError, MessageTypeError: if there is no type, or another
         """
-        topic = self._topic(topic)
-        if wait and typed_as is None:
-            topic.wait_for_type(wait, self._rospy.ended)
-        return topic.input_channel(self, typed_as, delegate, queue_size, inline, shared, from_)
+        return self._topic(topic).input_channel(self, typed_as, delegate, queue_size, inline, shared, from_, wait)
 
-    def output_channel(self, topic, typed_as=None, latch=False, queue_size=QUEUE_SIZE):
+    def output_channel(self, topic, typed_as=None, latch=False, queue_size=QUEUE_SIZE, wait=0):
         """Publish on a topic from now on; returns the :class:`OutputChannel`.
 
         :param typed_as: type name or message class; None: the master's type for the topic
         :param latch: send the last message to those who become interested later
         :param queue_size: messages kept for each slow receiver; the oldest are dropped
+        :param wait: as in :meth:`interested_in`
         """
-        return self._topic(topic).output_channel(self, typed_as, latch, queue_size)
+        return self._topic(topic).output_channel(self, typed_as, latch, queue_size, wait=wait)
 
-    def send_to(self, topic, block=None, *, typed_as=None, to=None, connect_timeout=None, **fields):
+    def send_to(self, topic, block=None, *, typed_as=None, to=None, connect_timeout=None, wait=0, **fields):
         """Send one message, filled by ``block(message)``, by keywords, or both; returns it.
 
         The report (listing 3.1)::
@@ -142,7 +141,7 @@ class Node(Life):
         seconds (None: the node's), so that it is not lost.
 
         :param to: send it to that node alone: a name, Node or ExternalNode
-
+        :param wait: as in :meth:`interested_in`
         :raises MessageTypeError: if a field does not exist or does not fit
         :raises UnknownTopicError, UnknownTypeError: if there is no type
         """
@@ -152,7 +151,7 @@ class Node(Life):
         channel = next((channel for channel in self.channels if channel.topic == topic.name
                         and hasattr(channel, 'publish')), None)
         if channel is None:
-            channel = topic.output_channel(self, typed_as, connect_timeout=connect_timeout)
+            channel = topic.output_channel(self, typed_as, connect_timeout=connect_timeout, wait=wait)
         elif typed_as is not None:
             topic.message_class(self, typed_as)    # refuses another type
         return channel.send(block, to=to, **fields)
@@ -231,9 +230,16 @@ class Node(Life):
         """The address that the node advertises, None before the first start."""
         return self._rospy and self._rospy.domain
 
+    def health(self):
+        """How the node is doing: ``registered, reachable_since, connections, dropped, errors, threads``, a named tuple.
+
+        Asks the master, for up to 5 s; ``str()`` of it is one line, which ``repr(node)`` shows too.
+        """
+        return health_of(self, ask=True)
+
     def __repr__(self):
-        return '<%s %s %s, %d channels%s>' % (type(self).__name__, self.name, self._lifecycle.value, len(self.channels),
-                                              ', %d errors' % len(self.errors) if self.errors else '')
+        return '<%s %s %s, %d channels: %s>' % (type(self).__name__, self.name, self._lifecycle.value,
+                                                len(self.channels), health_of(self, ask=False))
 
 
 class BlockNode(Node):

@@ -5,7 +5,7 @@ import rosgraph
 
 from pharos import graph_types, message_types
 from pharos.channel import InputChannel, OutputChannel
-from pharos.errors import MessageTypeError, UnknownTopicError, UnknownTypeError
+from pharos.errors import MessageTypeError, NodeStoppedError, UnknownTopicError, UnknownTypeError
 
 POLL = 0.05          # seconds between two looks at the master's types
 QUEUE_SIZE = 1000    # messages kept for a slow receiver, where nothing else is said
@@ -29,15 +29,15 @@ class Topic:
         :raises UnknownTopicError: if the master knows no such topic, or nobody has given its type yet
         """
         types = dict(self.master.topic_types())
-        name = types.get(self.name)
-        if name is None:
-            raise UnknownTopicError('no node of %s publishes or subscribes to %s%s: name its type with typed_as=, or '
-                                    'start the other node first'
-                                    % (self.master.url, self.name, self.master.near(self.name, types)))
-        if name == rosgraph.names.ANYTYPE:
-            raise UnknownTopicError('the type of %s is not known yet, for only subscribers of any type are there: '
-                                    'name it with typed_as=' % self.name)
-        return name
+        name = types.get(self.name, rosgraph.names.ANYTYPE)
+        if name != rosgraph.names.ANYTYPE:
+            return name
+        if self.publishers or self.subscribers:    # rosmaster does not list these
+            raise UnknownTopicError('the type of %s is not known yet, for only nodes of any type are there: name it '
+                                    'with typed_as=, or start the other node first' % self.name)
+        raise UnknownTopicError('no node of %s publishes or subscribes to %s%s: name its type with typed_as=, or start '
+                                'the other node first'
+                                % (self.master.url, self.name, self.master.near(self.name, types)))
 
     @property
     def publishers(self):
@@ -55,24 +55,28 @@ class Topic:
         return [channel for node in self.master.own_nodes() for channel in node.channels if channel.topic == self.name]
 
     def input_channel(self, node, typed_as=None, delegate=None, queue_size=QUEUE_SIZE, inline=False, shared=False,
-                      from_=None):
+                      from_=None, wait=0):
         """A new :class:`~pharos.InputChannel` of ``node``; see :meth:`Node.interested_in`."""
-        return InputChannel(node, self.name, self.message_class(node, typed_as), delegate=delegate,
+        return InputChannel(node, self.name, self.message_class(node, typed_as, wait), delegate=delegate,
                             queue_size=queue_size, inline=inline, shared=shared, from_=from_)
 
-    def output_channel(self, node, typed_as=None, latch=False, queue_size=QUEUE_SIZE, connect_timeout=None):
+    def output_channel(self, node, typed_as=None, latch=False, queue_size=QUEUE_SIZE, connect_timeout=None, wait=0):
         """A new :class:`~pharos.OutputChannel` of ``node``; see :meth:`Node.output_channel`."""
-        return OutputChannel(node, self.name, self.message_class(node, typed_as), latch=latch, queue_size=queue_size,
-                             connect_timeout=connect_timeout)
+        return OutputChannel(node, self.name, self.message_class(node, typed_as, wait), latch=latch,
+                             queue_size=queue_size, connect_timeout=connect_timeout)
 
-    def message_class(self, node, typed_as=None):
+    def message_class(self, node, typed_as=None, wait=0):
         """The message class of the topic for ``node``: ``typed_as``, else what the node knows, else the master's.
 
+        :param wait: seconds to wait until somebody has given it a type, and its definition where it is not known here
         :raises MessageTypeError: if the node uses the topic with another type already
+        :raises NodeStoppedError: if the node stops meanwhile
         """
         known = next((channel.message_class for channel in node.channels if channel.topic == self.name), None)
+        if known and typed_as in (None, known._type):
+            return known
         if typed_as is None:
-            return known or self._class_of(self.type)
+            return self._class_in_time(node, time.monotonic() + wait)
         asked = self._class_of(typed_as)
         if known and asked._md5sum != known._md5sum:
             raise MessageTypeError('%s uses %s with the type %s already and cannot use it as %s too: close that '
@@ -86,14 +90,16 @@ class Topic:
         except UnknownTypeError:
             return graph_types.class_from_publishers(self, type_or_class) or message_types.message_class(type_or_class)
 
-    def wait_for_type(self, timeout, ended):
-        """Wait until somebody has given the topic a type, for up to ``timeout`` seconds or until ``ended`` is set."""
-        deadline = time.monotonic() + timeout
-        while time.monotonic() < deadline and not ended.is_set():
+    def _class_in_time(self, node, deadline):
+        """The class of the master's type, which may come until the deadline."""
+        while True:
             try:
-                return self.type
-            except UnknownTopicError:
-                ended.wait(POLL)    # a master tells nobody of new types
+                return self._class_of(self.type)
+            except (UnknownTopicError, UnknownTypeError):    # only subscribers are there
+                if time.monotonic() >= deadline:
+                    raise
+            if node._rospy.ended.wait(POLL):    # a master tells nobody of new types
+                raise NodeStoppedError('%s stopped while it waited for the type of %s' % (node.name, self.name))
 
     def __eq__(self, other):
         return isinstance(other, Topic) and (self.master.url, self.name) == (other.master.url, other.name)

@@ -43,6 +43,8 @@ class Watcher:
         with self._changed:
             needed = self._is_needed()
             if needed and self._thread is None:
+                if self._master.own_nodes():
+                    self.reachable_since = time.time()    # one has just registered
                 self._thread = threading.Thread(target=self._run, name='watcher of %s' % self._master.url, daemon=True)
                 self._thread.start()
             elif self._waiting or not needed:

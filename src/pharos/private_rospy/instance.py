@@ -208,6 +208,11 @@ class PrivateRospy:
         """A warning in the node's log."""
         self.rospy.logwarn('%s', text)
 
+    @property
+    def thread_count(self):
+        """How many threads the node has."""
+        return sum(thread.is_alive() for thread in list(self._lifetime.threads))
+
     def owns(self, thread):
         """Whether the thread is one of this node's."""
         return thread in self._lifetime.threads

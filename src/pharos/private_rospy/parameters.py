@@ -1,6 +1,9 @@
 """Parameters that a node watches, through the master's paramUpdate calls."""
+import contextlib
 import threading
 import xmlrpc.client
+
+import rosgraph
 
 from pharos.private_rospy.proxies import ServerProxy, master_api
 from pharos.private_rospy.registration import COMMUNICATION_ERRORS, UNREGISTER_TIMEOUT
@@ -13,8 +16,10 @@ class WatchedParameters:
         self._instance = instance
         self._listeners = {}      # global name -> [function(value)]
         self._initialized = {}    # global name -> its first value
-        self._subscribed = set()  # global names of which the master tells, also those that rospy itself asked for
-        self._lock = threading.Lock()
+        self._subscribed = set()  # of those listened to, the outermost: of what is in them, the master tells for each
+        self._cached = set()      # global names of which rospy itself has the master tell
+        self._lock = threading.Lock()           # guards _listeners
+        self._subscribing = threading.Lock()    # guards _subscribed
 
     def hooks(self):
         """The load hooks."""
@@ -33,9 +38,10 @@ class WatchedParameters:
             set_ = module.ParamServerCache.set
 
             def set(self_, key, value):
-                self._subscribed.add(key)
+                self._cached.add(key)
                 set_(self_, key, value)
             module.ParamServerCache.set = set
+            self._cache = module.get_param_server_cache
         return {'rospy.impl.masterslave': tell_listeners, 'rospy.impl.paramserver': note_subscriptions}
 
     def initialize(self, name, value):
@@ -60,8 +66,17 @@ class WatchedParameters:
         self._subscribe(name)
 
     def _subscribe(self, name):
-        self._subscribed.add(name)
-        self._master().subscribeParam(self._instance.uri, name)
+        master, uri = self._master(), self._instance.uri
+        with self._subscribing:
+            if any(_holds(other, name) for other in self._subscribed):
+                return
+            master.subscribeParam(uri, name)
+            within = [other for other in self._subscribed if _holds(name, other)]
+            self._subscribed.difference_update(within)
+            self._subscribed.add(name)
+            for other in within:
+                if other not in self._cached:
+                    master.unsubscribeParam(uri, other)
 
     def _set_where_missing(self, name, value):
         master = self._master()
@@ -78,32 +93,42 @@ class WatchedParameters:
             self._instance.rospy.set_param('~' + name, value)
         for name, value in dict(self._initialized).items():
             self._set_where_missing(name, value)
+        for name in list(self._cached):
+            with contextlib.suppress(KeyError):
+                self._cache().delete(name)    # rospy subscribes anew when it is asked for it
+        with self._subscribing:
+            self._subscribed.clear()
         with self._lock:
-            watched = list(self._listeners)
+            watched = sorted(self._listeners)    # namespaces before what is in them
         for name in watched:
             self._subscribe(name)
 
     def tell_of_own(self, key, value):
-        """The node itself has set a parameter: a master tells all but the one who sets, of what it holds, too."""
-        self._tell(key, value)
-        for name, listeners in self._listeners_where(lambda name: name.startswith(key + '/')):
-            _call(listeners, self._value(name))
+        """The node itself has set a parameter, of which a master tells all but the one who sets."""
+        with self._subscribing:
+            told_by_master = isinstance(value, dict) and not any(_holds(name, key) for name in self._subscribed)
+        self._tell(key, value, not told_by_master)    # those subscribed to a part of a dict are told, whoever sets it
 
-    def _tell(self, key, value):
-        """Tell the listeners of a parameter, and of the namespaces around it; returns whether there are any."""
+    def _tell(self, key, value, within=True):
+        """Tell the listeners of a parameter, and of what is around and ``within`` it; returns whether there are any."""
         key = '/' + key.strip('/')
-        told = self._listeners_where(lambda name: name == key or key.startswith(name.rstrip('/') + '/'))
+        with self._lock:
+            told = [(name, list(listeners)) for name, listeners in self._listeners.items()
+                    if _holds(name, key) or within and _holds(key, name)]
         for name, listeners in told:
-            _call(listeners, value if name == key else self._value(name))    # a part of it was set: they get the whole
+            new = value if name == key else self._value(name)
+            for listener in listeners:
+                listener(new)
         return bool(told)
 
     def close(self):
         """Watch no longer: a master keeps the name of a node that does."""
-        if not self._subscribed:
+        subscribed = self._subscribed | self._cached
+        if not subscribed:
             return
         instance = self._instance
         calls = xmlrpc.client.MultiCall(ServerProxy(instance.settings.master_url, UNREGISTER_TIMEOUT))
-        for name in list(self._subscribed):
+        for name in subscribed:
             calls.unsubscribeParam(instance.name, instance.uri, name)
         try:
             calls()
@@ -111,14 +136,13 @@ class WatchedParameters:
             instance.rospy.logdebug('cannot tell the master %s that no parameter is watched any more: %s',
                                     instance.settings.master_url, error)
 
-    def _listeners_where(self, condition):
-        with self._lock:
-            return [(name, list(listeners)) for name, listeners in self._listeners.items() if condition(name)]
-
     def _value(self, name):
-        return self._instance.rospy.get_param(name, None)
+        try:
+            return self._master().getParam(name)    # rospy would remap the name once more
+        except rosgraph.MasterError:
+            return None
 
 
-def _call(listeners, value):
-    for listener in listeners:
-        listener(value)
+def _holds(namespace, name):
+    """Whether ``name`` is the namespace or in it."""
+    return (name + '/').startswith(namespace.rstrip('/') + '/')
