@@ -1,6 +1,4 @@
 """What ends or silences a rospy node does not end or silence this one."""
-import socket
-import struct
 import subprocess
 import sys
 import threading
@@ -112,56 +110,6 @@ def test_there_is_one_watcher_per_master_and_none_without_a_node(master):
     for node in nodes:
         node.stop()
     until(lambda: watchers() == 0)
-
-
-# -- bad clients ------------------------------------------------------------------------------------------------------
-
-def connect(port):
-    return socket.create_connection(('127.0.0.1', port), TIMEOUT)
-
-
-def test_silent_slow_and_huge_clients_keep_nobody_from_connecting(master, mailbox):
-    """With rospy, one silent client blocks all that come after it (ros_comm PR #1918)."""
-    sender = create(master, '/sender')
-    sent = sender.output_channel('/t', 'std_msgs/String')
-    clients = [connect(port) for port in (sender.tcp_port, sender.xmlrpc_port) for _ in range(100)]
-    for client in clients[:100:2]:
-        client.sendall(struct.pack('<I', 0xffffffff))
-    node = create(master, '/receiver')
-    node.ros.Subscriber('/t', sent.message_class, lambda message: mailbox(message, None))    # through TCPROS
-    assert sent.wait_for_subscribers(1, TIMEOUT)
-    sent.send(data='through')
-    assert mailbox.get().data == 'through'
-    for client in clients:
-        client.close()
-
-
-@pytest.mark.parametrize('bytes_sent, said', [
-    (struct.pack('<I', 0xffffffff), '4294967299 bytes; the limit is'),
-    (b'GET / HTTP/1.0\r\n\r\n', 'the limit is'),
-    (struct.pack('<I', 4) + struct.pack('<I', 0), '0-length'),
-    (struct.pack('<I', 7) + struct.pack('<I', 3) + b'abc', 'Invalid line'),
-    (b'\x01\x02', 'closed within the handshake'),
-])
-def test_a_bad_handshake_is_refused_and_logged_once(master, bytes_sent, said):
-    lines = Mailbox()
-    node = create(master, '/node')
-    create(master, '/auditor', delegate=lines).interested_in('/rosout', 'rosgraph_msgs/Log')
-    with connect(node.tcp_port) as client:
-        client.sendall(bytes_sent)
-        client.shutdown(socket.SHUT_WR)
-        assert client.recv(1) == b''    # the node closes
-    line = lines.get()
-    assert said in line.msg and 'Traceback' not in line.msg
-    assert lines.empty() and node.is_running
-
-
-def test_a_slow_handshake_ends_after_its_limit(master, monkeypatch):
-    monkeypatch.setattr(pharos.private_rospy.servers, 'HANDSHAKE_TIMEOUT', 0.2)
-    node = create(master, '/node')
-    with connect(node.tcp_port) as client:
-        client.settimeout(TIMEOUT)
-        assert client.recv(1) == b''
 
 
 # -- peers that die ---------------------------------------------------------------------------------------------------

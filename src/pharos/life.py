@@ -26,6 +26,7 @@ class Life:
     """What a :class:`~pharos.Node` does to live; its blocks, channels and services are there."""
 
     connect_timeout = 2.0    #: seconds that a topic's first message waits for the subscribers the master knows
+    allow_remote_shutdown = False    #: whether any host may ask it to stop, not only this one and the master's
     stop_timeout = 2.0       #: seconds that :meth:`stop` waits for souls, and for messages under way
 
     def _configure(self, master, settings):
@@ -54,7 +55,7 @@ class Life:
             before, self._lifecycle = self._lifecycle, Lifecycle.STARTING
         with running.signals_deferred():
             try:
-                instance = PrivateRospy(self._settings, self._asked_to_stop)
+                instance = PrivateRospy(self._settings, self._asked_to_stop, lambda: self.allow_remote_shutdown)
                 instance.start(self.connect_timeout)
             except BaseException:
                 self._become(before)

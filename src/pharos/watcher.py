@@ -37,6 +37,7 @@ class Watcher:
         self._seen = frozenset(), 0              # the graph at the last look that was answered, and which one it was
         self._thread = None
         self.reachable_since = None              # by time.time(); None while the master does not answer
+        self._is_away = False                    # whether it did not answer the last look
 
     def check(self):
         """Somebody came to watch for, or went: see to it that the thread is there just as long as it is needed."""
@@ -120,12 +121,13 @@ class Watcher:
         try:
             state = self._master.system_state()
         except MasterUnreachableError:
-            self.reachable_since = None
+            self.reachable_since, self._is_away = None, True
             return None
+        was_away, self._is_away = self._is_away, False
         if self.reachable_since is None:
             self.reachable_since = time.time()
         for node in nodes:
-            node._rospy.repair(state)
+            node._rospy.repair(state, was_away)
         return _graph(state)
 
 

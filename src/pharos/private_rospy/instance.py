@@ -32,12 +32,13 @@ class PrivateRospy:
     :param settings: the :class:`~.settings.Settings` of the node
     :param on_stop_request: called as ``on_stop_request(reason)``, in a thread of its own, when ROS or a user of
         ``rospy.signal_shutdown`` asks the node to stop
+    :param allows_remote_shutdown: ``allows_remote_shutdown()``: whether any host may ask for that
     """
 
-    def __init__(self, settings, on_stop_request):
+    def __init__(self, settings, on_stop_request, allows_remote_shutdown):
         self.settings = settings
         self.name = settings.name
-        self._on_stop_request = on_stop_request
+        self._on_stop_request, self.allows_remote_shutdown = on_stop_request, allows_remote_shutdown
         self._lifetime = Lifetime(self.name)
         self._stopping = threading.Lock()
         self.on_received = lambda: None    # called after the callbacks of a batch of messages, in its thread
@@ -55,7 +56,8 @@ class PrivateRospy:
         hooks = collections.defaultdict(list)
         for part in ({'rospy.service': _share_service_exception, 'rospy.impl.init': self._poll_quickly,
                       'rospy.core': self._shut_down_early},
-                     servers.hooks(lifetime), registration.hooks(self), pubsub.hooks(self), self.parameters.hooks()):
+                     logs.hooks(), servers.hooks(lifetime, self.warn), registration.hooks(self), pubsub.hooks(self),
+                     self.parameters.hooks()):
             for name, hook in part.items():
                 hooks[name].append(hook)
         modules = PrivateImports(hooks=hooks, substitutes={
@@ -124,8 +126,6 @@ class PrivateRospy:
         except BaseException:
             self.stop(0)
             raise
-        self.uri = core.get_node_uri()
-        self.wiring.open()
         self.xmlrpc_port = self._lifetime.xmlrpc.port
         self.domain = self._modules.load('rosgraph.network').get_host_name()
         core.add_preshutdown_hook(self.request_stop)    # rospy.signal_shutdown called by the node's own code
@@ -171,14 +171,14 @@ class PrivateRospy:
             with changed:
                 changed.notify_all()
 
-    def repair(self, state):
+    def repair(self, state, was_away):
         """Register with the master what it has forgotten; see :func:`.registration.repair`. Raises nothing."""
         handler = self._lifetime.xmlrpc.handler
         if handler is None or self.ended.is_set():
             return
         try:
             services = self._modules.load('rospy.impl.registration').get_service_manager()
-            if registration.repair(self, handler, self._topic_manager(), services, state):
+            if registration.repair(self, handler, self._topic_manager(), services, state, was_away):
                 self.rospy.logwarn('the master %s had forgotten this node: registered again', self.settings.master_url)
                 self.parameters.put_back()
         except (rosgraph.MasterException, *registration.COMMUNICATION_ERRORS) as error:

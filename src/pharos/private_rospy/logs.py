@@ -10,6 +10,10 @@ import logging.handlers
 import types
 import weakref
 
+from pharos.private_rospy.loader import Substitute
+
+_MESSAGE = '\0'    # where the message goes in a line of the screen
+
 
 def private_logging():
     """A module that looks like ``logging`` and shares nothing with it but its classes and functions."""
@@ -36,6 +40,30 @@ def private_logging():
     # fileConfig clears these two lists, the process's own if they were shared
     module._handlers, module._handlerList = weakref.WeakValueDictionary(), []
     return module
+
+
+def hooks():
+    """The load hooks of this module."""
+
+    def mend_screen(module):
+        """rosgraph.roslogging: '${time:' in a message is an error, as is a closed screen, of whoever logs."""
+        handler, formatter = module.RosStreamHandler, module._defaultFormatter
+        module._defaultFormatter = Substitute(formatter, format=lambda record: _MESSAGE)
+        emit, write = handler.emit, handler._write
+
+        def emit_what_can_be(self, record):
+            self._message = formatter.format(record)
+            try:
+                emit(self, record)
+            except (OSError, ValueError):
+                pass    # nobody is there to read it
+        handler.emit = emit_what_can_be
+
+        def write_message(self, file, line, color):
+            write(self, file, line.replace(_MESSAGE, self._message), color)
+        handler._write = write_message
+
+    return {'rosgraph.roslogging': mend_screen}
 
 
 def close_handlers(module):

@@ -2,10 +2,13 @@
 import threading
 import time
 
+from pharos.private_rospy import registration
 from pharos.private_rospy.intraprocess import protocol_handler
+from pharos.private_rospy.lifetime import keep_alive
 from pharos.private_rospy.publishing import mend_publisher
 
 RECONNECT_DELAY = 0.05    # seconds; a publisher that accepts and closes at once is not to be stormed
+CONNECT_TIMEOUT = 10.0    # seconds that one attempt may take
 
 
 def hooks(instance):
@@ -27,6 +30,44 @@ def hooks(instance):
             init(self, *args)
             self.protocol_handlers.insert(0, protocol_handler(instance))
         handler.__init__ = __init__
+
+        def _ready(self, uri):
+            """Who hears of the node from the master, as soon as it registers, is to find it here."""
+            instance.uri = uri
+            instance.wiring.open()
+            ready(self, uri)
+        ready, handler._ready = handler._ready, _ready
+
+    def notice_silence(module):
+        """rospy.impl.tcpros_base: takes 150 s to notice that a peer has gone, and cannot connect without the master."""
+        transport, is_wanted = module.TCPROSTransport, module._is_use_tcp_keepalive
+        connect = transport.connect
+
+        def is_keepalive_wanted():
+            try:
+                return is_wanted()    # asks the master for the parameter /tcp_keepalive, once
+            except registration.COMMUNICATION_ERRORS:
+                return True
+        module._is_use_tcp_keepalive = is_keepalive_wanted
+
+        def connect_kept_alive(self, *address, timeout=None):
+            connect(self, *address, timeout=timeout)
+            sock = self.socket    # None: closed meanwhile
+            if sock is not None and is_keepalive_wanted():
+                keep_alive(sock)
+        transport.connect = connect_kept_alive
+
+    def connect_once(module):
+        """rospy.impl.tcpros_pubsub: after a failure, rospy gives up silently, or waits for what it never connected."""
+
+        def connect(connection, host, port, uri, receive, topic):
+            try:
+                connection.connect(host, port, uri, timeout=CONNECT_TIMEOUT)
+            except module.rospy.exceptions.TransportInitError:
+                connection.close()    # remove_connection then sees to the next attempt
+            else:
+                connection.receive_loop(receive)
+        module.robust_connect_subscriber = connect
 
     def know_what_is_under_way(module):
         """rospy.impl.tcpros_pubsub: a queue knows nothing of the messages it has taken out and not yet sent."""
@@ -65,8 +106,12 @@ def hooks(instance):
             self._idle.wait(max(0.0, timeout))
         queued.flush = flush
 
+    def mend_tcpros(module):
+        connect_once(module)
+        know_what_is_under_way(module)
+
     return {'rospy.topics': mend_topics, 'rospy.impl.masterslave': offer_intraprocess,
-            'rospy.impl.tcpros_pubsub': know_what_is_under_way}
+            'rospy.impl.tcpros_base': notice_silence, 'rospy.impl.tcpros_pubsub': mend_tcpros}
 
 
 def _close_pollers(topic):
@@ -82,6 +127,7 @@ def _close_pollers(topic):
 def _mend_subscriber(subscriber, instance):
     """rospy.topics._SubscriberImpl."""
     receive, remove, add = subscriber.receive_callback, subscriber.remove_connection, subscriber.add_callback
+    subscriber.publishers = ()    # URIs, as the master last said
 
     def receive_callback(self, messages, connection):
         """Channels only queue in their callbacks, so that of a batch the newest are kept; delegates run then."""
@@ -90,10 +136,19 @@ def _mend_subscriber(subscriber, instance):
     subscriber.receive_callback = receive_callback
 
     def remove_connection(self, connection):
-        """rospy lets a link that broke go, though its publisher may be there, or there again under its old URI."""
+        """rospy lets a link that broke go, though its publisher may be there, or there again under its old URI.
+
+        A link that was lost for long never came back (ros_comm #851).
+        """
         remove(self, connection)
-        if connection.header and not self.closed:    # without a header, it never was a link
-            instance.start_thread(_reconnect, (instance, self, connection.endpoint_id), 'reconnect')
+        if self.closed:
+            return
+        if connection.header:
+            delay = None if 'error' in connection.header else RECONNECT_DELAY
+        else:
+            delay = registration.RETRY_DELAY if connection.dest_address else None
+        if delay is not None:    # None: the publisher refused, or may not be talked to, and so it stays
+            instance.start_thread(_reconnect, (instance, self, connection.endpoint_id, delay), 'reconnect')
     subscriber.remove_connection = remove_connection
 
     def add_callback(self, callback, arguments):
@@ -106,8 +161,8 @@ def _mend_subscriber(subscriber, instance):
     subscriber.add_callback = add_callback
 
 
-def _reconnect(instance, subscriber, uri):
-    if not instance.ended.wait(RECONNECT_DELAY) and not subscriber.closed:
+def _reconnect(instance, subscriber, uri, delay):
+    if not instance.ended.wait(delay) and not subscriber.closed:
         instance.connect(subscriber.resolved_name, uri)
 
 

@@ -1,16 +1,21 @@
 """How a node registers with the master and hears from it."""
 import http.client
 import threading
+import time
 import xml.parsers.expat
 import xmlrpc.client
 
 import rosgraph
 
 from pharos.errors import NodeNameInUseError
+from pharos.private_rospy.loader import Substitute
 from pharos.private_rospy.proxies import ServerProxy, master_api
+from pharos.private_rospy.xmlrpc_server import is_call_from_nearby
 
 PING_TIMEOUT = 1.0          # seconds in which a running node answers getPid
 UNREGISTER_TIMEOUT = 2.0    # seconds that a stop waits for the master
+PUBLISHER_LIMIT = 1000      # publishers of a topic that a call may name; a thread tries to reach each of them
+RETRY_DELAY = 2.0           # seconds between attempts to reach a publisher, for as long as the master knows it
 # the last where something answers that does not speak XML-RPC
 COMMUNICATION_ERRORS = (OSError, xmlrpc.client.Error, http.client.HTTPException, xml.parsers.expat.ExpatError)
 
@@ -23,6 +28,7 @@ def hooks(instance):
         handler = module.ROSHandler
         connect, lock = handler._connect_topic, threading.Lock()
         connecting = {}    # (topic, URI) -> whether it was asked for again meanwhile
+        attempt = instance.wiring.connecting
 
         def _connect_topic(self, topic, uri):
             """rospy looks for a connection long before it adds one, and so may connect twice to one publisher."""
@@ -35,8 +41,10 @@ def hooks(instance):
             while again:
                 answer = 0, 'failed', 0
                 try:
-                    instance.wiring.connecting.topic = topic
+                    attempt.topic, attempt.uri = topic, uri
                     answer = connect(self, topic, uri)
+                except _NotWanted as error:
+                    answer = 0, str(error), 0
                 except UnboundLocalError:    # rospy's, where it never asked or gave up because the node stops
                     answer = 0, '%s stops' % self.name, 0
                 finally:
@@ -49,11 +57,33 @@ def hooks(instance):
             return answer
         handler._connect_topic = _connect_topic
 
+        def wait_for_next_attempt(_):
+            """rospy asks a publisher that is out of reach ever more rarely, and never stops."""
+            instance.ended.wait(RETRY_DELAY)
+            subscriber = instance.subscriber(attempt.topic)
+            if instance.ended.is_set() or subscriber is None:
+                raise _NotWanted('nobody is interested in %s any more' % attempt.topic)
+            if attempt.uri not in subscriber.publishers:
+                raise _NotWanted('the master knows no publisher of %s at %s' % (attempt.topic, attempt.uri))
+        module.time = Substitute(time, sleep=wait_for_next_attempt)
+
+        @module.apivalidate(-1, (module.is_topic('topic'), module.is_publishers_list('publishers')))
+        def publisherUpdate(self, caller_id, topic, publishers):
+            """rospy passes the list on once for each publisher in it, and so does not hear that there is none."""
+            if len(publishers) > PUBLISHER_LIMIT:
+                return -1, '%d publishers; the limit is %d' % (len(publishers), PUBLISHER_LIMIT), 0
+            if self.reg_man:
+                self.reg_man.publisher_update(topic, publishers)
+            return 1, '', 0
+        handler.publisherUpdate = publisherUpdate
+
         @module.apivalidate(0, (None,))
         def shutdown(self, caller_id, msg=''):
-            if 'new node registered with same name' in str(msg) and not _name_is_anothers(self):
-                # the master meant an earlier owner of this URI (ros_comm #2241)
-                return 1, 'the name %s is still this node\'s' % self.name, 0
+            if 'new node registered with same name' in str(msg):    # the master knows, whoever says so
+                if not _name_is_anothers(self):    # it meant an earlier owner of this URI (ros_comm #2241)
+                    return 1, 'the name %s is still this node\'s' % self.name, 0
+            elif not (instance.allows_remote_shutdown() or is_call_from_nearby(self.masterUri)):
+                return -1, 'only this host and the master\'s may stop it, unless its allow_remote_shutdown is set', 0
             instance.request_stop('%s asked for it: %s' % (caller_id, msg))
             return 1, 'shutdown', 0
         handler.shutdown = shutdown
@@ -75,6 +105,13 @@ def hooks(instance):
             elif kind == 'sub':
                 self.publisher_update(name, value)
         manager.reg_added = reg_added
+
+        def publisher_update(self, topic, uris):
+            subscriber = instance.subscriber(topic)
+            if subscriber is not None:
+                subscriber.publishers = uris
+            update(self, topic, uris)
+        update, manager.publisher_update = manager.publisher_update, publisher_update
 
         def cleanup(self, reason):
             """rospy's version trips over a time-out and then closes nothing."""
@@ -100,6 +137,10 @@ def hooks(instance):
         manager.cleanup = cleanup
 
     return {'rospy.impl.masterslave': obey_only_the_master_of_the_name, 'rospy.impl.registration': register_once}
+
+
+class _NotWanted(Exception):
+    """A publisher that is out of reach need not be reached any more."""
 
 
 def _name_is_anothers(handler):
@@ -144,19 +185,21 @@ def _unregister_all(master, name, uri):
             master.unregisterService(service, master.lookupService(service))
 
 
-def repair(instance, handler, topics, services, state):
+def repair(instance, handler, topics, services, state, was_away):
     """Register again what the master has forgotten of a node: a restarted one knows nothing, another a part.
 
     :param state: ``(publishers, subscribers, services)`` of the master, each ``{name: [node names]}``
+    :param was_away: whether the master was out of reach: what it had to say of publishers then is asked for again
     :returns: whether it had forgotten the node altogether
     """
     name, uri, master = instance.name, instance.uri, master_api(instance.settings.master_url, instance.name)
     kinds = [(topics.get_publications, state[0], master.registerPublisher, master.unregisterPublisher),
              (topics.get_subscriptions, state[1], master.registerSubscriber, master.unregisterSubscriber)]
-    forgotten = not any(name in nodes for kind in state for nodes in kind.values())
+    # every node offers this from its start on; a channel may have been opened with a restarted master already
+    forgotten = name not in state[2].get(instance.rospy.resolve_name('~get_loggers'), ())
     for ours, theirs, register, unregister in kinds:
         for topic, type_ in ours():
-            if name not in theirs.get(topic, ()):
+            if name not in theirs.get(topic, ()) or was_away and ours == topics.get_subscriptions:
                 publishers = register(topic, type_, uri)
                 if instance.ended.is_set() or topic not in dict(ours()):
                     unregister(topic, uri)    # closed while we registered it

@@ -1,59 +1,25 @@
 """A node's two servers, XML-RPC and TCPROS: bound where errors can be raised, safe from bad clients, really closed."""
+import io
+import socket
 import struct
 import time
 
+from pharos.private_rospy import xmlrpc_server
+from pharos.private_rospy.door import Door, brief
+from pharos.private_rospy.host import rospy
 from pharos.private_rospy.lifetime import shut
 
-HANDSHAKE_TIMEOUT = 5.0          # seconds for the whole handshake, however slowly it comes
-HANDSHAKE_LIMIT = 1 << 20        # bytes of a connection header; real ones hold a message definition
-REQUEST_TIMEOUT = 30.0           # seconds that an XML-RPC client may be silent
-REQUEST_LIMIT = 8 << 20          # bytes of an XML-RPC request
-BACKLOG = 128                    # connections waiting to be accepted
+HANDSHAKE_TIMEOUT = 5.0       # seconds for the whole handshake, however slowly it comes
+HANDSHAKE_LIMIT = 1 << 20     # bytes of a connection header; real ones hold a message definition
+NAME_LIMIT = 1000             # characters of a name in it
+MESSAGE_LIMIT = 1000000000    # bytes of a message; roscpp's limit
+
+_NAMES = {'callerid', 'topic', 'service', 'type', 'md5sum'}    # the fields of a header that are shown to others
+_CLIENT_GONE = rospy.exceptions.TransportTerminated, ConnectionResetError
 
 
-def hooks(lifetime):
-    """The load hooks of this module, for a node of that lifetime."""
-
-    def limit_requests(module):
-        """rosgraph.xmlrpc: a request may be silent or huge for ever, and runs in a thread that nobody knows."""
-        handler, server, node = module.SilenceableXMLRPCRequestHandler, module.ThreadingXMLRPCServer, module.XmlRpcNode
-        handler.timeout = REQUEST_TIMEOUT
-        handler.wbufsize = -1                       # one segment per answer, and no waiting for its
-        handler.disable_nagle_algorithm = True      # acknowledgement: 40 ms a call otherwise
-        do_post = handler.do_POST
-
-        def post(self):
-            if int(self.headers.get('content-length', 0)) > REQUEST_LIMIT:
-                self.close_connection = True
-                self.send_error(413)
-            else:
-                do_post(self)
-        handler.do_POST = post
-
-        def process_request(self, request, address):
-            lifetime.hold(request)
-            lifetime.start_thread(self.process_request_thread, (request, address), 'xmlrpc')
-        server.process_request = process_request
-
-        def start(self):
-            """Bind here, in the caller's thread, where an error can be raised; rosgraph prints it in another."""
-            lifetime.xmlrpc = self
-            self._run_init()
-            self.accepting = lifetime.start_thread(self.server.serve_forever, (None,), 'xmlrpc-accept')
-        node.start = start
-
-        def shutdown(self, reason):
-            """rosgraph only closes the socket, on which serve_forever then spins (ros_comm #2238)."""
-            self.is_shutdown = True
-            server, handler, self.server, self.handler = self.server, self.handler, None, None
-            if handler:
-                handler._shutdown(reason)
-            if server:
-                server._BaseServer__shutdown_request = True
-                shut(server.socket)      # wakes serve_forever, which then sees the request
-                self.accepting.join()    # closed any earlier, the socket could not wake it any more
-                server.server_close()
-        node.shutdown = shutdown
+def hooks(lifetime, warn):
+    """The load hooks of the two servers, for a node of that lifetime; ``warn(text)`` writes to its log."""
 
     def limit_handshake(module):
         """rosgraph.network: a peer that is silent, slow or announces 4 GiB is listened to for ever."""
@@ -70,67 +36,142 @@ def hooks(lifetime):
                     if not received:
                         raise module.ROSHandshakeException('connection closed within the handshake')
                     buffer.write(received)
-                    data = buffer.getvalue()
-                    if len(data) < 4:
+                    if buffer.tell() < 4:
                         continue
-                    length = 4 + struct.unpack_from('<I', data)[0]
+                    length = 4 + struct.unpack_from('<I', buffer.getbuffer())[0]
                     if length > HANDSHAKE_LIMIT:
                         raise module.ROSHandshakeException('a handshake of %d bytes; the limit is %d'
                                                            % (length, HANDSHAKE_LIMIT))
-                    if len(data) >= length:
-                        buffer.seek(0)
-                        buffer.truncate()
-                        buffer.write(data[length:])    # the first message may have come along
-                        return module.decode_ros_handshake_header(data)
+                    if buffer.tell() >= length:
+                        break
+            except socket.timeout:
+                raise module.ROSHandshakeException('no handshake within %g s' % HANDSHAKE_TIMEOUT) from None
             finally:
                 try:
                     sock.settimeout(None)
                 except OSError:
                     pass    # closed meanwhile
+            data = buffer.getvalue()
+            buffer.seek(0)
+            buffer.truncate()
+            buffer.write(data[length:])    # the first message may have come along
+            header = module.decode_ros_handshake_header(data[:length])
+            for field in _NAMES & header.keys():
+                if len(header[field]) > NAME_LIMIT or not header[field].isprintable():
+                    raise module.ROSHandshakeException('%s can be no %s' % (brief(header[field], 60), field))
+            return header
         module.read_ros_handshake_header = read_ros_handshake_header
 
-    def accept_in_threads(module):
-        """rospy.impl.tcpros_base: one silent client keeps all others from connecting (ros_comm PR #1918)."""
-        server, tcp = module.TCPROSServer, module.TCPServer
-        handshake, create = server._tcp_server_callback, tcp._create_server_sock
-
-        def handshake_in_thread(self, sock, address):
-            lifetime.hold(sock)
-            lifetime.start_thread(handshake, (self, sock, address), 'handshake')
-        server._tcp_server_callback = handshake_in_thread
-
-        def create_server_sock(self):
-            sock = create(self)
-            sock.listen(BACKLOG)
-            return sock
-        tcp._create_server_sock = create_server_sock
-
-        def shutdown(self):
-            """close() alone does not wake accept(), and the port stays taken."""
-            if not self.is_shutdown:
-                self.is_shutdown = True
-                shut(self.server_sock)
-                self.server_sock.close()
-        tcp.shutdown = shutdown
-
-    def end_with_the_node(module):
-        """rospy.impl.tcpros_base: a persistent service connection loops for ever once the node is shut down."""
-        transport = module.TCPROSTransport
-        receive = transport.receive_once
-
-        def receive_once(self):
-            messages = receive(self)
-            if not messages and module.is_shutdown():
-                raise module.TransportTerminated('the node stops')
-            return messages
-        transport.receive_once = receive_once
-
     def mend_connections(module):
-        accept_in_threads(module)
-        end_with_the_node(module)
+        """rospy.impl.tcpros_base."""
+        _accept_at_a_door(module, Door('TCPROS', lifetime, warn))
+        _end_bad_connections(module, warn)
+        # where it writes tracebacks, a line of the log says what is wrong
+        module.rospyerr = module.rospydebug
 
-    return {'rosgraph.xmlrpc': limit_requests, 'rosgraph.network': limit_handshake,
-            'rospy.impl.tcpros_base': mend_connections}
+    def tell_no_tracebacks(module):
+        """rospy.msg: it writes one for each message that it cannot read, whoever sent it."""
+        module.logging.getLogger('rospy.msg').setLevel(module.logging.CRITICAL)
+
+    def expect_requests(module):
+        """rospy.impl.tcpros_service: a client that asks nothing is waited for, and one that asks nonsense kept."""
+        door, service = Door('service', lifetime, warn), module.ServiceImpl
+        tell = service.error_handler
+
+        def error_handler(self, error, *information):
+            if not isinstance(error, _CLIENT_GONE):    # that it did not wait for its answer is no error of ours
+                tell(self, error, *information)
+        service.error_handler = error_handler
+
+        def handle(self, transport, header):
+            sock, persistent = transport.socket, header.get('persistent', '').lower() in ('1', 'true')
+            try:
+                address = sock.getpeername()
+                again = header.get('probe') != '1'
+                while again:
+                    if not persistent:    # a client that is may say nothing for long
+                        door.expect(sock)
+                    received = transport.receive_once()
+                    door.heard(sock)
+                    for request in received:
+                        self._handle_request(transport, request)
+                    again = persistent
+            except _Unreadable as error:
+                door.complain(address, error)
+            except rospy.exceptions.TransportTerminated as error:
+                door.refuse(sock, address, error)    # a persistent one is not expected, and may go
+            except OSError:
+                pass    # it has gone
+            finally:
+                door.heard(sock)
+                transport.close()
+        service.handle = handle
+
+    return {'rosgraph.network': limit_handshake, 'rospy.impl.tcpros_base': mend_connections,
+            'rospy.msg': tell_no_tracebacks, 'rospy.impl.tcpros_service': expect_requests,
+            **xmlrpc_server.hooks(lifetime, warn)}
+
+
+def _accept_at_a_door(module, door):
+    """rospy.impl.tcpros_base: one silent client keeps all others from connecting (ros_comm PR #1918)."""
+    server, tcp = module.TCPROSServer, module.TCPServer
+    tcp.run = lambda self: door.accept(self.server_sock, self.inbound_handler)
+
+    def shutdown(self):
+        """close() alone does not wake accept(), and the port stays taken."""
+        if not self.is_shutdown:
+            self.is_shutdown = True
+            shut(self.server_sock)
+            self.server_sock.close()
+    tcp.shutdown = shutdown
+
+    def shake_hands(self, sock, address):
+        """rospy's logs tracebacks, and not whose fault it is."""
+        header = module.read_ros_handshake_header(sock, io.BytesIO(), 4096)
+        if 'topic' in header:
+            refusal = self.topic_connection_handler(sock, address, header)
+        elif 'service' in header:
+            refusal = self.service_connection_handler(sock, address, header)
+        else:
+            refusal = 'no topic or service name detected'
+        if refusal:
+            if module.is_shutdown():
+                refusal = 'node shutting down'
+            module.write_ros_handshake_header(sock, {'error': str(refusal)})
+            raise module.TransportInitError('%s (%s)' % (refusal, header.get('callerid', 'no caller id')))
+    server._tcp_server_callback = shake_hands
+
+
+def _end_bad_connections(module, warn):
+    """rospy.impl.tcpros_base: a stream that cannot be read is read on, and announcements of 4 GiB are believed."""
+    transport, protocol = module.TCPROSTransport, module.TCPROSTransportProtocol
+    receive, read = transport.receive_once, protocol.read_messages
+
+    def read_messages(self, buffer, queue, sock):
+        size, = struct.unpack_from('<I', buffer.getbuffer())
+        if size > MESSAGE_LIMIT:
+            raise module.TransportException('a message of %d bytes; the limit is %d' % (size, MESSAGE_LIMIT))
+        read(self, buffer, queue, sock)
+    protocol.read_messages = read_messages
+
+    def receive_once(self):
+        """A connection ends with the node, too: rospy's loop of a persistent service connection never does."""
+        try:
+            messages = receive(self)
+        except module.TransportTerminated:
+            raise
+        except module.TransportException as error:
+            if self.dest_address and not self.done and not module.is_shutdown():    # we are the client
+                warn('connection with %s for %s closed: %s' % (self.endpoint_id, self.name, brief(error)))
+            raise _Unreadable(str(error)) from None
+        if not messages and module.is_shutdown():
+            raise module.TransportTerminated('the node stops')
+        return messages
+    transport.receive_once = receive_once
+
+
+class _Unreadable(rospy.exceptions.TransportTerminated):
+    """What came cannot be read, so that nothing that comes after it can be."""
 
 
 def listen(tcpros_base, port):
