@@ -32,6 +32,7 @@ def nothing_left(master):
 
 @pytest.mark.parametrize('which', ['tcp_port', 'xmlrpc_port'])
 def test_a_busy_port(master, busy_port, nothing_left, which):
+    """rospy says 'init_node interrupted', or prints the error and registers a node that is deaf (ros_comm #127)."""
     with pytest.raises(pharos.PortInUseError, match='%s %d cannot be bound .*: choose another' % (which, busy_port)):
         create(master, **{which: busy_port})
 

@@ -220,6 +220,7 @@ def publishing_roscpp(master, request, tmp_path):
 @pytest.mark.parametrize('publishing', [publishing_rospy_peer, publishing_files_peer, publishing_rosbag_play,
                                         publishing_roscpp])
 def test_a_type_that_is_nowhere_here_is_received_with_all_fields_right(master, request, tmp_path, mailbox, publishing):
+    """rospy subscribes with a class alone, which must be there; only its tools take the type from the publisher."""
     with publishing(master, request, tmp_path) as topic:
         channel = create(master, '/receiver', delegate=mailbox).interested_in(topic, wait=TIMEOUT)
         message = mailbox.get()

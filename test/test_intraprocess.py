@@ -164,7 +164,7 @@ def test_a_type_made_at_run_time_is_received(master):
 
 
 def test_a_latched_message_reaches_those_who_come_late_as_it_was(master):
-    """By value: ros_comm #1481."""
+    """By value; rospy keeps the object, and later changes of it show (ros_comm #1481)."""
     node = create(master, '/sender')
     channel = node.output_channel('/t', 'std_msgs/Header', latch=True)
     message = channel.message_class(frame_id='as it was')

@@ -138,6 +138,7 @@ def rounds(ros_master):
 
 
 def test_fifty_rounds_of_stop_and_start_leave_nothing(rounds):
+    """Always on the same ports; rospy's TCPROS port still listens after a shutdown, and cannot be bound again."""
     assert rounds['counts'][-1] == rounds['counts'][1]
     assert rounds['counts'][-1]['registrations'] == 0
 

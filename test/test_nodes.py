@@ -25,6 +25,7 @@ def run(*command):
 
 
 def test_ten_nodes_of_one_process_are_ten_ros_nodes(master):
+    """rospy refuses a second init_node (ros_comm #185, #214)."""
     names = ['/ten/n%d' % i for i in range(10)]
     nodes = [create(master, name) for name in names]
     assert set(names) <= set(run('rosnode', 'list').split())
@@ -45,6 +46,7 @@ def test_a_message_goes_from_node_to_node(master, mailbox):
 
 
 def test_the_first_message_to_an_external_node_is_not_lost(master):
+    """In one call, its type found. rospy has no such call (ros_comm #1377), and loses 3 of 3 (#176, #286)."""
     with subprocess.Popen([sys.executable, '-c', RECEIVE_ONE, '/first'], stdout=subprocess.PIPE, text=True) as echo:
         wait_for_subscriber(master, '/first')
         create(master, '/sender').send_to('/first', data='not lost')
@@ -84,6 +86,7 @@ def test_a_roscpp_relay_passes_messages_between_two_nodes(master, mailbox):
 
 
 def test_a_node_starts_again_under_the_same_name_and_ports(master, mailbox):
+    """rospy's stays shut down, and its TCPROS port taken (ros_comm #185, #214)."""
     node = create(master, '/phoenix', delegate=mailbox)
     node.interested_in('/ashes', 'std_msgs/String')
     ports = node.tcp_port, node.xmlrpc_port
@@ -152,7 +155,7 @@ def test_rosnode_kill_stops_that_node_and_no_other(master):
 
 
 def test_a_shutdown_meant_for_an_earlier_owner_of_the_uri_does_not_reach_a_node(master):
-    """ros_comm #2241: the master tells the old URI of a name to shut down, where another node lives by now."""
+    """The master tells the old URI of a name to shut down, and a rospy node there by now does so (ros_comm #2241)."""
     node = create(master, '/heir')
     code, reason, _ = pharos.private_rospy.proxies.ServerProxy(node.uri).shutdown(
         '/master', '[/old] Reason: new node registered with same name')
@@ -208,6 +211,7 @@ def test_a_soul_that_ignores_the_stop_is_named_and_left_behind(master, capfd):
 
 
 def test_an_exception_in_a_delegate_ends_only_that_run(master, transcript, mailbox):
+    """rospy logs it, and nothing in the program is told."""
     def delegate(message, channel):
         if message.data == 'bad':
             raise ValueError('this one is bad')
@@ -272,6 +276,7 @@ def test_every_and_sleep_follow_simulated_time(master):
 
 
 def test_delegates_of_a_node_run_one_at_a_time(master, mailbox):
+    """rospy's callbacks run in as many threads as there are connections (ros_comm #1377)."""
     busy = threading.Lock()
     overlaps = []
 

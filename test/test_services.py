@@ -362,6 +362,7 @@ def descriptors():
 
 
 def test_a_provider_that_never_answers_is_given_up(master, silent):
+    """A call of rospy's has no time limit, and lasts for ever (ros_comm #152)."""
     service = master.lookup_service('/silent/spawn')
     assert silent.callers_gone()
     silent._taken.clear()

@@ -5,6 +5,7 @@ import sys
 import pytest
 
 from pharos import BlockNode
+from sockets import listening
 
 
 def create(master, name, **kwargs):
@@ -52,12 +53,11 @@ def test_the_process_keeps_its_arguments_and_environment(master):
 
 
 def test_a_loopback_domain_listens_on_loopback_alone(master):
+    """rospy listens on all interfaces unless the whole process is told otherwise (ros_comm #315)."""
+    before = listening()
     node = create(master, '/local', domain='127.0.0.2')
     assert node.domain == '127.0.0.2' and node.uri == 'http://127.0.0.2:%d/' % node.xmlrpc_port
-    with open('/proc/self/net/tcp', encoding='ascii') as table:
-        listening = {line.split()[1] for line in table if line.split()[3] == '0A'}
-    for port in node.tcp_port, node.xmlrpc_port:
-        assert {address for address in listening if address.endswith(':%04X' % port)} == {'0200007F:%04X' % port}
+    assert listening() - before == {('127.0.0.2', node.tcp_port), ('127.0.0.2', node.xmlrpc_port)}
 
 
 def test_parameters_of_the_server_have_the_nodes_names(master):

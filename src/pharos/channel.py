@@ -7,7 +7,7 @@ import genpy
 
 from pharos import message_types
 from pharos.blocks import check_delegate
-from pharos.dispatcher import Inbox
+from pharos.dispatcher import Inbox, SocketInbox
 from pharos.errors import MessageTypeError, NodeStoppedError
 from pharos.private_rospy.publishing import wait_until
 
@@ -82,11 +82,11 @@ class InputChannel(_Channel):
         dispatcher = self.node._dispatcher
         if not self.inline:
             dispatcher.need_thread()
-        self._tcpros = self._add_inbox(Inbox(self, dispatcher, inline=True))
+        self._tcpros = self._add_inbox(SocketInbox(self, dispatcher))
         # rospy's queue_size would drop without counting; the inbox has ours
         self._endpoint = self.node._rospy.wiring.subscribe(self, tcp_nodelay=True, buff_size=BUFFER_SIZE)
         self.node._remember_channel(self)
-        dispatcher.run()    # what came latched
+        dispatcher.received()    # what came latched
 
     def _unregister(self, endpoint):
         self.node._rospy.wiring.unsubscribe(self, endpoint)
@@ -199,7 +199,9 @@ class OutputChannel(_Channel):
 
         rospy loses what is published before (ros_comm #176, #286).
         """
-        missing = set(self.node.master.topic(self.topic).subscribers)
+        missing = self.node._rospy.wiring.known_subscribers(self.topic)
+        if missing is None:    # not always: a large graph's state takes long to read
+            missing = set(self.node.master.topic(self.topic).subscribers)
 
         def connected():
             missing.difference_update(name for name, _ in self.connections)

@@ -1,8 +1,9 @@
 """Runs the delegates of one node, one at a time, and hands messages to it quickly.
 
-A node's delegates run in one of two threads: in the thread that brings the message (a TCPROS connection's, or the
-publisher's where a channel is inline), or in the node's dispatcher thread. Nobody ever waits for a busy node: what comes
-meanwhile waits in its inbox for whoever is running the node. So no wiring deadlocks or recurses.
+A node's delegates run in one of two threads: in the thread that brings the message (a TCPROS connection's, where the
+delegate is quick, or the publisher's where a channel is inline), or in the node's dispatcher thread. Nobody ever waits
+for a busy node: what comes meanwhile waits in its inbox for whoever is running the node. So no wiring deadlocks or
+recurses.
 """
 import _thread
 import collections
@@ -11,6 +12,7 @@ import time
 
 BURST = 100e-6    # seconds; a publisher that comes again within them does not give way to the receiver
 GIVE_WAY = 1e-3   # seconds that a publisher at the most gives way, until the dispatcher thread has woken up
+QUICK = 1e-3      # seconds; a delegate that takes longer is not run by a thread that has a socket to read
 
 
 class Inbox:
@@ -84,8 +86,30 @@ class Inbox:
             node._report(error, block, 'delegate', channel)
 
 
+class SocketInbox(Inbox):
+    """The messages that come to one channel through TCPROS.
+
+    As long as the delegate is quick, the thread that reads the socket runs it, for waking another one takes longer. But
+    while it runs a slow one it does not read, and what that gets next has waited longest in the socket, for all that
+    the queue is short (ros_comm #536, #1901). So slow delegates are the dispatcher thread's, and those not known yet.
+    """
+
+    __slots__ = ()
+
+    def __init__(self, channel, dispatcher):
+        super().__init__(channel, dispatcher, channel.inline)
+
+    def run_next(self):
+        taken, begin = self.taken, time.perf_counter()
+        super().run_next()
+        if self.taken != taken:
+            is_quick = self.inline or time.perf_counter() - begin < QUICK
+            self._announce = (self.dispatcher.inline if is_quick else self.dispatcher.announced).append
+
+
 class Dispatcher:
-    """Whoever has messages for a node puts them into inboxes, then calls :meth:`run` or :meth:`wake`."""
+    """Whoever has messages for a node puts them into inboxes, then calls :meth:`run`, :meth:`received` or :meth:`wake`.
+    """
 
     def __init__(self, start_thread):
         self.inline = collections.deque()       # inboxes that whoever comes by may run
@@ -111,8 +135,14 @@ class Dispatcher:
                 running.release()
             # looked at again: what was announced just before the release found the node busy
 
+    def received(self):
+        """A thread that reads a socket has put what came."""
+        if self.announced and self.idle:
+            self.wake()
+        self.run()
+
     def need_thread(self):
-        """Have the dispatcher thread, from the first channel on that is neither inline nor TCPROS."""
+        """Have the dispatcher thread, from the first channel on that is not inline."""
         if self._started.acquire(blocking=False):
             self._start_thread(self._loop, name='dispatcher')
 

@@ -61,6 +61,11 @@ def mend_publisher(module):
             latch = self.is_latch if by is None else by.latch
             if not (inboxes or remote or latch):
                 return False
+            woken = None
+            for dispatcher in self._dispatchers:    # while it wakes up, the message is made ready
+                if dispatcher.idle:
+                    dispatcher.wake()
+                    woken = dispatcher
             self.seq += 1
             if getattr(message.__class__, '_has_header', False):
                 message.header.seq = self.seq
@@ -78,9 +83,8 @@ def mend_publisher(module):
                     self._early.add(frozen)
             for inbox in inboxes:
                 inbox.put(message if inbox.shared else frozen)
-            woken = None
             for dispatcher in self._dispatchers:
-                if dispatcher.idle:
+                if dispatcher.idle:    # again, or still
                     dispatcher.wake()
                     woken = dispatcher
             if woken is not None:
@@ -139,15 +143,20 @@ def mend_publisher(module):
             self._write(self._serialized(message, message.header.seq if hasattr(message, 'header') else 0), [connection])
 
     def add_connection(self, connection):
-        """rospy's, but for the latch; and no queue in front of a link."""
+        """rospy's, but for the latch; and no queue in front of a link, nor one whose thread waits for ever.
+
+        rospy leaves open what it does not add.
+        """
         link = getattr(connection, 'link', None)
         if link is None and self.queue_size is not None:
             connection = module.QueuedConnection(connection, self.queue_size)
         lock = self.publock
-        if lock is None:
-            return False    # closed meanwhile
+        if lock is None:    # closed meanwhile
+            connection.close()
+            return False
         with lock:    # so that the latched messages come before what is published now
             if not base.add_connection(self, connection):
+                connection.close()
                 return False
             if link:
                 send_latched(self, list(link.inboxes.values()))

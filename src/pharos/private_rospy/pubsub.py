@@ -106,9 +106,18 @@ def hooks(instance):
             self._idle.wait(max(0.0, timeout))
         queued.flush = flush
 
+    def send_at_once(module):
+        """rospy.impl.tcpros_pubsub: a subscriber that does not ask for TCP_NODELAY gets some messages 40 ms late.
+
+        rospy's and roscpp's do not, by default (ros_comm #1362, #2318).
+        """
+        configure = module._configure_pub_socket
+        module._configure_pub_socket = lambda sock, is_tcp_nodelay: configure(sock, True)
+
     def mend_tcpros(module):
         connect_once(module)
         know_what_is_under_way(module)
+        send_at_once(module)
 
     return {'rospy.topics': mend_topics, 'rospy.impl.masterslave': offer_intraprocess,
             'rospy.impl.tcpros_base': notice_silence, 'rospy.impl.tcpros_pubsub': mend_tcpros}

@@ -45,8 +45,9 @@ def hooks(instance):
                     answer = connect(self, topic, uri)
                 except _NotWanted as error:
                     answer = 0, str(error), 0
-                except UnboundLocalError:    # rospy's, where it never asked or gave up because the node stops
-                    answer = 0, '%s stops' % self.name, 0
+                except (UnboundLocalError, TypeError, AttributeError):
+                    # rospy's, where it gave up because the node stops, or the subscription or the protocols have gone
+                    answer = 0, '%s or its interest in %s ends' % (self.name, topic), 0
                 finally:
                     with lock:
                         # asked for again: what was no publisher a moment ago may be one now
@@ -104,6 +105,8 @@ def hooks(instance):
                 module.logerr('cannot register %s %s with the master %s: %s' % (kind, name, self.master_uri, message))
             elif kind == 'sub':
                 self.publisher_update(name, value)
+            elif kind == 'pub':
+                instance.wiring.told_subscribers[name] = value
         manager.reg_added = reg_added
 
         def publisher_update(self, topic, uris):

@@ -1,4 +1,5 @@
 """How the channels of a node are wired to its rospy, and to the nodes of this process."""
+import select
 import threading
 
 from pharos.private_rospy import publishing
@@ -17,6 +18,7 @@ class Wiring:
     def __init__(self, instance):
         self._instance = instance
         self._channels = {}                    # topic -> the channels that receive from it
+        self.told_subscribers = {}             # topic -> URIs, of which the master told a new publisher
         self.connecting = threading.local()    # .topic: of the connection that this thread negotiates
 
     def open(self):
@@ -63,6 +65,14 @@ class Wiring:
                 other.connect(channel.topic, self._instance.uri)
         return endpoint, endpoint.impl.publish
 
+    def known_subscribers(self, topic):
+        """Names of the nodes that the master knew to be interested when this one registered as a publisher.
+
+        None where the master must be asked: of others it told the URI alone, and of a second channel nothing.
+        """
+        nodes = [_running.get(uri) for uri in self.told_subscribers.pop(topic, [None])]
+        return None if None in nodes else {node.name for node in nodes}
+
     def unadvertise(self, channel, endpoint):
         """End what :meth:`advertise` began."""
         publishing.forget_latch(endpoint, channel)
@@ -70,9 +80,13 @@ class Wiring:
 
     @staticmethod
     def connections(endpoint):
-        """``[(peer node name, transport)]`` of a rospy Publisher or Subscriber."""
+        """``[(peer node name, transport)]`` of a rospy Publisher or Subscriber.
+
+        rospy looks twice a second for subscribers that have left; until then they count as connected (ros_comm #927).
+        """
+        ended = _has_left if endpoint.reg_type == 'pub' else _is_done    # a subscriber's thread sees the end by itself
         return [(_peer(connection), connection.transport_type)
-                for connection in (endpoint.impl.connections if endpoint.impl else ()) if not connection.done]
+                for connection in (endpoint.impl.connections if endpoint.impl else ()) if not ended(connection)]
 
     @staticmethod
     def is_closed(endpoint):
@@ -115,6 +129,22 @@ class Wiring:
         for connection in self._instance.subscriber(topic).connections:
             if connection.transport_type == 'INTRAPROCESS':
                 connection.link.channels_changed()
+
+
+def _is_done(connection):
+    return connection.done
+
+
+def _has_left(connection):
+    """Whether a publisher's connection is done, or its subscriber has closed it."""
+    if connection.done or connection.transport_type != 'TCPROS':
+        return connection.done
+    poll = select.poll()
+    try:
+        poll.register(connection.socket, select.POLLRDHUP)
+    except (TypeError, ValueError):    # it is just being closed
+        return True
+    return bool(poll.poll(0))
 
 
 def _peer(connection):
