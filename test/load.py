@@ -34,12 +34,10 @@ def create(master, name, **kwargs):
 
 def until(condition, what='it'):
     """Wait for what nobody tells."""
-    pause = threading.Event()
-    for _ in range(int(TIMEOUT / 0.01)):
-        if condition():
-            return
+    pause, deadline = threading.Event(), time.monotonic() + TIMEOUT
+    while not condition():
+        assert time.monotonic() < deadline, '%s did not come to be' % what
         pause.wait(0.01)
-    raise AssertionError('%s did not come to be' % what)
 
 
 def image(number):

@@ -102,7 +102,7 @@ def test_a_receiver_that_turns_slow_gets_an_old_image_once_at_the_most(master, m
     quick = Mailbox()
     with Program(master.url, sys.executable, '-c', CAMERA % COUNT, PYTHONPATH=PATHS):
         viewer = Viewer(master, quick)
-        for _ in range(5):
+        for _ in range(dispatcher.TRUSTED):
             viewer.ask(1)
             quick.get()
         monkeypatch.setattr(dispatcher, 'QUICK', 0.0)

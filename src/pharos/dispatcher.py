@@ -12,7 +12,8 @@ import time
 
 BURST = 100e-6    # seconds; a publisher that comes again within them does not give way to the receiver
 GIVE_WAY = 1e-3   # seconds that a publisher at the most gives way, until the dispatcher thread has woken up
-QUICK = 1e-3      # seconds; a delegate that takes longer is not run by a thread that has a socket to read
+QUICK = 1e-3      # seconds; a delegate that takes longer is not run by a thread that has a socket to read,
+TRUSTED = 10      # and one is that has been quick so many times in a row
 
 
 class Inbox:
@@ -94,17 +95,19 @@ class SocketInbox(Inbox):
     the queue is short (ros_comm #536, #1901). So slow delegates are the dispatcher thread's, and those not known yet.
     """
 
-    __slots__ = ()
+    __slots__ = ('_quick',)
 
     def __init__(self, channel, dispatcher):
         super().__init__(channel, dispatcher, channel.inline)
+        self._quick = 0    # how many times in a row
 
     def run_next(self):
         taken, begin = self.taken, time.perf_counter()
         super().run_next()
         if self.taken != taken:
-            is_quick = self.inline or time.perf_counter() - begin < QUICK
-            self._announce = (self.dispatcher.inline if is_quick else self.dispatcher.announced).append
+            self._quick = self._quick + 1 if time.perf_counter() - begin < QUICK else 0
+            is_trusted = self.inline or self._quick >= TRUSTED
+            self._announce = (self.dispatcher.inline if is_trusted else self.dispatcher.announced).append
 
 
 class Dispatcher:
