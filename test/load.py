@@ -1,4 +1,4 @@
-"""Much at once: nodes, topics, messages, and receivers that are too slow. test_load.py has seconds of it, tools/soak minutes.
+"""Much at once: nodes, topics, messages, and slow receivers. test_load.py has seconds of it, tools/soak minutes.
 
 Each function leaves nothing behind, returns counts, and raises AssertionError where something is not as it should be.
 """

@@ -1,9 +1,9 @@
 #!/usr/bin/python3
 """Do to nodes for minutes what the tests do to them for seconds, and print what they have survived.
 
-Bad clients, a master that is killed over and over, peers that are, nodes that come and go, a hundred nodes and a thousand
-topics, receivers too slow for images, and, as root, a link that is cut for a minute. Status 1 if anything is lost, left
-behind or gone; --seed repeats what was done, though not when.
+Bad clients, a master that is killed over and over, peers that are, nodes that come and go, a hundred nodes and a
+thousand topics, receivers too slow for images, and, as root, a link that is cut for a minute. Status 1 if anything is
+lost, left behind or gone; --seed repeats what was done, though not when.
 """
 import argparse
 import collections
@@ -112,8 +112,8 @@ def master_dies(soak):
     before = registrations()
     try:
         while soak.left > 0:
-            embedded._child.kill()
-            embedded._child.wait()
+            with embedded._child as child:
+                child.kill()
             for _ in range(100):
                 chat.send(data='while the master is away')
             embedded = Master.embedded(port=port)
@@ -271,7 +271,7 @@ def parse_arguments():
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     names = [stage.__name__ for stage in STAGES] + ['link']
     parser.add_argument('--minutes', type=float, default=5, help='how long, about (default: %(default)s)')
-    parser.add_argument('--seed', type=int, default=random.randrange(1, 1 << 32), help='of a run that is to be repeated')
+    parser.add_argument('--seed', type=int, default=random.randrange(1, 1 << 32), help='of a run to be repeated')
     parser.add_argument('--only', default=','.join(names), metavar='WORD,...', help='of: %(default)s')
     options = parser.parse_args()
     options.only = re.split(r'[ ,]+', options.only)
@@ -320,7 +320,7 @@ def main():
                 options, lambda text: screen.isatty() and print('==', text, file=screen, flush=True))
     print_summary(soak, rows, before)
     for name, failure in failures.items():
-        print('\n%s FAILED\n%s' % (name, failure))
+        print('\n%s FAILED\n%s' % (name, failure), flush=True)
     if failures:
         sys.exit('tools/soak: failed: %s; --seed %d repeats it' % (', '.join(failures), options.seed))
 

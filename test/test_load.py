@@ -53,7 +53,7 @@ rospy.spin()
 
 @pytest.fixture(params=['here', 'pharos', 'rospy'])
 def receiving(request, master):
-    """``receiving(queue_size)`` -> a delegate that is busy with its first image, and the channel that has got COUNT more.
+    """``receiving(queue_size)`` -> a delegate busy with its first image, and the channel that has got COUNT more.
 
     They come from a node here, or from a pharos or rospy node of another process.
     """
@@ -151,5 +151,5 @@ def test_nothing_is_lost_among_a_hundred_nodes_and_a_thousand_topics(master):
 
 def test_nodes_that_come_and_go_leave_nothing(master):
     seed = int(os.environ.get('PHAROS_LOAD_SEED', 0)) or random.randrange(1, 1 << 32)
-    counts = run(master, 'load.come_and_go(master, %d, turns=100)' % seed)
-    assert counts['starts'] > 50 and counts['calls'] > 50 and counts['delivered'] > 100
+    counts = run(master, 'load.come_and_go(master, %d, turns=60)' % seed)
+    assert counts['starts'] > 20 and counts['calls'] > 20 and counts['delivered'] > 50
