@@ -309,6 +309,7 @@ def soak_all(options, say):
 
 def main():
     options, screen = parse_arguments(), sys.stdout
+    signal.signal(signal.SIGINT, signal.default_int_handler)    # started with &, all it starts would ignore Ctrl-C
     load.allow_many_descriptors()
     faulthandler.dump_traceback_later(120 * options.minutes + 240, exit=True, file=sys.stderr)    # if it hangs
     print('seed %d' % options.seed, flush=True)
