@@ -21,7 +21,7 @@ from std_msgs.msg import Int32
 from std_srvs.srv import SetBool
 
 from pharos import BlockNode, ServiceCallError, UnknownServiceError, running
-from programs import TIMEOUT
+from programs import TIMEOUT, until
 
 NODES, TOPICS = 100, 1000
 IMAGE_SIZE = 640 * 480 * 3
@@ -30,14 +30,6 @@ STEP = 0.01    # seconds between two bursts of messages, where they are not sent
 
 def create(master, name, **kwargs):
     return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
-
-
-def until(condition, what='it'):
-    """Wait for what nobody tells."""
-    pause, deadline = threading.Event(), time.monotonic() + TIMEOUT
-    while not condition():
-        assert time.monotonic() < deadline, '%s did not come to be' % what
-        pause.wait(0.01)
 
 
 def image(number):

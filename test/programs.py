@@ -32,6 +32,14 @@ def run(master_url, *command, cwd=None):
         timeout=TIMEOUT, check=False)
 
 
+def until(condition, what='it'):
+    """Wait for what nobody tells: what another process does, or a thread of a node, or what only a master knows."""
+    pause, deadline = threading.Event(), time.monotonic() + TIMEOUT
+    while not condition():
+        assert time.monotonic() < deadline, '%s did not come to be: %s' % (what, condition)
+        pause.wait(0.01)
+
+
 def forget_parameters(master_url):
     """Delete all parameters: a node's outlive it on the master, and would be those of the next one of its name."""
     server = rosgraph.Master('/test', master_uri=master_url)

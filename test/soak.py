@@ -27,9 +27,9 @@ from std_msgs.msg import String
 
 import load
 from fuzz import Fuzz
-from load import create, until
+from load import create
 from pharos import Master, ServiceCallError, running
-from programs import Program, environment
+from programs import Program, environment, until
 
 HERE = pathlib.Path(__file__).resolve().parent
 PATHS = '%s:%s' % (HERE.parent / 'src', HERE)

@@ -23,7 +23,7 @@ from conftest import TIMEOUT, Mailbox
 from fuzz import Fuzz
 from pharos import BlockNode
 from pharos.private_rospy import door, registration, servers, xmlrpc_server
-from programs import Program
+from programs import Program, until
 
 FUZZ_COUNT = int(os.environ.get('PHAROS_FUZZ_COUNT', 2500))    # bad clients; tools/soak makes it more
 STRING = std_msgs.msg.String
@@ -35,16 +35,6 @@ def create(master, name, **kwargs):
 
 def connect(port):
     return socket.create_connection(('127.0.0.1', port), TIMEOUT)
-
-
-def until(condition):
-    """Wait for what happens in a thread of a node that tells nobody."""
-    pause = threading.Event()
-    for _ in range(int(TIMEOUT / 0.01)):
-        if condition():
-            return
-        pause.wait(0.01)
-    raise AssertionError('it did not come to be: %s' % condition)
 
 
 def threads(node, kind):

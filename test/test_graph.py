@@ -11,7 +11,7 @@ import pytest
 import rosgraph
 
 import pharos
-from conftest import TIMEOUT, InProcessMaster, Mailbox
+from conftest import TIMEOUT, InProcessMaster
 from pharos import BlockNode, ExternalNode, Master, UnknownNodeError, UnknownTopicError, watcher
 from pharos.errors import MasterUnreachableError, UnknownServiceError
 from programs import Program

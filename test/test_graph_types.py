@@ -24,7 +24,7 @@ from genpy.generator import MsgGenerator
 from conftest import TIMEOUT, Mailbox
 from pharos import (BlockNode, Master, MessageTypeError, NodeStoppedError, PharosError, UnknownTopicError,
                     UnknownTypeError, define_message, graph_types, message_class)
-from programs import Program, run
+from programs import Program, run, until
 from sockets import refused_url
 
 SEPARATOR = '\n' + '=' * 80 + '\n'
@@ -136,16 +136,6 @@ def plain(value):
     if isinstance(value, genpy.rostime.TVal):
         return [value.secs, value.nsecs]
     return [plain(one) for one in value] if isinstance(value, (list, tuple, bytes)) else value
-
-
-def until(condition):
-    """Wait for what only a master can be asked for."""
-    pause = threading.Event()
-    for _ in range(int(TIMEOUT / 0.01)):
-        if condition():
-            return
-        pause.wait(0.01)
-    raise AssertionError('it did not come to be: %s' % condition)
 
 
 def assert_unknown_here(type_=SCAN):

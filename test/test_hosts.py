@@ -16,6 +16,7 @@ from conftest import TIMEOUT, InProcessMaster
 from hosts import MASTER_PORT, network
 from pharos import BlockNode
 from pharos.private_rospy import registration
+from programs import until
 from sockets import listening, refused_url
 
 STRING = 'std_msgs/String'
@@ -38,15 +39,6 @@ def programs():
             running.callback(program.end, signal.SIGKILL)
             return program
         yield keep
-
-
-def until(condition):
-    """Wait for what nobody tells."""
-    for _ in range(int(TIMEOUT / 0.01)):
-        if condition():
-            return
-        threading.Event().wait(0.01)
-    raise AssertionError('it did not come to be')
 
 
 @pytest.fixture

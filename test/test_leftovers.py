@@ -35,7 +35,7 @@ def count():
             thread.join(20)    # it watches the master while there are nodes, and ends once it sees that there are none
     deadline = time.monotonic() + 20
     while len(os.listdir('/proc/self/task')) > threading.active_count() and time.monotonic() < deadline:
-        time.sleep(0.001)    # a thread that was joined has still to leave the kernel
+        threading.Event().wait(0.001)    # a thread that was joined has still to leave the kernel
     open_files = []
     for descriptor in os.listdir('/proc/self/fd'):
         try:

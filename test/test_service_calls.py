@@ -18,7 +18,7 @@ import rosnode
 import pharos
 from conftest import TIMEOUT, InProcessMaster
 from pharos import BlockNode, message_types
-from programs import Program, environment, forget_parameters, run, script
+from programs import Program, environment, forget_parameters, run, script, until
 from sockets import wait_for_end
 
 ECHO = 'diagnostic_msgs/AddDiagnostics'    # load_namespace -> success, message
@@ -122,7 +122,7 @@ def mux(ros_master):
         message_types.define_service(type_, text)
     master = pharos.Master(ros_master.url)
     with master.run('topic_tools', 'mux', '/calls/out', '/calls/a', '/calls/b', remap={'__ns': '/calls'}) as process:
-        wait_until(lambda: {'/calls/mux/' + name for name in MUX_TYPES} <= set(master.services()))
+        until(lambda: {'/calls/mux/' + name for name in MUX_TYPES} <= set(master.services()))
         yield process
 
 
@@ -144,14 +144,6 @@ def create(master, name, **kwargs):
 
 def echo(request):
     return {'success': True, 'message': request.load_namespace}
-
-
-def wait_until(condition):
-    """Wait for what has no event: another process's doing, or the kernel's."""
-    deadline = time.monotonic() + TIMEOUT
-    while not condition():
-        assert time.monotonic() < deadline
-        threading.Event().wait(0.01)
 
 
 def started(job):
@@ -542,13 +534,13 @@ def test_a_rospy_provider_killed_while_it_is_called(master, persistent):
 
 def test_a_roscpp_provider_killed_while_it_is_called(master):
     with master.run('topic_tools', 'mux', '/calls/other', '/calls/a', remap={'__ns': '/mortal'}) as process:
-        wait_until(lambda: '/mortal/mux/list' in master.services())
+        until(lambda: '/mortal/mux/list' in master.services())
         node, = master.system_state()[2]['/mortal/mux/list']
         service = master.lookup_service('/mortal/mux/list')
         with nothing_left(service):
             hang(process.pid)    # else it answers before it is killed
             ended = started(service.call)
-            wait_until(lambda: connections_to(service))
+            until(lambda: connections_to(service))
             os.kill(process.pid, signal.SIGKILL)
             assert type(ended()) is pharos.ServiceCallError
         assert wait_for_end(process.pid, TIMEOUT)

@@ -8,6 +8,7 @@ import pytest
 import pharos
 from conftest import TIMEOUT, Mailbox
 from pharos import BlockNode, Master, running, watcher
+from programs import until
 
 
 def create(master, name, **kwargs):
@@ -16,16 +17,6 @@ def create(master, name, **kwargs):
 
 def registrations(master, name):
     return [sorted(topic for topic, nodes in kind.items() if name in nodes) for kind in master.system_state()]
-
-
-def until(condition):
-    """Wait for what only another process, or a master, can be asked for."""
-    pause = threading.Event()
-    for _ in range(int(TIMEOUT / 0.02)):
-        if condition():
-            return
-        pause.wait(0.02)
-    raise AssertionError('it did not come to be: %s' % condition)
 
 
 @pytest.fixture

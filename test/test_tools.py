@@ -3,14 +3,13 @@ import os
 import re
 import signal
 import sys
-import threading
 
 import pytest
 import rosbag
 
 from conftest import TIMEOUT, InProcessMaster, Mailbox
 from pharos import BlockNode, Master
-from programs import Program, run
+from programs import Program, run, until
 
 STRING = 'std_msgs/String'
 NAMES = ['/n%d' % number for number in range(10)]
@@ -75,15 +74,6 @@ def peer(graph, name):
     program = Program(graph.master.url, sys.executable, '-c', PEER, name)
     program.wait_for('ready')
     return program
-
-
-def until(condition):
-    """Wait for what another process does."""
-    for _ in range(int(TIMEOUT / 0.01)):
-        if condition():
-            return
-        threading.Event().wait(0.01)
-    raise AssertionError('it did not come to be')
 
 
 def names(graph):
