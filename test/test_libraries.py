@@ -12,6 +12,7 @@ import pharos
 from conftest import TIMEOUT, Mailbox
 from pharos import BlockNode
 from pharos.private_rospy.host import rospy
+from programs import until
 
 LIBRARIES = 'message_filters', 'actionlib', 'tf2_ros'
 
@@ -93,6 +94,8 @@ def action(pair, execute):
     server.start()
     client = asking.ros_import('actionlib').SimpleActionClient('/count', actionlib.msg.TestAction)
     assert client.wait_for_server(asking.ros.Duration(TIMEOUT))
+    # a subscriber is connected a moment before its publisher knows; what is published in between goes to nobody
+    until(lambda: server.action_server.feedback_pub.get_num_connections() == 1)
     return client
 
 
