@@ -6,6 +6,7 @@ import time
 
 from pharos.dispatcher import BURST
 from pharos.private_rospy import copier
+from pharos.private_rospy.sender import Sender
 
 EARLY = 2.0    # seconds after the start in which log lines are kept for listeners that connect later
 _changed = threading.Condition()    # notified whenever a publisher of this process gains or loses a connection
@@ -149,7 +150,7 @@ def mend_publisher(module):
         """
         link = getattr(connection, 'link', None)
         if link is None and self.queue_size is not None:
-            connection = module.QueuedConnection(connection, self.queue_size)
+            connection = Sender(connection, self.queue_size)
         lock = self.publock
         if lock is None:    # closed meanwhile
             connection.close()

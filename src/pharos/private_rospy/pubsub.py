@@ -1,5 +1,4 @@
 """What a node publishes and hears: mended where rospy loses messages or links."""
-import threading
 import time
 
 from pharos.private_rospy import registration
@@ -69,43 +68,6 @@ def hooks(instance):
                 connection.receive_loop(receive)
         module.robust_connect_subscriber = connect
 
-    def know_what_is_under_way(module):
-        """rospy.impl.tcpros_pubsub: a queue knows nothing of the messages it has taken out and not yet sent."""
-        queued = module.QueuedConnection
-        init = queued.__init__
-
-        def __init__(self, connection, queue_size):
-            self._idle = threading.Event()
-            init(self, connection, queue_size)
-        queued.__init__ = __init__
-
-        def _run(self):
-            connection = self._connection
-            while not connection.done:
-                with self._lock:
-                    while not self._queue and not connection.done:
-                        self._idle.set()
-                        self._cond_data_available.wait()
-                    self._idle.clear()
-                    batch, self._queue = self._queue, []
-                for data in batch:
-                    try:
-                        connection.write_data(data)
-                    except Exception as error:    # the next publish raises it, as in rospy
-                        with self._lock:
-                            self._error = error
-            self._idle.set()
-        queued._run = _run
-
-        def flush(self, timeout):
-            """Wait until everything published is with the socket, up to ``timeout`` seconds."""
-            with self._lock:
-                if not self._queue and self._idle.is_set():
-                    return
-                self._idle.clear()    # what is queued may not have been taken out yet
-            self._idle.wait(max(0.0, timeout))
-        queued.flush = flush
-
     def send_at_once(module):
         """rospy.impl.tcpros_pubsub: a subscriber that does not ask for TCP_NODELAY gets some messages 40 ms late.
 
@@ -116,7 +78,6 @@ def hooks(instance):
 
     def mend_tcpros(module):
         connect_once(module)
-        know_what_is_under_way(module)
         send_at_once(module)
 
     return {'rospy.topics': mend_topics, 'rospy.impl.masterslave': offer_intraprocess,

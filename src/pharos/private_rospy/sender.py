@@ -1,0 +1,83 @@
+"""What is on its way to one subscriber over TCPROS."""
+import collections
+import socket
+import threading
+import time
+
+AT_ONCE = 1 << 16    # bytes; copying more into the socket would hold the publisher up longer than waking a thread
+
+
+class Sender:
+    """A bounded queue in front of a rospy transport, and the thread that writes what does not fit into the socket.
+
+    Instead of rospy's QueuedConnection, which has its thread write everything: waking it takes longer than writing. And
+    which takes all that is queued out at once, so that it can neither drop nor count it any more.
+    """
+
+    def __init__(self, connection, queue_size):
+        """:param queue_size: messages, the oldest of which are dropped; 0: without limit"""
+        self._connection = connection
+        self._queue = collections.deque(maxlen=queue_size or None)
+        self._begun = b''         # the rest of a message whose beginning the socket has
+        self._is_idle = True      # nothing is on its way but what the socket has
+        self._error = None        # of the thread, for the next who publishes, as in rospy
+        self._changed = threading.Condition(threading.Lock())
+        connection.set_cleanup_callback(self._closed)
+        threading.Thread(target=self._run, name='sender', daemon=True).start()
+
+    def __getattr__(self, name):
+        return getattr(self._connection, name)
+
+    def write_data(self, data):
+        """Send ``data``, a message with its length; never waits for the subscriber."""
+        with self._changed:
+            if self._error is not None:
+                error, self._error = self._error, None
+                raise error
+            if self._is_idle and len(data) <= AT_ONCE:
+                sent = self._send(data)
+                if sent == len(data):
+                    self._connection.stat_num_msg += 1
+                    return
+                self._begun = data[sent:]
+            else:
+                self._queue.append(data)
+            self._is_idle = False
+            self._changed.notify_all()
+        time.sleep(0)    # else the thread gets the interpreter 5 ms later from a busy publisher
+
+    def _send(self, data):
+        """Return how many bytes the socket has taken."""
+        connection = self._connection
+        try:
+            sent = connection.socket.send(data, socket.MSG_DONTWAIT)
+        except (OSError, AttributeError):    # it is full; or broken, or closed, as the thread will see
+            return 0
+        connection.stat_bytes += sent
+        return sent
+
+    def _run(self):
+        connection = self._connection
+        while True:
+            with self._changed:
+                self._is_idle = not self._begun and not self._queue
+                if self._is_idle:
+                    self._changed.notify_all()
+                    self._changed.wait_for(lambda: self._begun or self._queue or connection.done)
+                if connection.done:
+                    return
+                data, self._begun = self._begun or self._queue.popleft(), b''
+            try:
+                connection.write_data(data)
+            except Exception as error:
+                with self._changed:
+                    self._error = error
+
+    def _closed(self, connection):
+        with self._changed:
+            self._changed.notify_all()
+
+    def flush(self, timeout):
+        """Wait until everything published is with the socket, up to ``timeout`` seconds."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._is_idle or self._connection.done, max(0.0, timeout))
