@@ -82,11 +82,11 @@ class InputChannel(_Channel):
         dispatcher = self.node._dispatcher
         if not self.inline:
             dispatcher.need_thread()
-        self._tcpros = self._add_inbox(SocketInbox(self, dispatcher))
+        self._tcpros = self._add_inbox(Inbox(self, dispatcher, True) if self.inline else SocketInbox(self, dispatcher))
         # rospy's queue_size would drop without counting; the inbox has ours
         self._endpoint = self.node._rospy.wiring.subscribe(self, tcp_nodelay=True, buff_size=BUFFER_SIZE)
         self.node._remember_channel(self)
-        dispatcher.received()    # what came latched
+        dispatcher.run()    # what came latched
 
     def _unregister(self, endpoint):
         self.node._rospy.wiring.unsubscribe(self, endpoint)

@@ -88,7 +88,7 @@ class Inbox:
 
 
 class SocketInbox(Inbox):
-    """The messages that come to one channel through TCPROS.
+    """The messages that come to one channel, which is not inline, through TCPROS.
 
     As long as the delegate is quick, the thread that reads the socket runs it, for waking another one takes longer. But
     while it runs a slow one it does not read, and what that gets next has waited longest in the socket, for all that
@@ -98,7 +98,8 @@ class SocketInbox(Inbox):
     __slots__ = ('_quick',)
 
     def __init__(self, channel, dispatcher):
-        super().__init__(channel, dispatcher, channel.inline)
+        super().__init__(channel, dispatcher, inline=False)
+        self._announce = dispatcher.announce
         self._quick = 0    # how many times in a row
 
     def run_next(self):
@@ -106,12 +107,13 @@ class SocketInbox(Inbox):
         super().run_next()
         if self.taken != taken:
             self._quick = self._quick + 1 if time.perf_counter() - begin < QUICK else 0
-            is_trusted = self.inline or self._quick >= TRUSTED
-            self._announce = (self.dispatcher.inline if is_trusted else self.dispatcher.announced).append
+            dispatcher = self.dispatcher
+            self._announce = dispatcher.inline.append if self._quick >= TRUSTED else dispatcher.announce
 
 
 class Dispatcher:
-    """Whoever has messages for a node puts them into inboxes, then calls :meth:`run`, :meth:`received` or :meth:`wake`.
+    """Whoever has messages for a node puts them into inboxes, then calls :meth:`run` for those that are inline or came
+    through a socket, :meth:`wake` for others if the thread is :attr:`idle`.
     """
 
     def __init__(self, start_thread):
@@ -138,22 +140,25 @@ class Dispatcher:
                 running.release()
             # looked at again: what was announced just before the release found the node busy
 
-    def received(self):
-        """A thread that reads a socket has put what came."""
-        if self.announced and self.idle:
-            self.wake()
-        self.run()
-
     def need_thread(self):
         """Have the dispatcher thread, from the first channel on that is not inline."""
         if self._started.acquire(blocking=False):
             self._start_thread(self._loop, name='dispatcher')
 
+    def announce(self, inbox):
+        """Have the dispatcher thread run an inbox."""
+        self.announced.append(inbox)
+        if self.idle:
+            self.wake()
+
     def wake(self):
         """Wake the dispatcher thread, which is idle."""
         self.idle = False
         self._awake.acquire(False)    # a stale acknowledgement
-        _release(self._woken)
+        try:
+            self._woken.release()
+        except RuntimeError:
+            pass    # another thread has woken it meanwhile
 
     def give_way(self):
         """Let the woken dispatcher thread have the interpreter: it would get it 5 ms later from a busy publisher."""
@@ -168,7 +173,10 @@ class Dispatcher:
                 self.idle = True
                 if not announced and not self._closed:
                     self._woken.acquire()
-                    _release(self._awake)
+                    try:
+                        self._awake.release()
+                    except RuntimeError:
+                        pass    # nobody took the last acknowledgement
                 self.idle = False
                 continue
             with running:
@@ -181,11 +189,4 @@ class Dispatcher:
         self._closed = True
         self.inline.clear()
         self.announced.clear()
-        _release(self._woken)
-
-
-def _release(lock):
-    try:
-        lock.release()
-    except RuntimeError:
-        pass    # it was free already: two had the same to say
+        self.wake()

@@ -64,7 +64,7 @@ class Life:
             # the same ports next time, also where any free one was asked for
             self._settings.tcp_port, self._settings.xmlrpc_port = instance.tcp_port, instance.xmlrpc_port
             self._dispatcher = Dispatcher(instance.start_thread)
-            instance.on_received = self._dispatcher.received
+            instance.on_received = self._dispatcher.run
             self._become(Lifecycle.RUNNING)
             running.add(self)
             watcher_of(self.master).check()

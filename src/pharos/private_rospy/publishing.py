@@ -38,7 +38,7 @@ def mend_publisher(module):
             inboxes = [inbox for link in links for inbox in list(link.inboxes.values())]
             self._remote = [c for c in self.connections if c.transport_type != 'INTRAPROCESS']
             self._inboxes = inboxes
-            self._dispatchers = list({inbox.dispatcher for inbox in inboxes if not inbox.inline})
+            self._dispatchers = _dispatchers(inboxes)
             self._inline = list({inbox.dispatcher for inbox in inboxes if inbox.inline})
     publisher.refresh = refresh
 
@@ -52,21 +52,18 @@ def mend_publisher(module):
         if lock is None or self.closed:
             return write(self, message)    # says so
         with lock:
-            inboxes, remote = self._inboxes, self._remote
+            inboxes, remote, dispatchers = self._inboxes, self._remote, self._dispatchers
             if connection_override is not None:
                 link = getattr(connection_override, 'link', None)
                 inboxes, remote = (list(link.inboxes.values()), ()) if link else ((), [connection_override])
+                dispatchers = _dispatchers(inboxes)
             elif to is not None:
                 inboxes = [inbox for inbox in inboxes if inbox.channel.node.name == to]
                 remote = [connection for connection in remote if connection.endpoint_id == to]
+                dispatchers = _dispatchers(inboxes)
             latch = self.is_latch if by is None else by.latch
             if not (inboxes or remote or latch):
                 return False
-            woken = None
-            for dispatcher in self._dispatchers:    # while it wakes up, the message is made ready
-                if dispatcher.idle:
-                    dispatcher.wake()
-                    woken = dispatcher
             self.seq += 1
             if getattr(message.__class__, '_has_header', False):
                 message.header.seq = self.seq
@@ -84,8 +81,9 @@ def mend_publisher(module):
                     self._early.add(frozen)
             for inbox in inboxes:
                 inbox.put(message if inbox.shared else frozen)
-            for dispatcher in self._dispatchers:
-                if dispatcher.idle:    # again, or still
+            woken = None
+            for dispatcher in dispatchers:
+                if dispatcher.idle:
                     dispatcher.wake()
                     woken = dispatcher
             if woken is not None:
@@ -134,8 +132,9 @@ def mend_publisher(module):
         for inbox in inboxes:
             for frozen in self._early or self._latched.values():
                 inbox.put(self._copier.thaw(frozen) if inbox.shared else frozen)
-            if inbox.dispatcher.idle and not inbox.inline:
-                inbox.dispatcher.wake()
+        for dispatcher in _dispatchers(inboxes):
+            if dispatcher.idle:
+                dispatcher.wake()
 
     def write_latched(self, connection):
         """Write what is latched to a new TCPROS connection."""
@@ -198,6 +197,11 @@ def mend_publisher(module):
         self._remote = self._inboxes = self._dispatchers = self._inline = ()
         _notify()
     shut, publisher.close = publisher.close, close
+
+
+def _dispatchers(inboxes):
+    """Those whose threads run what is put into the inboxes."""
+    return list({inbox.dispatcher for inbox in inboxes if not inbox.inline})
 
 
 class _EarlyLines:
