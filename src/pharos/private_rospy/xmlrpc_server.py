@@ -120,6 +120,7 @@ def _request_handler(base, door):
                 while not self.close_connection:
                     door.expect(self.connection)
                     self.rfile.raw.begin()
+                    self.waits_for_us = False
                     self.handle_one_request()
             except OSError as error:
                 self.log_error('%s', error)
@@ -129,8 +130,8 @@ def _request_handler(base, door):
                 door.refuse(self.connection, self.client_address, format % args)
 
         def handle_expect_100(self):
-            super().handle_expect_100()
-            self.wfile.flush()    # else the client and this wait for each other
+            """The client is told to go on when its request is accepted."""
+            self.waits_for_us = True
             return True
 
         def do_POST(self):
@@ -154,6 +155,9 @@ def _request_handler(base, door):
                 self.send_error(503, 'too many large requests at once')
 
         def _answer(self, length):
+            if self.waits_for_us:
+                super().handle_expect_100()
+                self.wfile.flush()
             body = self.rfile.read(length)
             try:
                 if len(body) < length:
