@@ -155,7 +155,7 @@ class OutputChannel(_Channel):
         if message.__class__ is not self.message_class:
             self._check_type(message)
         try:
-            self._send(message, None, self, to if to is None else getattr(to, 'name', to))
+            self._send(message, self, to if to is None else getattr(to, 'name', to))
         except Exception as error:
             self._explain(error, message)
         self.sent += 1

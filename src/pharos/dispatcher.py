@@ -88,7 +88,7 @@ class Inbox:
 
 
 class SocketInbox(Inbox):
-    """The messages that come to one channel, which is not inline, through TCPROS.
+    """The messages that come to one channel, one that is not inline, through TCPROS.
 
     As long as the delegate is quick, the thread that reads the socket runs it, for waking another one takes longer. But
     while it runs a slow one it does not read, and what that gets next has waited longest in the socket, for all that
@@ -155,10 +155,7 @@ class Dispatcher:
         """Wake the dispatcher thread, which is idle."""
         self.idle = False
         self._awake.acquire(False)    # a stale acknowledgement
-        try:
-            self._woken.release()
-        except RuntimeError:
-            pass    # another thread has woken it meanwhile
+        _release(self._woken)
 
     def give_way(self):
         """Let the woken dispatcher thread have the interpreter: it would get it 5 ms later from a busy publisher."""
@@ -173,10 +170,7 @@ class Dispatcher:
                 self.idle = True
                 if not announced and not self._closed:
                     self._woken.acquire()
-                    try:
-                        self._awake.release()
-                    except RuntimeError:
-                        pass    # nobody took the last acknowledgement
+                    _release(self._awake)
                 self.idle = False
                 continue
             with running:
@@ -190,3 +184,10 @@ class Dispatcher:
         self.inline.clear()
         self.announced.clear()
         self.wake()
+
+
+def _release(lock):
+    try:
+        lock.release()
+    except RuntimeError:
+        pass    # it was free already: two had the same to say

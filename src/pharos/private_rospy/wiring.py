@@ -63,7 +63,7 @@ class Wiring:
         for other in self._neighbours():
             if other.subscriber(channel.topic):
                 other.connect(channel.topic, self._instance.uri)
-        return endpoint, endpoint.impl.publish
+        return endpoint, endpoint.impl.fanout.publish
 
     def known_subscribers(self, topic):
         """Names of the nodes that the master knew to be interested when this one registered as a publisher.
@@ -75,7 +75,7 @@ class Wiring:
 
     def unadvertise(self, channel, endpoint):
         """End what :meth:`advertise` began."""
-        publishing.forget_latch(endpoint, channel)
+        endpoint.impl.fanout.forget(channel)
         endpoint.unregister()
 
     @staticmethod

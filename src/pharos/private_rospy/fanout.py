@@ -1,0 +1,172 @@
+"""The way of a message from a publisher to all who are interested."""
+import io
+import struct
+import time
+
+from pharos.dispatcher import BURST
+from pharos.private_rospy import copier
+
+EARLY = 2.0    # seconds after the start in which log lines are kept for listeners that connect later
+_clock = time.perf_counter
+
+
+class Fanout:
+    """Where the messages of one node on one topic go, through INTRAPROCESS and TCPROS, and what is latched.
+
+    :param publisher: rospy's _PublisherImpl
+    :param module: the rospy.topics that it is of
+    """
+
+    # a message that comes alone meets cold caches: all that it needs lies together
+    __slots__ = ('_lock', '_closed', '_seq', '_has_header', '_freeze', '_inboxes', '_remote', '_dispatchers', '_inline',
+                 '_last', '_publisher', '_module', '_thaw', '_buffer', '_latched', '_early')
+
+    def __init__(self, publisher, module):
+        self._publisher, self._module = publisher, module
+        self._lock, self._closed, self._seq = publisher.publock, False, 0
+        self._has_header = getattr(publisher.data_class, '_has_header', False)
+        self._freeze, self._thaw = copier.copier_for(publisher.data_class)[:2]
+        self._buffer = io.BytesIO()
+        self._latched = {}    # channel -> the last message it latched, frozen
+        self._early = _EarlyLines() if publisher.resolved_name == '/rosout' else None
+        self._last = 0.0      # when the last message woke a dispatcher
+        self.set_connections(())
+
+    def set_connections(self, connections):
+        """Sort the connections out, whenever they change: by how a message goes to them."""
+        links = [connection.link for connection in connections if connection.transport_type == 'INTRAPROCESS']
+        inboxes = [inbox for link in links for inbox in list(link.inboxes.values())]
+        self._remote = [connection for connection in connections if connection.transport_type != 'INTRAPROCESS']
+        self._inboxes, self._dispatchers = inboxes, _dispatchers(inboxes)
+        self._inline = list({inbox.dispatcher for inbox in inboxes if inbox.inline})
+
+    def publish(self, message, by=None, to=None, connection=None):
+        """Send a message to all; returns whether there is anybody.
+
+        :param by: the channel whose message it is; None: a rospy Publisher's, which calls :meth:`run` when it has released
+            the lock
+        :param to: name of the only node that is to get it, None: all
+        :param connection: the only connection through which it is to go, None: all
+        """
+        with self._lock:
+            if self._closed:
+                raise self._module.ROSException('publish() to a closed topic')
+            inboxes, remote, dispatchers = self._inboxes, self._remote, self._dispatchers
+            if to is not None or connection is not None:
+                inboxes, remote = self._only(to, connection)
+                dispatchers = _dispatchers(inboxes)
+            latch = self._publisher.is_latch if by is None else by.latch
+            if not (inboxes or remote or latch):
+                return False
+            self._seq += 1
+            if self._has_header and message._md5sum != '*':    # AnyMsg has none
+                message.header.seq = self._seq
+                if message.header.frame_id is None:
+                    message.header.frame_id = '0'
+            if inboxes or latch:
+                try:
+                    frozen = self._freeze(message)
+                except struct.error as error:
+                    raise self._module.ROSSerializationException(error) from error
+            data = self._serialized(message, self._seq) if remote else None
+            if latch:
+                self._latched[by] = frozen
+                if self._early is not None:
+                    self._early.add(frozen)
+            for inbox in inboxes:
+                inbox.put(message if inbox.shared else frozen)
+            woken = None
+            for dispatcher in dispatchers:
+                if dispatcher.idle:
+                    dispatcher.wake()
+                    woken = dispatcher
+            if woken is not None:
+                last, self._last = self._last, _clock()
+                if self._last - last > BURST:
+                    woken.give_way()
+            if remote:
+                self._write(data, remote)
+        if by is not None:
+            for dispatcher in self._inline:
+                dispatcher.run()
+        return True
+
+    def run(self):
+        """Run the delegates that are inline, without the lock, which others may wait for."""
+        for dispatcher in self._inline:
+            dispatcher.run()
+
+    def _only(self, name, connection):
+        """The inboxes and the TCPROS connections of a node, or of a connection."""
+        if connection is None:
+            return ([inbox for inbox in self._inboxes if inbox.channel.node.name == name],
+                    [connection for connection in self._remote if connection.endpoint_id == name])
+        link = getattr(connection, 'link', None)
+        return (list(link.inboxes.values()), ()) if link else ((), [connection])
+
+    def _serialized(self, message, seq):
+        buffer = self._buffer
+        try:
+            self._module.serialize_message(buffer, seq, message)
+            return buffer.getvalue()
+        finally:    # what does not serialize must leave nothing that would corrupt the stream
+            buffer.seek(0)
+            buffer.truncate()
+
+    def _write(self, data, connections):
+        self._publisher.message_data_sent += len(data)
+        for connection in connections:
+            try:
+                connection.write_data(data)
+            except Exception as error:    # the connection broke
+                self._module.logdebug('publisher connection to [%s] terminated: %s' % (connection.endpoint_id, error))
+                connection.close()
+
+    def send_latched(self, inboxes):
+        """Put what is latched into new inboxes; :meth:`run` is to be called when the lock is released."""
+        for inbox in inboxes:
+            for frozen in self._early or self._latched.values():
+                inbox.put(self._thaw(frozen) if inbox.shared else frozen)
+        for dispatcher in _dispatchers(inboxes):
+            if dispatcher.idle:
+                dispatcher.wake()
+
+    def write_latched(self, connection):
+        """Write what is latched to a new TCPROS connection."""
+        for frozen in self._early or self._latched.values():
+            message = self._thaw(frozen)
+            self._write(self._serialized(message, message.header.seq if hasattr(message, 'header') else 0), [connection])
+
+    def forget(self, channel):
+        """A channel closes, and what it latched goes with it."""
+        self._latched.pop(channel, None)
+
+    def close(self):
+        """Nothing is sent any more."""
+        self._closed = True
+        self.set_connections(())
+
+
+def _dispatchers(inboxes):
+    """Those whose threads run what is put into the inboxes."""
+    return list({inbox.dispatcher for inbox in inboxes if not inbox.inline})
+
+
+class _EarlyLines:
+    """The first log lines of a node: its listeners connect a tenth of a second later, and would miss them."""
+
+    def __init__(self):
+        self._until = time.monotonic() + EARLY
+        self._lines = []
+
+    def add(self, line):
+        if time.monotonic() < self._until:
+            self._lines.append(line)
+        else:
+            self._lines = ()
+
+    def __iter__(self):
+        return iter(self._lines)
+
+    def __bool__(self):
+        return bool(self._lines) and time.monotonic() < self._until
