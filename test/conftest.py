@@ -1,7 +1,9 @@
 """Fixtures: a real ROS master in this process, on a free port and loopback, so that runs go side by side."""
+import atexit
 import os
 import pathlib
 import queue
+import shutil
 import sys
 import tempfile
 import threading
@@ -9,6 +11,7 @@ import threading
 # before pharos is imported: logs and addresses of the tests are their own
 os.environ['ROS_HOSTNAME'] = '127.0.0.1'
 os.environ['ROS_LOG_DIR'] = tempfile.mkdtemp(prefix='pharos-test-log-')
+atexit.register(shutil.rmtree, os.environ['ROS_LOG_DIR'], ignore_errors=True)
 for name in ('ROS_IP', 'ROS_NAMESPACE', 'ROS_MASTER_URI'):
     os.environ.pop(name, None)
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parent.parent / 'src'))

@@ -280,7 +280,7 @@ def test_to_an_external_node_alone(master):
         assert 'for two' in two.wait_for('heard') and 'for all' in one.wait_for('heard')
 
 
-# -- what comes and goes ------------------------------------------------------------------------------------------------
+# -- what comes and goes -----------------------------------------------------------------------------------------------
 
 class Changes:
     """A block for on_change that keeps what it is told."""
@@ -367,7 +367,7 @@ def test_wait_for_node_tells_one_that_is_gone_from_one_that_is_there(master):
     node = create(master, '/goes')
     changes.wait_for('node', '/goes', True)
     node.stop()
-    with pytest.raises(UnknownNodeError, match='no node /goes came to .* within 0.2 s'):
+    with pytest.raises(UnknownNodeError, match="no node /goes came to .* within 0.2 s: is it started"):
         master.wait_for_node('/goes', 0.2)
     end()
 

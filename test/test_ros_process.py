@@ -90,11 +90,11 @@ def test_an_unknown_package_or_program_is_said(master, package):
         master.run('topic_tools', 'relai')
     with pytest.raises(UnknownNodeError, match="no ROS package 'no_such_robot'"):
         master.launch('no_such_robot', 'a.launch')
-    with pytest.raises(UnknownNodeError, match="fake_robot has no launch file 'b.launch'"):
+    with pytest.raises(UnknownNodeError, match="fake_robot has no launch file 'b.launch': is it"):
         master.launch('fake_robot', 'b.launch')
 
 
-# -- what they are told, and what they tell -------------------------------------------------------------------------------
+# -- what they are told, and what they tell ----------------------------------------------------------------------------
 
 def test_name_remappings_and_parameters_reach_it(master, package):
     mailbox = Mailbox()
@@ -184,7 +184,7 @@ def test_a_program_that_ignores_ctrl_c_is_terminated(master, package):
     assert process.terminate(timeout=1) == 5
 
 
-# -- the end ------------------------------------------------------------------------------------------------------------
+# -- the end -----------------------------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize('how', ['sleep 1000 & echo $!; wait',
                                  'setsid sleep 1000 & echo $!; wait',
@@ -224,7 +224,7 @@ def test_a_program_that_ended_long_ago_is_not_signalled_again(master, package, m
         monkeypatch.setattr(os, 'killpg', None)    # its number may be another's by now
 
 
-# -- launch files -------------------------------------------------------------------------------------------------------
+# -- launch files ------------------------------------------------------------------------------------------------------
 
 LAUNCH = """<launch>
   <arg name="who" /><arg name="text" default="hello" />

@@ -25,9 +25,10 @@ class Link:
             ours, _ = server.accept()
         ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 14)
         self._file = self.socket.makefile('rb')
-        self.transport = rospy.impl.tcpros_base.TCPROSTransport(rospy.impl.tcpros_pubsub.TCPROSPub('/t', rospy.AnyMsg), '/t')
+        protocol = rospy.impl.tcpros_pubsub.TCPROSPub('/t', rospy.AnyMsg)
+        self.transport = rospy.impl.tcpros_base.TCPROSTransport(protocol, '/t')
         self.transport.set_socket(ours, '/subscriber')
-        self.sender = Sender(self.transport, queue_size)
+        self.sender = Sender(self.transport, queue_size, start_thread)
         self._numbers = itertools.count()
 
     def write(self, size):
@@ -55,6 +56,10 @@ class Link:
         """The subscriber goes."""
         self._file.close()
         self.socket.close()
+
+
+def start_thread(run, name):
+    threading.Thread(target=run, name=name, daemon=True).start()
 
 
 def senders():

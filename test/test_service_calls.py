@@ -743,7 +743,7 @@ def test_a_master_that_is_away_is_told_when_it_is_needed():
         service.call(load_namespace='bob', timeout=TIMEOUT)
 
 
-# -- a service of ours, called by a C++ program -------------------------------------------------------------------------
+# -- a service of ours, called by a C++ program ------------------------------------------------------------------------
 
 @pytest.mark.parametrize('topic, status, said', [('front', 0, 'switched from back to front'), ('broken', 1, 'failed')])
 def test_a_roscpp_client_calls_a_service_of_ours(master, topic, status, said):

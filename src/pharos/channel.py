@@ -141,7 +141,8 @@ class OutputChannel(_Channel):
         self._open(connect_timeout)
 
     def _open(self, connect_timeout=None):
-        self._endpoint, self._send = self.node._rospy.wiring.advertise(self, tcp_nodelay=True, queue_size=self.queue_size)
+        self._endpoint, self._send = self.node._rospy.wiring.advertise(self, tcp_nodelay=True,
+                                                                       queue_size=self.queue_size)
         self.node._remember_channel(self)
         self._wait_for_known_subscribers(self.node.connect_timeout if connect_timeout is None else connect_timeout)
 

@@ -26,8 +26,9 @@ class Inbox:
     :param header: the ``_connection_header`` of the messages; None where they have one already
     """
 
-    __slots__ = ('channel', 'dispatcher', 'inline', 'shared', 'arrived', 'taken', 'closed', '_thaw', '_header', '_queue',
-                 '_limit', '_announce', '_announced', '_seen')    # a message that comes alone meets cold caches
+    # a message that comes alone meets cold caches: all that it needs lies together
+    __slots__ = ('channel', 'dispatcher', 'inline', 'shared', 'arrived', 'taken', 'closed', '_thaw', '_header',
+                 '_queue', '_limit', '_announce', '_announced', '_seen')
 
     def __init__(self, channel, dispatcher, inline, thaw=None, header=None, shared=False):
         self.channel, self.dispatcher, self.inline, self.shared = channel, dispatcher, inline, shared
@@ -162,7 +163,8 @@ class Dispatcher:
         self._awake.acquire(True, GIVE_WAY)
 
     def _loop(self):
-        announced, inline, running = self.announced, self.inline, self._running
+        announced, inline = self.announced, self.inline
+        acquire, release = self._running.acquire, self._running.release    # ``with`` costs more
         while not self._closed:
             try:
                 inbox = announced.popleft()
@@ -173,8 +175,11 @@ class Dispatcher:
                     _release(self._awake)
                 self.idle = False
                 continue
-            with running:
+            acquire()
+            try:
                 inbox.run_next()
+            finally:
+                release()
             if inline:
                 self.run()
 

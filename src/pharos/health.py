@@ -31,7 +31,8 @@ class Health(NamedTuple):
 def health_of(node, ask):
     """The :class:`Health` of a node; ``ask``: the master too, which may take its time, else ``registered`` is None."""
     connections = collections.Counter(transport for channel in node.channels for _, transport in channel.connections)
-    return Health(_is_registered(node) if ask else None, watcher_of(node.master).reachable_since if node.is_running else None,
+    reachable_since = watcher_of(node.master).reachable_since if node.is_running else None
+    return Health(_is_registered(node) if ask else None, reachable_since,
                   dict(connections), sum(getattr(channel, 'dropped', 0) for channel in node.channels), len(node.errors),
                   node._rospy.thread_count if node._rospy else 0)
 

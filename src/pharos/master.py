@@ -51,7 +51,7 @@ class Master:
         child, url = embedded_master.start(check_port('port', port))
         master = cls(url)
         master._child = child
-        atexit.register(master.stop)    # the child would end by itself, but perhaps after us, and keep its port till then
+        atexit.register(master.stop)    # the child would end by itself, but perhaps after us
         return master
 
     def stop(self):
@@ -81,7 +81,8 @@ class Master:
 
         The report (listing 3.7)::
 
-            master create: PhaROSBlockNode named: '/myNode' domain: '127.0.0.1' tcpPort: 9999 xmlRpcPort: 6123 soul: [...]
+            master create: PhaROSBlockNode named: '/myNode' domain: '127.0.0.1' tcpPort: 9999 xmlRpcPort: 6123
+                soul: [...]
             master.create(BlockNode, named='/myNode', domain='127.0.0.1', tcp_port=9999, xmlrpc_port=6123, soul=...)
 
         :param node_class: Node, BlockNode or a subclass
@@ -130,7 +131,7 @@ class Master:
         """
         return ros_process.launch(self.url, package, file, args, on_line)
 
-    # -- what is there --------------------------------------------------------------------------------------------------
+    # -- what is there -------------------------------------------------------------------------------------------------
 
     def nodes(self):
         """All nodes: a Node where it runs in this process, an ExternalNode elsewhere."""
@@ -160,7 +161,8 @@ class Master:
         watcher = watcher_of(self)
         if not watcher.wait_for_node(name, timeout):
             self._ask('getPid')
-            raise UnknownNodeError('no node %s came to %s within %g s' % (name, self.url, timeout))
+            raise UnknownNodeError('no node %s came to %s within %g s: is it started, with that '
+                                   'master, and under that name?' % (name, self.url, timeout))
         return next((node for node in self.own_nodes() if node.name == name), None) or ExternalNode(self, name)
 
     def on_change(self, block):
@@ -213,7 +215,7 @@ class Master:
         """``(publishers, subscribers, services)``, each ``{name: [node names]}``."""
         return tuple({name: list(nodes) for name, nodes in kind} for kind in self._ask('getSystemState'))
 
-    # -- the master itself ------------------------------------------------------------------------------------------------
+    # -- the master itself ---------------------------------------------------------------------------------------------
 
     @property
     def pid(self):

@@ -54,8 +54,8 @@ class Node(Life):
     def delegate(self):
         """The block run for each message received, called as ``delegate(message, channel)``.
 
-        The report: ``self receiverDelegate: [:message :channel | ...]``. Delegates of a node run one at a time. It may be
-        replaced while the node runs, and takes effect with the next message.
+        The report: ``self receiverDelegate: [:message :channel | ...]``. Delegates of a node run one at a time. It may
+        be replaced while the node runs, and takes effect with the next message.
         """
         return self._delegate
 
@@ -170,7 +170,7 @@ class Node(Life):
     def _forget_channel(self, channel):
         self._channels = [other for other in self._channels if other is not channel]
 
-    # -- services, parameters, log --------------------------------------------------------------------------------------
+    # -- services, parameters, log -------------------------------------------------------------------------------------
 
     def serve(self, name, typed_as, block):
         """Offer a service; returns a handle with ``close()``.
@@ -199,7 +199,7 @@ class Node(Life):
             log = self._rospy.log
             log('%s', (text,), {}, level=level)    # no wrapper between: rospy looks for the caller of this method
 
-    # -- what rospy offers beyond -----------------------------------------------------------------------------------------
+    # -- what rospy offers beyond --------------------------------------------------------------------------------------
 
     @property
     def ros(self):

@@ -51,7 +51,7 @@ class Parameter:
         :raises MasterUnreachableError: if there is no answer
         """
         if value is None:
-            raise ValueError('%s cannot be set to None: no parameter can' % self.name)
+            raise ValueError('%s cannot be set to None: choose a value, such as an empty text or list' % self.name)
         value = self._checked(self._carried(value))
         watched = self.node._live_rospy().parameters
         with self.node.master._reached():

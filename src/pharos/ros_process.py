@@ -159,7 +159,8 @@ def launch(master_url, package, file, args, on_line=None):
         raise UnknownNodeError('no ROS package %r on ROS_PACKAGE_PATH: install it, or source its workspace\'s '
                                'setup.bash' % package) from None
     if not found:
-        raise UnknownNodeError('the ROS package %s has no launch file %r' % (package, file))
+        raise UnknownNodeError('the ROS package %s has no launch file %r: is it spelt so, and installed?'
+                               % (package, file))
     command = [sys.executable, '-c', 'import roslaunch; roslaunch.main()', '--skip-log-check', found[0]]
     return RosProcess([*command, *('%s:=%s' % arg for arg in args.items())], master_url, on_line)
 

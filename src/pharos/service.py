@@ -103,8 +103,8 @@ class Service:
         except services.Failed as error:
             raise ServiceCallError('%s failed: %s' % (self.name, error)) from None
         except socket.timeout as error:
-            raise ServiceCallError('%s did not answer in time (%s s): is its provider at %s busy? Call it with a longer '
-                                   'timeout=' % (self.name, timeout, self.uri)) from error
+            raise ServiceCallError('%s did not answer in time (%s s): is its provider at %s busy? Call it with a '
+                                   'longer timeout=' % (self.name, timeout, self.uri)) from error
         except (OSError, genpy.DeserializationError) as error:
             raise ServiceCallError('the connection to %s at %s broke (%s): is its provider still running?'
                                    % (self.name, self.uri, error)) from error
@@ -150,8 +150,8 @@ class Service:
             self._idle.append(connection)
         else:
             connection.close()
-        if not ok:
-            raise services.Failed(answer.decode(errors='replace') or 'its provider gives no reason')    # roscpp has none
+        if not ok:    # roscpp gives no reason
+            raise services.Failed(answer.decode(errors='replace') or 'its provider gives no reason')
         response = self.service_class._response_class().deserialize(answer)
         response._connection_header = connection.header
         return response

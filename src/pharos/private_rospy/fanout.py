@@ -18,8 +18,8 @@ class Fanout:
     """
 
     # a message that comes alone meets cold caches: all that it needs lies together
-    __slots__ = ('_lock', '_closed', '_seq', '_has_header', '_freeze', '_inboxes', '_remote', '_dispatchers', '_inline',
-                 '_last', '_publisher', '_module', '_thaw', '_buffer', '_latched', '_early')
+    __slots__ = ('_lock', '_closed', '_seq', '_has_header', '_freeze', '_inboxes', '_remote', '_dispatchers',
+                 '_inline', '_last', '_publisher', '_module', '_thaw', '_buffer', '_latched', '_early')
 
     def __init__(self, publisher, module):
         self._publisher, self._module = publisher, module
@@ -43,8 +43,8 @@ class Fanout:
     def publish(self, message, by=None, to=None, connection=None):
         """Send a message to all; returns whether there is anybody.
 
-        :param by: the channel whose message it is; None: a rospy Publisher's, which calls :meth:`run` when it has released
-            the lock
+        :param by: the channel whose message it is; None: a rospy Publisher's, which calls :meth:`run` when it has
+            released the lock
         :param to: name of the only node that is to get it, None: all
         :param connection: the only connection through which it is to go, None: all
         """
@@ -135,7 +135,8 @@ class Fanout:
         """Write what is latched to a new TCPROS connection."""
         for frozen in self._early or self._latched.values():
             message = self._thaw(frozen)
-            self._write(self._serialized(message, message.header.seq if hasattr(message, 'header') else 0), [connection])
+            seq = message.header.seq if hasattr(message, 'header') else 0
+            self._write(self._serialized(message, seq), [connection])
 
     def forget(self, channel):
         """A channel closes, and what it latched goes with it."""

@@ -133,7 +133,8 @@ class PrivateRospy:
     def request_stop(self, reason):
         """Have the node stopped, from a thread that the stop need not wait for."""
         if not self._stopping.locked():
-            threading.Thread(target=self._on_stop_request, args=(reason,), name=self.name + ' stop', daemon=True).start()
+            threading.Thread(target=self._on_stop_request, args=(reason,), name=self.name + ' stop',
+                             daemon=True).start()
 
     def end_sleeps(self):
         """Begin the stop: sleeps end, ``is_shutdown()`` holds, and nothing more is received."""

@@ -8,7 +8,7 @@ from pharos.private_rospy.sender import Sender
 _changed = threading.Condition()    # notified whenever a publisher of this process gains or loses a connection
 
 
-def mend_publisher(module):
+def mend_publisher(module, start_thread):
     """rospy.topics._PublisherImpl.
 
     rospy latches the user's object, which may change (ros_comm #1481), and one for all publishers of a node on the
@@ -43,7 +43,7 @@ def mend_publisher(module):
         """
         link = getattr(connection, 'link', None)
         if link is None and self.queue_size is not None:
-            connection = Sender(connection, self.queue_size)
+            connection = Sender(connection, self.queue_size, start_thread)
         lock = self.publock
         if lock is None:    # closed meanwhile
             connection.close()

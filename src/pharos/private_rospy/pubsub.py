@@ -17,7 +17,7 @@ def hooks(instance):
         """rospy.topics."""
         module.is_shutdown = instance.is_shut_down
         _close_pollers(module._TopicImpl)
-        mend_publisher(module)
+        mend_publisher(module, instance.start_thread)
         _mend_subscriber(module._SubscriberImpl, instance)
 
     def offer_intraprocess(module):

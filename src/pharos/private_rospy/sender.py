@@ -14,7 +14,7 @@ class Sender:
     which takes all that is queued out at once, so that it can neither drop nor count it any more.
     """
 
-    def __init__(self, connection, queue_size):
+    def __init__(self, connection, queue_size, start_thread):
         """:param queue_size: messages, the oldest of which are dropped; 0: without limit"""
         self._connection = connection
         self._queue = collections.deque(maxlen=queue_size or None)
@@ -23,7 +23,7 @@ class Sender:
         self._error = None        # of the thread, for the next who publishes, as in rospy
         self._changed = threading.Condition(threading.Lock())
         connection.set_cleanup_callback(self._closed)
-        threading.Thread(target=self._run, name='sender', daemon=True).start()
+        start_thread(self._run, name='sender')
 
     def __getattr__(self, name):
         return getattr(self._connection, name)
