@@ -4,13 +4,14 @@ import socket
 import subprocess
 import sys
 import threading
+import types
 
 import genpy
 import pytest
 
 import pharos
 from conftest import TIMEOUT, InProcessMaster, Mailbox
-from pharos import BlockNode, Master
+from pharos import BlockNode, Master, dispatcher
 from pharos.life import Lifecycle
 
 TWIST, IMAGE, STRING = 'geometry_msgs/Twist', 'sensor_msgs/Image', 'std_msgs/String'
@@ -486,3 +487,16 @@ def test_counters_hold_over_many_publishers(master, mailbox):
             sender.send_to('/t', data='x')
         mailbox.get()
     assert (received.received, received.dropped) == (10, 0)
+
+
+def test_a_publisher_gives_way_to_a_receiver_that_takes_nothing_once_in_a_while(monkeypatch):
+    now, naps = [1.0], []
+    monkeypatch.setattr(dispatcher, 'time', types.SimpleNamespace(perf_counter=lambda: now[0], sleep=naps.append))
+    inbox = dispatcher.Inbox(types.SimpleNamespace(queue_size=10), dispatcher.Dispatcher(None), inline=True)
+    for number in range(1000):
+        inbox.put(number)
+    assert len(naps) == 1 and inbox.dropped == 990
+    now[0] += 2 * dispatcher.STARVING
+    for number in range(1000):
+        inbox.put(number)
+    assert len(naps) == 2 and inbox.dropped == 1990

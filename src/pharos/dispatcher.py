@@ -12,6 +12,7 @@ import time
 
 BURST = 100e-6    # seconds; a publisher that comes again within them does not give way to the receiver
 GIVE_WAY = 1e-3   # seconds that a publisher at the most gives way, until the dispatcher thread has woken up
+STARVING = 1e-3   # seconds; so often a publisher gives way to a receiver that takes nothing from a full inbox
 QUICK = 1e-3      # seconds; a delegate that takes longer is not run by a thread that has a socket to read,
 TRUSTED = 10      # and one is that has been quick so many times in a row
 
@@ -28,7 +29,7 @@ class Inbox:
 
     # a message that comes alone meets cold caches: all that it needs lies together
     __slots__ = ('channel', 'dispatcher', 'inline', 'shared', 'arrived', 'taken', 'closed', '_thaw', '_header',
-                 '_queue', '_limit', '_announce', '_announced', '_seen')
+                 '_queue', '_limit', '_announce', '_announced', '_seen', '_given')
 
     def __init__(self, channel, dispatcher, inline, thaw=None, header=None, shared=False):
         self.channel, self.dispatcher, self.inline, self.shared = channel, dispatcher, inline, shared
@@ -39,7 +40,8 @@ class Inbox:
         self._limit = channel.queue_size
         self._announce = dispatcher.inline.append if inline else dispatcher.announced.append
         self._announced = False
-        self._seen = -1
+        self._seen = -1     # how many were taken when a publisher last gave way,
+        self._given = 0.0   # and when that was
 
     @property
     def dropped(self):
@@ -52,10 +54,11 @@ class Inbox:
     def put(self, value):
         """Add a message; the dispatcher is to be told afterwards."""
         queue = self._queue
-        if len(queue) == self._limit and self._seen != self.taken:
-            # Full, but the receiver is getting on. A publisher that never lets go of the interpreter would starve it.
+        if len(queue) == self._limit and (self._seen != self.taken or time.perf_counter() - self._given > STARVING):
+            # Full: a publisher that never lets go of the interpreter would starve the receiver.
             self._seen = self.taken
             time.sleep(1e-6)
+            self._given = time.perf_counter()
         queue.append(value)
         self.arrived += 1
         if not self._announced:
