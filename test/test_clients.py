@@ -244,6 +244,18 @@ def shake(**fields):
     return encode_ros_handshake_header({name: value for name, value in header.items() if value is not None})
 
 
+def assert_refused_and_logged_once(node, port, kind, warnings, said, logged):
+    with connect(port) as client:
+        with contextlib.suppress(ConnectionError):    # it closes before all of a long one is said
+            client.sendall(said)
+            client.shutdown(socket.SHUT_WR)
+        assert is_closed(client)
+        line = warnings.get()
+        assert logged in line and line.startswith('%s client %s refused: ' % (kind, address_of(client)))
+    assert '\n' not in line and len(line) < 500
+    assert answers(node) and warnings.empty()
+
+
 @pytest.mark.parametrize('said, logged', [
     (struct.pack('<I', 0xffffffff), '4294967299 bytes; the limit is'),
     (b'GET / HTTP/1.0\r\n\r\n', 'the limit is'),
@@ -267,15 +279,7 @@ def shake(**fields):
     (shake(topic='/%s%n%(x)s{0.__class__}'), '[/node] is not a publisher of [/%s%n%(x)s{0.__class__}]'),
 ], ids=named)
 def test_a_bad_handshake_is_refused_and_logged_once(node, warnings, said, logged):
-    with connect(node.tcp_port) as client:
-        with contextlib.suppress(ConnectionError):    # it closes before all of a long one is said
-            client.sendall(said)
-            client.shutdown(socket.SHUT_WR)
-        assert is_closed(client)
-        line = warnings.get()
-        assert logged in line and line.startswith('TCPROS client %s refused: ' % address_of(client))
-    assert '\n' not in line and len(line) < 500
-    assert answers(node) and warnings.empty()
+    assert_refused_and_logged_once(node, node.tcp_port, 'TCPROS', warnings, said, logged)
 
 
 def test_a_caller_id_is_shown_as_it_is(node, warnings, screen):
@@ -448,15 +452,7 @@ LAUGHS = b'<!DOCTYPE a [<!ENTITY b "ha"><!ENTITY c "&b;&b;">]>' + call('getPid',
     (post(call('system.multicall', [{'methodName': 'nothing', 'params': []}])), 'call of nothing: '),
 ], ids=named)
 def test_a_bad_call_is_refused_and_logged_once(node, warnings, said, logged):
-    with connect(node.xmlrpc_port) as client:
-        with contextlib.suppress(ConnectionError):
-            client.sendall(said)
-            client.shutdown(socket.SHUT_WR)
-        assert is_closed(client)
-        line = warnings.get()
-        assert logged in line and line.startswith('XML-RPC client %s refused: ' % address_of(client))
-    assert '\n' not in line and len(line) < 500
-    assert answers(node) and warnings.empty()
+    assert_refused_and_logged_once(node, node.xmlrpc_port, 'XML-RPC', warnings, said, logged)
 
 
 @pytest.mark.parametrize('method, parameters', [

@@ -104,15 +104,19 @@ class SocketInbox(Inbox):
     def __init__(self, channel, dispatcher):
         super().__init__(channel, dispatcher, inline=False)
         self._announce = dispatcher.announce
-        self._quick = 0    # how many times in a row
+        self._quick = 0    # how many times in a row, TRUSTED at the most
 
     def run_next(self):
         taken, begin = self.taken, time.perf_counter()
         super().run_next()
-        if self.taken != taken:
-            self._quick = self._quick + 1 if time.perf_counter() - begin < QUICK else 0
-            dispatcher = self.dispatcher
-            self._announce = dispatcher.inline.append if self._quick >= TRUSTED else dispatcher.announce
+        if self.taken == taken:
+            return
+        if time.perf_counter() - begin >= QUICK:
+            self._quick, self._announce = 0, self.dispatcher.announce
+        elif self._quick < TRUSTED:
+            self._quick += 1
+            if self._quick == TRUSTED:
+                self._announce = self.dispatcher.inline.append
 
 
 class Dispatcher:

@@ -99,7 +99,8 @@ class Topic:
                 if time.monotonic() >= deadline:
                     raise
             if node._rospy.ended.wait(POLL):    # a master tells nobody of new types
-                raise NodeStoppedError('%s stopped while it waited for the type of %s' % (node.name, self.name))
+                raise NodeStoppedError('%s stopped while it waited for the type of %s: start it again first'
+                                       % (node.name, self.name))
 
     def __eq__(self, other):
         return isinstance(other, Topic) and (self.master.url, self.name) == (other.master.url, other.name)
