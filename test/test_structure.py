@@ -13,7 +13,7 @@ MODULES = sorted(ROOT.rglob('*.py'))
 SCRIPTS = sorted(path for path in (ROOT.parent.parent / 'scripts').iterdir() if path.is_file())
 
 ROSPYS_INSIDE = re.compile(r'rospy\.impl|rospy\.(core|topics|names)\._|_topic_manager|protocol_handlers')
-LINE_LIMIT = 300
+LINE_LIMIT = 400
 
 EXPORTS = """
     Master Node BlockNode ExternalNode Topic InputChannel OutputChannel Service Parameter Transcript RosProcess

@@ -15,7 +15,13 @@ _stops = 0     # since it ran
 _nodes = {}    # a dict, for its order
 _none_left = threading.Condition()
 _deferred = None    # the signals that came while the main thread started a node; None: it starts none
+_raised = None    # the last exception by which a signal ends the main thread, and with it the program
 _waiting = 0   # how deep the main thread is in a wait of ours, which ends with the nodes
+
+
+def is_from_signal(error):
+    """Whether a signal ends the program with this exception, and not what a block raised by itself."""
+    return error is _raised
 
 
 def add(node):
@@ -108,15 +114,16 @@ def signals_deferred():
 
 
 def _on_signal(number, frame):
+    global _raised
     if _deferred is not None:
         _deferred.append(number)
         return
     stop = threading.Thread(target=stop_all, name='stop on signal', daemon=True)
     stop.start()    # not here: the main thread may hold any lock just now
     if not _waiting:
-        if number == signal.SIGINT:
-            raise KeyboardInterrupt
-        raise SystemExit(128 + number)    # as the shell reports a process that SIGTERM ended
+        # the status is the shell's for a process that SIGTERM ended
+        _raised = KeyboardInterrupt() if number == signal.SIGINT else SystemExit(128 + number)
+        raise _raised
 
 
 atexit.register(stop_all)
