@@ -119,7 +119,7 @@ def counted(ros_master):
 def mux(ros_master):
     """A roscpp provider, topic_tools's mux between /calls/a and /calls/b."""
     for type_, text in MUX_TYPES.values():
-        message_types.define_service(type_, text)
+        pharos.define_service(type_, text)
     master = pharos.Master(ros_master.url)
     with master.run('topic_tools', 'mux', '/calls/out', '/calls/a', '/calls/b', remap={'__ns': '/calls'}) as process:
         until(lambda: {'/calls/mux/' + name for name in MUX_TYPES} <= set(master.services()))
@@ -251,7 +251,7 @@ try:
     service.call(x=1.0)
 except pharos.UnknownTypeError as error:
     print(error)
-message_types.define_service(service.type, text)
+pharos.define_service(service.type, text)
 service.call(x=1.0, timeout=20)
 service.md5sum = 'wrong'
 try:
@@ -748,7 +748,7 @@ def test_a_master_that_is_away_is_told_when_it_is_needed():
 @pytest.mark.parametrize('topic, status, said', [('front', 0, 'switched from back to front'), ('broken', 1, 'failed')])
 def test_a_roscpp_client_calls_a_service_of_ours(master, topic, status, said):
     """topic_tools's switch_mux is a C++ program."""
-    message_types.define_service(*MUX_TYPES['select'])
+    pharos.define_service(*MUX_TYPES['select'])
 
     def select(request):
         if request.topic == 'broken':

@@ -17,7 +17,7 @@ LINE_LIMIT = 400
 
 EXPORTS = """
     Master Node BlockNode ExternalNode Topic InputChannel OutputChannel Service Parameter Transcript RosProcess
-    message_class define_message service_class spin __version__
+    message_class service_class define_message define_service spin __version__
     PharosError MasterUnreachableError NodeNameInUseError PortInUseError UnknownNodeError UnknownTopicError
     UnknownTypeError MessageTypeError UnknownServiceError ServiceTypeError ServiceCallError NodeStoppedError
 """.split()

@@ -5,7 +5,7 @@ from pharos.errors import (MasterUnreachableError, MessageTypeError, NodeNameInU
                            UnknownTopicError, UnknownTypeError)
 from pharos.external_node import ExternalNode
 from pharos.master import Master
-from pharos.message_types import define_message, message_class, service_class
+from pharos.message_types import define_message, define_service, message_class, service_class
 from pharos.node import BlockNode, Node
 from pharos.parameter import Parameter
 from pharos.ros_process import RosProcess
@@ -17,7 +17,8 @@ from pharos.transcript import Transcript
 __version__ = '0.1.0'
 __all__ = [
     'Master', 'Node', 'BlockNode', 'ExternalNode', 'Topic', 'InputChannel', 'OutputChannel', 'Service', 'Parameter',
-    'Transcript', 'RosProcess', 'message_class', 'define_message', 'service_class', 'spin', '__version__',
+    'Transcript', 'RosProcess', 'message_class', 'service_class', 'define_message', 'define_service', 'spin',
+    '__version__',
     'PharosError', 'MasterUnreachableError', 'NodeNameInUseError', 'PortInUseError', 'UnknownNodeError',
     'UnknownTopicError', 'UnknownTypeError', 'MessageTypeError', 'UnknownServiceError', 'ServiceTypeError',
     'ServiceCallError', 'NodeStoppedError',

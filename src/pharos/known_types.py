@@ -30,18 +30,28 @@ def check_name(kind, type_):
 
 def seek(kind, type_, must=True):
     """Return the class of a type or, where it has none yet, the text of its definition."""
-    for look in (_found_before, installed, file_text, _shipped):
+    for look in _LOOKS:
         known = look(kind, type_)
         if known is not None:
             return known
     if not must:
         return None
     package, _, name = type_.partition('/')
-    define = 'define_message' if kind == 'msg' else 'pharos.message_types.define_service'
+    define = 'define_message' if kind == 'msg' else 'define_service'
     raise UnknownTypeError(
         f'unknown {_KINDS[kind]} type {type_!r}{_near_types(kind, type_)}: Python has no {package}.{kind}.{name}, '
         f'there is no {package}/{kind}/{name}.{kind} on ROS_PACKAGE_PATH ({os.pathsep.join(rospkg.get_ros_paths())}), '
         f'and no definition was given; install the package {package} or call {define}({type_!r}, text)')
+
+
+def everywhere(kind, type_):
+    """Return each class of a type, and each text of its definition, that is here."""
+    try:
+        check_name(kind, type_)
+        everything = [look(kind, type_) for look in _LOOKS]
+    except UnknownTypeError:
+        return []
+    return [known for known in everything if known is not None]
 
 
 def _found_before(kind, type_):
@@ -80,6 +90,9 @@ def file_text(kind, type_):
 
 def _shipped(kind, type_):
     return DEFINITIONS[kind].get(type_)
+
+
+_LOOKS = _found_before, installed, file_text, _shipped
 
 
 def _near_types(kind, type_):

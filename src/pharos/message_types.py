@@ -9,11 +9,11 @@ import threading
 import genpy
 
 from pharos import known_types, message_definition
-from pharos.errors import MessageTypeError
+from pharos.errors import MessageTypeError, UnknownTypeError
 from pharos.message_fields import build, check_fits, describe_fields, explain, fill
 
 __all__ = ['message_class', 'service_class', 'define_message', 'define_service', 'class_from_definition',
-           'describe_fields', 'build', 'fill', 'check_fits', 'explain']
+           'known_service_classes', 'describe_fields', 'describe_service', 'build', 'fill', 'check_fits', 'explain']
 
 _lock = threading.RLock()
 _given = {}  # (kind, type): class from define_message or define_service
@@ -50,6 +50,25 @@ def define_message(type_, text):
 def define_service(type_, text):
     """Define the service type ``'package/Type'`` by the text of a ``.srv`` file, as :func:`define_message` does."""
     return _define('srv', type_, text)
+
+
+def known_service_classes(type_):
+    """Return the classes of all definitions of a service type that are here, whichever :func:`service_class` gives."""
+    classes = []
+    with _lock:
+        for known in known_types.everywhere('srv', type_):
+            try:
+                cls = message_definition.make('srv', type_, known) if isinstance(known, str) else known
+            except UnknownTypeError:  # a text that cannot be read tells nobody anything
+                continue
+            classes.append(cls)
+    return classes
+
+
+def describe_service(cls):
+    """Return the fields of a service class as a text: ``'request: data: bool; response: no fields'``."""
+    request, response = map(describe_fields, (cls._request_class, cls._response_class))
+    return f'request: {request}; response: {response}'
 
 
 def class_from_definition(type_, full_text, md5sum=None):

@@ -3,7 +3,7 @@ import genpy
 
 from pharos import message_types
 from pharos.blocks import check_block
-from pharos.errors import PharosError
+from pharos.errors import MessageTypeError, PharosError
 from pharos.private_rospy import services
 from pharos.private_rospy.host import rospy
 
@@ -42,6 +42,11 @@ class OfferedService:
         """The response that the block meant: itself, its fields, or its only field."""
         response = self.service_class._response_class
         if isinstance(value, genpy.Message) and value._type == response._type:
+            if value._md5sum != response._md5sum:    # the caller would read its bytes as other fields
+                raise MessageTypeError(
+                    f'{self.name} answers with a {response._type} of {message_types.describe_fields(response)} '
+                    f'[{response._md5sum}]; its block returned one of {message_types.describe_fields(type(value))} '
+                    f'[{value._md5sum}]: make it of the class that the service was offered with')
             try:
                 self._check(value)
             except Exception:

@@ -8,7 +8,7 @@ import rosgraph
 
 from pharos import message_types
 from pharos.blocks import check_block
-from pharos.errors import ServiceCallError, ServiceTypeError, UnknownServiceError, UnknownTypeError
+from pharos.errors import ServiceCallError, ServiceTypeError, UnknownServiceError
 from pharos.private_rospy import services
 from pharos.private_rospy.host import rospy
 from pharos.tcpros_connection import TcprosConnection
@@ -24,21 +24,21 @@ class Service:
         service := master lookupService: '/clear' with: '/myID'. service call
         service = master.lookup_service('/clear', caller_id='/myID'); service.call()
 
-    :attr:`type` and :attr:`md5sum` are found by asking the provider; a ``md5sum`` set by hand is what is sent.
-    :attr:`response` is the last call's. May be called from several threads at once.
+    :attr:`type` and :attr:`md5sum` are found by asking the provider. A call sends the md5sum of the definition that
+    fills the request, so that the provider refuses one of another layout; a ``md5sum`` set by hand is sent instead,
+    until it is set to None. :attr:`response` is the last call's. May be called from several threads at once.
     """
 
     def __init__(self, master, name, caller_id, persistent=False):
         self.master, self.name, self.caller_id, self.persistent = master, name, caller_id, persistent
-        self.uri = self.type = self.md5sum = self.response = self._found_md5sum = None
+        self.uri = self.type = self.response = self._found_md5sum = self._md5sum_by_hand = None
         self._calls = 0
         self._class = None
         self._here = None    # the provider, where it is a node of this process
         self._idle = []      # persistent connections that nobody uses just now
         self._look_up(None)
         header = self._ask()
-        self.type = header.get('type')
-        self.md5sum = self._found_md5sum = header.get('md5sum')
+        self.type, self._found_md5sum = header.get('type'), header.get('md5sum')
 
     def _look_up(self, deadline):
         """Find the provider, which may have moved; returns its URI."""
@@ -59,7 +59,8 @@ class Service:
         """
         limit = time.monotonic() + TIMEOUT
         try:
-            connection = self._connect(limit if deadline is None else min(limit, deadline), probe='1', md5sum='*')
+            connection = self._connect({**self._header('*'), 'probe': '1'},
+                                       limit if deadline is None else min(limit, deadline))
         except OSError as error:
             raise ServiceCallError('the provider of %s at %s does not answer (%s): is it still running? '
                                    'rosnode cleanup removes it if not' % (self.name, self.uri, error)) from error
@@ -70,8 +71,17 @@ class Service:
         return connection.header
 
     @property
+    def md5sum(self):
+        """The provider's md5sum, or the one set by hand; setting it to None takes that back."""
+        return self._md5sum_by_hand or self._found_md5sum
+
+    @md5sum.setter
+    def md5sum(self, md5sum):
+        self._md5sum_by_hand = md5sum
+
+    @property
     def service_class(self):
-        """The service class of its type.
+        """The service class of its type, as it is defined here.
 
         :raises UnknownTypeError: if there is no definition of it here
         """
@@ -86,7 +96,8 @@ class Service:
         no wiring deadlocks, and with one in a thread of that node.
 
         :param timeout: seconds that the whole call may take; None: no limit
-        :raises ServiceTypeError: if the md5sum set by hand does not fit, or the provider changed the type
+        :raises ServiceTypeError: if the type is defined otherwise here than at the provider, the provider changed it,
+            or the md5sum set by hand does not fit
         :raises MessageTypeError: if a field does not exist or does not fit
         :raises UnknownServiceError: if it is no longer offered
         :raises ServiceCallError: if the provider fails, goes away or does not answer in time
@@ -95,6 +106,7 @@ class Service:
         self.response = None
         if block is not None:
             check_block(block, 'block', ('request',))
+        self._check_definition(deadline)
         request = message_types.build(self.service_class._request_class, block, fields)
         self._calls += 1
         services.number(request, self._calls)
@@ -109,6 +121,16 @@ class Service:
             raise ServiceCallError('the connection to %s at %s broke (%s): is its provider still running?'
                                    % (self.name, self.uri, error)) from error
         return response    # not self.response, which is another thread's by now
+
+    def _check_definition(self, deadline):
+        """Refuse a definition that is not the provider's, before anybody wonders which fields a request has."""
+        if self._md5sum_by_hand or self._found_md5sum in (None, '*', self.service_class._md5sum):
+            return
+        self._look_up(deadline)
+        header = self._ask(deadline)    # it may have been built anew since it was looked up
+        if header.get('md5sum') != self.service_class._md5sum:
+            raise self._type_error(header)
+        self._found_md5sum = header['md5sum']
 
     def _exchange(self, request, deadline):
         """Send the request to the provider, and where that has gone, to where it is now; returns the response."""
@@ -131,13 +153,14 @@ class Service:
         here = self._here
         if here is None or not here.is_offered(self.uri):
             here = self._here = services.find(self.name, self.uri, self.service_class)
-        here = here if here and here.md5sum == self._md5sum_sent == self._found_md5sum else None
+        # what is sent by hand as another type's is left to the wire
+        here = here if here and here.md5sum == self._md5sum_sent == self.service_class._md5sum else None
         try:
             data = here.freeze(request) if here else services.serialize(request)
         except Exception:
             message_types.check_fits(request)    # tells what of it does not
             raise
-        return here.call(data, self._header(), deadline) if here else self._send_over_tcp(data, deadline)
+        return here.call(data, self._header(self._md5sum_sent), deadline) if here else self._send_over_tcp(data, deadline)
 
     def _send_over_tcp(self, data, deadline):
         connection = self._connection(deadline)
@@ -158,22 +181,22 @@ class Service:
 
     @property
     def _md5sum_sent(self):
-        return self.md5sum or self._found_md5sum
+        return self._md5sum_by_hand or self.service_class._md5sum
 
-    def _header(self):
-        header = {'service': self.name, 'md5sum': self._md5sum_sent or '*', 'callerid': self.caller_id}
+    def _header(self, md5sum):
+        header = {'service': self.name, 'md5sum': md5sum, 'callerid': self.caller_id}
         if self.persistent:
             header['persistent'] = '1'
         return header
 
     def _connection(self, deadline):
         """An idle connection that lives, or a new one."""
-        header = self._header()
+        header = self._header(self._md5sum_sent)
         for connection in self._take_idle():
             if connection.sent == header and connection.is_alive():    # not made with an md5sum that was set meanwhile
                 return connection
             connection.close()
-        connection = self._connect(deadline)
+        connection = self._connect(header, deadline)
         if 'error' in connection.header:
             connection.close()
             raise _NotShakenHands(connection.header['error'])
@@ -184,30 +207,42 @@ class Service:
             while True:
                 yield self._idle.pop()
 
-    def _connect(self, deadline, **fields):
-        return TcprosConnection(rospy.parse_rosrpc_uri(self.uri), {**self._header(), **fields}, deadline)
+    def _connect(self, header, deadline):
+        return TcprosConnection(rospy.parse_rosrpc_uri(self.uri), header, deadline)
 
     def _refused(self, error, deadline):
-        """The error of a provider that refuses, by what it says of itself now.
+        """The error of a provider that refuses, by what it says of itself now."""
+        header = self._ask(deadline)
+        if header.get('md5sum') == self._md5sum_sent:
+            return ServiceCallError('the provider of %s at %s refused the call: %s' % (self.name, self.uri, error))
+        return self._type_error(header)
+
+    def _type_error(self, header):
+        """The error of a provider whose type is another than what is sent.
 
         The report: the "error message provides all information about the service including the md5sum".
         """
-        header = self._ask(deadline)
-        type_, md5sum, sent = header.get('type'), header.get('md5sum'), self._md5sum_sent
-        if sent == md5sum:
-            return ServiceCallError('the provider of %s at %s refused the call: %s' % (self.name, self.uri, error))
-        try:
-            service_class = message_types.service_class(type_)
-            fields = 'request: %s; response: %s' % (message_types.describe_fields(service_class._request_class),
-                                                    message_types.describe_fields(service_class._response_class))
-        except UnknownTypeError:
-            fields = 'its fields are not known here'
-        if sent == self._found_md5sum:
-            advice = 'it was %s when it was looked up: look it up again' % self.type
-        else:
-            advice = 'set that one, or none'
-        return ServiceTypeError('the md5sum %r is not that of %s, which is of type %s with md5sum %s (%s): %s'
-                                % (sent, self.name, type_, md5sum, fields, advice))
+        type_, md5sum, by_hand = header.get('type'), header.get('md5sum'), self._md5sum_by_hand
+        theirs = f'{type_} with md5sum {md5sum} ({self._fields_of(type_, md5sum)})'
+        if by_hand:
+            return ServiceTypeError(f'the md5sum {by_hand!r} is not that of {self.name}, which is of type {theirs}: set '
+                                    'that one, or none')
+        if type_ != self.type:
+            return ServiceTypeError(f'the md5sum {self.service_class._md5sum!r} is not that of {self.name}, which is of '
+                                    f'type {theirs}: it was {self.type} when it was looked up: look it up again')
+        ours, self._class = self.service_class, None    # the right definition may come, and is sought then
+        return ServiceTypeError(
+            f'{self.name} is of type {theirs}, but {type_} is defined here with md5sum {ours._md5sum} '
+            f'({message_types.describe_service(ours)}), so nothing was sent: have both sides use the same '
+            f'{type_.rpartition("/")[2]}.srv')
+
+    def _fields_of(self, type_, md5sum):
+        """What can be said of the fields of a provider's type; a provider elsewhere tells its md5sum alone."""
+        here = services.class_of(self.name, self.uri)
+        for known in (here, *message_types.known_service_classes(type_)):
+            if known is not None and known._md5sum == md5sum:
+                return message_types.describe_service(known)
+        return 'its fields are not known here'
 
     def close(self):
         """Close the connections of a persistent service; a later call opens them again."""

@@ -21,11 +21,23 @@ class Failed(Exception):
 
 def find(name, uri, service_class):
     """The :class:`LocalService` of that name and URI, if its provider is of this process; else None."""
+    instance, service = _offered_here(name, uri)
+    return service and LocalService(instance, service, service_class)
+
+
+def class_of(name, uri):
+    """The service class of that name and URI, if its provider is of this process; else None."""
+    _, service = _offered_here(name, uri)
+    return service and service.service_class
+
+
+def _offered_here(name, uri):
+    """The PrivateRospy and the rospy Service of that name and URI, or twice None."""
     for instance in running_here():
         service = instance.services.get(name)
         if service is not None and service.uri == uri:
-            return LocalService(instance, service, service_class)
-    return None
+            return instance, service
+    return None, None
 
 
 class LocalService:
