@@ -1,9 +1,12 @@
 """Blocks: the callables that a node is made of, and the souls among them that run in threads of their own."""
+import functools
 import inspect
 import threading
 
 from pharos import running
 from pharos.errors import NodeStoppedError
+
+_ASYNC = inspect.CO_COROUTINE | inspect.CO_ITERABLE_COROUTINE | inspect.CO_ASYNC_GENERATOR
 
 
 def check_block(block, what, parameters):
@@ -13,6 +16,7 @@ def check_block(block, what, parameters):
     call = '%s(%s)' % (what, ', '.join(parameters))
     if not callable(block):
         raise TypeError('a %s is a block, called as %s; %r cannot be called' % (what, call, block))
+    check_runs(block, 'a ' + what)
     try:
         signature = inspect.signature(block)
     except (TypeError, ValueError):
@@ -22,6 +26,24 @@ def check_block(block, what, parameters):
     except TypeError as error:
         raise TypeError('a %s is called as %s; %r does not take that: %s' % (what, call, block, error)) from None
     return block
+
+
+def check_runs(block, what):
+    """Raise TypeError for a function that does not run when it is called: ``async def``, or one with ``yield``."""
+    function = block
+    while isinstance(function, functools.partial):
+        function = function.func
+    # an object that can be called tells it of its __call__
+    code = getattr(function, '__code__', None) or getattr(getattr(type(function), '__call__', None), '__code__', None)
+    flags = getattr(code, 'co_flags', 0)
+    if flags & _ASYNC:
+        raise TypeError(f'{what} is called and not awaited, so that {block!r}, which is async, would never run: write '
+                        'a plain function that calls asyncio.run_coroutine_threadsafe(coroutine, loop) or '
+                        'asyncio.run(coroutine)')
+    if flags & inspect.CO_GENERATOR:
+        raise TypeError(f'{what} is called and not iterated, so that {block!r}, which has a yield, would never run: '
+                        'write a plain function; to do something again and again, a soul loops over '
+                        'node.every(seconds)')
 
 
 def check_delegate(block):

@@ -6,7 +6,7 @@ import time
 import genpy
 
 from pharos import message_types
-from pharos.blocks import check_delegate
+from pharos.blocks import check_delegate, check_runs
 from pharos.dispatcher import Inbox, SocketInbox
 from pharos.errors import MessageTypeError, NodeStoppedError
 from pharos.private_rospy.publishing import wait_until
@@ -181,6 +181,8 @@ class OutputChannel(_Channel):
 
     def send(self, block=None, *, to=None, **fields):
         """Fill a fresh message with ``block(message)`` and by keywords, publish it, and return it."""
+        if block is not None:
+            check_runs(block, 'a block')
         message = message_types.build(self.message_class, block, fields)
         if not self.connections:
             message_types.check_fits(message)    # with nobody interested, rospy does not look at it

@@ -79,9 +79,11 @@ class Inbox:
         channel, thaw, header = self.channel, self._thaw, self._header
         channel.received += 1
         node = channel.node
-        block = channel._delegate or node._delegate
+        block = channel._delegate
         if block is None:
-            return
+            block = node._delegate
+            if block is None:
+                return
         try:
             message = value if thaw is None else thaw(value)
             if header is not None:

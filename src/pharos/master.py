@@ -137,7 +137,7 @@ class Master:
         """All nodes: a Node where it runs in this process, an ExternalNode elsewhere."""
         own = {node.name: node for node in self.own_nodes()}
         names = sorted({name for kind in self.system_state() for users in kind.values() for name in users})
-        return [own.get(name) or ExternalNode(self, name) for name in names]
+        return [own[name] if name in own else ExternalNode(self, name) for name in names]
 
     def node(self, name):
         """The node of that name.
@@ -163,7 +163,8 @@ class Master:
             self._ask('getPid')
             raise UnknownNodeError('no node %s came to %s within %g s: is it started, with that '
                                    'master, and under that name?' % (name, self.url, timeout))
-        return next((node for node in self.own_nodes() if node.name == name), None) or ExternalNode(self, name)
+        own = {node.name: node for node in self.own_nodes()}
+        return own[name] if name in own else ExternalNode(self, name)
 
     def on_change(self, block):
         """Run ``block(kind, name, is_there)`` for each node, topic and service that comes or goes.

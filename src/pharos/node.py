@@ -2,7 +2,7 @@
 import collections
 import traceback
 
-from pharos.blocks import check_block, check_delegate, check_soul, name_of
+from pharos.blocks import check_block, check_delegate, check_runs, check_soul, name_of
 from pharos.errors import NodeStoppedError, PharosError
 from pharos.health import health_of
 from pharos.life import Life
@@ -78,7 +78,7 @@ class Node(Life):
         The report (listing 3.8): ``[node execute] fork``. :meth:`stop` ends it at its next :meth:`sleep` or turn of
         :meth:`every`.
         """
-        block = check_soul(block) or self._the_soul()
+        block = self._the_soul() if block is None else check_soul(block)
         return self._souls.fork(block, name or 'soul', self._live_rospy().start_thread)
 
     def _the_soul(self):
@@ -256,6 +256,8 @@ def make(node_class, master, named, soul, delegate, init, **settings):
     """A new node of ``node_class``, configured and not yet started."""
     if not (isinstance(node_class, type) and issubclass(node_class, Node)):
         raise TypeError('a node is made of a subclass of Node, or BlockNode; not %r' % (node_class,))
+    for method in node_class.start, node_class.stop:
+        check_runs(method, f'{node_class.__name__}.{method.__name__}')
     node = node_class.__new__(node_class)
     node._configure(master, Settings(named, master.url, **settings), soul, delegate)
     node.__init__(**init)

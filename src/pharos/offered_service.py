@@ -14,10 +14,8 @@ class OfferedService:
     def __init__(self, node, name, typed_as, block):
         self.node, self.name = node, name
         self.service_class = message_types.service_class(typed_as)
-        if block is None:
-            raise TypeError('%s needs a block that answers, called as service block(request)' % name)
         self._check = services.checker(self.service_class._response_class)
-        self.block = check_block(block, 'service block', ('request',))
+        self.block = block
         if any(other.name == name for other in node._services):
             raise PharosError('%s offers %s already: close that one first' % (node.name, name))
         self._open()
@@ -25,6 +23,17 @@ class OfferedService:
     def _open(self):
         self._service = self.node.ros.Service(self.name, self.service_class, self._answer)
         self.node._services = [*self.node._services, self]
+
+    @property
+    def block(self):
+        """The block that answers, called as ``block(request)``; may be replaced, and takes effect with the next call."""
+        return self._block
+
+    @block.setter
+    def block(self, block):
+        if block is None:
+            raise TypeError('%s needs a block that answers, called as service block(request)' % self.name)
+        self._block = check_block(block, 'service block', ('request',))
 
     @property
     def type(self):

@@ -40,7 +40,7 @@ class RosProcess:
             for line in output:
                 line = line.rstrip('\n')
                 self._lines.append(line)
-                if self._on_line:
+                if self._on_line is not None:
                     self._show(line)
         self._process.wait()
         self._signal(signal.SIGKILL)    # what it left behind; not later, when its number may be another's

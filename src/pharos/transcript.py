@@ -2,6 +2,8 @@
 import sys
 import threading
 
+from pharos.blocks import check_block
+
 
 class _Transcript:
     """Shows things a line each, from any thread, on standard output or wherever :meth:`on_show` says.
@@ -30,6 +32,7 @@ class _Transcript:
 
         Returns the receiver so far, so that it can be put back.
         """
+        check_block(receiver, 'receiver', ('text',))
         with self._lock:
             before, self._receiver = self._receiver, receiver
         return before
