@@ -25,7 +25,9 @@ class _Channel:
         self.topic = topic
         self.message_class = message_class
         self.queue_size = queue_size
+        self.closed = False      # whether close() was called
         self._endpoint = None    # rospy's Publisher or Subscriber while the channel is open
+        self._lock = threading.Lock()    # guards the above against two threads that close it, and what a subclass has
 
     @property
     def type(self):
@@ -43,11 +45,27 @@ class _Channel:
         return self._endpoint is not None
 
     def close(self):
-        """End it: the node no longer publishes, or is interested. Harmless when done twice."""
-        endpoint, self._endpoint = self._endpoint, None
+        """End it: the node no longer publishes, or is interested. Harmless when done twice.
+
+        When it returns, no delegate runs for the channel any more; but for the one that calls it, if one does.
+        """
+        self.closed = True    # where it is only just being opened, it is closed right after that
+        self.node._forget_channel(self)
+        self._release()
+
+    def _release(self):
+        """Give rospy's Publisher or Subscriber back, if there is one."""
+        with self._lock:
+            endpoint, self._endpoint = self._endpoint, None
         if endpoint is not None:
-            self.node._forget_channel(self)
             self._unregister(endpoint)
+
+    def _opened(self, endpoint):
+        """The channel is open, unless a delegate or another thread has closed it meanwhile."""
+        self._endpoint = endpoint
+        self.node._remember_channel(self)
+        if self.closed:
+            self.close()
 
     def _stopped(self):
         """The node stops, and its rospy closes all endpoints."""
@@ -74,7 +92,6 @@ class InputChannel(_Channel):
         self.shared = shared
         self.from_ = getattr(from_, 'name', from_)
         self.received = 0
-        self._offering = threading.Lock()    # TCPROS connections offer side by side
         self._inboxes, self._dropped_before = [], 0
         self._open()
 
@@ -84,12 +101,12 @@ class InputChannel(_Channel):
             dispatcher.need_thread()
         self._tcpros = self._add_inbox(Inbox(self, dispatcher, True) if self.inline else SocketInbox(self, dispatcher))
         # rospy's queue_size would drop without counting; the inbox has ours
-        self._endpoint = self.node._rospy.wiring.subscribe(self, tcp_nodelay=True, buff_size=BUFFER_SIZE)
-        self.node._remember_channel(self)
+        self._opened(self.node._rospy.wiring.subscribe(self, tcp_nodelay=True, buff_size=BUFFER_SIZE))
         dispatcher.run()    # what came latched
 
     def _unregister(self, endpoint):
         self.node._rospy.wiring.unsubscribe(self, endpoint)
+        self.node._dispatcher.wait_for_delegate(self.node.stop_timeout)
 
     def _stopped(self):
         super()._stopped()
@@ -116,15 +133,16 @@ class InputChannel(_Channel):
                                      self.shared))
 
     def _add_inbox(self, inbox):
-        over = [inbox for inbox in self._inboxes if inbox.closed and inbox.is_empty]
-        self._dropped_before += sum(inbox.dropped for inbox in over)
-        self._inboxes = [inbox for inbox in self._inboxes if inbox not in over] + [inbox]
+        with self._lock:
+            over = [inbox for inbox in self._inboxes if inbox.closed and inbox.is_empty]
+            self._dropped_before += sum(inbox.dropped for inbox in over)
+            self._inboxes = [inbox for inbox in self._inboxes if inbox not in over] + [inbox]
         return inbox
 
     def _offer(self, message):
         """Take a message from rospy, which runs the dispatcher after a batch of them."""
         if self.from_ is None or message._connection_header.get('callerid') == self.from_:
-            with self._offering:
+            with self._lock:    # TCPROS connections offer side by side
                 self._tcpros.put(message)
 
 
@@ -141,9 +159,8 @@ class OutputChannel(_Channel):
         self._open(connect_timeout)
 
     def _open(self, connect_timeout=None):
-        self._endpoint, self._send = self.node._rospy.wiring.advertise(self, tcp_nodelay=True,
-                                                                       queue_size=self.queue_size)
-        self.node._remember_channel(self)
+        endpoint, self._send = self.node._rospy.wiring.advertise(self, tcp_nodelay=True, queue_size=self.queue_size)
+        self._opened(endpoint)
         self._wait_for_known_subscribers(self.node.connect_timeout if connect_timeout is None else connect_timeout)
 
     def publish(self, message, to=None):

@@ -3,7 +3,7 @@
 A node's delegates run in one of two threads: in the thread that brings the message (a TCPROS connection's, where the
 delegate is quick, or the publisher's where a channel is inline), or in the node's dispatcher thread. Nobody ever waits
 for a busy node: what comes meanwhile waits in its inbox for whoever is running the node. So no wiring deadlocks or
-recurses.
+recurses. Nor does a thread run a node for long because others bring messages: those it leaves to the dispatcher thread.
 """
 import _thread
 import collections
@@ -15,6 +15,7 @@ GIVE_WAY = 1e-3   # seconds that a publisher at the most gives way, until the di
 STARVING = 1e-3   # seconds; so often a publisher gives way to a receiver that takes nothing from a full inbox
 QUICK = 1e-3      # seconds; a delegate that takes longer is not run by a thread that has a socket to read,
 TRUSTED = 10      # and one is that has been quick so many times in a row
+COURTESY = 1e-3   # seconds for which a thread that brings a message also runs what others bring meanwhile
 
 
 class Inbox:
@@ -77,6 +78,8 @@ class Inbox:
             self._announced = True
             self._announce(self)
         channel, thaw, header = self.channel, self._thaw, self._header
+        if channel.closed:
+            return
         channel.received += 1
         node = channel.node
         block = channel._delegate
@@ -130,7 +133,8 @@ class Dispatcher:
         self.inline = collections.deque()       # inboxes that whoever comes by may run
         self.announced = collections.deque()    # inboxes for the dispatcher thread
         self.idle = False                       # whether that thread waits for inboxes
-        self._running = threading.Lock()        # held by the thread that runs delegates
+        self._running = threading.Lock()        # held by the thread that runs delegates,
+        self._runner = None                     # which is this one, by its identifier
         self._start_thread, self._started, self._closed = start_thread, threading.Lock(), False
         # bare locks as signals: every other primitive costs several of them
         self._woken, self._awake = _thread.allocate_lock(), _thread.allocate_lock()
@@ -138,17 +142,55 @@ class Dispatcher:
         self._awake.acquire()
 
     def run(self):
-        """Run the delegates of the inline inboxes in this thread, unless another thread is running the node."""
+        """Run the delegates of the inline inboxes in this thread, unless another thread is running the node.
+
+        It runs a message of each inbox that has some, and for a moment what comes meanwhile. The rest is left to the
+        dispatcher thread: others that bring messages all the time would never let this thread go.
+        """
         inline, running = self.inline, self._running
+        turns, until = len(inline), None
         while inline and running.acquire(False):
+            self._runner = _thread.get_ident()
             try:
                 while inline:
+                    if turns <= 0:
+                        now = time.perf_counter()
+                        until = until or now + COURTESY
+                        if now > until:
+                            break
+                    turns -= 1
                     inline.popleft().run_next()
             except IndexError:
                 pass    # close() cleared it
             finally:
+                self._runner = None
                 running.release()
             # looked at again: what was announced just before the release found the node busy
+            if until and inline:
+                self._leave_to_thread()
+                return
+
+    def _leave_to_thread(self):
+        """Have the dispatcher thread run the inline inboxes that have messages."""
+        if self._closed:
+            return
+        self.need_thread()
+        try:
+            for _ in range(len(self.inline)):
+                self.announced.append(self.inline.popleft())
+        except IndexError:
+            pass    # another thread runs them
+        if self.idle:
+            self.wake()
+
+    def wait_for_delegate(self, timeout):
+        """Wait until the delegate that another thread runs just now has ended, for up to ``timeout`` seconds."""
+        if self._runner == _thread.get_ident():
+            return
+        if self._running.acquire(True, timeout):
+            self._running.release()
+            if self.inline:    # announced meanwhile by a thread that found the node busy
+                self._leave_to_thread()
 
     def need_thread(self):
         """Have the dispatcher thread, from the first channel on that is not inline."""
@@ -174,6 +216,7 @@ class Dispatcher:
     def _loop(self):
         announced, inline = self.announced, self.inline
         acquire, release = self._running.acquire, self._running.release    # ``with`` costs more
+        me = _thread.get_ident()
         while not self._closed:
             try:
                 inbox = announced.popleft()
@@ -185,9 +228,11 @@ class Dispatcher:
                 self.idle = False
                 continue
             acquire()
+            self._runner = me
             try:
                 inbox.run_next()
             finally:
+                self._runner = None
                 release()
             if inline:
                 self.run()

@@ -1,5 +1,6 @@
 """Nodes: real ROS nodes of this process, written with blocks."""
 import collections
+import threading
 import traceback
 
 from pharos.blocks import check_block, check_delegate, check_runs, check_soul, name_of
@@ -33,6 +34,7 @@ class Node(Life):
     def _configure(self, master, settings, soul, delegate):
         super()._configure(master, settings)
         self.soul, self.delegate = soul, delegate
+        self._opening = threading.Lock()    # held to change _channels
         #: the exceptions that souls, delegates and services raised, the newest last
         self.errors = collections.deque(maxlen=100)
 
@@ -165,10 +167,12 @@ class Node(Life):
         return self.master.topic(self._live_rospy().rospy.resolve_name(_check_topic_name(name)))
 
     def _remember_channel(self, channel):
-        self._channels = [*self._channels, channel]    # replaced, so that others may iterate meanwhile
+        with self._opening:
+            self._channels = [*self._channels, channel]    # replaced, so that others may iterate meanwhile
 
     def _forget_channel(self, channel):
-        self._channels = [other for other in self._channels if other is not channel]
+        with self._opening:
+            self._channels = [other for other in self._channels if other is not channel]
 
     # -- services, parameters, log -------------------------------------------------------------------------------------
 

@@ -200,6 +200,10 @@ class PrivateRospy:
         """``start_thread(target, args=(), name=None)``: a thread that the stop waits for."""
         return self._lifetime.start_thread
 
+    def shut_at_end(self, sock):
+        """Shut the socket down when the node stops, at the latest."""
+        self._lifetime.shut_at_end(sock)
+
     @property
     def ended(self):
         """The event set when the stop begins."""

@@ -57,6 +57,10 @@ class Lifetime:
     def hold(self, sock):
         """Shut this accepted socket down at the end, at the latest."""
         keep_alive(sock)    # rospy waits for ever for a service's client, or in vain for a subscriber's leaving
+        self.shut_at_end(sock)
+
+    def shut_at_end(self, sock):
+        """Shut this socket down at the end: a thread that waits for what comes through it then ends."""
         self._sockets.add(sock)
 
     def end(self, given_up=()):

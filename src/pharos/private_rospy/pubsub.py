@@ -51,8 +51,11 @@ def hooks(instance):
 
         def connect_kept_alive(self, *address, timeout=None):
             connect(self, *address, timeout=timeout)
-            sock = self.socket    # None: closed meanwhile
-            if sock is not None and is_keepalive_wanted():
+            sock = self.socket
+            if sock is None:    # closed meanwhile
+                return
+            instance.shut_at_end(sock)    # a call of a service waits for its answer for ever
+            if is_keepalive_wanted():
                 keep_alive(sock)
         transport.connect = connect_kept_alive
 

@@ -100,8 +100,8 @@ def hooks(lifetime, warn):
                 door.complain(address, error)
             except rospy.exceptions.TransportTerminated as error:
                 door.refuse(sock, address, error)    # a persistent one is not expected, and may go
-            except OSError:
-                pass    # it has gone
+            except (OSError, rospy.exceptions.TransportInitError):
+                pass    # it has gone; what would tell it of that finds the transport closed
             finally:
                 door.heard(sock)
                 transport.close()

@@ -18,6 +18,7 @@ class Wiring:
     def __init__(self, instance):
         self._instance = instance
         self._channels = {}                    # topic -> the channels that receive from it
+        self._lock = threading.Lock()          # held to change that
         self.told_subscribers = {}             # topic -> URIs, of which the master told a new publisher
         self.connecting = threading.local()    # .topic: of the connection that this thread negotiates
 
@@ -38,7 +39,8 @@ class Wiring:
         The master's word of them takes its time.
         """
         topic = channel.topic
-        self._channels[topic] = (*self.channels_on(topic), channel)
+        with self._lock:
+            self._channels[topic] = (*self.channels_on(topic), channel)
         endpoint = self._instance.rospy.Subscriber(topic, channel.message_class, channel._offer, **options)
         self._channels_changed(topic)
         publishers = [other for other in self._neighbours() if other.publisher(topic)]
@@ -50,8 +52,10 @@ class Wiring:
 
     def unsubscribe(self, channel, endpoint):
         """End what :meth:`subscribe` began."""
-        self._channels[channel.topic] = tuple(c for c in self.channels_on(channel.topic) if c is not channel)
-        self._channels_changed(channel.topic)
+        topic = channel.topic
+        with self._lock:
+            self._channels[topic] = tuple(c for c in self.channels_on(topic) if c is not channel)
+        self._channels_changed(topic)
         endpoint.unregister()
 
     def advertise(self, channel, **options):
@@ -126,7 +130,8 @@ class Wiring:
         return [other for other in running_here() if other.settings.master_url == master]
 
     def _channels_changed(self, topic):
-        for connection in self._instance.subscriber(topic).connections:
+        subscriber = self._instance.subscriber(topic)
+        for connection in subscriber.connections if subscriber else ():    # None: the node stops
             if connection.transport_type == 'INTRAPROCESS':
                 connection.link.channels_changed()
 

@@ -1,0 +1,194 @@
+"""Closing a channel: nothing runs for it afterwards, and nobody is held up for long by what others publish inline."""
+import threading
+
+import pytest
+
+import pharos
+from conftest import TIMEOUT, Mailbox
+from pharos import BlockNode
+from pharos.message_types import define_service
+
+STRING = 'std_msgs/String'
+
+
+def create(master, name, **kwargs):
+    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
+
+
+def in_thread(block, *args):
+    thread = threading.Thread(target=block, args=args, daemon=True)
+    thread.start()
+    return thread
+
+
+def ended(thread):
+    thread.join(TIMEOUT)
+    return not thread.is_alive()
+
+
+@pytest.mark.parametrize('inline', [False, True])
+def test_no_delegate_runs_once_close_has_returned(master, inline):
+    runs, proceed, calls = threading.Semaphore(0), threading.Event(), []
+
+    def slow(message, channel):
+        runs.release()
+        proceed.wait(TIMEOUT)
+        calls.append(message.data)
+    receiver = create(master, '/receiver')
+    closing = receiver.interested_in('/closing', STRING, delegate=slow, inline=inline)
+    mailbox = Mailbox()
+    receiver.interested_in('/not_closing', STRING, delegate=mailbox)
+    sender = create(master, '/sender')
+    first = in_thread(lambda: sender.send_to('/closing', typed_as=STRING, data='0'))
+    assert runs.acquire(timeout=TIMEOUT)    # the delegate is busy, and all the rest waits in the queue
+    for number in range(1, 10):
+        sender.send_to('/closing', data=str(number))
+
+    called_at_return = []
+
+    def close():
+        closing.close()
+        called_at_return.extend(calls)
+    thread = in_thread(close)
+    while not closing.closed:
+        pass
+    proceed.set()
+    assert ended(thread) and ended(first)
+    sender.send_to('/not_closing', typed_as=STRING, data='done')
+    assert mailbox.get().data == 'done'    # whatever was queued before has been looked at
+    assert calls == called_at_return == ['0']
+    assert closing.received == 1
+
+
+def test_a_delegate_may_close_its_channel_while_the_channel_opens(master):
+    publisher, receiver = create(master, '/publisher'), create(master, '/receiver')
+    publisher.output_channel('/latched', STRING, latch=True).send(data='latched')
+    closed = threading.Event()
+
+    def close(message, channel):
+        channel.close()
+        closed.set()
+    for inline in (False, True):
+        channel = receiver.interested_in('/latched', STRING, delegate=close, inline=inline)
+        assert closed.wait(TIMEOUT)
+        assert not channel.is_open
+        assert receiver.channels == []
+        closed.clear()
+
+
+def test_two_threads_may_close_one_channel(master):
+    node = create(master, '/receiver')
+    for _ in range(20):
+        channels = node.interested_in('/twice', STRING), node.output_channel('/twice', STRING)
+        for channel in channels:
+            threads = [in_thread(channel.close) for _ in range(4)]
+            assert all(map(ended, threads))
+        assert node.channels == []
+
+
+def test_a_channel_may_be_closed_while_its_node_stops(master):
+    node = create(master, '/receiver')
+    for _ in range(20):
+        channels = node.interested_in('/ending', STRING), node.output_channel('/ending', STRING)
+        errors, begun = [], threading.Barrier(2)
+
+        def close():
+            try:
+                begun.wait(TIMEOUT)
+                for channel in channels:
+                    channel.close()
+            except Exception as error:
+                errors.append(error)
+        thread = in_thread(close)
+        begun.wait(TIMEOUT)
+        node.stop()
+        assert ended(thread)
+        assert errors == []
+        node.start()
+        assert node.channels == []
+
+
+def test_threads_that_open_channels_side_by_side_lose_none(master):
+    node, begun = create(master, '/receiver'), threading.Barrier(8)
+
+    def open_some(number):
+        begun.wait(TIMEOUT)
+        for index in range(5):
+            node.interested_in('/side_by_side', STRING)
+    threads = [in_thread(open_some, number) for number in range(8)]
+    assert all(map(ended, threads))
+    assert len(node.channels) == len(master.topic('/side_by_side').channels) == 40
+
+
+def test_an_inline_publisher_is_not_held_by_what_others_publish(master):
+    """What others bring without end is run by the node's own thread."""
+    entered, flooding, over = threading.Event(), threading.Event(), threading.Event()
+
+    def delegate(message, channel):
+        if message.data == 'first':
+            entered.set()
+            flooding.wait(TIMEOUT)
+        else:
+            over.wait(0.001)    # slower than the others bring messages
+    receiver = create(master, '/receiver')
+    receiver.interested_in('/busy', STRING, delegate=delegate, inline=True)
+    sent, flood = (create(master, name).output_channel('/busy', STRING) for name in ('/one', '/many'))
+
+    def publish_without_end():
+        while not over.is_set():
+            flood.send(data='more')
+            if flood.sent == 100:
+                flooding.set()
+    published = in_thread(lambda: sent.send(data='first'))
+    assert entered.wait(TIMEOUT)
+    other = in_thread(publish_without_end)
+    returned = ended(published)    # while the other goes on
+    over.set()
+    assert returned
+    assert ended(other)
+
+
+def test_inline_nodes_that_send_to_each_other_without_end_let_the_publisher_go(master):
+    nodes = [create(master, name) for name in ('/ping', '/pong')]
+    channels = [node.output_channel(f'/to{index}', STRING) for index, node in enumerate(nodes)]
+    turns = threading.Semaphore(0)
+
+    def pass_on(message, channel):
+        turns.release()
+        channels[nodes.index(channel.node)].publish(message)
+    for index, node in enumerate(nodes):
+        node.interested_in(f'/to{1 - index}', STRING, delegate=pass_on, inline=True)
+    assert ended(in_thread(lambda: channels[0].send(data='ball')))
+    for _ in range(1000):
+        assert turns.acquire(timeout=TIMEOUT)    # they go on in the nodes' own threads
+
+
+def test_a_service_block_that_outlives_its_caller_ends_quietly(master, capfd):
+    node = create(master, '/provider')
+    entered, proceed = threading.Event(), threading.Event()
+
+    def slow(request):
+        entered.set()
+        proceed.wait(TIMEOUT)
+        return 'x' * (1 << 24)    # more than the socket of a client that has gone takes
+    define_service('closing/Large', '---\nstring text\n')
+    node.serve('/slow', 'closing/Large', slow)
+    service_class = pharos.service_class('closing/Large')
+    caller = create(master, '/caller')
+    proxy = caller.ros.ServiceProxy('/slow', service_class)
+    errors = []
+
+    def call():
+        try:
+            proxy()
+        except Exception as error:
+            errors.append(error)
+    thread = in_thread(call)
+    assert entered.wait(TIMEOUT)
+    answering = [thread for thread in threading.enumerate() if thread.name.startswith('/provider ')]
+    caller.stop()
+    assert ended(thread) and errors
+    proceed.set()
+    node.stop()
+    assert all(map(ended, answering))
+    assert 'Traceback' not in capfd.readouterr().err
