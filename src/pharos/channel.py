@@ -9,6 +9,7 @@ from pharos import message_types
 from pharos.blocks import check_delegate, check_runs
 from pharos.dispatcher import Inbox, SocketInbox
 from pharos.errors import MessageTypeError, NodeStoppedError
+from pharos.private_rospy.fanout import Latch
 from pharos.private_rospy.publishing import wait_until
 
 ANSWER_TIMEOUT = 0.5      # seconds in which the master has told a live subscriber; then it is asked whether it lives
@@ -155,6 +156,7 @@ class OutputChannel(_Channel):
     def __init__(self, node, topic, message_class, latch=False, queue_size=1, connect_timeout=None):
         super().__init__(node, topic, message_class, queue_size)
         self.latch = latch
+        self.latched = Latch()
         self.sent = 0
         self._open(connect_timeout)
 

@@ -125,7 +125,8 @@ class Node(Life):
         """Publish on a topic from now on; returns the :class:`OutputChannel`.
 
         :param typed_as: type name or message class; None: the master's type for the topic
-        :param latch: send the last message to those who become interested later
+        :param latch: send the last message to those who become interested later, also after a restart of this node;
+            one sent ``to=`` a node is for that node alone
         :param queue_size: messages kept for each slow receiver; the oldest are dropped
         :param wait: as in :meth:`interested_in`
         """

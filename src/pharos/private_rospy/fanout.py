@@ -19,7 +19,7 @@ class Fanout:
 
     # a message that comes alone meets cold caches: all that it needs lies together
     __slots__ = ('_lock', '_closed', '_seq', '_has_header', '_freeze', '_inboxes', '_remote', '_dispatchers',
-                 '_inline', '_last', '_publisher', '_module', '_thaw', '_buffer', '_latched', '_early')
+                 '_inline', '_last', '_publisher', '_module', '_thaw', '_buffer', '_latches', '_early')
 
     def __init__(self, publisher, module):
         self._publisher, self._module = publisher, module
@@ -27,7 +27,7 @@ class Fanout:
         self._has_header = getattr(publisher.data_class, '_has_header', False)
         self._freeze, self._thaw = copier.copier_for(publisher.data_class)[:2]
         self._buffer = io.BytesIO()
-        self._latched = {}    # channel -> the last message it latched, frozen
+        self._latches = {}    # channel, None: rospy's Publishers -> its Latch
         self._early = _EarlyLines() if publisher.resolved_name == '/rosout' else None
         self._last = 0.0      # when the last message woke a dispatcher
         self.set_connections(())
@@ -70,9 +70,7 @@ class Fanout:
                     raise self._module.ROSSerializationException(error) from error
             data = self._serialized(message, self._seq) if remote else None
             if latch:
-                self._latched[by] = frozen
-                if self._early is not None:
-                    self._early.add(frozen)
+                self._latch(by, frozen, to or connection and connection.endpoint_id)
             for inbox in inboxes:
                 inbox.put(message if inbox.shared else frozen)
             woken = None
@@ -122,30 +120,87 @@ class Fanout:
                 self._module.logdebug('publisher connection to [%s] terminated: %s' % (connection.endpoint_id, error))
                 connection.close()
 
-    def send_latched(self, inboxes):
-        """Put what is latched into new inboxes; :meth:`run` is to be called when the lock is released."""
+    def _latch(self, by, frozen, receiver):
+        if by not in self._latches:
+            self._latches[by] = Latch() if by is None else by.latched
+        self._latches[by].keep(frozen, receiver)
+        if self._early is not None:
+            self._early.add(frozen)
+
+    def _latched_for(self, receiver):
+        """What is latched for the node of that name, frozen."""
+        return self._early or [frozen for latch in self._latches.values() for frozen in latch.of(receiver)]
+
+    def send_latched(self, inboxes, receiver):
+        """Put what is latched into new inboxes; :meth:`run` is to be called when the lock is released.
+
+        :param receiver: the name of the node whose inboxes they are
+        """
+        for frozen in self._latched_for(receiver):
+            self._put_latched(frozen, inboxes)
+
+    def _put_latched(self, frozen, inboxes):
         for inbox in inboxes:
-            for frozen in self._early or self._latched.values():
-                inbox.put(self._thaw(frozen) if inbox.shared else frozen)
+            inbox.put(self._thaw(frozen) if inbox.shared else frozen)
         for dispatcher in _dispatchers(inboxes):
             if dispatcher.idle:
                 dispatcher.wake()
 
     def write_latched(self, connection):
         """Write what is latched to a new TCPROS connection."""
-        for frozen in self._early or self._latched.values():
-            message = self._thaw(frozen)
-            seq = message.header.seq if hasattr(message, 'header') else 0
-            self._write(self._serialized(message, seq), [connection])
+        for frozen in self._latched_for(connection.endpoint_id):
+            self._write_latched(frozen, connection)
+
+    def _write_latched(self, frozen, connection):
+        message = self._thaw(frozen)
+        seq = message.header.seq if self._has_header else 0
+        self._write(self._serialized(message, seq), [connection])
+
+    def resume(self, channel):
+        """A channel opens again: who has connected by now gets what it latched before, too.
+
+        :meth:`run` is to be called afterwards.
+        """
+        with self._lock:
+            self._latches[channel] = channel.latched
+            for connection in self._publisher.connections:
+                for frozen in channel.latched.of(connection.endpoint_id):
+                    link = getattr(connection, 'link', None)
+                    if link is None:
+                        self._write_latched(frozen, connection)
+                    else:
+                        self._put_latched(frozen, list(link.inboxes.values()))
 
     def forget(self, channel):
         """A channel closes, and what it latched goes with it."""
-        self._latched.pop(channel, None)
+        self._latches.pop(channel, None)
 
     def close(self):
         """Nothing is sent any more."""
         self._closed = True
         self.set_connections(())
+
+
+class Latch:
+    """What one channel sent last, for those who come late; it outlives the run of the node.
+
+    What went to one node alone is for that node alone: for it, the last message is another one than for all others.
+    """
+
+    def __init__(self):
+        self._to_all = ()      # the message, frozen, if there is one
+        self._to_one = {}      # node name -> likewise, where that is newer
+
+    def keep(self, frozen, receiver):
+        """Keep a message that was sent to the node of that name, None: to all."""
+        if receiver is None:
+            self._to_all, self._to_one = (frozen,), {}
+        else:
+            self._to_one[receiver] = (frozen,)
+
+    def of(self, receiver):
+        """The last message for the node of that name, frozen; none or one."""
+        return self._to_one.get(receiver, self._to_all)
 
 
 def _dispatchers(inboxes):

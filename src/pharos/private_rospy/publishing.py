@@ -52,11 +52,11 @@ def mend_publisher(module, start_thread):
             if not base.add_connection(self, connection):
                 connection.close()
                 return False
+            _refresh(self)
             if link:
-                self.fanout.send_latched(list(link.inboxes.values()))
+                self.fanout.send_latched(list(link.inboxes.values()), connection.endpoint_id)
             else:
                 self.fanout.write_latched(connection)
-            _refresh(self)
         for listener in self.subscriber_listeners or ():
             listener.peer_subscribe(self.resolved_name, self.publish,
                                     functools.partial(self.publish, connection_override=connection))
@@ -71,8 +71,9 @@ def mend_publisher(module, start_thread):
         if lock is None:
             return
         with lock:
-            self.fanout.send_latched(link.match_channels())
+            new = link.match_channels()
             _refresh(self)
+            self.fanout.send_latched(new, link.sending.endpoint_id)
         self.fanout.run()
     publisher.channels_changed = channels_changed
 

@@ -64,6 +64,9 @@ class Wiring:
         rosmaster tells them in steps of 0.1 s.
         """
         endpoint = self._instance.rospy.Publisher(channel.topic, channel.message_class, latch=channel.latch, **options)
+        if channel.latch:
+            endpoint.impl.fanout.resume(channel)
+            endpoint.impl.fanout.run()
         for other in self._neighbours():
             if other.subscriber(channel.topic):
                 other.connect(channel.topic, self._instance.uri)
