@@ -130,8 +130,9 @@ class InputChannel(_Channel):
 
     def _new_inbox(self, thaw, header):
         """An inbox for what a node of this process sends."""
-        return self._add_inbox(Inbox(self, self.node._dispatcher, self.inline, None if self.shared else thaw, header,
-                                     self.shared))
+        if self.shared:    # the messages are marked with the header when they are handed over
+            thaw = header = None
+        return self._add_inbox(Inbox(self, self.node._dispatcher, self.inline, thaw, header, self.shared))
 
     def _add_inbox(self, inbox):
         with self._lock:

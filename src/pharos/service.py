@@ -109,7 +109,7 @@ class Service:
         self._check_definition(deadline)
         request = message_types.build(self.service_class._request_class, block, fields)
         self._calls += 1
-        services.number(request, self._calls)
+        request = services.numbered(request, self._calls)
         try:
             self.response = response = self._exchange(request, deadline)
         except services.Failed as error:

@@ -4,7 +4,7 @@ import struct
 import time
 
 from pharos.dispatcher import BURST
-from pharos.private_rospy import copier
+from pharos.private_rospy import copier, sharing
 
 EARLY = 2.0    # seconds after the start in which log lines are kept for listeners that connect later
 _clock = time.perf_counter
@@ -19,7 +19,7 @@ class Fanout:
 
     # a message that comes alone meets cold caches: all that it needs lies together
     __slots__ = ('_lock', '_closed', '_seq', '_has_header', '_freeze', '_inboxes', '_remote', '_dispatchers',
-                 '_inline', '_last', '_publisher', '_module', '_thaw', '_buffer', '_latches', '_early')
+                 '_inline', '_last', '_publisher', '_module', '_thaw', '_buffer', '_latches', '_early', '_mark')
 
     def __init__(self, publisher, module):
         self._publisher, self._module = publisher, module
@@ -39,6 +39,8 @@ class Fanout:
         self._remote = [connection for connection in connections if connection.transport_type != 'INTRAPROCESS']
         self._inboxes, self._dispatchers = inboxes, _dispatchers(inboxes)
         self._inline = list({inbox.dispatcher for inbox in inboxes if inbox.inline})
+        # of the messages that receivers share
+        self._mark = sharing.Mark(links[0].header) if any(inbox.shared for inbox in inboxes) else None
 
     def publish(self, message, by=None, to=None, connection=None):
         """Send a message to all; returns whether there is anybody.
@@ -51,15 +53,18 @@ class Fanout:
         with self._lock:
             if self._closed:
                 raise self._module.ROSException('publish() to a closed topic')
-            inboxes, remote, dispatchers = self._inboxes, self._remote, self._dispatchers
+            inboxes, remote, dispatchers, mark = self._inboxes, self._remote, self._dispatchers, self._mark
             if to is not None or connection is not None:
                 inboxes, remote = self._only(to, connection)
                 dispatchers = _dispatchers(inboxes)
+                mark = mark if any(inbox.shared for inbox in inboxes) else None
             latch = self._publisher.is_latch if by is None else by.latch
             if not (inboxes or remote or latch):
                 return False
             self._seq += 1
             if self._has_header and message._md5sum != '*':    # AnyMsg has none
+                if sharing.is_held(message.header):
+                    message = sharing.with_own_header(message)
                 message.header.seq = self._seq
                 if message.header.frame_id is None:
                     message.header.frame_id = '0'
@@ -71,6 +76,8 @@ class Fanout:
             data = self._serialized(message, self._seq) if remote else None
             if latch:
                 self._latch(by, frozen, to or connection and connection.endpoint_id)
+            if mark is not None:
+                message = mark.put_on(message)
             for inbox in inboxes:
                 inbox.put(message if inbox.shared else frozen)
             woken = None
@@ -141,7 +148,7 @@ class Fanout:
 
     def _put_latched(self, frozen, inboxes):
         for inbox in inboxes:
-            inbox.put(self._thaw(frozen) if inbox.shared else frozen)
+            inbox.put(self._mark.put_on(self._thaw(frozen)) if inbox.shared else frozen)
         for dispatcher in _dispatchers(inboxes):
             if dispatcher.idle:
                 dispatcher.wake()

@@ -8,6 +8,7 @@ from pharos.private_rospy import xmlrpc_server
 from pharos.private_rospy.door import Door, brief
 from pharos.private_rospy.host import rospy
 from pharos.private_rospy.lifetime import shut
+from pharos.private_rospy.sharing import numbered
 
 HANDSHAKE_TIMEOUT = 5.0       # seconds for the whole handshake, however slowly it comes
 HANDSHAKE_LIMIT = 1 << 20     # bytes of a connection header; real ones hold a message definition
@@ -69,9 +70,12 @@ def hooks(lifetime, warn):
         # where it writes tracebacks, a line of the log says what is wrong
         module.rospyerr = module.rospydebug
 
-    def tell_no_tracebacks(module):
-        """rospy.msg: it writes one for each message that it cannot read, whoever sent it."""
+    def mend_messages(module):
+        """rospy.msg: it writes a traceback for each message that it cannot read, whoever sent it."""
         module.logging.getLogger('rospy.msg').setLevel(module.logging.CRITICAL)
+        serialize = module.serialize_message
+        # it would number what others hold
+        module.serialize_message = lambda buffer, seq, message: serialize(buffer, seq, numbered(message, seq))
 
     def expect_requests(module):
         """rospy.impl.tcpros_service: a client that asks nothing is waited for, and one that asks nonsense kept."""
@@ -108,7 +112,7 @@ def hooks(lifetime, warn):
         service.handle = handle
 
     return {'rosgraph.network': limit_handshake, 'rospy.impl.tcpros_base': mend_connections,
-            'rospy.msg': tell_no_tracebacks, 'rospy.impl.tcpros_service': expect_requests,
+            'rospy.msg': mend_messages, 'rospy.impl.tcpros_service': expect_requests,
             **xmlrpc_server.hooks(lifetime, warn)}
 
 

@@ -7,6 +7,7 @@ import time
 
 from pharos.private_rospy import copier
 from pharos.private_rospy.host import rospy
+from pharos.private_rospy.sharing import numbered
 from pharos.private_rospy.wiring import running_here
 
 NESTED = 64     # service calls of one thread within one another: a cycle, which would only end with the stack
@@ -93,8 +94,7 @@ class LocalService:
         try:
             response = self._as_response(service.handler(request), service.response_class)
             service.seq += 1
-            number(response, service.seq)
-            return self._freeze_response(response)
+            return self._freeze_response(numbered(response, service.seq))
         # the caller gets the text alone, as from elsewhere: the reason's traceback is its node's to report
         except rospy.ServiceException as error:
             raise Failed('service cannot process request: %s' % error) from None
@@ -113,12 +113,6 @@ def serialize(request):
 def checker(cls):
     """The function that raises what ``serialize()`` of a message of that class would raise; cheaper than that."""
     return copier.copier_for(cls).freeze
-
-
-def number(message, seq):
-    """Number a message that has a header, as rospy.msg.serialize_message does for services too."""
-    if message._has_header:
-        message.header.seq = seq
 
 
 class Workers:

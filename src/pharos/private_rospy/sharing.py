@@ -1,0 +1,44 @@
+"""Messages that several nodes hold at once: nothing may be written into them any more.
+
+A channel with ``shared=True`` gets the published message itself. Whoever publishes it again, or another message with
+its header, would write the next ``header.seq`` and ``_connection_header`` into what the others hold.
+"""
+import copy
+
+
+class Mark(dict):
+    """The ``_connection_header`` of the messages that one publisher hands over, and of their headers."""
+
+    def put_on(self, message):
+        """Mark a message that is handed over; returns it, or a copy if it is held as another publisher's already."""
+        if is_held(message) and message._connection_header != self:
+            message = copy.copy(message)    # genpy copies the fields alone, not the mark
+        message._connection_header = self
+        if getattr(message, '_has_header', False):
+            message.header._connection_header = self
+        return message
+
+
+def is_held(message):
+    """Whether a message or header has been handed over, so that others hold it."""
+    return type(getattr(message, '_connection_header', None)) is Mark
+
+
+def with_own_header(message):
+    """The message, whose header others hold, with a header of its own; a copy of it if they hold the message, too."""
+    if is_held(message):
+        message = copy.copy(message)
+    message.header = copy.copy(message.header)
+    return message
+
+
+def numbered(message, seq):
+    """The message with that ``header.seq``, as rospy.msg.serialize_message numbers messages, services' among them.
+
+    A copy if others hold it.
+    """
+    if getattr(message, '_has_header', False):
+        if is_held(message.header):
+            message = with_own_header(message)
+        message.header.seq = seq
+    return message
