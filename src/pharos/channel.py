@@ -91,7 +91,7 @@ class InputChannel(_Channel):
         self.delegate = delegate
         self.inline = inline
         self.shared = shared
-        self.from_ = getattr(from_, 'name', from_)
+        self.from_ = None if from_ is None else str(node._name_of(from_))
         self.received = 0
         self._inboxes, self._dropped_before = [], 0
         self._open()
@@ -159,6 +159,7 @@ class OutputChannel(_Channel):
         self.latch = latch
         self.latched = Latch()
         self.sent = 0
+        self._uninterested = set()    # names of nodes of which the log says so
         self._open(connect_timeout)
 
     def _open(self, connect_timeout=None):
@@ -169,17 +170,33 @@ class OutputChannel(_Channel):
     def publish(self, message, to=None):
         """Send ``message`` to all who are interested, or to the node ``to`` alone.
 
-        :param to: a name, Node or ExternalNode
+        :param to: a name, Node or ExternalNode; see :meth:`Node.send_to`
         :raises MessageTypeError: if it is of another type, or a field holds what does not fit
+        :raises UnknownNodeError: if there is no node ``to``
         :raises NodeStoppedError: if the channel is closed
         """
         if message.__class__ is not self.message_class:
             self._check_type(message)
+        if to is not None:
+            to = str(self.node._name_of(to))
+            self._check_is_there(to)
         try:
-            self._send(message, self, to if to is None else getattr(to, 'name', to))
+            is_sent = self._send(message, self, to)
         except Exception as error:
             self._explain(error, message)
-        self.sent += 1
+        if is_sent or to is None:
+            self.sent += 1
+
+    def _check_is_there(self, name):
+        """Raise UnknownNodeError if a message for that node alone has nowhere to go, since there is no such node."""
+        endpoint = self._endpoint
+        if endpoint is None or self.node._rospy.wiring.reaches(endpoint, name):
+            return
+        self.node.master._find(name, self.node.connect_timeout)
+        if name not in self._uninterested:
+            self._uninterested.add(name)
+            self.node.log(f'{name} is not interested in {self.topic}, or not connected yet: what {self.node.name} sends '
+                          'to it alone goes nowhere', level='warning')
 
     def _check_type(self, message):
         if not isinstance(message, genpy.Message) or message._md5sum not in (self.message_class._md5sum, '*'):

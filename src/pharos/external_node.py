@@ -1,8 +1,6 @@
 """Nodes outside this process."""
 import urllib.parse
 
-import rosgraph
-
 from pharos.errors import UnknownNodeError
 from pharos.private_rospy.proxies import ServerProxy
 from pharos.private_rospy.registration import COMMUNICATION_ERRORS
@@ -19,11 +17,7 @@ class ExternalNode:
     @property
     def uri(self):
         """The URI of its XML-RPC server."""
-        with self.master._reached():
-            try:
-                return self.master._api().lookupNode(self.name)
-            except rosgraph.MasterError:
-                raise UnknownNodeError('no node %s at %s: see rosnode list' % (self.name, self.master.url)) from None
+        return self.master._find(self.name)
 
     @property
     def host(self):

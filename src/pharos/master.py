@@ -11,6 +11,7 @@ from pharos.blocks import check_block
 from pharos.errors import MasterUnreachableError, PharosError, UnknownNodeError
 from pharos.external_node import ExternalNode
 from pharos.parameters import Parameters
+from pharos.private_rospy.names import check_name, global_name
 from pharos.private_rospy.proxies import ServerProxy, master_api
 from pharos.private_rospy.registration import COMMUNICATION_ERRORS
 from pharos.private_rospy.settings import check_port, check_url
@@ -144,11 +145,27 @@ class Master:
 
         :raises UnknownNodeError: if the master knows none
         """
+        name = global_name(name, 'node')
         known = {node.name: node for node in self.nodes()}
-        name = rosgraph.names.resolve_name(name, '/pharos')
         if name not in known:
-            raise UnknownNodeError('no node %s at %s%s: see rosnode list' % (name, self.url, self.near(name, known)))
+            raise self._unknown(name, known)
         return known[name]
+
+    def _find(self, name, timeout=TIMEOUT):
+        """The URI of the node of that name.
+
+        :param timeout: seconds that the master may take
+        :raises UnknownNodeError: if the master knows none
+        """
+        with self._reached():
+            try:
+                return self._api(timeout=timeout).lookupNode(name)
+            except rosgraph.MasterError:
+                pass
+        raise self._unknown(name, [node.name for node in self.nodes()])
+
+    def _unknown(self, name, known):
+        return UnknownNodeError(f'no node {name} at {self.url}{self.near(name, known)}: see rosnode list')
 
     def wait_for_node(self, name, timeout=None):
         """Wait until a node of that name is there; returns it.
@@ -157,7 +174,7 @@ class Master:
         :raises UnknownNodeError: if it does not come in time
         :raises MasterUnreachableError: if the master has not answered in that time either
         """
-        name = rosgraph.names.resolve_name(name, '/pharos')
+        name = global_name(name, 'node')
         watcher = watcher_of(self)
         if not watcher.wait_for_node(name, timeout):
             self._ask('getPid')
@@ -191,7 +208,7 @@ class Master:
 
     def topic(self, name):
         """The topic of that name, whether anybody uses it yet or not."""
-        return Topic(self, rosgraph.names.resolve_name(name, '/pharos'))
+        return Topic(self, global_name(name, 'topic'))
 
     def topic_types(self):
         """``[(topic name, type name)]`` of all topics."""
@@ -209,8 +226,10 @@ class Master:
         :param persistent: keep connections between calls; they are opened again when the provider comes back
         :raises UnknownServiceError: if nobody offers it
         """
+        caller_id = global_name(caller_id, 'node')
+        name = rosgraph.names.resolve_name(check_name(name, 'service', private=True), caller_id)
         with self._reached():
-            return Service(self, rosgraph.names.resolve_name(name, caller_id), caller_id, persistent)
+            return Service(self, name, caller_id, persistent)
 
     def system_state(self):
         """``(publishers, subscribers, services)``, each ``{name: [node names]}``."""

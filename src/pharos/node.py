@@ -5,11 +5,13 @@ import traceback
 
 from pharos.blocks import check_block, check_delegate, check_runs, check_soul, name_of
 from pharos.errors import NodeStoppedError, PharosError
+from pharos.external_node import ExternalNode
 from pharos.health import health_of
 from pharos.life import Life
 from pharos.offered_service import OfferedService
 from pharos.parameter import Parameter
 from pharos.private_rospy.host import rospy
+from pharos.private_rospy.names import Resolved, check_name
 from pharos.private_rospy.settings import Settings
 from pharos.topic import QUEUE_SIZE
 from pharos.transcript import Transcript
@@ -115,9 +117,11 @@ class Node(Life):
         :param queue_size: messages kept while the node is busy; the oldest are dropped and counted
         :param inline: run the delegate in the publisher's thread, where that is a node of this process
         :param shared: get the very message that a node of this process published, and promise not to change it
-        :param from_: only messages of that node: a name, Node or ExternalNode
+        :param from_: only messages of that node: a name, resolved as the topic's is, a Node or ExternalNode; it need not
+            be there yet
         :param wait: without ``typed_as``, seconds to wait until somebody has given the topic a type
         :raises UnknownTopicError, UnknownTypeError, MessageTypeError: if there is no type, or another
+        :raises ValueError: if ``topic`` or ``from_`` cannot be a name
         """
         return self._topic(topic).input_channel(self, typed_as, delegate, queue_size, inline, shared, from_, wait)
 
@@ -143,13 +147,18 @@ class Node(Life):
         The first message on a topic waits for the subscribers that the master knows, for up to ``connect_timeout``
         seconds (None: the node's), so that it is not lost.
 
-        :param to: send it to that node alone: a name, Node or ExternalNode
+        :param to: send it to that node alone: a name, resolved as the topic's is, a Node or ExternalNode. One that is
+            not interested in the topic gets nothing, and the log says so once.
         :param wait: as in :meth:`interested_in`
+        :raises UnknownNodeError: if there is no node ``to``
+        :raises ValueError: if ``topic`` or ``to`` cannot be a name
         :raises MessageTypeError: if a field does not exist or does not fit
         :raises UnknownTopicError, UnknownTypeError: if there is no type
         """
         if block is not None:
             check_block(block, 'block', ('message',))
+        if to is not None:
+            to = self._name_of(to)
         topic = self._topic(topic)
         channel = next((channel for channel in self.channels if channel.topic == topic.name
                         and hasattr(channel, 'publish')), None)
@@ -165,7 +174,30 @@ class Node(Life):
         return [channel for channel in self._channels if channel.is_open]
 
     def _topic(self, name):
-        return self.master.topic(self._live_rospy().rospy.resolve_name(_check_topic_name(name)))
+        return self.master.topic(self._resolve(name, 'topic'))
+
+    def _resolve(self, name, what):
+        """A name as the node means it, in its namespace and remapped, in full."""
+        resolve = self._live_rospy().rospy.resolve_name
+        name = check_name(name, what, private=True)
+        # where rospy takes what follows for a global name (ros_comm #3044)
+        return check_name(resolve('~' + name[2:] if name.startswith('~/') else name), what)
+
+    def _name_of(self, peer):
+        """The full name of a node that messages come from or go to.
+
+        :param peer: a name, Node or ExternalNode
+        :raises ValueError: if it is none of these, or of another master
+        """
+        if isinstance(peer, (Node, ExternalNode)):
+            if peer.master != self.master:
+                raise ValueError(f'{peer} is at another master than {self.name}, and nothing goes from one to the other')
+            return Resolved(peer.name)
+        if isinstance(peer, Resolved):
+            return peer
+        if not isinstance(peer, str):
+            raise ValueError(f'from_= and to= are a node or its name, not {peer!r}')
+        return Resolved(self._resolve(peer, 'node'))
 
     def _remember_channel(self, channel):
         with self._opening:
@@ -185,11 +217,11 @@ class Node(Life):
 
         :param typed_as: service type name, such as 'std_srvs/Empty', or class
         """
-        return OfferedService(self, self._live_rospy().rospy.resolve_name(_check_topic_name(name)), typed_as, block)
+        return OfferedService(self, self._resolve(name, 'service'), typed_as, block)
 
     def parameter(self, name, initialized=None):
         """The :class:`Parameter` of that name ('~rate' is private); set to ``initialized`` where it has no value."""
-        return Parameter(self, self._live_rospy().rospy.resolve_name(_check_topic_name(name)), initialized)
+        return Parameter(self, self._resolve(name, 'parameter'), initialized)
 
     def log(self, text, level='info'):
         """Log a line on /rosout, the node's log file and the screen, with the file and line of the caller.
@@ -271,14 +303,3 @@ def make(node_class, master, named, soul, delegate, init, **settings):
 
 _LEVELS = {'debug': 'debug', 'info': 'info', 'warning': 'warning', 'warn': 'warning', 'error': 'error',
            'err': 'error', 'fatal': 'critical', 'critical': 'critical'}
-
-
-def _check_topic_name(name):
-    if not isinstance(name, str) or not name or name.startswith('/') and not name.strip('/'):
-        raise ValueError('a topic, service or parameter needs a name such as /turtle1/pose, not %r' % (name,))
-    illegal = next((char for char in name if not (char.isalnum() and char.isascii() or char in '_/~')), None)
-    if illegal or name[0].isdigit():
-        at = name.index(illegal) if illegal else 0
-        raise ValueError('%r is no ROS name (letters, digits, _ and /, after an optional ~ or /):\n  %s\n  %s^'
-                         % (name, name, ' ' * at))
-    return name

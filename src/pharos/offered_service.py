@@ -6,6 +6,7 @@ from pharos.blocks import check_block
 from pharos.errors import MessageTypeError, PharosError
 from pharos.private_rospy import services
 from pharos.private_rospy.host import rospy
+from pharos.private_rospy.names import Resolved
 
 
 class OfferedService:
@@ -21,7 +22,7 @@ class OfferedService:
         self._open()
 
     def _open(self):
-        self._service = self.node.ros.Service(self.name, self.service_class, self._answer)
+        self._service = self.node.ros.Service(Resolved(self.name), self.service_class, self._answer)
         self.node._services = [*self.node._services, self]
 
     @property

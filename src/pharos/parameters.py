@@ -3,6 +3,8 @@ import collections.abc
 
 import rosgraph
 
+from pharos.private_rospy.names import global_name
+
 
 class Parameters(collections.abc.MutableMapping):
     """``{global name: value}`` of a master's parameter server; made by :attr:`Master.parameters`.
@@ -30,10 +32,10 @@ class Parameters(collections.abc.MutableMapping):
 
     def __contains__(self, name):
         with self._master._reached():
-            return self._master._api().hasParam(rosgraph.names.resolve_name(name, '/pharos'))
+            return self._master._api().hasParam(_global(name))
 
     def _call(self, method, name, *args):
-        name = rosgraph.names.resolve_name(name, '/pharos')
+        name = _global(name)
         with self._master._reached():
             try:
                 return getattr(self._master._api(), method)(name, *args)
@@ -43,3 +45,7 @@ class Parameters(collections.abc.MutableMapping):
 
     def __repr__(self):
         return '<Parameters of %s>' % self._master.url
+
+
+def _global(name):
+    return name if name == '/' else global_name(name, 'parameter')    # the namespace of all

@@ -101,6 +101,10 @@ class Fanout:
         for dispatcher in self._inline:
             dispatcher.run()
 
+    def reaches(self, name):
+        """Whether the node of that name gets what is sent to it alone."""
+        return any(self._only(name, None))
+
     def _only(self, name, connection):
         """The inboxes and the TCPROS connections of a node, or of a connection."""
         if connection is None:

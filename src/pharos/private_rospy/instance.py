@@ -15,7 +15,7 @@ import _thread
 import rosgraph
 
 from pharos.errors import MasterUnreachableError, PortInUseError
-from pharos.private_rospy import host, logs, pubsub, registration, servers
+from pharos.private_rospy import host, logs, names, pubsub, registration, servers
 from pharos.private_rospy.lifetime import Lifetime
 from pharos.private_rospy.loader import PrivateImports, Substitute
 from pharos.private_rospy.parameters import WatchedParameters
@@ -56,7 +56,7 @@ class PrivateRospy:
         hooks = collections.defaultdict(list)
         for part in ({'rospy.service': _share_service_exception, 'rospy.impl.init': self._poll_quickly,
                       'rospy.core': self._shut_down_early},
-                     logs.hooks(), servers.hooks(lifetime, self.warn), registration.hooks(self), pubsub.hooks(self),
+                     names.hooks(), logs.hooks(), servers.hooks(lifetime, self.warn), registration.hooks(self), pubsub.hooks(self),
                      self.parameters.hooks()):
             for name, hook in part.items():
                 hooks[name].append(hook)

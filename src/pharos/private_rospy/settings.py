@@ -9,6 +9,8 @@ import urllib.parse
 import rosgraph.names
 from rosgraph.rosenv import ROS_HOSTNAME, ROS_IP, ROS_MASTER_URI, ROS_NAMESPACE
 
+from pharos.private_rospy.names import check_name
+
 
 class Settings:
     """The settings of one node.
@@ -31,35 +33,18 @@ class Settings:
         if domain is not None:
             self.environ.pop(ROS_IP, None)
             self.environ[ROS_HOSTNAME] = domain
-        namespace, _, base = check_name(name).rpartition('/')
+        namespace, _, base = check_name(name, 'node').rpartition('/')
         if name.startswith('/'):
             self.environ[ROS_NAMESPACE] = namespace or '/'
         elif namespace:
             self.environ[ROS_NAMESPACE] = rosgraph.names.ns_join(rosgraph.names.get_ros_namespace(argv=[]), namespace)
-        self.base_name = check_name(special.get('__name', base), base=True)
+        self.base_name = check_name(special.get('__name', base), 'node', base=True)
         self.namespace = rosgraph.names.get_ros_namespace(self.environ, mappings)
         self.name = self.namespace + self.base_name
         self.argv = [self.base_name, *mappings]
         self.master_url = master_url
         self.tcp_port = check_port('tcp_port', tcp_port)
         self.xmlrpc_port = check_port('xmlrpc_port', xmlrpc_port)
-
-
-def check_name(name, base=False):
-    """``name`` if it can be a node's, else ValueError with a caret under the first bad character."""
-    legal = rosgraph.names.is_legal_base_name if base else rosgraph.names.is_legal_name
-    if not isinstance(name, str):
-        raise ValueError('a node name is a string, not %r' % (name,))
-    stem = name.rstrip('/')
-    if name and stem == name and legal(name) and not name.startswith('~'):
-        return name
-    if not stem:
-        raise ValueError("a node needs a name, for example named='/driver'; got %r" % name)
-    allowed = 'letters, digits and _%s, beginning with a letter' % ('' if base else ', parts joined by /')
-    for end in range(1, len(name) + 1):
-        if not legal(name[:end].rstrip('/') or 'a') or name[:end].startswith('~'):
-            break
-    raise ValueError('%r cannot be a node name (%s):\n  %s\n  %s^' % (name, allowed, name, ' ' * (end - 1)))
 
 
 def check_port(what, port):

@@ -3,6 +3,7 @@ import select
 import threading
 
 from pharos.private_rospy import publishing
+from pharos.private_rospy.names import Resolved
 
 _running = {}    # URI -> the PrivateRospy that runs there, in this process
 
@@ -41,7 +42,7 @@ class Wiring:
         topic = channel.topic
         with self._lock:
             self._channels[topic] = (*self.channels_on(topic), channel)
-        endpoint = self._instance.rospy.Subscriber(topic, channel.message_class, channel._offer, **options)
+        endpoint = self._instance.rospy.Subscriber(Resolved(topic), channel.message_class, channel._offer, **options)
         self._channels_changed(topic)
         publishers = [other for other in self._neighbours() if other.publisher(topic)]
         for other in publishers:
@@ -63,7 +64,8 @@ class Wiring:
 
         rosmaster tells them in steps of 0.1 s.
         """
-        endpoint = self._instance.rospy.Publisher(channel.topic, channel.message_class, latch=channel.latch, **options)
+        endpoint = self._instance.rospy.Publisher(Resolved(channel.topic), channel.message_class, latch=channel.latch,
+                                                  **options)
         if channel.latch:
             endpoint.impl.fanout.resume(channel)
             endpoint.impl.fanout.run()
@@ -94,6 +96,11 @@ class Wiring:
         ended = _has_left if endpoint.reg_type == 'pub' else _is_done    # a subscriber's thread sees the end by itself
         return [(_peer(connection), connection.transport_type)
                 for connection in (endpoint.impl.connections if endpoint.impl else ()) if not ended(connection)]
+
+    @staticmethod
+    def reaches(endpoint, name):
+        """Whether a rospy Publisher is connected to the node of that name."""
+        return endpoint.impl is not None and endpoint.impl.fanout.reaches(name)
 
     @staticmethod
     def is_closed(endpoint):
