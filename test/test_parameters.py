@@ -1,4 +1,5 @@
 """Parameters, bound to a node both ways."""
+import datetime
 import itertools
 import socketserver
 import threading
@@ -182,12 +183,19 @@ def test_initialized_with_none_any_value_is_taken(master):
     assert changes.until_now() == []
 
 
-@pytest.mark.parametrize('value', [None, 2 ** 31, object(), {1: 'a'}, 'a\0b', [1, None], 1j, {'a': 2 ** 40}])
+@pytest.mark.parametrize('value', [None, 2 ** 31, object(), {1: 'a'}, 'a\0b', [1, None], 1j, {'a': 2 ** 40}, '\ud800',
+                                   {1, 2}, datetime.date(2020, 2, 3)])
 def test_a_value_that_the_server_cannot_hold_is_refused_by_name(master, value):
     parameter = create(master).parameter('~any')
     with pytest.raises(ValueError, match='/robot1/driver/any cannot be'):
         parameter.set(value)
     assert parameter.value is None
+    with pytest.raises(ValueError, match='/robot1/driver/any cannot be'):
+        master.parameters[parameter.name] = value
+    assert parameter.value is None and parameter.name not in master.parameters
+    if value is not None:
+        with pytest.raises(ValueError, match='/robot1/driver/any cannot be'):
+            parameter.node.parameter('~any', initialized=value)
 
 
 # -- namespaces -------------------------------------------------------------------------------------------------------

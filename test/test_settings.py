@@ -5,6 +5,7 @@ import sys
 import pytest
 
 from pharos import BlockNode
+from programs import forget_parameters, run
 from sockets import listening
 
 
@@ -44,6 +45,53 @@ def test_private_parameters_come_from_argv(master):
     node = create(master, '/robot1/driver', argv=['_rate:=2.5', '_name:=bob'])
     assert node.ros.get_param('~rate') == 2.5
     assert master._api().getParam('/robot1/driver/name') == 'bob'
+
+
+@pytest.mark.parametrize('value, said', [
+    ('99999999999999999999', '~bad cannot be 99999999999999999999: .*integers of 32 bits'),
+    ('-2147483649', '~bad cannot be -2147483649'),
+    ('[1, [2, {a: 2147483648}]]', '~bad cannot be .*2147483648'),
+    ('~', '~bad cannot be None'),
+    ('[1, null]', '~bad cannot be .1, None.'),
+    ('2020-02-03', '~bad cannot be datetime.date.2020, 2, 3.'),
+    ('{1: a}', "~bad cannot be {1: 'a'}: .*key must be string"),
+    ('{a: {2: b}}', '~bad cannot be .*key must be string'),
+    ('!!set {a, b}', '~bad cannot be {'),
+    ('&loop [*loop]', '~bad cannot be .*recursive'),
+    ('{', "'_bad:={' sets no private parameter, for its value is no YAML"),
+    ('!!python/object:os.system x', 'its value is no YAML: .*constructor'),
+    ('a\x01b', 'its value is no YAML'),
+    ('"a\\x01b"', '~bad cannot be'),
+    ('[' * 2000, 'its value is no YAML'),
+    ('a:=b', 'its value is no YAML'),
+])
+def test_a_private_parameter_that_the_server_cannot_hold_is_refused_by_name(master, value, said):
+    before = master.system_state(), dict(master.parameters)
+    with pytest.raises(ValueError, match=said):
+        create(master, '/holds/driver', argv=['_good:=1', '_bad:=' + value])
+    assert (master.system_state(), dict(master.parameters)) == before
+    create(master, '/holds/driver').stop()    # the name is free
+
+
+HELD = ['0', '2147483647', '0123', '0x10', '1e400', '.inf', '-.inf', 'yes', '"0"', "'yes'", 'ü', '12:30:45', '[a, [1.5]]',
+        '{a: {b: [true]}}', '2020-02-03 10:00:00', '!!omap [a: 1]', '""', ' padded ', '1_000']
+
+
+def test_private_parameters_are_what_plain_rospy_makes_of_them(master):
+    arguments = ['_p%d:=%s' % numbered for numbered in enumerate(HELD)]
+    create(master, '/ours', argv=arguments)
+    done = run(master.url, sys.executable, '-c', "import rospy; rospy.init_node('theirs')", *arguments)
+    assert done.returncode == 0, done.stderr
+    ours, theirs = master.parameters['/ours'], master.parameters['/theirs']
+    forget_parameters(master.url)
+    assert {name: (type(value), value) for name, value in ours.items()} == {
+        name: (type(value), value) for name, value in theirs.items()}
+    assert len(ours) == len(HELD)
+
+
+def test_a_private_parameter_without_a_value_is_none_as_with_rospy(master):
+    create(master, '/holds/driver', argv=['_empty:=', '_blank:= '])
+    assert [name for name in master.parameters if name.startswith('/holds')] == []
 
 
 def test_the_process_keeps_its_arguments_and_environment(master):

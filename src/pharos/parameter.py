@@ -1,9 +1,8 @@
 """Parameters of the parameter server, bound to a node both ways."""
-import xmlrpc.client
-
 import rosgraph
 
 from pharos.blocks import check_block
+from pharos.private_rospy.parameters import carried
 
 
 class Parameter:
@@ -19,7 +18,7 @@ class Parameter:
 
     def __init__(self, node, name, initialized=None):
         self.node, self.name = node, name
-        self._initialized = self._carried(initialized)
+        self._initialized = None if initialized is None else carried(name, initialized)
         self._kind = type(self._initialized)
         self._blocks = []
         if self._initialized is not None:
@@ -52,7 +51,7 @@ class Parameter:
         """
         if value is None:
             raise ValueError('%s cannot be set to None: choose a value, such as an empty text or list' % self.name)
-        value = self._checked(self._carried(value))
+        value = self._checked(carried(self.name, value))
         watched = self.node._live_rospy().parameters
         with self.node.master._reached():
             self.node.master._api(self.node.name).setParam(self.name, value)
@@ -80,16 +79,6 @@ class Parameter:
                 block(self._checked(value))
             except Exception as error:
                 self.node._report(error, block, 'parameter %s' % self.name)
-
-    def _carried(self, value):
-        """The value as the parameter server brings it back: with lists for tuples."""
-        if value is None:
-            return None
-        try:
-            return xmlrpc.client.loads(xmlrpc.client.dumps((value,)))[0][0]
-        except Exception as error:    # of several kinds; text with characters that XML has not, for one
-            raise ValueError('%s cannot be %r: the parameter server holds booleans, numbers (integers of 32 bits), '
-                             'strings, and lists and dicts of them (%s)' % (self.name, value, error)) from error
 
     def _checked(self, value):
         if value is None or self._kind in (type(None), type(value)):

@@ -4,12 +4,14 @@ import collections.abc
 import rosgraph
 
 from pharos.private_rospy.names import global_name
+from pharos.private_rospy.parameters import carried
 
 
 class Parameters(collections.abc.MutableMapping):
     """``{global name: value}`` of a master's parameter server; made by :attr:`Master.parameters`.
 
-    A name may be a namespace, whose value is a dict of what it holds. Iteration gives all full names.
+    A name may be a namespace, whose value is a dict of what it holds. Iteration gives all full names. Setting a value
+    that the server cannot hold is a ValueError.
     """
 
     def __init__(self, master):
@@ -19,7 +21,7 @@ class Parameters(collections.abc.MutableMapping):
         return self._call('getParam', name)
 
     def __setitem__(self, name, value):
-        self._call('setParam', name, value)
+        self._call('setParam', name, carried(name, value))
 
     def __delitem__(self, name):
         self._call('deleteParam', name)

@@ -73,10 +73,13 @@ class Service:
     @property
     def md5sum(self):
         """The provider's md5sum, or the one set by hand; setting it to None takes that back."""
-        return self._md5sum_by_hand or self._found_md5sum
+        return self._found_md5sum if self._md5sum_by_hand is None else self._md5sum_by_hand
 
     @md5sum.setter
     def md5sum(self, md5sum):
+        if not isinstance(md5sum, (str, type(None))):
+            raise ValueError(f'the md5sum of {self.name} is a text such as {self._found_md5sum!r}, not {md5sum!r}: where '
+                             "it comes from YAML, as parameters do, put one of digits alone in quotes (\"'0'\")")
         self._md5sum_by_hand = md5sum
 
     @property
@@ -124,7 +127,7 @@ class Service:
 
     def _check_definition(self, deadline):
         """Refuse a definition that is not the provider's, before anybody wonders which fields a request has."""
-        if self._md5sum_by_hand or self._found_md5sum in (None, '*', self.service_class._md5sum):
+        if self._md5sum_by_hand is not None or self._found_md5sum in (None, '*', self.service_class._md5sum):
             return
         self._look_up(deadline)
         header = self._ask(deadline)    # it may have been built anew since it was looked up
@@ -160,7 +163,9 @@ class Service:
         except Exception:
             message_types.check_fits(request)    # tells what of it does not
             raise
-        return here.call(data, self._header(self._md5sum_sent), deadline) if here else self._send_over_tcp(data, deadline)
+        if here:
+            return here.call(data, self._header(self._md5sum_sent), deadline)
+        return self._send_over_tcp(data, deadline)
 
     def _send_over_tcp(self, data, deadline):
         connection = self._connection(deadline)
@@ -181,7 +186,7 @@ class Service:
 
     @property
     def _md5sum_sent(self):
-        return self._md5sum_by_hand or self.service_class._md5sum
+        return self.service_class._md5sum if self._md5sum_by_hand is None else self._md5sum_by_hand
 
     def _header(self, md5sum):
         header = {'service': self.name, 'md5sum': md5sum, 'callerid': self.caller_id}
@@ -224,13 +229,14 @@ class Service:
         """
         type_, md5sum, by_hand = header.get('type'), header.get('md5sum'), self._md5sum_by_hand
         theirs = f'{type_} with md5sum {md5sum} ({self._fields_of(type_, md5sum)})'
-        if by_hand:
+        if by_hand is not None:
             return ServiceTypeError(f'the md5sum {by_hand!r} is not that of {self.name}, which is of type {theirs}: set '
                                     'that one, or none')
         if type_ != self.type:
             return ServiceTypeError(f'the md5sum {self.service_class._md5sum!r} is not that of {self.name}, which is of '
                                     f'type {theirs}: it was {self.type} when it was looked up: look it up again')
-        ours, self._class = self.service_class, None    # the right definition may come, and is sought then
+        ours = self.service_class
+        self._class = self._here = None    # the right definition may come, and is sought then
         return ServiceTypeError(
             f'{self.name} is of type {theirs}, but {type_} is defined here with md5sum {ours._md5sum} '
             f'({message_types.describe_service(ours)}), so nothing was sent: have both sides use the same '

@@ -1,5 +1,6 @@
 """Parameters that a node watches, through the master's paramUpdate calls."""
 import contextlib
+import reprlib
 import threading
 import xmlrpc.client
 
@@ -141,6 +142,18 @@ class WatchedParameters:
             return self._master().getParam(name)    # rospy would remap the name once more
         except rosgraph.MasterError:
             return None
+
+
+def carried(name, value):
+    """The value as the parameter server brings it back: with lists for tuples.
+
+    :raises ValueError: if it can hold no such value
+    """
+    try:
+        return xmlrpc.client.loads(xmlrpc.client.dumps((value,)))[0][0]
+    except Exception as error:    # of several kinds; text with characters that XML has not, for one
+        raise ValueError(f'{name} cannot be {reprlib.repr(value)}: the parameter server holds booleans, numbers '
+                         f'(integers of 32 bits), strings, and lists and dicts of them ({error})') from error
 
 
 def _holds(namespace, name):

@@ -9,7 +9,9 @@ import urllib.parse
 import rosgraph.names
 from rosgraph.rosenv import ROS_HOSTNAME, ROS_IP, ROS_MASTER_URI, ROS_NAMESPACE
 
+from pharos.private_rospy.host import rospy
 from pharos.private_rospy.names import check_name
+from pharos.private_rospy.parameters import carried
 
 
 class Settings:
@@ -22,11 +24,12 @@ class Settings:
     :param tcp_port: TCPROS port, 0 for any free one
     :param xmlrpc_port: XML-RPC port, 0 for any free one
     :param argv: ROS remappings and private parameters; what is no remapping is ignored
-    :raises ValueError: if a name or port cannot be one
+    :raises ValueError: if a name or port cannot be one, or the value of a private parameter
     """
 
     def __init__(self, name, master_url, domain=None, tcp_port=0, xmlrpc_port=0, argv=None):
         mappings = [arg for arg in argv or () if rosgraph.names.REMAP in arg and not arg.startswith('__master:=')]
+        check_private_parameters(mappings)
         special = rosgraph.names.load_mappings(mappings)
         self.environ = dict(os.environ)
         self.environ[ROS_MASTER_URI] = master_url
@@ -45,6 +48,21 @@ class Settings:
         self.master_url = master_url
         self.tcp_port = check_port('tcp_port', tcp_port)
         self.xmlrpc_port = check_port('xmlrpc_port', xmlrpc_port)
+
+
+def check_private_parameters(arguments):
+    """Raise ValueError for the value of a private parameter that the server cannot hold, or that is no YAML.
+
+    rospy sets them when the node has registered, one after the other.
+    """
+    for argument in arguments:
+        try:
+            parameters = rospy.client.load_command_line_node_params([argument])
+        except rospy.ROSInitException as error:
+            raise ValueError(f'{argument!r} sets no private parameter, for its value is no YAML: put text with special '
+                             f'characters in quotes ({error})') from error
+        for name, value in parameters.items():
+            carried('~' + name, value)
 
 
 def check_port(what, port):
