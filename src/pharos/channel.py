@@ -9,6 +9,7 @@ from pharos import message_types
 from pharos.blocks import check_delegate, check_runs
 from pharos.dispatcher import Inbox, SocketInbox
 from pharos.errors import MessageTypeError, NodeStoppedError
+from pharos.private_rospy.copier import copier_for
 from pharos.private_rospy.fanout import Latch
 from pharos.private_rospy.publishing import wait_until
 
@@ -25,7 +26,7 @@ class _Channel:
         self.node = node
         self.topic = topic
         self.message_class = message_class
-        self.queue_size = queue_size
+        self.queue_size, self.queue_bytes = queue_size, node.queue_bytes
         self.closed = False      # whether close() was called
         self._endpoint = None    # rospy's Publisher or Subscriber while the channel is open
         self._lock = threading.Lock()    # guards the above against two threads that close it, and what a subclass has
@@ -93,6 +94,7 @@ class InputChannel(_Channel):
         self.shared = shared
         self.from_ = None if from_ is None else str(node._name_of(from_))
         self.received = 0
+        self._size = copier_for(message_class).size
         self._inboxes, self._dropped_before = [], 0
         self._open()
 
@@ -145,7 +147,7 @@ class InputChannel(_Channel):
         """Take a message from rospy, which runs the dispatcher after a batch of them."""
         if self.from_ is None or message._connection_header.get('callerid') == self.from_:
             with self._lock:    # TCPROS connections offer side by side
-                self._tcpros.put(message)
+                self._tcpros.put(message, self._size(message) if self._size else 0)
 
 
 class OutputChannel(_Channel):

@@ -19,7 +19,9 @@ COURTESY = 1e-3   # seconds for which a thread that brings a message also runs w
 
 
 class Inbox:
-    """The messages on their way to one channel, through one connection: bounded, drops the oldest, counts.
+    """The messages on their way to one channel, through one connection: drops the oldest, counts.
+
+    It is bounded by a number of messages and, where they are large, by their bytes; the newest always has room.
 
     One thread at a time puts (it holds the publisher's lock), one at a time runs (it holds the node's).
 
@@ -30,7 +32,8 @@ class Inbox:
 
     # a message that comes alone meets cold caches: all that it needs lies together
     __slots__ = ('channel', 'dispatcher', 'inline', 'shared', 'arrived', 'taken', 'closed', '_thaw', '_header',
-                 '_queue', '_limit', '_announce', '_announced', '_seen', '_given')
+                 '_queue', '_limit', '_announce', '_announced', '_seen', '_given', '_sizes', '_put_bytes',
+                 '_taken_bytes')
 
     def __init__(self, channel, dispatcher, inline, thaw=None, header=None, shared=False):
         self.channel, self.dispatcher, self.inline, self.shared = channel, dispatcher, inline, shared
@@ -43,6 +46,8 @@ class Inbox:
         self._announced = False
         self._seen = -1     # how many were taken when a publisher last gave way,
         self._given = 0.0   # and when that was
+        self._sizes = collections.deque()          # of the large messages in the queue, and for a moment of one more
+        self._put_bytes = self._taken_bytes = 0    # of those put and not dropped, and of those taken
 
     @property
     def dropped(self):
@@ -52,19 +57,42 @@ class Inbox:
     def is_empty(self):
         return not self._queue
 
-    def put(self, value):
-        """Add a message; the dispatcher is to be told afterwards."""
+    def put(self, value, size=0):
+        """Add a message; the dispatcher is to be told afterwards.
+
+        :param size: its bytes, if that matters
+        """
         queue = self._queue
-        if len(queue) == self._limit and (self._seen != self.taken or time.perf_counter() - self._given > STARVING):
-            # Full: a publisher that never lets go of the interpreter would starve the receiver.
-            self._seen = self.taken
-            time.sleep(1e-6)
-            self._given = time.perf_counter()
+        if len(queue) == self._limit:
+            self._let_receiver_run()
+        if size:
+            self._make_room(size)
         queue.append(value)
         self.arrived += 1
         if not self._announced:
             self._announced = True
             self._announce(self)
+
+    def _let_receiver_run(self):
+        """Where the queue is full, a publisher that never lets go of the interpreter would starve the receiver."""
+        if self._seen != self.taken or time.perf_counter() - self._given > STARVING:
+            self._seen = self.taken
+            time.sleep(1e-6)
+            self._given = time.perf_counter()
+
+    def _make_room(self, size):
+        """Drop the oldest messages, where there is no room for another of ``size`` bytes."""
+        queue, sizes = self._queue, self._sizes
+        self._put_bytes += size
+        sizes.append(size)
+        if queue and self._put_bytes - self._taken_bytes > self.channel.queue_bytes:
+            self._let_receiver_run()
+        while self._put_bytes - self._taken_bytes > self.channel.queue_bytes or len(queue) == self._limit:
+            try:
+                queue.popleft()
+            except IndexError:    # the receiver has taken them all
+                return
+            self._put_bytes -= sizes.popleft()
 
     def run_next(self):
         """Run the delegate for the oldest message, if there is one still."""
@@ -74,6 +102,8 @@ class Inbox:
         except IndexError:
             return
         self.taken += 1
+        if self._sizes:
+            self._taken_bytes += self._sizes.popleft()
         if self._queue and not self._announced:
             self._announced = True
             self._announce(self)

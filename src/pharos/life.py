@@ -26,6 +26,7 @@ class Life:
     """What a :class:`~pharos.Node` does to live; its blocks, channels and services are there."""
 
     connect_timeout = 2.0    #: seconds that a topic's first message waits for the subscribers the master knows
+    queue_bytes = 64 << 20   #: bytes of messages, about, that wait for a slow receiver for each publisher, or one message
     allow_remote_shutdown = False    #: whether any host may ask it to stop, not only this one and the master's
     stop_timeout = 2.0       #: seconds that :meth:`stop` waits for souls, and for messages under way
 

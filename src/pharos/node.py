@@ -114,7 +114,8 @@ class Node(Life):
         :param typed_as: type name or message class; None: the master's type for the topic, whose definition comes from
             a publisher where no package here has it
         :param delegate: block for this channel only, instead of the node's
-        :param queue_size: messages kept while the node is busy; the oldest are dropped and counted
+        :param queue_size: messages kept while the node is busy; the oldest are dropped and counted. Of large messages
+            no more are kept than have :attr:`queue_bytes` bytes, 64 MiB by default.
         :param inline: run the delegate in the publisher's thread, where that is a node of this process
         :param shared: get the very message that a node of this process published, and promise not to change it
         :param from_: only messages of that node: a name, resolved as the topic's is, a Node or ExternalNode; it need not

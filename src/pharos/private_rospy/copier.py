@@ -43,16 +43,18 @@ from genmsg.msgs import parse_type
 from genpy.base import SIMPLE_TYPES_DICT as STRUCT_CODES    # primitive type -> its code on the wire
 
 ARRIVAL_CODES = {**STRUCT_CODES, 'bool': '?'}   # genpy sends a bool as a number: 7 goes out, True arrives
+SMALL = 64     # bytes that a message is taken to have beside its texts and arrays
 
 
 class Copier(NamedTuple):
-    """The functions that copy the messages of one class. Where it is always serialized, the last three are missing."""
+    """The functions that copy the messages of one class. Where it is always serialized, two of them are missing."""
 
     freeze: Callable    # message -> tuple or bytes; raises what message.serialize() raises
     thaw: Callable      # tuple or bytes -> fresh message
+    size: Optional[Callable]    # message -> about how many bytes it has on the wire; None: always a few
     freeze_fields: Optional[Callable] = None    # message -> tuple; raises where freeze would serialize
     thaw_fields: Optional[Callable] = None      # tuple -> message, its times not canonized
-    source: str = ''    # of these two, to be read when debugging
+    source: str = ''    # of all but the first two, to be read when debugging
 
 
 def copier_for(cls):
@@ -62,7 +64,7 @@ def copier_for(cls):
         try:
             copier = _generate(cls)
         except Exception:   # a class not understood costs time, never a wrong copy
-            copier = Copier(serialized, lambda frozen: cls().deserialize(frozen))
+            copier = Copier(serialized, lambda frozen: cls().deserialize(frozen), _estimated_size)
         # Kept in the class itself: a registry here would keep classes made at run time alive for ever.
         cls._pharos_copier = copier
     return copier
@@ -78,6 +80,12 @@ def thawer(publisher_cls, receiver_cls):
         data = frozen if type(frozen) is bytes else serialized(copier.thaw_fields(frozen))
         return receiver_cls().deserialize(data)
     return thaw_as_receiver
+
+
+def _estimated_size(message):
+    """The size of a message of any class, such as rospy's AnyMsg or one with numpy arrays."""
+    values = [getattr(message, name, None) for name in message.__slots__]
+    return SMALL + sum(getattr(value, 'nbytes', None) or len(value) for value in values if hasattr(value, '__len__'))
 
 
 def serialized(message):
@@ -156,9 +164,11 @@ def _generate(cls):
     # The wire canonizes the times that are the message's own, not those of its header or of other messages in it.
     canon = [f'message.{name}.canon()' for name, type_name in _fields(cls) if type_name in ('time', 'duration')]
     freeze, build = list(writer.freeze_lines()), list(writer.thaw_lines(cls))
+    sizes = writer.sizes()
     source = '\n'.join([
         'def freeze_fields(message):', *_indented(freeze), '',
         'def thaw_fields(frozen):', *_indented(build), '    return message', '',
+        'def size(message):', f'    return {" + ".join(sizes)}', '',
         # each of these again with all of it in one function: a message that comes alone meets cold caches
         'def freeze(message):', '    if type(message) is cls:', '        try:', *_indented(_indented(_indented(freeze))),
         '        except Exception:', '            pass', '    return serialized(message)', '',
@@ -166,7 +176,8 @@ def _generate(cls):
         *_indented([*build, *canon]), '    return message', ''])
     scope = {**writer.scope, 'cls': cls, 'serialized': serialized}
     exec(compile(source, '<copier of %s>' % cls.__name__, 'exec'), scope)
-    return Copier(scope['freeze'], scope['thaw'], scope['freeze_fields'], scope['thaw_fields'], source)
+    size = scope['size'] if len(sizes) > 1 else None
+    return Copier(scope['freeze'], scope['thaw'], size, scope['freeze_fields'], scope['thaw_fields'], source)
 
 
 def _indented(lines):
@@ -209,12 +220,15 @@ class _Writer:
         self._values = []               # the variables in the frozen tuple
         self._floats = []               # those of them that are float64
         self._numbers = []              # other numbers: (primitive type, where it is read, variable)
+        self._sizes = []                # expressions of size
 
-    def add_object(self, cls, owner):
-        """Add the fields of the object of class cls that is in the variable owner."""
+    def add_object(self, cls, owner, path='message'):
+        """Add the fields of the object of class cls that is in the variable owner, and at that path in a message."""
         for name, type_name in _fields(cls):
             base, is_array, length = parse_type(type_name)
             field, local = f'{owner}.{name}', self._unique(name)
+            if length is None:    # else it hardly varies
+                self._add_size(cls, base, is_array, f'{path}.{name}')
             if is_array:
                 self._add_array(cls, base, length, field, local)
             elif base in STRUCT_CODES or base == 'string':
@@ -223,7 +237,25 @@ class _Writer:
                 nested = _nested_class(cls, base)
                 self._reads.append(f'{local} = {field}')
                 self._builds.append(f'{local} = {field} = new({self._refer(nested)})')
-                self.add_object(nested, local)
+                self.add_object(nested, local, f'{path}.{name}')
+
+    def _add_size(self, cls, base, is_array, path):
+        """Add what may make a message large: an array or a text, unless that names a frame."""
+        if not is_array:
+            if base == 'string' and not path.endswith('frame_id'):
+                self._sizes.append(f'len({path})')
+        elif base == 'string':
+            self._sizes.append(f'sum(map(len, {path}))')
+        elif base in STRUCT_CODES:
+            self._sizes.append(f'len({path}) * {struct.calcsize("<" + STRUCT_CODES[base])}')
+        else:
+            size = copier_for(_nested_class(cls, base)).size
+            items = f'sum(map({self._refer(size)}, {path}))' if size else f'len({path}) * {SMALL}'
+            self._sizes.append(items)
+
+    def sizes(self):
+        """The terms of a message's size."""
+        return [str(SMALL), *self._sizes]
 
     def _add_scalar(self, base, field, local):
         self._add_value(field, local, fresh=local)

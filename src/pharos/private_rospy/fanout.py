@@ -19,13 +19,14 @@ class Fanout:
 
     # a message that comes alone meets cold caches: all that it needs lies together
     __slots__ = ('_lock', '_closed', '_seq', '_has_header', '_freeze', '_inboxes', '_remote', '_dispatchers',
-                 '_inline', '_last', '_publisher', '_module', '_thaw', '_buffer', '_latches', '_early', '_mark')
+                 '_inline', '_last', '_size', '_mark', '_publisher', '_module', '_thaw', '_buffer', '_latches',
+                 '_early')
 
     def __init__(self, publisher, module):
         self._publisher, self._module = publisher, module
         self._lock, self._closed, self._seq = publisher.publock, False, 0
         self._has_header = getattr(publisher.data_class, '_has_header', False)
-        self._freeze, self._thaw = copier.copier_for(publisher.data_class)[:2]
+        self._freeze, self._thaw, self._size = copier.copier_for(publisher.data_class)[:3]
         self._buffer = io.BytesIO()
         self._latches = {}    # channel, None: rospy's Publishers -> its Latch
         self._early = _EarlyLines() if publisher.resolved_name == '/rosout' else None
@@ -78,8 +79,10 @@ class Fanout:
                 self._latch(by, frozen, to or connection and connection.endpoint_id)
             if mark is not None:
                 message = mark.put_on(message)
-            for inbox in inboxes:
-                inbox.put(message if inbox.shared else frozen)
+            if inboxes:
+                size = self._size_of(message, frozen) if self._size else 0
+                for inbox in inboxes:
+                    inbox.put(message if inbox.shared else frozen, size)
             woken = None
             for dispatcher in dispatchers:
                 if dispatcher.idle:
@@ -95,6 +98,9 @@ class Fanout:
             for dispatcher in self._inline:
                 dispatcher.run()
         return True
+
+    def _size_of(self, message, frozen):
+        return len(frozen) if type(frozen) is bytes else self._size(message)
 
     def run(self):
         """Run the delegates that are inline, without the lock, which others may wait for."""

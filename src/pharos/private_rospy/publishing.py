@@ -1,5 +1,6 @@
 """rospy's publishers, mended: they send through INTRAPROCESS too, and latch by value."""
 import functools
+import math
 import threading
 
 from pharos.private_rospy.fanout import Fanout
@@ -16,6 +17,7 @@ def mend_publisher(module, start_thread):
     """
     publisher, base = module._PublisherImpl, module._TopicImpl
     init, write, shut = publisher.__init__, publisher.publish, publisher.close
+    publisher.queue_bytes = math.inf    # that wait for a subscriber; an OutputChannel has a limit
 
     def __init__(self, name, data_class):
         init(self, name, data_class)
@@ -43,7 +45,7 @@ def mend_publisher(module, start_thread):
         """
         link = getattr(connection, 'link', None)
         if link is None and self.queue_size is not None:
-            connection = Sender(connection, self.queue_size, start_thread)
+            connection = Sender(connection, self.queue_size, start_thread, self.queue_bytes)
         lock = self.publock
         if lock is None:    # closed meanwhile
             connection.close()

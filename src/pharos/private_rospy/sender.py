@@ -1,5 +1,6 @@
 """What is on its way to one subscriber over TCPROS."""
 import collections
+import math
 import socket
 import threading
 import time
@@ -14,10 +15,13 @@ class Sender:
     which takes all that is queued out at once, so that it can neither drop nor count it any more.
     """
 
-    def __init__(self, connection, queue_size, start_thread):
-        """:param queue_size: messages, the oldest of which are dropped; 0: without limit"""
+    def __init__(self, connection, queue_size, start_thread, queue_bytes=math.inf):
+        """:param queue_size: messages, the oldest of which are dropped; 0: without limit
+        :param queue_bytes: bytes of messages, likewise; the newest always has room
+        """
         self._connection = connection
-        self._queue = collections.deque(maxlen=queue_size or None)
+        self._queue, self._bytes = collections.deque(), 0
+        self._limit, self._byte_limit = queue_size or math.inf, queue_bytes
         self._begun = b''         # the rest of a message whose beginning the socket has
         self._is_idle = True      # nothing is on its way but what the socket has
         self._error = None        # of the thread, for the next who publishes, as in rospy
@@ -41,10 +45,17 @@ class Sender:
                     return
                 self._begun = data[sent:]
             else:
-                self._queue.append(data)
+                self._enqueue(data)
             self._is_idle = False
             self._changed.notify_all()
         time.sleep(0)    # else the thread gets the interpreter 5 ms later from a busy publisher
+
+    def _enqueue(self, data):
+        queue = self._queue
+        queue.append(data)
+        self._bytes += len(data)
+        while len(queue) > self._limit or self._bytes > self._byte_limit and len(queue) > 1:
+            self._bytes -= len(queue.popleft())
 
     def _send(self, data):
         """Return how many bytes the socket has taken."""
@@ -66,7 +77,10 @@ class Sender:
                     self._changed.wait_for(lambda: self._begun or self._queue or connection.done)
                 if connection.done:
                     return
-                data, self._begun = self._begun or self._queue.popleft(), b''
+                data, self._begun = self._begun, b''
+                if not data:
+                    data = self._queue.popleft()
+                    self._bytes -= len(data)
             try:
                 connection.write_data(data)
             except Exception as error:

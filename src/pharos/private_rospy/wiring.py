@@ -66,6 +66,7 @@ class Wiring:
         """
         endpoint = self._instance.rospy.Publisher(Resolved(channel.topic), channel.message_class, latch=channel.latch,
                                                   **options)
+        endpoint.impl.queue_bytes = channel.queue_bytes
         if channel.latch:
             endpoint.impl.fanout.resume(channel)
             endpoint.impl.fanout.run()

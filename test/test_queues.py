@@ -1,0 +1,141 @@
+"""What waits for a slow receiver is bounded: by a number of messages, and by their bytes."""
+import threading
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from conftest import TIMEOUT, Mailbox
+from pharos import BlockNode, Node, dispatcher
+from pharos.private_rospy import sender
+
+BYTES, NUMBERS = 'std_msgs/UInt8MultiArray', 'std_msgs/Float64MultiArray'
+MEGABYTE = 1 << 20
+
+
+def create(master, name, cls=BlockNode, **kwargs):
+    return master.create(cls, named=name, domain='127.0.0.1', **kwargs)
+
+
+class Gate:
+    """A delegate that is entered with the first message, and keeps all others waiting until it is opened."""
+
+    def __init__(self):
+        self.entered, self.opened, self.sizes = threading.Event(), threading.Event(), Mailbox()
+
+    def __call__(self, message, channel):
+        self.entered.set()
+        self.opened.wait(TIMEOUT)
+        self.sizes(len(message.data), channel)
+
+
+class Small(Node):
+    queue_bytes = 4 * MEGABYTE
+
+
+@pytest.mark.parametrize('shared', [False, True])
+def test_large_messages_wait_up_to_so_many_bytes_and_the_oldest_are_dropped_and_counted(master, shared):
+    gate = Gate()
+    received = create(master, '/receiver', Small, delegate=gate).interested_in('/large', BYTES, shared=shared)
+    sent = create(master, '/sender').output_channel('/large', BYTES)
+    sent.send(data=b'')
+    assert gate.entered.wait(TIMEOUT)
+    for number in range(10):
+        sent.send(data=bytes(MEGABYTE - 1000 + number))
+    assert received.dropped == 6
+    gate.opened.set()
+    assert [len_ for len_ in gate.sizes.take(5)] == [0, *range(MEGABYTE - 994, MEGABYTE - 990)]
+    assert (received.received, received.dropped) == (5, 6)
+
+
+def test_the_newest_message_has_room_however_large_it_is(master):
+    gate = Gate()
+    received = create(master, '/receiver', Small, delegate=gate).interested_in('/larger', BYTES)
+    sent = create(master, '/sender').output_channel('/larger', BYTES)
+    sent.send(data=b'')
+    assert gate.entered.wait(TIMEOUT)
+    for size in (10, 20 * MEGABYTE, 30, 40):
+        sent.send(data=bytes(size))
+    gate.opened.set()
+    assert gate.sizes.take(3) == [0, 30, 40]
+    assert received.dropped == 2
+
+
+def test_by_default_a_slow_receiver_of_images_holds_64_megabytes(master):
+    gate = Gate()
+    received = create(master, '/receiver', delegate=gate).interested_in('/images', BYTES)
+    sent = create(master, '/sender').output_channel('/images', BYTES)
+    sent.send(data=b'')
+    assert gate.entered.wait(TIMEOUT)
+    image = bytes(10 * MEGABYTE)
+    for _ in range(20):
+        sent.send(data=image)
+    assert received.dropped == 14
+    gate.opened.set()
+
+
+def test_what_comes_through_tcpros_is_bounded_by_bytes_too(master):
+    gate = Gate()
+    received = create(master, '/receiver', Small, delegate=gate).interested_in('/remote', NUMBERS)
+    message = received.message_class
+    received._offer(message())
+    received.node._dispatcher.announce(received._tcpros)
+    assert gate.entered.wait(TIMEOUT)
+    for _ in range(10):
+        received._offer(message(data=(1.0,) * (MEGABYTE // 8)))
+    assert received.dropped == 7
+    gate.opened.set()
+
+
+class Receiver:
+    queue_size, queue_bytes, closed, received = 5, 100, False, 0
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(st.one_of(st.none(), st.integers(1, 150)), max_size=60))
+def test_a_queue_never_holds_more_than_it_may_and_counts_what_it_drops(steps):
+    """None takes a message, a number puts one of so many bytes."""
+    taken = []
+
+    class Channel(Receiver):
+        _delegate = staticmethod(lambda message, channel: taken.append(message))
+        node = None
+    inbox = dispatcher.Inbox(Channel(), dispatcher.Dispatcher(None), inline=True)
+    put = []
+    for size in steps:
+        if size is None:
+            inbox.run_next()
+        else:
+            put.append(size)
+            inbox.put(size, size)
+            waiting = list(inbox._queue)
+            assert waiting == put[len(put) - len(waiting):]
+            assert len(waiting) <= 5 and (sum(waiting) <= 100 or len(waiting) == 1)
+        assert inbox.dropped == len(put) - len(taken) - len(inbox._queue)
+
+
+class Connection:
+    """A connection whose socket is full, and stays so."""
+    done, socket = False, None
+
+    def __init__(self):
+        self.writes = threading.Semaphore(0)
+
+    def set_cleanup_callback(self, callback):
+        pass
+
+    def write_data(self, data):
+        self.writes.acquire()
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.integers(1, 150), max_size=30))
+def test_what_waits_for_a_subscriber_elsewhere_is_bounded_too(sizes):
+    threads = []
+    way = sender.Sender(Connection(), 5, lambda target, name: threads.append(target), queue_bytes=100)
+    way._is_idle = False
+    for size in sizes:
+        way.write_data(bytes(size))
+        waiting = [len(data) for data in way._queue]
+        assert len(waiting) <= 5 and (sum(waiting) <= 100 or len(waiting) == 1)
+        assert waiting[-1] == size
