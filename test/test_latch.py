@@ -55,15 +55,13 @@ def test_what_is_sent_to_one_node_is_latched_for_that_one_alone(master, come):
     assert mailbox.empty()
 
 
-def test_what_is_sent_to_one_node_before_it_comes_waits_for_that_one(master, come):
+def test_what_is_sent_to_a_node_that_is_not_there_is_latched_for_nobody(master, come):
     channel = latched_channel(master, '/latch/before')
-    channel.send(data='for b', to='/b')
-    other, _ = come('/c', '/latch/before')
+    with pytest.raises(pharos.UnknownNodeError, match='/b'):
+        channel.send(data='for b', to='/b')
     mailbox, _ = come('/b', '/latch/before')
-    assert texts(mailbox, 1) == ['for b']
-    until(lambda: len(channel.connections) == 2)
     channel.send(data='for all')
-    assert texts(other, 1) == texts(mailbox, 1) == ['for all']
+    assert texts(mailbox, 1) == ['for all']
 
 
 def test_what_a_rospy_publisher_sends_to_one_listener_is_latched_for_that_one_alone(master, come):
