@@ -216,10 +216,11 @@ def test_a_timer_fires_until_its_node_stops(pair, mailbox):
 
 def test_a_rate_ends_with_its_node(pair):
     asking, _ = pair
-    rate, turned = asking.ros.Rate(1e-3), Mailbox()
+    ros, turned = asking.ros, Mailbox()    # node.ros is for a node that runs
+    rate = ros.Rate(1e-3)
 
     def turn():
-        while not asking.ros.is_shutdown():
+        while not ros.is_shutdown():
             turned('turn', None)
             rate.sleep()
         turned('end', None)

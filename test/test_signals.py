@@ -8,7 +8,8 @@ from conftest import Mailbox
 from pharos import BlockNode
 from programs import Program
 
-SIGNALS = pytest.mark.parametrize('with_signal', [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
+SIGNALS = pytest.mark.parametrize('with_signal', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP],
+                                  ids=lambda number: number.name)
 
 PREPARED = '''
 import signal, sys, threading
@@ -29,7 +30,7 @@ def wait_for(event):
 def ready_in_wait():
     """Tell when the main thread waits in something of ours; before that, it runs code of its own."""
     def tell():
-        while not pharos.running._waiting:
+        while not pharos.signals._waiting:
             threading.Event().wait(0.001)
         ready()
     threading.Thread(target=tell, daemon=True).start()
@@ -55,7 +56,7 @@ def program(master):
 
 def ended_by(with_signal):
     """The exit status of a program that the signal ended while it did something of its own."""
-    return {signal.SIGINT: -signal.SIGINT, signal.SIGTERM: 128 + signal.SIGTERM}[with_signal]
+    return -signal.SIGINT if with_signal == signal.SIGINT else 128 + with_signal
 
 
 # -- signals -----------------------------------------------------------------------------------------------------------
@@ -159,6 +160,86 @@ ready_in_wait()
 pharos.spin()
 """)
     assert running.end(signal.SIGINT) == 0
+
+
+@SIGNALS
+def test_a_node_of_another_thread_is_stopped(program, with_signal):
+    running = program("""
+thread = threading.Thread(target=node)
+thread.start()
+thread.join()
+ready()
+wait_for(threading.Event())
+""")
+    assert running.end(with_signal) == ended_by(with_signal)
+
+
+@SIGNALS
+def test_a_signal_after_the_last_node_is_pythons(program, with_signal):
+    running = program('node().stop(); ready(); wait_for(threading.Event())')
+    assert running.end(with_signal) == -with_signal
+
+
+def test_sighup_is_ignored_as_nohup_has_it(program):
+    running = program("""
+import os
+os.execv(sys.executable, [sys.executable, '-c', 'import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN); '
+    'import pharos; me = pharos.Master().create(pharos.BlockNode, "/program"); '
+    'print("ready", flush=True); pharos.spin()'])
+""")
+    running.process.send_signal(signal.SIGHUP)
+    assert running.end(signal.SIGTERM) == 0
+
+
+CAREFUL = """
+class Careful(pharos.Node):
+    def stop(self):
+        print('begun', flush=True)
+        super().stop()
+        threading.Event().wait(0.3)    # other threads go on meanwhile
+        print('ended', flush=True)
+me = Master().create(Careful, named='/program', domain='127.0.0.1')
+"""
+CAREFUL_ENDS = {
+    **WAITS,
+    'plain code': 'ready(); wait_for(threading.Event())',
+    'its own with block': 'with me: ready(); wait_for(threading.Event())',
+    'a stop by itself': 'threading.Thread(target=lambda: (me._rospy.ended.wait(), ready())).start(); me.stop()',
+    'a stop of a soul': 'me.fork(lambda me: (ready(), me.stop())); pharos.spin()',
+}
+
+
+@SIGNALS
+@pytest.mark.parametrize('end', CAREFUL_ENDS.values(), ids=CAREFUL_ENDS)
+def test_an_overridden_stop_runs_once_to_its_end(program, with_signal, end):
+    running = program(CAREFUL + ('ready_in_wait()\n' if end in WAITS.values() else '') + end)
+    assert running.end(with_signal) in (0, ended_by(with_signal))
+    printed = running.read_to_the_end()
+    assert (printed.count('begun'), printed.count('ended')) == (1, 1)
+
+
+def test_an_overridden_stop_runs_to_its_end_when_the_program_ends(program):
+    running = program(CAREFUL + 'me.fork(lambda me: me.stop()); me._rospy.ended.wait(); ready()')
+    assert running.process.wait(60) == 0
+    printed = running.read_to_the_end()
+    assert (printed.count('begun'), printed.count('ended')) == (1, 1)
+
+
+@SIGNALS
+def test_a_signal_ends_a_start(program, with_signal):
+    """At a master that says nothing, which takes seconds."""
+    running = program("""
+import socket
+silent = socket.create_server(('127.0.0.1', 0))
+def tell():
+    silent.accept()
+    ready()
+    threading.Event().wait()
+threading.Thread(target=tell, daemon=True).start()
+Master('http://127.0.0.1:%d' % silent.getsockname()[1]).create(BlockNode, named='/program')
+""")
+    assert running.end(with_signal) == ended_by(with_signal)
+    assert 'NodeStoppedError' in running.read_to_the_end() or with_signal != signal.SIGINT
 
 
 def test_a_second_ctrl_c_while_the_nodes_stop_does_no_harm(program):

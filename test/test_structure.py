@@ -16,7 +16,7 @@ ROSPYS_INSIDE = re.compile(r'rospy\.impl|rospy\.(core|topics|names)\._|_topic_ma
 LINE_LIMIT = 400
 
 EXPORTS = """
-    Master Node BlockNode ExternalNode Topic InputChannel OutputChannel Service Parameter Transcript RosProcess
+    Master Node BlockNode Lifecycle ExternalNode Topic InputChannel OutputChannel Service Parameter Transcript RosProcess
     message_class service_class define_message define_service spin __version__
     PharosError MasterUnreachableError NodeNameInUseError PortInUseError UnknownNodeError UnknownTopicError
     UnknownTypeError MessageTypeError UnknownServiceError ServiceTypeError ServiceCallError NodeStoppedError

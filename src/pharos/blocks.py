@@ -73,7 +73,8 @@ class Souls:
         """Run a soul in this thread; an exception in it is reported and ends nothing else."""
         self._here.depth = self._depth() + 1
         try:
-            return block(self._node)
+            with self._node._live_rospy().here():
+                return block(self._node)
         except Exception as error:
             self._node._report(error, block, 'soul')
         finally:

@@ -11,7 +11,6 @@ from pharos.dispatcher import Inbox, SocketInbox
 from pharos.errors import MessageTypeError, NodeStoppedError
 from pharos.private_rospy.copier import copier_for
 from pharos.private_rospy.fanout import Latch
-from pharos.private_rospy.publishing import wait_until
 
 ANSWER_TIMEOUT = 0.5      # seconds in which the master has told a live subscriber; then it is asked whether it lives
 BUFFER_SIZE = 1 << 20     # bytes read from a socket at once; rospy's 64 KiB let subscribers of images fall behind
@@ -231,9 +230,11 @@ class OutputChannel(_Channel):
     def wait_for_subscribers(self, count=1, timeout=None):
         """Wait until ``count`` subscribers are connected, for up to ``timeout`` seconds (None: without limit).
 
-        Returns whether they are; ends early, with False, when the node stops.
+        Returns whether they are; ends early, with False, when the node stops; a soul of the node is ended by that.
         """
-        wait_until(lambda: len(self.connections) >= count or not self.is_open, timeout)
+        if self.is_open:
+            self.node._rospy.wait_until(lambda: len(self.connections) >= count or not self.is_open, timeout)
+        self.node._end_soul()
         return self.is_open and len(self.connections) >= count
 
     def _wait_for_known_subscribers(self, timeout):
@@ -247,10 +248,11 @@ class OutputChannel(_Channel):
 
         def connected():
             missing.difference_update(name for name, _ in self.connections)
-            missing.difference_update(node.name for node in self.node.master.own_nodes() if not node.is_running)
+            missing.difference_update(node.name for node in self.node.master.own_nodes() if node._is_ending())
             return not missing or not self.is_open
-        deadline = time.monotonic() + timeout
-        if not wait_until(connected, min(timeout, ANSWER_TIMEOUT)):
+        deadline, wait_until = time.monotonic() + timeout, self.node._rospy.wait_until
+        wait_until(connected, min(timeout, ANSWER_TIMEOUT))
+        if not connected() and self.node.is_running:
             # those that do not answer any more, killed for example, are not worth the wait
             missing.intersection_update(filter(self.node.master.answers, tuple(missing)))
             wait_until(connected, deadline - time.monotonic())

@@ -3,7 +3,7 @@ import contextlib
 import enum
 import threading
 
-from pharos import running
+from pharos import running, signals, stopping
 from pharos.blocks import Souls
 from pharos.dispatcher import Dispatcher
 from pharos.errors import NodeStoppedError, PharosError
@@ -35,10 +35,17 @@ class Life:
         self.name = settings.name
         self._settings = settings
         self._lifecycle = Lifecycle.NEW
-        self._changing = threading.Condition()    # guards _lifecycle
+        self._changing = stopping.changed         # guards _lifecycle
         self._rospy = self._dispatcher = None     # of the present run, or the last
+        self._starting = self._starter = None     # the rospy of the run that starts, and the thread that starts it
+        self._is_start_ended = False              # whether a stop() is to end that start
         self._souls = Souls(self)
         self._channels, self._services = [], []
+
+    def __init_subclass__(cls, **kwargs):
+        super().__init_subclass__(**kwargs)
+        if not stopping.is_once(cls.stop):
+            cls.stop = stopping.once(cls.stop)
 
     def start(self):
         """Register with the master. A subclass overrides this, calls ``super().start()``, then makes its channels.
@@ -48,50 +55,101 @@ class Life:
 
         :raises PharosError: if the node is running already
         :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: and the node is then as it was
+        :raises NodeStoppedError: if :meth:`stop` was called meanwhile, and the node is then as it was
         """
-        with self._changing:
-            if self._lifecycle not in (Lifecycle.NEW, Lifecycle.STOPPED):
-                raise PharosError('%s is %s already: stop() it before you start it again'
-                                  % (self.name, self._lifecycle.value))
-            before, self._lifecycle = self._lifecycle, Lifecycle.STARTING
-        with running.signals_deferred():
-            try:
-                instance = PrivateRospy(self._settings, self._asked_to_stop, lambda: self.allow_remote_shutdown)
-                instance.start(self.connect_timeout)
-            except BaseException:
-                self._become(before)
-                raise
-            former, self._rospy = self._rospy, instance
-            # the same ports next time, also where any free one was asked for
-            self._settings.tcp_port, self._settings.xmlrpc_port = instance.tcp_port, instance.xmlrpc_port
-            self._dispatcher = Dispatcher(instance.start_thread)
-            instance.on_received = self._dispatcher.run
-            self._become(Lifecycle.RUNNING)
-            running.add(self)
-            watcher_of(self.master).check()
+        with signals.held(stopping.LIMIT):
+            former = self._rospy
+            self._start_run()
         kept, self._channels = self._channels, []
         services, self._services = self._services, []
         if type(self).start is Life.start:
             for opened in (*kept, *services):
                 opened._open()
             if former:
-                instance.parameters.take_over(former.parameters)
+                self._rospy.parameters.take_over(former.parameters)
 
+    def _start_run(self):
+        before = self._begin_start()
+        try:
+            instance = PrivateRospy(self._settings, self._asked_to_stop, lambda: self.allow_remote_shutdown)
+            with stopping.changed:
+                self._starting = instance
+                is_ended = self._is_start_ended
+            if is_ended:
+                instance.end()
+            instance.start(self.connect_timeout)
+            self._finish_start(instance)
+        except BaseException as error:
+            with stopping.changed:
+                is_ended = self._is_start_ended
+                self._become(before)
+            if is_ended and isinstance(error, Exception):
+                raise NodeStoppedError('%s was stopped while it started' % self.name) from error
+            raise
+        watcher_of(self.master).check()
+
+    def _begin_start(self):
+        """Be STARTING, and known in this process before the master knows the node; returns what it was."""
+        if not self._is_starting():
+            with contextlib.suppress(TimeoutError):
+                stopping.wait_for_end(self)    # what an overriding stop() does last
+        with stopping.changed:
+            if self._lifecycle not in (Lifecycle.NEW, Lifecycle.STOPPED):
+                raise PharosError('%s is %s already: stop() it before you start it again'
+                                  % (self.name, self._lifecycle.value))
+            running.claim(self)
+            before = self._lifecycle
+            self._starter, self._is_start_ended = threading.get_ident(), False
+            self._become(Lifecycle.STARTING)
+        return before
+
+    def _finish_start(self, instance):
+        with stopping.changed:
+            if not self._is_start_ended:
+                self._rospy = instance
+                # the same ports next time, also where any free one was asked for
+                self._settings.tcp_port, self._settings.xmlrpc_port = instance.tcp_port, instance.xmlrpc_port
+                self._dispatcher = Dispatcher(instance.start_thread)
+                instance.on_received = self._dispatcher.run
+                self._become(Lifecycle.RUNNING)
+                return
+        instance.stop(0)
+        raise NodeStoppedError('it is registered, and goes again')
+
+    def _is_starting(self):
+        return self._lifecycle is Lifecycle.STARTING
+
+    def _is_ending(self):
+        return self._lifecycle in (Lifecycle.STOPPING, Lifecycle.STOPPED)
+
+    def _end_start(self):
+        """Have the start end, where the node is starting: its caller gets a NodeStoppedError."""
+        with stopping.changed:
+            self._is_start_ended = self._is_starting()
+            instance = self._starting
+        if instance:
+            instance.end()
+
+    @stopping.once
     def stop(self):
         """End the souls, send what is under way, unregister, close the ports, end the threads.
 
-        A subclass overrides this and calls ``super().stop()``. Harmless when done twice; may be called from any
-        thread, also the node's own, in which case what that thread runs is not waited for.
+        A subclass overrides this and calls ``super().stop()``. It runs once for each start, to its end, in the thread
+        that was the first to ask for it: the program (here, a signal, its end) or ROS (``rosnode kill``). Who asks
+        meanwhile, from any thread, waits until it has ended, as does the end of the program, but only until 30 s after
+        its beginning. Called in a thread of the node's own, it does not wait for what that thread runs. A node that is
+        still starting is stopped, too: its start raises NodeStoppedError.
         """
-        with self._changing:
-            if self._lifecycle is Lifecycle.STOPPING and not self._is_own_thread():
-                self._changing.wait_for(lambda: self._lifecycle is Lifecycle.STOPPED, 2 * self.stop_timeout)
+        self._stop_run()
+
+    def _stop_run(self):
+        with stopping.changed:
             if self._lifecycle is not Lifecycle.RUNNING:
                 return
-            self._lifecycle = Lifecycle.STOPPING
+            self._become(Lifecycle.STOPPING)
         instance = self._rospy
         try:
-            instance.end_sleeps()
+            instance.end()
             ignoring = self._souls.end(self.stop_timeout)
             if ignoring:
                 self.log('left behind, for it did not end within %g s of the stop: %s. A soul ends by itself if it '
@@ -105,16 +163,32 @@ class Life:
                 channel._stopped()
         finally:
             self._become(Lifecycle.STOPPED)
-            running.discard(self)
+            running.collect()
             watcher_of(self.master).check()
 
     def _is_own_thread(self):
-        return self._rospy.owns(threading.current_thread())
+        """Whether a stop() may have to wait for this thread."""
+        if self._is_starting():
+            return self._starter == threading.get_ident()
+        return self._rospy is not None and self._rospy.owns(threading.current_thread())
 
     def _become(self, lifecycle):
-        with self._changing:
+        with stopping.changed:
             self._lifecycle = lifecycle
-            self._changing.notify_all()
+            if lifecycle is not Lifecycle.STARTING:
+                self._starting = self._starter = None
+            if lifecycle in (Lifecycle.NEW, Lifecycle.STOPPED):
+                running.discard(self)
+            stopping.changed.notify_all()
+
+    def _is_anothers(self):
+        """This is a process that was forked: the node runs in its parent, and here it is stopped."""
+        self._lifecycle = Lifecycle.STOPPED
+        self._changing = stopping.changed
+        self._rospy = self._starting = None
+        for channel in self._channels:
+            channel._stopped()
+        self._channels, self._services = [], []
 
     def _asked_to_stop(self, reason):
         self.log('stops: %s' % (reason,))
@@ -141,8 +215,12 @@ class Life:
 
         The report: ``(Delay forSeconds: 1) wait``.
         """
-        with running.waiting(), contextlib.suppress(rospy.ROSInterruptException):
+        with signals.waiting(), contextlib.suppress(rospy.ROSInterruptException):
             self._live_rospy().rospy.sleep(seconds)
+        self._end_soul()
+
+    def _end_soul(self):
+        """End the soul that runs in this thread, if one does and the node stops."""
         if not self.is_running:
             self._souls.end_here()
 
@@ -158,7 +236,7 @@ class Life:
     def _turns(self, rate):
         while self.is_running:
             yield
-            with running.waiting(), contextlib.suppress(rospy.ROSInterruptException):
+            with signals.waiting(), contextlib.suppress(rospy.ROSInterruptException):
                 rate.sleep()
 
     def _live_rospy(self):

@@ -1,6 +1,7 @@
 """The proxy of a ROS master."""
 import atexit
 import difflib
+import threading
 import time
 
 import rosgraph
@@ -8,18 +9,20 @@ import rosgraph
 from pharos import node as nodes_of_ours
 from pharos import ros_process, running
 from pharos.blocks import check_block
-from pharos.errors import MasterUnreachableError, PharosError, UnknownNodeError
+from pharos.errors import MasterUnreachableError, NodeStoppedError, PharosError, UnknownNodeError
 from pharos.external_node import ExternalNode
 from pharos.parameters import Parameters
+from pharos.private_rospy.lifetime import Interruption
 from pharos.private_rospy.names import check_name, global_name
 from pharos.private_rospy.proxies import ServerProxy, master_api
-from pharos.private_rospy.registration import COMMUNICATION_ERRORS
+from pharos.private_rospy.registration import COMMUNICATION_ERRORS, PING_TIMEOUT
 from pharos.private_rospy.settings import check_port, check_url
 from pharos.service import Service
 from pharos.topic import Topic
 from pharos.watcher import watcher_of
 
 TIMEOUT = 5.0    # seconds that a question to the master may take
+POLL = 0.05      # seconds between two questions whether there is a master
 
 
 class Master:
@@ -168,20 +171,36 @@ class Master:
         return UnknownNodeError(f'no node {name} at {self.url}{self.near(name, known)}: see rosnode list')
 
     def wait_for_node(self, name, timeout=None):
-        """Wait until a node of that name is there; returns it.
+        """Wait until a node of that name is there, which means registered and not dead; returns it.
 
         :param timeout: seconds, None: without limit
         :raises UnknownNodeError: if it does not come in time
         :raises MasterUnreachableError: if the master has not answered in that time either
         """
         name = global_name(name, 'node')
-        watcher = watcher_of(self)
-        if not watcher.wait_for_node(name, timeout):
+        node = watcher_of(self).wait_for_node(name, timeout)
+        if node is None:
             self._ask('getPid')
             raise UnknownNodeError('no node %s came to %s within %g s: is it started, with that '
                                    'master, and under that name?' % (name, self.url, timeout))
-        own = {node.name: node for node in self.own_nodes()}
-        return own[name] if name in own else ExternalNode(self, name)
+        return node
+
+    def live_node(self, name):
+        """The node of that name, if it is there; one that only starts, has died or is unknown is not: None."""
+        own = next((node for node in self.own_nodes() if node.name == name), None)
+        if own is not None:
+            return own if own.is_running else None
+        try:
+            uri = self._api().lookupNode(name)
+        except (rosgraph.MasterException, *COMMUNICATION_ERRORS):
+            return None
+        try:
+            ServerProxy(uri, PING_TIMEOUT).getPid('/pharos')
+        except ConnectionRefusedError:
+            return None
+        except COMMUNICATION_ERRORS:
+            pass    # it is there, and busy perhaps
+        return ExternalNode(self, name)
 
     def on_change(self, block):
         """Run ``block(kind, name, is_there)`` for each node, topic and service that comes or goes.
@@ -199,7 +218,7 @@ class Master:
 
     def own_nodes(self):
         """The nodes of this process at this master."""
-        return [node for node in running.nodes() if node.master.url == self.url]
+        return [node for node in running.nodes() if node.master == self]
 
     def topics(self):
         """All topics that somebody publishes on or is interested in."""
@@ -254,22 +273,27 @@ class Master:
         """Wait until the master answers, for up to ``timeout`` seconds (None: without limit); returns this Master.
 
         :raises MasterUnreachableError: if it does not in time
+        :raises NodeStoppedError: if the node whose soul or delegate waits stops meanwhile
         """
         deadline = None if timeout is None else time.monotonic() + timeout
-        while True:
-            left = TIMEOUT if deadline is None else deadline - time.monotonic()
-            try:
-                self._ask('getPid', min(TIMEOUT, max(left, 0.1)))
-                return self
-            except MasterUnreachableError:
-                if left <= 0:
-                    raise
-                time.sleep(0.05)    # there is nobody yet who could tell
+        woken = threading.Event()
+        with Interruption(woken.set) as stop:
+            while True:
+                left = TIMEOUT if deadline is None else deadline - time.monotonic()
+                try:
+                    self._ask('getPid', min(TIMEOUT, max(left, 0.1)))
+                    return self
+                except MasterUnreachableError:
+                    if left <= 0:
+                        raise
+                    woken.wait(POLL)    # there is nobody yet who could tell
+                if stop.came:
+                    raise NodeStoppedError('the node that waited for the master %s stops' % self.url)
 
     def answers(self, name):
         """Whether the node of that name is registered and its XML-RPC server answers."""
         try:
-            ServerProxy(self._api().lookupNode(name), 1.0).getPid('/pharos')
+            ServerProxy(self._api().lookupNode(name), PING_TIMEOUT).getPid('/pharos')
         except (rosgraph.MasterException, *COMMUNICATION_ERRORS):
             return False
         return True

@@ -1,73 +1,101 @@
-"""The running nodes of this process, and how they end with it."""
+"""The nodes of this process, and how they end with it."""
 import atexit
-import contextlib
 import gc
-import signal
+import os
 import threading
 import time
 
+from pharos import signals, stopping
+from pharos.errors import NodeNameInUseError
 from pharos.private_rospy.lifetime import SIGNAL_LATENCY
+from pharos.signals import is_from_signal  # noqa: F401: for those who know the nodes, and no signals
 
 # A stopped node's rospy is a web of cycles of 0.7 MB, which only the collector frees. It looks at the running nodes,
 # too, so it runs after as many stops as there are nodes left, and at least so many:
 COLLECT_EVERY = 20
 _stops = 0     # since it ran
-_nodes = {}    # a dict, for its order
-_none_left = threading.Condition()
-_deferred = None    # the signals that came while the main thread started a node; None: it starts none
-_raised = None    # the last exception by which a signal ends the main thread, and with it the program
-_waiting = 0   # how deep the main thread is in a wait of ours, which ends with the nodes
+_nodes = {}    # (master, name) -> Node: those that the master may know, in the order of their starts
+_others = []   # functions that end what else the program has started: programs, masters
 
 
-def is_from_signal(error):
-    """Whether a signal ends the program with this exception, and not what a block raised by itself."""
-    return error is _raised
+def claim(node):
+    """The node starts, and the master is to know it soon.
 
-
-def add(node):
-    """The node runs from now on."""
-    with _none_left:
-        _nodes[node] = None
+    :raises NodeNameInUseError: if another node of this process has its name at its master
+    """
+    with stopping.changed:
+        other = _nodes.setdefault((node.master, node.name), node)
+    if other is not node:
+        raise NodeNameInUseError('the node name %s is taken by a node of this process, which is %s: choose another '
+                                 'name, or stop() that one first' % (node.name, other.lifecycle.value))
 
 
 def discard(node):
-    """The node has stopped."""
+    """The node has stopped, or did not come to run."""
+    with stopping.changed:
+        if _nodes.get((node.master, node.name)) is node:
+            del _nodes[node.master, node.name]
+        stopping.changed.notify_all()
+
+
+def collect():
+    """One more node has stopped: free what such leave in memory, now and then."""
     global _stops
-    with _none_left:
-        _nodes.pop(node, None)
-        if not _nodes:
-            _none_left.notify_all()
+    with stopping.changed:
         _stops += 1
-        collect = _stops >= max(COLLECT_EVERY, len(_nodes))
-        if collect:
+        due = _stops >= max(COLLECT_EVERY, len(_nodes))
+        if due:
             _stops = 0
-    if collect:
+    if due:
         gc.collect()
 
 
 def nodes():
-    """The running nodes, in the order of their starts."""
-    with _none_left:
-        return list(_nodes)
+    """The nodes that start, run or stop, in the order of their starts."""
+    with stopping.changed:
+        return list(_nodes.values())
+
+
+def at_end(function):
+    """Run ``function()`` when the program ends, after the nodes have stopped; the last that was given first."""
+    _others.append(function)
+
+
+def not_at_end(function):
+    """Do not run it then: what it ends has ended."""
+    if function in _others:
+        _others.remove(function)
 
 
 def spin():
-    """Block until every node of the process has stopped, or Ctrl-C or SIGTERM, which stops them."""
-    with waiting():
+    """Block until every node of the process has stopped, or Ctrl-C, SIGTERM or SIGHUP, which stop them."""
+    with signals.waiting():
         try:
-            with _none_left:
-                while _nodes:
-                    _none_left.wait(SIGNAL_LATENCY)
+            _wait_until(lambda: all(map(stopping.has_failed, nodes())) and not stopping.is_awaited())
         except KeyboardInterrupt:    # the host program has a handler of its own
             stop_all()
 
 
 def stop_all():
-    """Stop all nodes of the process, side by side."""
+    """Stop all nodes of the process, side by side.
+
+    Returns when each has ended its ``stop()``, or after ``stopping.LIMIT`` seconds.
+    """
+    deadline = time.monotonic() + stopping.LIMIT
     threads = [threading.Thread(target=node.stop, name=node.name + ' stop', daemon=True) for node in nodes()]
     for thread in threads:
         thread.start()
-    join(threads, 10.0)
+    join(threads, stopping.LIMIT)
+    _wait_until(lambda: not stopping.is_awaited(), deadline)
+
+
+def _wait_until(predicate, deadline=None):
+    with stopping.changed:
+        while not predicate():
+            left = SIGNAL_LATENCY if deadline is None else deadline - time.monotonic()
+            if left <= 0:
+                return
+            stopping.changed.wait(min(left, SIGNAL_LATENCY))
 
 
 def join(threads, timeout):
@@ -77,53 +105,22 @@ def join(threads, timeout):
         thread.join(max(0.0, deadline - time.monotonic()))
 
 
-@contextlib.contextmanager
-def waiting():
-    """Within this, a signal raises nothing in the main thread: the wait ends because the nodes stop."""
-    global _waiting
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    _waiting += 1
-    try:
-        yield
-    finally:
-        _waiting -= 1
+def _end():
+    """The program ends."""
+    stop_all()
+    while _others:
+        _others.pop()()
 
 
-@contextlib.contextmanager
-def signals_deferred():
-    """Within this, signals wait: a start that is torn up half way leaves registrations behind.
-
-    From the first time on, Ctrl-C and SIGTERM stop the nodes, where the host program does nothing itself.
-    """
-    global _deferred
-    if threading.current_thread() is not threading.main_thread() or _deferred is not None:
-        yield
-        return
-    for number, default in (signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL):
-        if signal.getsignal(number) is default:
-            signal.signal(number, _on_signal)
-    _deferred = []
-    try:
-        yield
-    finally:
-        came, _deferred = _deferred, None
-        if came:
-            _on_signal(came[0], None)
+def _forget():
+    """In a process that was forked: the nodes are its parent's, as are the programs, and it must not end them."""
+    former = list(_nodes.values())
+    _nodes.clear()
+    _others.clear()
+    for node in former:
+        node._is_anothers()
 
 
-def _on_signal(number, frame):
-    global _raised
-    if _deferred is not None:
-        _deferred.append(number)
-        return
-    stop = threading.Thread(target=stop_all, name='stop on signal', daemon=True)
-    stop.start()    # not here: the main thread may hold any lock just now
-    if not _waiting:
-        # the status is the shell's for a process that SIGTERM ended
-        _raised = KeyboardInterrupt() if number == signal.SIGINT else SystemExit(128 + number)
-        raise _raised
-
-
-atexit.register(stop_all)
+signals.serve(lambda: bool(_nodes or _others or stopping.is_under_way()), stop_all)
+atexit.register(_end)
+os.register_at_fork(after_in_child=_forget)

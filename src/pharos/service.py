@@ -8,9 +8,10 @@ import rosgraph
 
 from pharos import message_types
 from pharos.blocks import check_block
-from pharos.errors import ServiceCallError, ServiceTypeError, UnknownServiceError
+from pharos.errors import NodeStoppedError, ServiceCallError, ServiceTypeError, UnknownServiceError
 from pharos.private_rospy import services
 from pharos.private_rospy.host import rospy
+from pharos.private_rospy.lifetime import Interruption
 from pharos.tcpros_connection import TcprosConnection
 
 TIMEOUT = 5.0    # seconds in which the master, and a provider asked for its type, must answer
@@ -57,11 +58,12 @@ class Service:
         As ``rosservice.get_service_headers`` asks for it, which hides why there is none, and waits for ever for a
         provider that sends a byte every four seconds.
         """
-        limit = time.monotonic() + TIMEOUT
+        limit, waiting = time.monotonic() + TIMEOUT, Interruption()
         try:
             connection = self._connect({**self._header('*'), 'probe': '1'},
                                        limit if deadline is None else min(limit, deadline))
         except OSError as error:
+            self._check_awaited(waiting, error)
             raise ServiceCallError('the provider of %s at %s does not answer (%s): is it still running? '
                                    'rosnode cleanup removes it if not' % (self.name, self.uri, error)) from error
         connection.close()
@@ -104,6 +106,7 @@ class Service:
         :raises MessageTypeError: if a field does not exist or does not fit
         :raises UnknownServiceError: if it is no longer offered
         :raises ServiceCallError: if the provider fails, goes away or does not answer in time
+        :raises NodeStoppedError: if the node whose soul or delegate waits for the answer stops meanwhile
         """
         deadline = None if timeout is None else time.monotonic() + timeout
         self.response = None
@@ -113,6 +116,7 @@ class Service:
         request = message_types.build(self.service_class._request_class, block, fields)
         self._calls += 1
         request = services.numbered(request, self._calls)
+        waiting = Interruption()
         try:
             self.response = response = self._exchange(request, deadline)
         except services.Failed as error:
@@ -121,6 +125,7 @@ class Service:
             raise ServiceCallError('%s did not answer in time (%s s): is its provider at %s busy? Call it with a '
                                    'longer timeout=' % (self.name, timeout, self.uri)) from error
         except (OSError, genpy.DeserializationError) as error:
+            self._check_awaited(waiting, error)
             raise ServiceCallError('the connection to %s at %s broke (%s): is its provider still running?'
                                    % (self.name, self.uri, error)) from error
         return response    # not self.response, which is another thread's by now
@@ -134,6 +139,11 @@ class Service:
         if header.get('md5sum') != self.service_class._md5sum:
             raise self._type_error(header)
         self._found_md5sum = header['md5sum']
+
+    def _check_awaited(self, waiting, error):
+        """Raise NodeStoppedError where a connection broke because the node that waits stops."""
+        if waiting.came:
+            raise NodeStoppedError('the node that waited for %s stops' % self.name) from error
 
     def _exchange(self, request, deadline):
         """Send the request to the provider, and where that has gone, to where it is now; returns the response."""

@@ -9,7 +9,7 @@ import time
 
 import rosgraph.network
 
-from pharos.private_rospy.lifetime import keep_alive
+from pharos.private_rospy.lifetime import Interruption, keep_alive, shut
 
 _HEADER_LIMIT = 1 << 22    # bytes of a connection header; it holds a message definition
 _LIMIT = 1 << 30           # bytes of a response; a length beyond is a broken stream
@@ -32,9 +32,11 @@ class TcprosConnection:
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             keep_alive(self._socket, while_sending=True)    # an answer may take any time, while its host is there
-            rosgraph.network.write_ros_handshake_header(self._socket, header)
-            size = self._read(4)
-            self.header = rosgraph.network.decode_ros_handshake_header(size + self._read_sized(size, _HEADER_LIMIT))
+            with Interruption(lambda: shut(self._socket)):
+                rosgraph.network.write_ros_handshake_header(self._socket, header)
+                size = self._read(4)
+                answer = self._read_sized(size, _HEADER_LIMIT)
+            self.header = rosgraph.network.decode_ros_handshake_header(size + answer)
         except (rosgraph.network.ROSHandshakeException, struct.error, UnicodeError) as error:
             self.close()
             raise ConnectionError('no connection header: %s' % error) from error
@@ -45,10 +47,11 @@ class TcprosConnection:
     def exchange(self, request, deadline):
         """Send a serialized request to a service; returns ``(ok, serialized response or error text)``."""
         self._deadline = deadline
-        self._socket.settimeout(self._left())
-        self._socket.sendall(struct.pack('<I', len(request)) + request)
-        ok = self._read(1) != b'\0'
-        return ok, self._read_sized(self._read(4), _LIMIT)
+        with Interruption(lambda: shut(self._socket)):
+            self._socket.settimeout(self._left())
+            self._socket.sendall(struct.pack('<I', len(request)) + request)
+            ok = self._read(1) != b'\0'
+            return ok, self._read_sized(self._read(4), _LIMIT)
 
     def _read_sized(self, size, limit):
         size, = struct.unpack('<I', size)

@@ -14,8 +14,8 @@ import _thread
 
 import rosgraph
 
-from pharos.errors import MasterUnreachableError, PortInUseError
-from pharos.private_rospy import host, logs, names, pubsub, registration, servers
+from pharos.errors import MasterUnreachableError, NodeStoppedError, PortInUseError
+from pharos.private_rospy import host, logs, names, publishing, pubsub, registration, servers
 from pharos.private_rospy.lifetime import Lifetime
 from pharos.private_rospy.loader import PrivateImports, Substitute
 from pharos.private_rospy.parameters import WatchedParameters
@@ -79,6 +79,7 @@ class PrivateRospy:
     def _poll_quickly(self, module):
         """rospy.impl.init: waits in steps of 0.1 s, for as long as the master takes."""
         def sleep(seconds):
+            self._check_not_ended()
             if time.monotonic() > self._deadline:
                 raise MasterUnreachableError('the ROS master %s stopped answering while %s registered'
                                              % (self.settings.master_url, self.name))
@@ -105,6 +106,7 @@ class PrivateRospy:
 
         :param timeout: seconds that the master may take
         :raises MasterUnreachableError, NodeNameInUseError, PortInUseError:
+        :raises NodeStoppedError: if :meth:`end` was called meanwhile
         """
         settings = self.settings
         self._deadline = time.monotonic() + timeout
@@ -123,6 +125,7 @@ class PrivateRospy:
             with _ports_checked('xmlrpc_port', settings.xmlrpc_port):
                 self.rospy.init_node(settings.base_name, argv=settings.argv, disable_signals=True,
                                      xmlrpc_port=settings.xmlrpc_port, tcpros_port=settings.tcp_port)
+            self._check_not_ended()
         except BaseException:
             self.stop(0)
             raise
@@ -130,15 +133,19 @@ class PrivateRospy:
         self.domain = self._modules.load('rosgraph.network').get_host_name()
         core.add_preshutdown_hook(self.request_stop)    # rospy.signal_shutdown called by the node's own code
 
+    def _check_not_ended(self):
+        if self.ended.is_set():
+            raise NodeStoppedError('%s was stopped while it started' % self.name)
+
     def request_stop(self, reason):
         """Have the node stopped, from a thread that the stop need not wait for."""
         if not self._stopping.locked():
             threading.Thread(target=self._on_stop_request, args=(reason,), name=self.name + ' stop',
                              daemon=True).start()
 
-    def end_sleeps(self):
-        """Begin the stop: sleeps end, ``is_shutdown()`` holds, and nothing more is received."""
-        self._lifetime.ended.set()
+    def end(self):
+        """Begin the stop: all that waits ends, ``is_shutdown()`` holds, and nothing more is received."""
+        self._lifetime.begin_end()
         changed = self._modules.load('rospy.rostime').get_rostime_cond()
         with changed:
             changed.notify_all()    # simulated time may stand still
@@ -166,7 +173,7 @@ class PrivateRospy:
         return [thread.name for thread in left]
 
     def _wake(self, reason):
-        self._lifetime.ended.set()
+        self._lifetime.begin_end()
         if self._lifetime.xmlrpc and self._lifetime.xmlrpc.handler:
             changed = self._lifetime.xmlrpc.handler.reg_man.cond
             with changed:
@@ -203,6 +210,18 @@ class PrivateRospy:
     def shut_at_end(self, sock):
         """Shut the socket down when the node stops, at the latest."""
         self._lifetime.shut_at_end(sock)
+
+    @property
+    def here(self):
+        """``with here():`` what waits in this thread does so on behalf of the node, and ends with it."""
+        return self._lifetime.here
+
+    def wait_until(self, predicate, timeout):
+        """Wait until ``predicate()``, which speaks of connections in this process, holds, or the node stops.
+
+        :param timeout: seconds, None: no limit
+        """
+        publishing.wait_until(predicate, timeout, self._lifetime)
 
     @property
     def ended(self):

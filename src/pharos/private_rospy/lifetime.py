@@ -1,4 +1,5 @@
 """What a node's rospy holds while it runs, so that its stop leaves nothing behind: threads and sockets."""
+import contextlib
 import socket
 import threading
 import time
@@ -12,15 +13,18 @@ KEEPALIVE_IDLE = 10       # seconds of silence after which the peer's host is as
 KEEPALIVE_INTERVAL = 5    # seconds between two such questions
 KEEPALIVE_COUNT = 4       # of them without an answer, and the connection is broken
 
+_thread = threading.local()    # .lifetime: of the node on whose behalf the thread runs, if it does
+
 
 class Lifetime:
     """The threads and accepted sockets of one run of a node, and the event that ends it.
 
-    :attr:`ended` is set when the node stops: sleeps inside rospy end with it.
+    :attr:`ended` is set when the node stops: sleeps inside rospy end with it, as do waits in an :class:`Interruption`.
     """
 
     def __init__(self, name):
         self.ended = threading.Event()
+        self._interruptions = set()    # of waits under way
         self.threads = weakref.WeakSet()
         self.xmlrpc = None    # the node's XML-RPC server, once it is bound
         self._sockets = weakref.WeakSet()
@@ -28,6 +32,10 @@ class Lifetime:
 
         class Thread(threading.Thread):
             """A thread that is named after its node, ends with the process, and can be waited for."""
+
+            def run(self):
+                with lifetime.here():
+                    super().run()
 
             def start(self):
                 self.daemon = True
@@ -42,6 +50,21 @@ class Lifetime:
         thread = self.Thread(target=target, args=args, name=name)
         thread.start()
         return thread
+
+    @contextlib.contextmanager
+    def here(self):
+        """Within this, what waits in this thread does so on behalf of the node, and ends with it."""
+        before, _thread.lifetime = getattr(_thread, 'lifetime', None), self
+        try:
+            yield
+        finally:
+            _thread.lifetime = before
+
+    def begin_end(self):
+        """Begin the end: all that waits on behalf of the node ends."""
+        self.ended.set()
+        for interruption in tuple(self._interruptions):
+            interruption.wake()
 
     def sleep(self, seconds):
         """``time.sleep`` that ends with the node; ``sleep(0)`` yields, as rospy's publishers mean it to."""
@@ -65,7 +88,7 @@ class Lifetime:
 
     def end(self, given_up=()):
         """Shut the sockets, wait for the threads but those given up; returns those that did not end in time."""
-        self.ended.set()
+        self.begin_end()
         for sock in list(self._sockets):
             shut(sock)
         me = threading.current_thread()
@@ -75,6 +98,36 @@ class Lifetime:
             if thread.ident is not None:    # None: it is only just being started, and will see that all has ended
                 thread.join(max(0.0, deadline - time.monotonic()))
         return [thread for thread in threads if thread.is_alive()]
+
+
+class Interruption:
+    """Within this, a wait ends when a node stops: the one on whose behalf this thread runs, or another one given.
+
+    A wait that begins only when the node stops already is for its last words, and is not ended.
+
+    :param wake: ``wake()`` makes the wait end, in whatever thread; None where :attr:`came` is all that is wanted
+    """
+
+    def __init__(self, wake=None, lifetime=None):
+        self.wake = wake
+        here = getattr(_thread, 'lifetime', None)
+        self._lifetimes = [each for each in {lifetime, here} if each is not None and not each.ended.is_set()]
+
+    @property
+    def came(self):
+        """Whether the node stops."""
+        return any(lifetime.ended.is_set() for lifetime in self._lifetimes)
+
+    def __enter__(self):
+        for lifetime in self._lifetimes:
+            lifetime._interruptions.add(self)
+        if self.came:
+            self.wake()
+        return self
+
+    def __exit__(self, *error):
+        for lifetime in self._lifetimes:
+            lifetime._interruptions.discard(self)
 
 
 def keep_alive(sock, while_sending=False):

@@ -1,9 +1,11 @@
 """rospy's publishers, mended: they send through INTRAPROCESS too, and latch by value."""
 import functools
 import math
+import os
 import threading
 
 from pharos.private_rospy.fanout import Fanout
+from pharos.private_rospy.lifetime import Interruption
 from pharos.private_rospy.sender import Sender
 
 _changed = threading.Condition()    # notified whenever a publisher of this process gains or loses a connection
@@ -104,10 +106,20 @@ def _notify():
         _changed.notify_all()
 
 
-def wait_until(predicate, timeout):
+def wait_until(predicate, timeout, lifetime):
     """Wait until ``predicate()``, which speaks of connections of publishers of this process, holds.
 
     :param timeout: seconds, None: no limit
+    :param lifetime: of the node with whose stop the wait ends
     """
-    with _changed:
-        return _changed.wait_for(predicate, None if timeout is None else max(0.0, timeout))
+    with Interruption(_notify, lifetime) as stop, _changed:
+        _changed.wait_for(lambda: stop.came or predicate(), None if timeout is None else max(0.0, timeout))
+
+
+def _forget():
+    """In a process that was forked, when another thread may have held the lock."""
+    global _changed
+    _changed = threading.Condition()
+
+
+os.register_at_fork(after_in_child=_forget)

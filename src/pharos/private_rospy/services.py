@@ -7,6 +7,7 @@ import time
 
 from pharos.private_rospy import copier
 from pharos.private_rospy.host import rospy
+from pharos.private_rospy.lifetime import Interruption
 from pharos.private_rospy.sharing import numbered
 from pharos.private_rospy.wiring import running_here
 
@@ -136,7 +137,8 @@ class Workers:
             if self._closed:
                 raise _stopped()
             self._give(job, outcome)
-            result = outcome.get(timeout=max(0.0, deadline - time.monotonic()))
+            with Interruption(lambda: outcome.put(_stopped())):
+                result = outcome.get(timeout=max(0.0, deadline - time.monotonic()))
         except queue.Empty:
             raise socket.timeout('time is up') from None
         finally:

@@ -1,8 +1,8 @@
 """How the channels of a node are wired to its rospy, and to the nodes of this process."""
+import os
 import select
 import threading
 
-from pharos.private_rospy import publishing
 from pharos.private_rospy.names import Resolved
 
 _running = {}    # URI -> the PrivateRospy that runs there, in this process
@@ -47,8 +47,8 @@ class Wiring:
         publishers = [other for other in self._neighbours() if other.publisher(topic)]
         for other in publishers:
             self._instance.connect(topic, other.uri)
-        publishing.wait_until(lambda: all(other.wiring.sends_to(self._instance.name, topic) for other in publishers),
-                              channel.node.connect_timeout)
+        self._instance.wait_until(lambda: all(other.wiring.sends_to(self._instance.name, topic)
+                                              for other in publishers), channel.node.connect_timeout)
         return endpoint
 
     def unsubscribe(self, channel, endpoint):
@@ -145,6 +145,10 @@ class Wiring:
         for connection in subscriber.connections if subscriber else ():    # None: the node stops
             if connection.transport_type == 'INTRAPROCESS':
                 connection.link.channels_changed()
+
+
+# a process that was forked has none of these nodes, whose sockets are its parent's
+os.register_at_fork(after_in_child=_running.clear)
 
 
 def _is_done(connection):

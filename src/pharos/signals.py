@@ -1,0 +1,127 @@
+"""Ctrl-C, SIGTERM and SIGHUP, which stop the nodes where the program has no handlers of its own."""
+import contextlib
+import os
+import signal
+import threading
+import time
+import _thread
+
+_DEFAULTS = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
+
+_is_needed = _end = None    # see :func:`serve`
+_raised = None    # the last exception by which a signal ends the main thread, and with it the program
+_waiting = 0      # how deep the main thread is in a wait of ours, which ends with the nodes
+_held = []        # of each start and stop that the main thread runs, the _Hold
+
+
+class _Hold:
+    """A stretch of the main thread's work that no signal may cut off, for up to ``limit`` seconds after it came."""
+
+    def __init__(self, limit):
+        self._limit = limit
+        self.came = None      # the first signal,
+        self._when = None     # and when it came, by time.monotonic()
+
+    def take(self, number):
+        """Keep a signal for the end; returns whether it waits until then."""
+        if self.came is None:
+            self.came, self._when = number, time.monotonic()
+        return time.monotonic() - self._when < self._limit
+
+
+def is_from_signal(error):
+    """Whether a signal ends the program with this exception, and not what a block raised by itself."""
+    return error is _raised
+
+
+def serve(is_needed, end):
+    """From now on, a signal that ends the program has ``end()`` run first, in a thread of its own.
+
+    While ``is_needed()`` does not hold, signals do what they do without us.
+    """
+    global _is_needed, _end
+    _is_needed, _end = is_needed, end
+    # not Ctrl-C, which the main thread hears of without us
+    install(signal.SIGTERM, signal.SIGHUP)
+
+
+def install(*numbers):
+    """Take on the signals for which the program has no handlers, where this is the main thread, which alone can."""
+    if threading.current_thread() is threading.main_thread():
+        for number in numbers:
+            if signal.getsignal(number) is _DEFAULTS[number]:
+                signal.signal(number, _on_signal)
+
+
+@contextlib.contextmanager
+def waiting():
+    """Within this, a signal raises nothing in the main thread: the wait ends because the nodes stop."""
+    global _waiting
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    _waiting += 1
+    try:
+        yield
+    finally:
+        _waiting -= 1
+
+
+@contextlib.contextmanager
+def held(limit):
+    """Within this, a signal raises nothing in the main thread, and afterwards what it would have raised.
+
+    A start or a stop that is torn up half way leaves registrations behind.
+
+    :param limit: seconds after which a second signal raises all the same
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    install(*_DEFAULTS)
+    hold = _Hold(limit)
+    _held.append(hold)
+    try:
+        yield
+    finally:
+        if hold in _held:    # else the process was forked in it
+            _held.remove(hold)
+        if hold.came is not None:
+            _raise(hold.came)
+
+
+def _on_signal(number, frame):
+    if not (_held or _is_needed()):
+        _do_default(number, frame)
+        return
+    # Not here, nor in a Thread, whose start takes a lock: the main thread may hold any lock just now.
+    _thread.start_new_thread(_end, ())
+    _raise(number)
+
+
+def _raise(number):
+    """End what the main thread does, if it does not end by itself, at once or when the hold ends."""
+    global _raised
+    if _held and _held[-1].take(number) or _waiting:
+        return
+    # the status is the shell's for a process that the signal ended
+    _raised = KeyboardInterrupt() if number == signal.SIGINT else SystemExit(128 + number)
+    raise _raised
+
+
+def _do_default(number, frame):
+    """What Python and the system do with a signal."""
+    if number == signal.SIGINT:
+        signal.default_int_handler(number, frame)
+    signal.signal(number, signal.SIG_DFL)
+    os.kill(os.getpid(), number)
+
+
+def _forget():
+    """In a process that was forked: it begins anew."""
+    global _waiting
+    _waiting = 0
+    _held.clear()
+
+
+os.register_at_fork(after_in_child=_forget)

@@ -1,0 +1,362 @@
+"""One life at a time: a node is known here first, its stop() runs once, and what waits for it ends with it."""
+import threading
+import time
+
+import pytest
+
+from conftest import TIMEOUT
+from pharos import BlockNode, ExternalNode, Lifecycle, Master, Node, NodeNameInUseError, NodeStoppedError, running
+from pharos import message_class, stopping
+from pharos.private_rospy import lifetime, services
+from programs import until
+from sockets import refused_url, silent_peer
+
+
+def create(master, name, node_class=BlockNode, **settings):
+    return master.create(node_class, named=name, domain='127.0.0.1', **settings)
+
+
+def in_thread(function, *arguments):
+    """Run it in a thread; returns the thread, and a list of what came of it: a value, or an exception."""
+    outcome = []
+
+    def run():
+        try:
+            outcome.append(function(*arguments))
+        except Exception as error:
+            outcome.append(error)
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    return thread, outcome
+
+
+def ended(thread):
+    thread.join(TIMEOUT)
+    return not thread.is_alive()
+
+
+# -- known here before the master knows it ------------------------------------------------------------------------------
+
+def test_a_node_that_starts_or_stops_is_never_one_of_another_process(master):
+    seen, over = [], threading.Event()
+
+    def look():
+        while not over.is_set():
+            seen.extend(node for node in master.nodes() if node.name == '/flickering')
+    thread, _ = in_thread(look)
+    for _ in range(20):
+        with create(master, '/flickering'):
+            pass
+    over.set()
+    assert ended(thread)
+    assert {type(node) for node in seen} == {BlockNode}
+
+
+def test_a_node_that_is_waited_for_runs(master):
+    thread, found = in_thread(master.wait_for_node, '/awaited', TIMEOUT)
+    node = create(master, '/awaited')
+    assert ended(thread)
+    assert found == [node] and node.is_running
+
+
+def test_of_threads_that_create_a_node_of_one_name_one_wins(master):
+    go = threading.Barrier(4)
+
+    def start():
+        go.wait(TIMEOUT)
+        return create(master, '/contested')
+    threads, outcomes = zip(*(in_thread(start) for _ in range(4)))
+    assert all(map(ended, threads))
+    nodes = [outcome for outcome, in outcomes if isinstance(outcome, BlockNode)]
+    errors = [outcome for outcome, in outcomes if isinstance(outcome, NodeNameInUseError)]
+    assert (len(nodes), len(errors)) == (1, 3)
+    assert all('/contested' in str(error) and 'node of this process' in str(error) for error in errors)
+    assert nodes[0].is_running and master.node('/contested') is nodes[0]
+
+
+def test_a_name_is_free_again_when_the_start_has_failed(master):
+    with pytest.raises(Exception, match='no ROS master answers'):
+        create(Master(refused_url()), '/unlucky')
+    assert running.nodes() == []
+    assert create(master, '/unlucky').is_running
+
+
+# -- stop() runs once, to its end ----------------------------------------------------------------------------------------
+
+class Careful(Node):
+    """Its stop() goes on after super().stop(), until it may end."""
+
+    def __init__(self):
+        self.calls, self.begun, self.may_end = [], threading.Event(), threading.Event()
+
+    def stop(self):
+        self.calls.append('begun')
+        super().stop()
+        self.begun.set()
+        assert self.may_end.wait(TIMEOUT)
+        self.calls.append('ended')
+
+
+def test_an_overridden_stop_runs_once_and_others_wait_for_its_end(master):
+    node = create(master, '/careful', Careful)
+    first, _ = in_thread(node.stop)
+    assert node.begun.wait(TIMEOUT)
+    others = [in_thread(ask)[0] for ask in (node.stop, running.stop_all, running.spin, lambda: node.__exit__())]
+    until(lambda: len(stopping._waiting) == 2)
+    assert all(thread.is_alive() for thread in (first, *others))
+    node.may_end.set()
+    assert all(map(ended, (first, *others)))
+    node.stop()
+    assert node.calls == ['begun', 'ended']
+
+
+def test_an_overridden_stop_runs_once_for_each_start(master):
+    node = create(master, '/careful', Careful)
+    node.may_end.set()
+    node.stop()
+    node.start()
+    with node:
+        node.stop()
+    assert node.calls == ['begun', 'ended'] * 2
+
+
+@pytest.mark.parametrize('how', ['delegate', 'soul', 'rosnode kill'])
+def test_a_stop_that_comes_from_the_node_itself_is_waited_for(master, how):
+    node = create(master, '/careful', Careful)
+    if how == 'delegate':
+        node.interested_in('/careful_end', 'std_msgs/Empty', delegate=lambda message, channel: node.stop())
+        node.send_to('/careful_end')
+    elif how == 'soul':
+        node.fork(lambda me: me.stop())
+    else:
+        ExternalNode(master, '/careful').shutdown()
+    assert node.begun.wait(TIMEOUT)
+    thread, _ = in_thread(node.stop)
+    until(lambda: stopping._waiting)
+    assert thread.is_alive()
+    node.may_end.set()
+    assert ended(thread)
+    assert node.calls == ['begun', 'ended']
+
+
+def test_a_mixins_stop_runs_once_too(master):
+    class Mixin:
+        calls = 0
+
+        def stop(self):
+            super().stop()
+            Mixin.calls += 1
+            self.stop()
+
+    class Mixed(Mixin, BlockNode):
+        pass
+    node = create(master, '/mixed', Mixed)
+    node.stop()
+    node.stop()
+    assert Mixin.calls == 1
+
+
+def test_each_of_several_overriding_stops_runs_once_in_order(master):
+    calls = []
+
+    class Middle(Node):
+        def stop(self):
+            calls.append('middle')
+            super().stop()
+            calls.append(self.lifecycle)
+
+    class Last(Middle):
+        def stop(self):
+            super().stop()
+            calls.append('last')
+    create(master, '/layered', Last).stop()
+    assert calls == ['middle', Lifecycle.STOPPED, 'last']
+
+
+@pytest.mark.parametrize('fails', [True, False], ids=['raises', 'forgets super().stop()'])
+def test_a_node_is_stopped_when_its_stop_has_ended_however(master, fails):
+    class Clumsy(Node):
+        def stop(self):
+            if fails:
+                raise ZeroDivisionError
+    node = create(master, '/clumsy', Clumsy)
+    if fails:
+        with pytest.raises(ZeroDivisionError):
+            node.stop()
+    else:
+        node.stop()
+    assert node.lifecycle is Lifecycle.STOPPED
+    assert '/clumsy' not in [each.name for each in master.nodes()]
+
+
+def test_nodes_that_stop_each_other_do_not_wait_for_ever(master):
+    both = threading.Barrier(2)
+
+    class Partner(Node):
+        def stop(self):
+            both.wait(TIMEOUT)
+            self.other.stop()
+            super().stop()
+    first, second = create(master, '/partner', Partner), create(master, '/partner_too', Partner)
+    first.other, second.other = second, first
+    begin = time.monotonic()
+    running.stop_all()
+    assert time.monotonic() - begin < stopping.LIMIT / 2
+    assert first.lifecycle is second.lifecycle is Lifecycle.STOPPED
+
+
+def test_a_stop_that_does_not_end_is_given_up(master, monkeypatch):
+    monkeypatch.setattr(stopping, 'LIMIT', 0.2)
+    node = create(master, '/careful', Careful)
+    thread, _ = in_thread(node.stop)
+    assert node.begun.wait(TIMEOUT)
+    running.spin()
+    running.stop_all()
+    assert thread.is_alive()
+    node.may_end.set()
+    assert ended(thread)
+
+
+def test_a_node_may_start_again_at_the_end_of_its_stop(master):
+    class Phoenix(Node):
+        def stop(self):
+            super().stop()
+            if not hasattr(self, 'rose'):
+                self.rose = True
+                self.start()
+    node = create(master, '/phoenix', Phoenix)
+    node.stop()
+    assert node.is_running and master.node('/phoenix') is node
+    node.stop()
+    assert not node.is_running
+
+
+# -- stop() during the start -------------------------------------------------------------------------------------------
+
+def test_a_stop_during_the_start_ends_it(master, monkeypatch):
+    from pharos.private_rospy import registration
+    claim, claiming, go_on = registration.claim_name, threading.Event(), threading.Event()
+
+    def claim_name(*arguments):
+        claim(*arguments)
+        claiming.set()
+        assert go_on.wait(TIMEOUT)
+    monkeypatch.setattr(registration, 'claim_name', claim_name)
+    starting, outcome = in_thread(create, master, '/premature')
+    assert claiming.wait(TIMEOUT)
+    node, = running.nodes()
+    assert node.lifecycle is Lifecycle.STARTING
+    stop, _ = in_thread(node.stop)
+    until(lambda: stopping._waiting)
+    go_on.set()
+    assert ended(starting) and ended(stop)
+    assert isinstance(outcome[0], NodeStoppedError) and '/premature' in str(outcome[0])
+    assert node.lifecycle is Lifecycle.NEW and running.nodes() == []
+    assert '/premature' not in [each.name for each in master.nodes()]
+    monkeypatch.undo()
+    node.start()
+    assert node.is_running
+
+
+def test_stops_at_any_time_of_the_start_leave_nothing(master):
+    """At 30 times spread over the start."""
+    begin = time.perf_counter()
+    create(master, '/premature').stop()
+    duration = time.perf_counter() - begin
+    for turn in range(30):
+        starting, outcome = in_thread(create, master, '/premature')
+        until(lambda: running.nodes() or outcome)
+        threading.Event().wait(duration * turn / 30)
+        running.stop_all()
+        assert ended(starting)
+        assert isinstance(outcome[0], (NodeStoppedError, BlockNode))
+        assert running.nodes() == []
+        assert '/premature' not in [each.name for each in master.nodes()]
+
+
+def test_a_stop_ends_a_start_at_a_master_that_says_nothing():
+    with silent_peer() as url:
+        starting, outcome = in_thread(create, Master(url), '/premature')
+        until(running.nodes)
+        running.stop_all()
+        assert ended(starting)
+        assert isinstance(outcome[0], NodeStoppedError) and running.nodes() == []
+
+
+# -- what waits ends with the node -------------------------------------------------------------------------------------
+
+def loop(me):
+    channel = me.output_channel('/nobody', 'std_msgs/Empty')
+    while not channel.wait_for_subscribers(timeout=TIMEOUT):
+        pass
+
+
+WAITS = {
+    'wait_for_subscribers': lambda me: me.output_channel('/nobody', 'std_msgs/Empty').wait_for_subscribers(),
+    'wait_for_subscribers in a loop': loop,
+    'wait_for_node': lambda me: me.master.wait_for_node('/nobody'),
+    'Master.wait': lambda me: Master(refused_url()).wait(),
+    'the type of a topic': lambda me: me.interested_in('/untold', wait=TIMEOUT),
+    'a publisher that does not connect': lambda me: me.interested_in('/slow', 'std_msgs/Empty'),
+    'a subscriber that does not connect': lambda me: me.send_to('/fast', typed_as='std_msgs/Empty'),
+    'a service': lambda me: me.master.lookup_service('/sleep').call(timeout=TIMEOUT),
+    'a service elsewhere': lambda me: me.master.lookup_service('/sleep_elsewhere').call(),
+}
+
+
+@pytest.fixture
+def waiting(master, monkeypatch):
+    """Peers that do not connect, and services that do not answer; returns an event set when one is waited for."""
+    peer, waiting, over = create(master, '/slow_peer'), threading.Event(), threading.Event()
+    peer.output_channel('/slow', 'std_msgs/Empty')
+    peer.interested_in('/fast', 'std_msgs/Empty')
+
+    def sleep(request):
+        waiting.set()
+        over.wait(TIMEOUT)
+    peer.serve('/sleep', 'std_srvs/Empty', sleep)
+    peer.serve('/sleep_elsewhere', 'std_srvs/Empty', sleep)
+    monkeypatch.setattr('pharos.private_rospy.wiring.Wiring.sends_to', lambda self, name, topic: False)
+    monkeypatch.setattr('pharos.channel.OutputChannel.connections', [])
+    monkeypatch.setattr('pharos.private_rospy.services.find', lambda name, uri, cls, find=services.find: (
+        find(name, uri, cls) if name == '/sleep' else None))
+    yield waiting
+    over.set()
+
+
+@pytest.mark.parametrize('where, name', [
+    (where, name) for where in ('soul', 'executed soul', 'delegate') for name in WAITS
+    if (where, name) != ('delegate', 'wait_for_subscribers in a loop')])    # a delegate is told, and must end itself
+def test_what_waits_ends_with_the_node(master, waiting, monkeypatch, where, name):
+    node = create(master, '/waiter')
+    node.connect_timeout = node.stop_timeout = TIMEOUT
+
+    def run(me):
+        if 'service' not in name:    # there, it is the peer who knows
+            monkeypatch.setattr(lifetime.Interruption, '__enter__', enter)
+            monkeypatch.setattr('pharos.topic.POLL', TIMEOUT)
+            if 'type' in name:
+                waiting.set()
+        WAITS[name](me)
+        me.sleep(0)
+
+    def enter(self, really=lifetime.Interruption.__enter__):
+        waiting.set()
+        return really(self)
+    if where == 'delegate':
+        sender = create(master, '/sender').output_channel('/go', 'std_msgs/Empty', latch=True)
+        sender.publish(message_class('std_msgs/Empty')())
+        node.delegate = lambda message, channel: run(node)
+        thread, _ = in_thread(node.interested_in, '/go', 'std_msgs/Empty')
+    elif where == 'soul':
+        thread = node.fork(run)
+    else:
+        node.soul = run
+        thread, _ = in_thread(node.execute)
+    assert waiting.wait(TIMEOUT)
+    begin = time.monotonic()
+    node.stop()
+    assert ended(thread)
+    assert time.monotonic() - begin < TIMEOUT / 2
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith('/waiter ')]
+    assert not node.errors
