@@ -194,3 +194,15 @@ def test_without_a_master_the_error_names_it(monkeypatch):
     assert pharos.running.nodes() == []
     ended = run(refused_url(), sys.executable, '-c', 'from pharos import Master; Master().nodes()')
     assert 'Master.embedded()' in ended.stderr.splitlines()[-1]
+
+
+def test_an_address_of_the_environment_that_nobody_would_reach_is_named(monkeypatch):
+    monkeypatch.setenv('ROS_HOSTNAME', 'http://127.0.0.1')
+    with pytest.raises(ValueError, match='^ROS_HOSTNAME cannot be'):
+        Master.embedded()
+
+
+def test_an_empty_address_of_the_environment_is_none(monkeypatch):
+    monkeypatch.setenv('ROS_HOSTNAME', '')
+    with Master.embedded() as master:
+        assert master.url.startswith('http://127.0.0.1:') and master.is_reachable()

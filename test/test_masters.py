@@ -1,6 +1,7 @@
 """Several masters in one process, and the bridge between two."""
 import re
 import signal
+import socket
 import threading
 
 import pytest
@@ -8,6 +9,7 @@ import pytest
 import pharos
 from conftest import TIMEOUT, InProcessMaster, Mailbox
 from pharos import BlockNode, Master
+from pharos.private_rospy import addresses
 from programs import Program, run, script
 from sockets import refused_url
 
@@ -96,6 +98,85 @@ def test_a_block_joins_two_masters(masters):
     for number in range(100):
         sent.send(data=str(number))
     assert [message.data for message in heard.take(100)] == [str(number) for number in range(100)]
+
+
+# -- one master, spelt in several ways --------------------------------------------------------------------------------
+
+@pytest.fixture
+def spellings(master):
+    """The session's master, as given and by another name of its address."""
+    return master, Master(master.url.replace('127.0.0.1', 'LocalHost').rstrip('/'))
+
+
+def test_masters_of_one_address_are_one(spellings):
+    given, other = spellings
+    assert given == other and hash(given) == hash(other) and len({given, other}) == 1
+    assert other.url == given.url.replace('127.0.0.1', 'localhost')
+    assert given.topic('/t') == other.topic('/t') and len({given.topic('/t'), other.topic('/t')}) == 1
+    assert pharos.ExternalNode(given, '/n') == pharos.ExternalNode(other, '/n')
+    node = create(given, '/own')
+    assert other.node('/own') is node and other.own_nodes() == [node] and other.wait_for_node('/own', TIMEOUT) is node
+    assert other.nodes() == [node]
+    assert pharos.watcher.watcher_of(given) is pharos.watcher.watcher_of(other)
+
+
+def test_nodes_at_one_master_are_neighbours_however_it_is_spelt(spellings):
+    given, other = spellings
+    heard = listen(given, '/spelt')
+    speaker = create(other, '/speaker')
+    speaker.serve('/spelt', 'std_srvs/Empty', lambda request: None)
+    channel = speaker.output_channel('/spelt', STRING)
+    channel.send(data='next door', to=given.node('/listener'))
+    assert heard.get().data == 'next door'
+    assert channel.connections == [('/listener', 'INTRAPROCESS')]
+    assert other.topic('/spelt').channels == given.topic('/spelt').channels != []
+
+
+def test_an_embedded_master_stops_the_nodes_that_spell_it_otherwise():
+    with Master.embedded() as embedded:
+        node = create(Master(embedded.url.replace('127.0.0.1', 'localhost')), '/n')
+    assert not node.is_running
+
+
+@pytest.mark.parametrize('one, other, are_one', [
+    ('http://127.0.0.1:11311', 'HTTP://127.0.0.1:011311/', True),
+    ('http://localhost:11311', 'http://127.0.0.1:11311', True),
+    ('http://me:11311', 'http://localhost:11311', True),
+    ('http://me:11311', 'http://ME:11311', True),
+    ('http://me:11311', 'http://10.0.0.1:11311', True),
+    ('http://robot:11311', 'http://10.0.0.2:11311', True),
+    ('http://robot:11311', 'http://me:11311', False),
+    ('http://127.0.0.2:11311', 'http://127.0.0.1:11311', False),
+    ('http://127.0.0.1:11311', 'http://127.0.0.1:11312', False),
+    ('http://nowhere:11311', 'http://nowhere:11311', True),
+    ('http://nowhere:11311', 'http://127.0.0.1:11311', False),
+])
+def test_which_urls_mean_one_address(monkeypatch, one, other, are_one):
+    """On a host called me, as Debian sets one up, with a robot beside it."""
+    looked_up = []
+    known = {'me': '127.0.1.1', 'localhost': '127.0.0.1', 'robot': '10.0.0.2'}
+
+    def getaddrinfo(host, *_, **__):
+        looked_up.append(host)
+        if host == 'nowhere':
+            raise socket.gaierror('Name or service not known')
+        return [(socket.AF_INET, socket.SOCK_STREAM, 6, '', (known.get(host, host), 0))]
+    addresses._of_master.cache_clear()
+    monkeypatch.setattr(addresses.socket, 'getaddrinfo', getaddrinfo)
+    monkeypatch.setattr(addresses.socket, 'gethostname', lambda: 'me')
+    monkeypatch.setattr(addresses.rosgraph.network, 'get_local_addresses', lambda: ['127.0.0.1', '10.0.0.1'])
+    try:
+        one, other = Master(one), Master(other)
+        assert {one: 1} and not looked_up    # neither by making one nor by keeping one
+        assert (one == other, other == one) == (are_one, are_one)
+        assert len({one, other}) == (1 if are_one else 2)
+    finally:
+        addresses._of_master.cache_clear()
+
+
+def test_a_master_at_a_host_that_does_not_resolve_is_unreachable():
+    with pytest.raises(pharos.MasterUnreachableError, match='http://nowhere.invalid:11311/ .*not known'):
+        create(Master('http://nowhere.invalid:11311'), '/n')
 
 
 # -- the script -------------------------------------------------------------------------------------------------------

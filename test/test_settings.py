@@ -1,8 +1,10 @@
 """What a node is told: names, namespaces, remappings, parameters, addresses."""
 import os
+import socket
 import sys
 
 import pytest
+import rosgraph.network
 
 from pharos import BlockNode
 from programs import forget_parameters, run
@@ -116,3 +118,58 @@ def test_parameters_of_the_server_have_the_nodes_names(master):
     assert node.parameter('~rate', initialized=10).value == 20
     with pytest.raises(ValueError, match='/robot1/rated/rate holds int'):
         rate.set('fast')
+
+
+NO_DOMAINS = ['http://127.0.0.1', 'http://localhost:80', '127.0.0.1:80', '::1', '[::1]', 'a b', ' localhost', 'x..y',
+              'nowhere.invalid', '0.0.0.0', '5', '224.0.0.1', '255.255.255.255', 'robot1/']
+
+
+@pytest.fixture
+def nothing_left(master):
+    before = master.system_state()
+    yield
+    assert master.system_state() == before
+    create(master, '/nowhere').stop()    # the name is free
+
+
+@pytest.mark.parametrize('domain', [*NO_DOMAINS, '', 5, b'127.0.0.1', True])
+def test_an_address_that_nobody_would_reach_is_refused_before_anything_is_registered(master, nothing_left, domain):
+    with pytest.raises(ValueError, match='^domain .*: give a host name or an IPv4 address'):
+        create(master, '/nowhere', domain=domain)
+
+
+@pytest.mark.parametrize('variable', ['ROS_HOSTNAME', 'ROS_IP'])
+@pytest.mark.parametrize('domain', NO_DOMAINS)
+def test_the_environments_address_is_checked_alike(master, nothing_left, monkeypatch, variable, domain):
+    monkeypatch.delenv('ROS_HOSTNAME')
+    monkeypatch.setenv(variable, domain)
+    with pytest.raises(ValueError, match=f'^{variable} .*: give a host name or an IPv4 address'):
+        create(master, '/nowhere', domain=None)
+
+
+@pytest.mark.parametrize('argument', ['__hostname', '__ip'])
+def test_the_address_of_argv_is_checked_alike(master, nothing_left, argument):
+    with pytest.raises(ValueError, match=f'^{argument} .*: give a host name or an IPv4 address'):
+        create(master, '/nowhere', argv=[f'{argument}:=0.0.0.0'])
+    with create(master, '/here', argv=[f'{argument}:=127.0.0.2']) as node:
+        assert node.domain == '127.0.0.2'
+
+
+def test_the_environments_address_does_not_matter_where_another_is_given(master, monkeypatch):
+    monkeypatch.setenv('ROS_HOSTNAME', 'nowhere.invalid')
+    assert create(master, '/here', domain='127.0.0.1').domain == '127.0.0.1'
+
+
+def test_a_host_whose_name_does_not_resolve_is_reached_by_its_address(master, monkeypatch):
+    """rospy says the name, and nobody reaches the node."""
+    monkeypatch.delenv('ROS_HOSTNAME')
+    monkeypatch.setattr(socket, 'gethostname', lambda: 'nowhere.invalid')
+    node = create(master, '/here', domain=None)
+    assert node.domain in rosgraph.network.get_local_addresses()
+    assert master.answers('/here')
+
+
+def test_an_empty_variable_says_nothing(master, monkeypatch):
+    monkeypatch.setenv('ROS_HOSTNAME', '')
+    monkeypatch.setenv('ROS_IP', '127.0.0.1')
+    assert create(master, '/here', domain=None).domain == '127.0.0.1'

@@ -194,7 +194,7 @@ class OutputChannel(_Channel):
         if endpoint is None or self.node._rospy.wiring.reaches(endpoint, name):
             return
         self.node.master._find(name, self.node.connect_timeout)
-        if name not in self._uninterested:
+        if name not in self._uninterested and not self.latch:
             self._uninterested.add(name)
             self.node.log(f'{name} is not interested in {self.topic}, or not connected yet: what {self.node.name} sends '
                           'to it alone goes nowhere', level='warning')

@@ -13,6 +13,7 @@ import sys
 import rosgraph.network
 
 from pharos.errors import MasterUnreachableError, PortInUseError
+from pharos.private_rospy.addresses import check_environment
 
 LOOPBACK = '127.0.0.1'
 
@@ -21,9 +22,10 @@ def start(port):
     """Start the child; returns ``(process, URL)``.
 
     :raises PortInUseError: if the port is taken
+    :raises ValueError: if ROS_HOSTNAME or ROS_IP cannot be an address of this host
     """
     environ = dict(os.environ, PYTHONPATH=os.pathsep.join(path for path in sys.path if path))
-    if not ('ROS_IP' in environ or 'ROS_HOSTNAME' in environ):
+    if check_environment(environ) is None:
         environ['ROS_HOSTNAME'] = LOOPBACK    # for this host alone, where nothing else is said
     child = subprocess.Popen([sys.executable, '-m', __name__, str(port)], env=environ, stdin=subprocess.PIPE,
                              stdout=subprocess.PIPE, text=True, start_new_session=True)    # Ctrl-C is the program's

@@ -3,6 +3,7 @@ import atexit
 import difflib
 import threading
 import time
+import urllib.parse
 
 import rosgraph
 
@@ -12,11 +13,11 @@ from pharos.blocks import check_block
 from pharos.errors import MasterUnreachableError, NodeStoppedError, PharosError, UnknownNodeError
 from pharos.external_node import ExternalNode
 from pharos.parameters import Parameters
+from pharos.private_rospy.addresses import check_port, check_url, is_same_master
 from pharos.private_rospy.lifetime import Interruption
 from pharos.private_rospy.names import check_name, global_name
 from pharos.private_rospy.proxies import ServerProxy, master_api
 from pharos.private_rospy.registration import COMMUNICATION_ERRORS, PING_TIMEOUT
-from pharos.private_rospy.settings import check_port, check_url
 from pharos.service import Service
 from pharos.topic import Topic
 from pharos.watcher import watcher_of
@@ -32,6 +33,9 @@ class Master:
 
         master := PhaROSMaster url: 'http://127.0.0.1:11311/'
         master = Master('http://127.0.0.1:11311/')
+
+    Masters whose URLs mean one address ('localhost' and '127.0.0.1') are equal; a host name is looked up where two are
+    compared.
 
     :param url: URL of the ROS master; None: ROS_MASTER_URI, else ROS's default. Makes no connection yet.
     :raises ValueError: if it is no URL
@@ -100,7 +104,7 @@ class Master:
         :param argv: ROS remappings and private parameters for this node (a script passes ``sys.argv``)
         :param kwargs: for the node's ``__init__``
         :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: and nothing is left behind
-        :raises ValueError: if a name or port cannot be one
+        :raises ValueError: if a name, port or address cannot be one, also an address in ROS_HOSTNAME or ROS_IP
         """
         node = nodes_of_ours.make(node_class, self, named, soul, delegate, kwargs, domain=domain, tcp_port=tcp_port,
                                   xmlrpc_port=xmlrpc_port, argv=argv)
@@ -314,10 +318,10 @@ class Master:
         return _Reached(self.url)
 
     def __eq__(self, other):
-        return isinstance(other, Master) and self.url == other.url
+        return isinstance(other, Master) and is_same_master(self.url, other.url)
 
     def __hash__(self):
-        return hash(self.url)
+        return urllib.parse.urlsplit(self.url).port    # the host may have several names
 
     def __repr__(self):
         return '<Master %s>' % self.url

@@ -103,10 +103,10 @@ class Topic:
                                        % (node.name, self.name))
 
     def __eq__(self, other):
-        return isinstance(other, Topic) and (self.master.url, self.name) == (other.master.url, other.name)
+        return isinstance(other, Topic) and (self.name, self.master) == (other.name, other.master)
 
     def __hash__(self):
-        return hash((self.master.url, self.name))
+        return hash((self.name, self.master))
 
     def __repr__(self):
         return '<Topic %s of %s>' % (self.name, self.master.url)

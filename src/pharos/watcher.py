@@ -14,16 +14,16 @@ from pharos.transcript import Transcript
 
 PERIOD = 1.0        # seconds between two looks at the master
 IMPATIENT = 0.1     # seconds between them while somebody waits for a node
-_watchers = {}      # master URL -> its Watcher
+_watchers = {}      # Master -> its Watcher
 _lock = threading.Lock()
 
 
 def watcher_of(master):
     """The one :class:`Watcher` of this process for a master."""
     with _lock:
-        if master.url not in _watchers:
-            _watchers[master.url] = Watcher(master)
-        return _watchers[master.url]
+        if master not in _watchers:
+            _watchers[master] = Watcher(master)
+        return _watchers[master]
 
 
 class Watcher:

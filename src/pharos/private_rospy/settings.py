@@ -4,11 +4,11 @@ rospy takes them from ``os.environ`` and ``sys.argv``; a node gets private ones,
 overridden and the process's own stay untouched.
 """
 import os
-import urllib.parse
 
 import rosgraph.names
 from rosgraph.rosenv import ROS_HOSTNAME, ROS_IP, ROS_MASTER_URI, ROS_NAMESPACE
 
+from pharos.private_rospy.addresses import check_domain, check_environment, check_port, default_domain
 from pharos.private_rospy.host import rospy
 from pharos.private_rospy.names import check_name
 from pharos.private_rospy.parameters import carried
@@ -24,7 +24,7 @@ class Settings:
     :param tcp_port: TCPROS port, 0 for any free one
     :param xmlrpc_port: XML-RPC port, 0 for any free one
     :param argv: ROS remappings and private parameters; what is no remapping is ignored
-    :raises ValueError: if a name or port cannot be one, or the value of a private parameter
+    :raises ValueError: if a name, port or address cannot be one, or the value of a private parameter
     """
 
     def __init__(self, name, master_url, domain=None, tcp_port=0, xmlrpc_port=0, argv=None):
@@ -33,9 +33,7 @@ class Settings:
         special = rosgraph.names.load_mappings(mappings)
         self.environ = dict(os.environ)
         self.environ[ROS_MASTER_URI] = master_url
-        if domain is not None:
-            self.environ.pop(ROS_IP, None)
-            self.environ[ROS_HOSTNAME] = domain
+        self._set_domain(domain, special)
         namespace, _, base = check_name(name, 'node').rpartition('/')
         if name.startswith('/'):
             self.environ[ROS_NAMESPACE] = namespace or '/'
@@ -48,6 +46,18 @@ class Settings:
         self.master_url = master_url
         self.tcp_port = check_port('tcp_port', tcp_port)
         self.xmlrpc_port = check_port('xmlrpc_port', xmlrpc_port)
+
+    def _set_domain(self, domain, mappings):
+        """Have rosgraph find the address to advertise, which is checked."""
+        if domain is not None:
+            self.environ.pop(ROS_IP, None)
+            self.environ[ROS_HOSTNAME] = check_domain('domain', domain)
+        for argument in '__hostname', '__ip':    # before all others
+            if argument in mappings:
+                check_domain(argument, mappings[argument])
+                return
+        if check_environment(self.environ) is None:
+            self.environ[ROS_IP] = default_domain()
 
 
 def check_private_parameters(arguments):
@@ -63,21 +73,3 @@ def check_private_parameters(arguments):
                              f'characters in quotes ({error})') from error
         for name, value in parameters.items():
             carried('~' + name, value)
-
-
-def check_port(what, port):
-    """``port`` if it is one, else ValueError."""
-    if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port <= 65535:
-        raise ValueError('%s must be a port number, 0 (any free one) to 65535, not %r' % (what, port))
-    return port
-
-
-def check_url(url):
-    """``url`` with a closing slash if it can be a master's, else ValueError."""
-    parts = urllib.parse.urlsplit(url) if isinstance(url, str) else None
-    try:
-        if parts and parts.scheme == 'http' and parts.hostname and parts.port and parts.path in ('', '/'):
-            return 'http://%s/' % parts.netloc
-    except ValueError:
-        pass    # the port is no number
-    raise ValueError('%r is not the URL of a ROS master: it looks like http://127.0.0.1:11311/' % (url,))

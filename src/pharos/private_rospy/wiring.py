@@ -3,6 +3,7 @@ import os
 import select
 import threading
 
+from pharos.private_rospy.addresses import is_same_master
 from pharos.private_rospy.names import Resolved
 
 _running = {}    # URI -> the PrivateRospy that runs there, in this process
@@ -138,7 +139,7 @@ class Wiring:
     def _neighbours(self):
         """The nodes of this process at the same master, this one among them."""
         master = self._instance.settings.master_url
-        return [other for other in running_here() if other.settings.master_url == master]
+        return [other for other in running_here() if is_same_master(other.settings.master_url, master)]
 
     def _channels_changed(self, topic):
         subscriber = self._instance.subscriber(topic)

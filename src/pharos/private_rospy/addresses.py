@@ -1,0 +1,122 @@
+"""Addresses: where a master is, and where a node says that it is."""
+import contextlib
+import functools
+import ipaddress
+import re
+import socket
+import urllib.parse
+
+import rosgraph.network
+from rosgraph.rosenv import ROS_HOSTNAME, ROS_IP
+
+_HOST = re.compile(r'\w([\w.-]*\w)?\.?', re.ASCII)    # Docker's names have underscores
+_NOBODYS = ipaddress.ip_network('0.0.0.0/8')          # '5' is one of these
+_BROADCAST = ipaddress.ip_address('255.255.255.255')
+
+
+def check_port(what, port):
+    """``port`` if it is one, else ValueError."""
+    if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port <= 65535:
+        raise ValueError('%s must be a port number, 0 (any free one) to 65535, not %r' % (what, port))
+    return port
+
+
+def check_url(url):
+    """``url`` if it can be a master's, else ValueError; written as URLs should be, with a closing slash."""
+    try:
+        parts = urllib.parse.urlsplit(url) if isinstance(url, str) else None
+        if parts and parts.scheme == 'http' and parts.path in ('', '/') and not parts.query + parts.fragment:
+            host, port = parts.hostname, parts.port
+            is_host = host and _HOST.fullmatch(host) or _is_ipv6(host)
+            if is_host and port and '@' not in parts.netloc:
+                return f'http://[{host}]:{port}/' if ':' in host else f'http://{host}:{port}/'
+    except ValueError:
+        pass    # the port is no number, for example
+    raise ValueError('%r is not the URL of a ROS master: it looks like http://127.0.0.1:11311/' % (url,))
+
+
+def check_domain(what, domain):
+    """``domain`` if other nodes can be told to come there, else ValueError.
+
+    :param what: where it comes from: the parameter of that name, or a variable of the environment
+    """
+    advice = 'give a host name or an IPv4 address of this host, such as robot1 or 192.168.1.5'
+    if _is_ipv6(domain):
+        raise ValueError(f'{what} cannot be {domain!r}, for ROS puts no IPv6 address into a URL: {advice}; with '
+                         'ROS_IPV6=on the name may be one of an IPv6 address')
+    if not isinstance(domain, str) or not _HOST.fullmatch(domain):
+        raise ValueError(f'{what} cannot be {domain!r}: {advice}, without http:// and port')
+    try:
+        found = _look_up(domain, socket.AF_UNSPEC if rosgraph.network.use_ipv6() else socket.AF_INET)
+    except (OSError, UnicodeError) as error:
+        raise ValueError(f'{what} {domain!r} does not resolve ({error}), so that nobody would reach the node: '
+                         f'{advice}') from error
+    for address in found:
+        if address in _NOBODYS or address.is_multicast or address in (_BROADCAST, ipaddress.ip_address('::')):
+            raise ValueError(f'{what} {domain!r} means {address}, at which nobody would reach the node: {advice}')
+    return domain
+
+
+def check_environment(environ):
+    """The address that the environment gives, None if it gives none; else ValueError.
+
+    Takes empty variables away: rosgraph takes them for an answer, and that for none.
+    """
+    for variable in ROS_HOSTNAME, ROS_IP:
+        if not environ.get(variable):
+            environ.pop(variable, None)
+    for variable in ROS_HOSTNAME, ROS_IP:
+        if variable in environ:
+            return check_domain(variable, environ[variable])
+    return None
+
+
+def default_domain():
+    """What a node says where nothing else is said: the host's name, or its address where the name does not resolve.
+
+    rosgraph says the name, and nobody reaches the node.
+    """
+    try:
+        return check_domain("the host's name", socket.gethostname())
+    except ValueError:
+        return rosgraph.network.get_local_address()
+
+
+def is_same_master(url, other):
+    """Whether two URLs as of :func:`check_url` mean one address; looks host names up, once, but never connects."""
+    if url == other:
+        return True
+    one, two = urllib.parse.urlsplit(url), urllib.parse.urlsplit(other)
+    if one.port != two.port:
+        return False
+    try:
+        return not _of_master(one.hostname).isdisjoint(_of_master(two.hostname))
+    except (OSError, UnicodeError):    # what cannot be looked up is the same only where it is spelt so
+        return False
+
+
+@functools.lru_cache(maxsize=1000)
+def _of_master(host):
+    """The addresses of a host; this one has a master at all of its own."""
+    found = _look_up(host, socket.AF_UNSPEC)
+    here = {_address(own) for own in rosgraph.network.get_local_addresses()}
+    for own in 'localhost', socket.gethostname():
+        with contextlib.suppress(OSError, UnicodeError):
+            here |= _look_up(own, socket.AF_UNSPEC)
+    return found if found.isdisjoint(here) else found | here
+
+
+def _look_up(host, family):
+    """The IP addresses of a host."""
+    return {_address(found[0]) for *_, found in socket.getaddrinfo(host, None, family, socket.SOCK_STREAM)}
+
+
+def _address(text):
+    return ipaddress.ip_address(text.partition('%')[0])
+
+
+def _is_ipv6(host):
+    try:
+        return isinstance(host, str) and ipaddress.ip_address(host).version == 6
+    except ValueError:
+        return False
