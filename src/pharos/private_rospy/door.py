@@ -1,4 +1,5 @@
 """How the clients of a server come in: none is waited for, and none is trusted to say what it ought to."""
+import collections
 import errno
 import threading
 import time
@@ -9,6 +10,8 @@ BACKLOG = 1024     # connections waiting to be accepted; of a rush, those beyond
 CLIENTS = 128      # of one server, that have something to say before they are served
 GRACE = 0.25       # seconds that each of them has in any case
 PAUSE = 0.05       # seconds until the next attempt to accept a client where there are no descriptors left
+COMPLAINTS = 100   # lines of the log within
+COMPLAINT_PERIOD = 10.0    # seconds, about the clients of one server; the rest is counted
 TEXT_LIMIT = 300   # characters of a client's in a line of the log
 _EXHAUSTED = errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM
 _SHUT = errno.EINVAL, errno.EBADF
@@ -31,6 +34,8 @@ class Door:
         self._expected = {}    # socket -> since when; those expected longest first
         self._inside = 0       # threads
         self._crowded = False  # and the log says so
+        self._complaints = collections.deque(maxlen=COMPLAINTS)    # when the last were logged
+        self._not_logged = 0   # since then
 
     def accept(self, listener, serve):
         """Accept clients until the listener is shut; ``serve(socket, address)`` runs for each.
@@ -101,9 +106,19 @@ class Door:
             self.complain(address, why)
 
     def complain(self, address, why):
-        """Log what is wrong with a client."""
-        if not self._lifetime.ended.is_set():
-            self._warn('%s client %s:%s refused: %s' % (self._kind, *address[:2], brief(why)))
+        """Log what is wrong with a client, unless so many others are wrong that it would fill the log."""
+        if self._lifetime.ended.is_set():
+            return
+        now = time.monotonic()
+        with self._changed:
+            told = self._complaints
+            if len(told) == COMPLAINTS and now - told[0] < COMPLAINT_PERIOD:
+                self._not_logged += 1
+                return
+            told.append(now)
+            untold, self._not_logged = self._not_logged, 0
+        more = f' (and {untold} more before, which were too many for the log)' if untold else ''
+        self._warn('%s client %s:%s refused: %s%s' % (self._kind, *address[:2], brief(why), more))
 
     def _make_room(self, wait=False):
         while True:

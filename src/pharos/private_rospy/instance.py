@@ -56,7 +56,8 @@ class PrivateRospy:
         hooks = collections.defaultdict(list)
         for part in ({'rospy.service': _share_service_exception, 'rospy.impl.init': self._poll_quickly,
                       'rospy.core': self._shut_down_early},
-                     names.hooks(), logs.hooks(), servers.hooks(lifetime, self.warn), registration.hooks(self), pubsub.hooks(self),
+                     names.hooks(), logs.hooks(), servers.hooks(lifetime, self.warn, self.debug),
+                     registration.hooks(self), pubsub.hooks(self),
                      self.parameters.hooks()):
             for name, hook in part.items():
                 hooks[name].append(hook)
@@ -231,6 +232,10 @@ class PrivateRospy:
     def warn(self, text):
         """A warning in the node's log."""
         self.rospy.logwarn('%s', text)
+
+    def debug(self, text):
+        """A line in the node's log for those who look for errors."""
+        self.rospy.logdebug('%s', text)
 
     @property
     def thread_count(self):

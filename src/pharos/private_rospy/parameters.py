@@ -29,9 +29,10 @@ class WatchedParameters:
             handler = module.ROSHandler
             update = handler.paramUpdate
 
+            @module.apivalidate(-1, (module.global_name('parameter_key'), None))
             def paramUpdate(self_, caller_id, key, value):
                 answer = update(self_, caller_id, key, value)
-                return (1, '', 0) if isinstance(key, str) and self._tell(key, value) else answer
+                return (1, '', 0) if self._tell(key, value) else answer
             handler.paramUpdate = paramUpdate
 
         def note_subscriptions(module):

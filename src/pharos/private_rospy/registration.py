@@ -10,7 +10,7 @@ import rosgraph
 from pharos.errors import NodeNameInUseError
 from pharos.private_rospy.loader import Substitute
 from pharos.private_rospy.proxies import ServerProxy, master_api
-from pharos.private_rospy.xmlrpc_server import is_call_from_nearby
+from pharos.private_rospy.xmlrpc_server import REFUSED, is_call_from_nearby
 
 PING_TIMEOUT = 1.0          # seconds in which a running node answers getPid
 UNREGISTER_TIMEOUT = 2.0    # seconds that a stop waits for the master
@@ -72,7 +72,7 @@ def hooks(instance):
         def publisherUpdate(self, caller_id, topic, publishers):
             """rospy passes the list on once for each publisher in it, and so does not hear that there is none."""
             if len(publishers) > PUBLISHER_LIMIT:
-                return -1, '%d publishers; the limit is %d' % (len(publishers), PUBLISHER_LIMIT), 0
+                return -1, f'{REFUSED}{len(publishers)} publishers; the limit is {PUBLISHER_LIMIT}', 0
             if self.reg_man:
                 self.reg_man.publisher_update(topic, publishers)
             return 1, '', 0
@@ -84,7 +84,8 @@ def hooks(instance):
                 if not _name_is_anothers(self):    # it meant an earlier owner of this URI (ros_comm #2241)
                     return 1, 'the name %s is still this node\'s' % self.name, 0
             elif not (instance.allows_remote_shutdown() or is_call_from_nearby(self.masterUri)):
-                return -1, 'only this host and the master\'s may stop it, unless its allow_remote_shutdown is set', 0
+                return -1, REFUSED + 'only this host and the master\'s may stop it, unless its ' \
+                    'allow_remote_shutdown is set', 0
             instance.request_stop('%s asked for it: %s' % (caller_id, msg))
             return 1, 'shutdown', 0
         handler.shutdown = shutdown

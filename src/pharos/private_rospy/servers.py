@@ -19,8 +19,9 @@ _NAMES = {'callerid', 'topic', 'service', 'type', 'md5sum'}    # the fields of a
 _CLIENT_GONE = rospy.exceptions.TransportTerminated, ConnectionResetError
 
 
-def hooks(lifetime, warn):
-    """The load hooks of the two servers, for a node of that lifetime; ``warn(text)`` writes to its log."""
+def hooks(lifetime, warn, debug):
+    """The load hooks of the two servers, for a node of that lifetime; ``warn(text)``, ``debug(text)`` write to its log.
+    """
 
     def limit_handshake(module):
         """rosgraph.network: a peer that is silent, slow or announces 4 GiB is listened to for ever."""
@@ -113,7 +114,7 @@ def hooks(lifetime, warn):
 
     return {'rosgraph.network': limit_handshake, 'rospy.impl.tcpros_base': mend_connections,
             'rospy.msg': mend_messages, 'rospy.impl.tcpros_service': expect_requests,
-            **xmlrpc_server.hooks(lifetime, warn)}
+            **xmlrpc_server.hooks(lifetime, warn, debug)}
 
 
 def _accept_at_a_door(module, door):

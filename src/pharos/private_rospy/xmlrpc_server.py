@@ -17,12 +17,12 @@ REQUEST_LIMIT = 8 << 20   # bytes of a request
 LARGE_REQUEST = 1 << 16   # bytes; of requests beyond, only so many are held at a time:
 LARGE_REQUESTS = 8
 
-_TOO_LATE = 'Not a publisher of', 'not subscribed'    # answers to calls that come too late, which is nobody's fault
+REFUSED = 'refused: '     # how an answer begins by which a node defends itself
 _call = threading.local()    # .client: the address of the client whose call this thread answers; .here: ours
 
 
-def hooks(lifetime, warn):
-    """The load hooks of this module, for a node of that lifetime; ``warn(text)`` writes to its log."""
+def hooks(lifetime, warn, debug):
+    """The load hooks of this module, for a node of that lifetime; ``warn(text)``, ``debug(text)`` write to its log."""
 
     def limit_requests(module):
         """rosgraph.xmlrpc: a request may be silent or huge for ever, and runs in a thread that nobody knows."""
@@ -32,14 +32,21 @@ def hooks(lifetime, warn):
         dispatch = server._dispatch
 
         def _dispatch(self, method, parameters):
-            """Nothing in rospy says whose the calls were that it refused."""
+            """Nothing in rospy says whose the calls were that it refused.
+
+            A call that ROS's slave API answers with an error is the caller's affair: peers come too late, or try.
+            """
             try:
                 answer = dispatch(self, method, parameters)
             except Exception as error:
                 door.complain(_call.client, 'call of %s: %s' % (brief(method), error))
                 raise
-            if type(answer) is tuple and answer[0] < 1 and not answer[1].startswith(_TOO_LATE):
-                door.complain(_call.client, 'call of %s: %s' % (method, answer[1]))
+            if type(answer) is tuple and answer[0] < 1:
+                if answer[1].startswith(REFUSED):
+                    door.complain(_call.client, f'call of {method}: {answer[1][len(REFUSED):]}')
+                else:
+                    client = '%s:%s' % _call.client[:2]
+                    debug(f'XML-RPC client {client}: call of {method}: {brief(answer[1])}')
             return answer
         server._dispatch = _dispatch
 
