@@ -20,7 +20,7 @@ class Fanout:
     # a message that comes alone meets cold caches: all that it needs lies together
     __slots__ = ('_lock', '_closed', '_seq', '_has_header', '_freeze', '_inboxes', '_remote', '_dispatchers',
                  '_inline', '_last', '_size', '_mark', '_publisher', '_module', '_thaw', '_buffer', '_latches',
-                 '_early')
+                 '_early', '_links')
 
     def __init__(self, publisher, module):
         self._publisher, self._module = publisher, module
@@ -35,13 +35,13 @@ class Fanout:
 
     def set_connections(self, connections):
         """Sort the connections out, whenever they change: by how a message goes to them."""
-        links = [connection.link for connection in connections if connection.transport_type == 'INTRAPROCESS']
-        inboxes = [inbox for link in links for inbox in list(link.inboxes.values())]
+        self._links = [connection.link for connection in connections if connection.transport_type == 'INTRAPROCESS']
+        inboxes = [inbox for link in self._links for inbox in link.all_inboxes()]
         self._remote = [connection for connection in connections if connection.transport_type != 'INTRAPROCESS']
         self._inboxes, self._dispatchers = inboxes, _dispatchers(inboxes)
         self._inline = list({inbox.dispatcher for inbox in inboxes if inbox.inline})
         # of the messages that receivers share
-        self._mark = sharing.Mark(links[0].header) if any(inbox.shared for inbox in inboxes) else None
+        self._mark = sharing.Mark(self._links[0].header) if any(inbox.shared for inbox in inboxes) else None
 
     def publish(self, message, by=None, to=None, connection=None):
         """Send a message to all; returns whether there is anybody.
@@ -114,10 +114,11 @@ class Fanout:
     def _only(self, name, connection):
         """The inboxes and the TCPROS connections of a node, or of a connection."""
         if connection is None:
-            return ([inbox for inbox in self._inboxes if inbox.channel.node.name == name],
+            links = [link for link in self._links if link.sending.endpoint_id == name]
+            return ([inbox for link in links for inbox in link.all_inboxes()],
                     [connection for connection in self._remote if connection.endpoint_id == name])
         link = getattr(connection, 'link', None)
-        return (list(link.inboxes.values()), ()) if link else ((), [connection])
+        return (link.all_inboxes(), ()) if link else ((), [connection])
 
     def _serialized(self, message, seq):
         buffer = self._buffer
@@ -186,7 +187,7 @@ class Fanout:
                     if link is None:
                         self._write_latched(frozen, connection)
                     else:
-                        self._put_latched(frozen, list(link.inboxes.values()))
+                        self._put_latched(frozen, link.all_inboxes())
 
     def forget(self, channel):
         """A channel closes, and what it latched goes with it."""

@@ -9,6 +9,7 @@ import uuid
 import rospy.impl.transport
 
 from pharos.private_rospy import copier
+from pharos.private_rospy.statistics import Statistics
 
 PROTOCOL = 'INTRAPROCESS-%s' % uuid.uuid4().hex
 
@@ -23,6 +24,7 @@ class Link:
         self.publisher_name = other.name
         self.thaw = copier.thawer(publisher.data_class, subscriber.data_class)
         self.inboxes = {}    # channel of the subscription -> its Inbox for this link
+        self.statistics = None    # where somebody wants them
         self.sending = _End(self, rospy.impl.transport.OUTBOUND, publisher.resolved_name, instance.name)
         self.receiving = _End(self, rospy.impl.transport.INBOUND, subscriber.resolved_name, other.uri)
         self.receiving.callerid_pub = other.name
@@ -30,6 +32,8 @@ class Link:
     def open(self):
         """Add the ends to the subscription and the publisher; returns whether both are open still."""
         self.match_channels()
+        if self._subscriber.statistics_logger is not None:
+            self.statistics = Statistics(self._subscriber, self.publisher_name, self.thaw, self._instance.start_thread)
         return self._subscriber.add_connection(self.receiving) and self._publisher.add_connection(self.sending)
 
     def match_channels(self):
@@ -40,6 +44,10 @@ class Link:
                if channel not in self.inboxes}
         self.inboxes = {**{channel: inbox for channel, inbox in self.inboxes.items() if channel in channels}, **new}
         return list(new.values())
+
+    def all_inboxes(self):
+        """Where the publisher is to put its messages."""
+        return [*self.inboxes.values(), *([self.statistics] if self.statistics else ())]
 
     def channels_changed(self):
         """The subscription has other channels now."""
@@ -52,6 +60,8 @@ class Link:
         """
         for inbox in self.inboxes.values():
             inbox.closed = True
+        if self.statistics is not None:
+            self.statistics.end()
         other, instance = ((self.receiving, self._instance) if end is self.sending else (self.sending, self._other))
         if not other.done:
             instance.start_thread(other.close, name='closing')

@@ -58,7 +58,7 @@ def mend_publisher(module, start_thread):
                 return False
             _refresh(self)
             if link:
-                self.fanout.send_latched(list(link.inboxes.values()), connection.endpoint_id)
+                self.fanout.send_latched(link.all_inboxes(), connection.endpoint_id)
             else:
                 self.fanout.write_latched(connection)
         for listener in self.subscriber_listeners or ():
