@@ -11,6 +11,7 @@ from genpy.base import SIMPLE_TYPES_DICT
 
 from pharos.errors import MessageTypeError
 from pharos.known_types import near
+from pharos.nested_types import nested_class
 
 
 # Raises where the value of a field of this type would not serialize, and is quick.
@@ -74,14 +75,11 @@ def _fields(cls):
     return zip(cls.__slots__, getattr(cls, '_slot_types', ()))  # rospy.AnyMsg has no _slot_types
 
 
-def _nested_class(cls, type_):
-    # What an installed class nests is installed too; genpy returns genpy.Time for 'time'.
-    return getattr(cls, '_classes', {}).get(type_) or genpy.message.get_message_class(type_)
-
-
 def nested_classes(cls):
-    """Return the classes of the messages that a message class nests."""
-    return [_nested_class(cls, t) for t in map(bare_msg_type, cls._slot_types) if not is_builtin(t)]
+    """Return the class of each field that holds messages, in a message class."""
+    types = [bare_msg_type(field_type) for _, field_type in _fields(cls)]
+    nested = [nested_class(cls, type_) for type_ in types if not is_builtin(type_)]
+    return [cls for cls in nested if cls]  # None for one of a class written by hand
 
 
 def _no_field(cls, path, name):
@@ -114,7 +112,7 @@ def _from_dicts(cls, field_type, value, path, present=None):
     if is_array and isinstance(value, (list, tuple)):
         return [_from_dicts(cls, base, item, f'{path}[{index}]') for index, item in enumerate(value)]
     if not is_array and isinstance(value, dict):
-        nested = _nested_class(cls, base)
+        nested = nested_class(cls, base) or type(present)
         return _fill(present if isinstance(present, nested) else nested(), value, path)
     return value
 
@@ -140,7 +138,7 @@ def _check_value(cls, field_type, value, path):
         elif base == 'string':
             value.encode('utf-8')
         else:
-            nested = _nested_class(cls, base)
+            nested = nested_class(cls, base) or type(value)
             for name, nested_type in _fields(nested):
                 _check_value(nested, nested_type, getattr(value, name), f'{path}.{name}')
     except MessageTypeError:
@@ -164,5 +162,8 @@ def _what_fits(cls, field_type):
     if code:
         bits = 8 * struct.calcsize(code) - code.islower()
         return f'an integer from {-2 ** bits if code.islower() else 0} to {2 ** bits - 1}'
-    nested = _nested_class(cls, base)
-    return f'a {nested.__name__} ({describe_fields(nested)})' if nested else f'a {base}'  # None: made elsewhere
+    nested = nested_class(cls, base)
+    if nested is None:  # of a class written by hand
+        return f'a {base}'
+    name = getattr(nested, '_type', nested.__name__).rpartition('/')[2]
+    return f'a {name} ({describe_fields(nested)})'

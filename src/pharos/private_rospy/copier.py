@@ -42,6 +42,8 @@ import genpy
 from genmsg.msgs import parse_type
 from genpy.base import SIMPLE_TYPES_DICT as STRUCT_CODES    # primitive type -> its code on the wire
 
+from pharos.nested_types import nested_class
+
 ARRIVAL_CODES = {**STRUCT_CODES, 'bool': '?'}   # genpy sends a bool as a number: 7 goes out, True arrives
 SMALL = 64     # bytes that a message is taken to have beside its texts and arrays
 
@@ -196,16 +198,6 @@ def _fields(cls):
     return list(zip(cls.__slots__, cls._slot_types))
 
 
-def _nested_class(cls, type_name):
-    """The class that the code generated for cls means by the name of a nested type."""
-    if type_name in ('time', 'duration'):
-        return genpy.Time if type_name == 'time' else genpy.Duration
-    package, name = ('std_msgs/Header' if type_name == 'Header' else type_name).split('/')
-    names = cls.deserialize.__globals__
-    made_together = names.get('_%s__%s' % (package, name))      # genpy.dynamic puts its classes into one module
-    return made_together or getattr(names[package].msg, name)
-
-
 class _Writer:
     """Writes the bodies of freeze_fields and thaw_fields, field by field.
 
@@ -234,7 +226,7 @@ class _Writer:
             elif base in STRUCT_CODES or base == 'string':
                 self._add_scalar(base, field, local)
             else:
-                nested = _nested_class(cls, base)
+                nested = nested_class(cls, base)
                 self._reads.append(f'{local} = {field}')
                 self._builds.append(f'{local} = {field} = new({self._refer(nested)})')
                 self.add_object(nested, local, f'{path}.{name}')
@@ -249,7 +241,7 @@ class _Writer:
         elif base in STRUCT_CODES:
             self._sizes.append(f'len({path}) * {struct.calcsize("<" + STRUCT_CODES[base])}')
         else:
-            size = copier_for(_nested_class(cls, base)).size
+            size = copier_for(nested_class(cls, base)).size
             items = f'sum(map({self._refer(size)}, {path}))' if size else f'len({path}) * {SMALL}'
             self._sizes.append(items)
 
@@ -273,7 +265,7 @@ class _Writer:
             self._reads.append(f'{local} = {base}_array({field})')
             self._add_value(field, local, fresh=f'list({local})' if base in ('bool', 'string') else local)
         else:
-            element = copier_for(_nested_class(cls, base))
+            element = copier_for(nested_class(cls, base))
             if element.freeze_fields is None:
                 raise Odd
             freeze, thaw = self._refer(element.freeze_fields), self._refer(element.thaw_fields)
