@@ -17,7 +17,7 @@ LINE_LIMIT = 400
 
 EXPORTS = """
     Master Node BlockNode Lifecycle ExternalNode Topic InputChannel OutputChannel Service Parameter Transcript RosProcess
-    message_class service_class define_message define_service spin __version__
+    Failure message_class service_class define_message define_service spin __version__
     PharosError MasterUnreachableError NodeNameInUseError PortInUseError UnknownNodeError UnknownTopicError
     UnknownTypeError MessageTypeError UnknownServiceError ServiceTypeError ServiceCallError NodeStoppedError
 """.split()

@@ -4,6 +4,7 @@ from pharos.errors import (MasterUnreachableError, MessageTypeError, NodeNameInU
                            PortInUseError, ServiceCallError, ServiceTypeError, UnknownNodeError, UnknownServiceError,
                            UnknownTopicError, UnknownTypeError)
 from pharos.external_node import ExternalNode
+from pharos.failures import Failure
 from pharos.life import Lifecycle
 from pharos.master import Master
 from pharos.message_types import define_message, define_service, message_class, service_class
@@ -18,8 +19,8 @@ from pharos.transcript import Transcript
 __version__ = '0.1.0'
 __all__ = [
     'Master', 'Node', 'BlockNode', 'Lifecycle', 'ExternalNode', 'Topic', 'InputChannel', 'OutputChannel', 'Service',
-    'Parameter', 'Transcript', 'RosProcess', 'message_class', 'service_class', 'define_message', 'define_service',
-    'spin', '__version__',
+    'Parameter', 'Transcript', 'RosProcess', 'Failure', 'message_class', 'service_class', 'define_message',
+    'define_service', 'spin', '__version__',
     'PharosError', 'MasterUnreachableError', 'NodeNameInUseError', 'PortInUseError', 'UnknownNodeError',
     'UnknownTopicError', 'UnknownTypeError', 'MessageTypeError', 'UnknownServiceError', 'ServiceTypeError',
     'ServiceCallError', 'NodeStoppedError',

@@ -8,7 +8,7 @@ import genpy
 from pharos import message_types
 from pharos.blocks import check_delegate, check_runs
 from pharos.dispatcher import Inbox, SocketInbox
-from pharos.errors import MessageTypeError, NodeStoppedError
+from pharos.errors import MessageTypeError, NodeStoppedError, PharosError
 from pharos.private_rospy.copier import copier_for
 from pharos.private_rospy.fanout import Latch
 
@@ -123,6 +123,20 @@ class InputChannel(_Channel):
     @delegate.setter
     def delegate(self, block):
         self._delegate = check_delegate(block)
+
+    def _run_again(self, message):
+        """Run the delegate, as it is now, on a message on which it failed, when no other of the node runs."""
+        self.node._live_rospy()
+        self.node._dispatcher.run_in_turn(lambda: self._run(message))
+
+    def _run(self, message):
+        block = self.node._delegate if self._delegate is None else self._delegate
+        if block is None:
+            raise PharosError(f'{self.topic} has no delegate any more: give {self.node.name} or its channel one first')
+        try:
+            block(message, self)
+        except BaseException as error:
+            self.node._report(error, block, 'delegate', self, message)
 
     @property
     def dropped(self):

@@ -117,13 +117,14 @@ class Inbox:
             block = node._delegate
             if block is None:
                 return
+        message = None
         try:
             message = value if thaw is None else thaw(value)
             if header is not None:
                 message._connection_header = header
             block(message, channel)
-        except Exception as error:
-            node._report(error, block, 'delegate', channel)
+        except BaseException as error:
+            node._report(error, block, 'delegate', channel, message)
 
 
 class SocketInbox(Inbox):
@@ -221,6 +222,20 @@ class Dispatcher:
             self._running.release()
             if self.inline:    # announced meanwhile by a thread that found the node busy
                 self._leave_to_thread()
+
+    def run_in_turn(self, job):
+        """Run ``job()`` in this thread when no delegate runs; within one that this thread runs, at once."""
+        if self._runner == _thread.get_ident():
+            job()
+            return
+        with self._running:
+            self._runner = _thread.get_ident()
+            try:
+                job()
+            finally:
+                self._runner = None
+        if self.inline:    # as in wait_for_delegate
+            self._leave_to_thread()
 
     def need_thread(self):
         """Have the dispatcher thread, from the first channel on that is not inline."""

@@ -16,7 +16,7 @@ class Health(NamedTuple):
     reachable_since: Optional[float]    # since when the master answers, in seconds as of time.time(); None: it does not
     connections: Dict[str, int]         # transport -> how many the node's channels have
     dropped: int                        # messages that its input channels have dropped
-    errors: int                         # exceptions in node.errors
+    errors: int                         # times that its blocks have failed; of identical ones, node.errors has one
     threads: int                        # of the node
 
     def __str__(self):
@@ -33,7 +33,7 @@ def health_of(node, ask):
     connections = collections.Counter(transport for channel in node.channels for _, transport in channel.connections)
     reachable_since = watcher_of(node.master).reachable_since if node.is_running else None
     return Health(_is_registered(node) if ask else None, reachable_since,
-                  dict(connections), sum(getattr(channel, 'dropped', 0) for channel in node.channels), len(node.errors),
+                  dict(connections), sum(getattr(channel, 'dropped', 0) for channel in node.channels), node._failures.count,
                   node._rospy.thread_count if node._rospy else 0)
 
 

@@ -1,11 +1,10 @@
 """Nodes: real ROS nodes of this process, written with blocks."""
-import collections
 import threading
-import traceback
 
-from pharos.blocks import check_block, check_delegate, check_runs, check_soul, name_of
+from pharos.blocks import attempt, check_block, check_delegate, check_runs, check_soul, name_of
 from pharos.errors import NodeStoppedError, PharosError
 from pharos.external_node import ExternalNode
+from pharos.failures import Failures
 from pharos.health import health_of
 from pharos.life import Life
 from pharos.offered_service import OfferedService
@@ -37,8 +36,7 @@ class Node(Life):
         super()._configure(master, settings)
         self.soul, self.delegate = soul, delegate
         self._opening = threading.Lock()    # held to change _channels
-        #: the exceptions that souls, delegates and services raised, the newest last
-        self.errors = collections.deque(maxlen=100)
+        self._failures = Failures(self._tell_failure)
 
     # -- blocks -------------------------------------------------------------------------------------------------------
 
@@ -74,7 +72,7 @@ class Node(Life):
         ends only this run, which then returns None.
         """
         self._live_rospy()
-        return self._souls.run(self._the_soul())
+        return self._souls.run(self._the_soul(), self._the_soul)
 
     def fork(self, block=None, name=None):
         """Run the soul, or ``block(node)``, in a thread of its own, and return the thread.
@@ -82,23 +80,40 @@ class Node(Life):
         The report (listing 3.8): ``[node execute] fork``. :meth:`stop` ends it at its next :meth:`sleep` or turn of
         :meth:`every`.
         """
-        block = self._the_soul() if block is None else check_soul(block)
-        return self._souls.fork(block, name or 'soul', self._live_rospy().start_thread)
+        present = self._the_soul if block is None else (lambda: check_soul(block))
+        return self._souls.fork(present(), present, name or 'soul', self._live_rospy().start_thread)
 
     def _the_soul(self):
         if self._soul is None:
             raise PharosError('%s has no soul to run: give it one with soul= or node.soul =' % self.name)
         return self._soul
 
-    def _report(self, error, block, what, channel=None):
-        """Tell of an exception in a block, which ends nothing but that run of it."""
+    @property
+    def errors(self):
+        """The exceptions that blocks raised, the newest last: of identical ones the newest alone, and 100 in all.
+
+        The first is kept, for it may be the cause of the others. Who has seen to them may ``pop`` or ``clear`` them.
+        """
+        return self._failures.errors
+
+    @property
+    def failures(self):
+        """For each of :attr:`errors` its :class:`~pharos.Failure`: what failed, on what, how often, and to try again."""
+        return self._failures.all()
+
+    def _report(self, error, block, what, channel=None, message=None, again=None):
+        """Keep and tell an exception in a block, which ends nothing but that run of it; see :meth:`Failures.report`."""
         if not self.is_running and isinstance(error, (NodeStoppedError, rospy.ROSInterruptException)):
             return    # that is how the stop of a node ends its souls
-        self.errors.append(error)
-        where = '%s %s of %s%s' % (what, name_of(block), self.name, ' on %s' % channel.topic if channel else '')
-        self.log('%s raised %s: %s\n%s' % (where, type(error).__name__, error, ''.join(
-            traceback.format_exception(type(error), error, error.__traceback__))), level='error')
-        Transcript.show('%s raised %s: %s' % (where, type(error).__name__, error))
+        where = f'{what} {name_of(block)} of {self.name}'
+        if channel is not None:
+            where += f' on {channel.topic}'
+            again = channel._run_again
+        self._failures.report(error, block, where, channel, message, again)
+
+    def _tell_failure(self, line, details):
+        attempt(lambda: self.log(f'{line}\n{details}' if details else line, level='error'))
+        Transcript.show(line)
 
     # -- topics -------------------------------------------------------------------------------------------------------
 

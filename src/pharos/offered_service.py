@@ -1,8 +1,10 @@
 """Services that a node offers."""
+import contextlib
+
 import genpy
 
 from pharos import message_types
-from pharos.blocks import check_block
+from pharos.blocks import check_block, text_of
 from pharos.errors import MessageTypeError, PharosError
 from pharos.private_rospy import services
 from pharos.private_rospy.host import rospy
@@ -42,11 +44,16 @@ class OfferedService:
         return self.service_class._type
 
     def _answer(self, request):
+        block = self.block
         try:
-            return self._as_response(self.block(request))
-        except Exception as error:
-            self.node._report(error, self.block, 'service %s' % self.name)
-            raise rospy.ServiceException('%s: %s' % (type(error).__name__, error)) from error
+            return self._as_response(block(request))
+        except BaseException as error:
+            self.node._report(error, block, 'service %s' % self.name, message=request, again=self._answer_again)
+            raise rospy.ServiceException('%s: %s' % (type(error).__name__, text_of(error))) from error
+
+    def _answer_again(self, request):
+        with contextlib.suppress(rospy.ServiceException):    # it is reported
+            self._answer(request)
 
     def _as_response(self, value):
         """The response that the block meant: itself, its fields, or its only field."""

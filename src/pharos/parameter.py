@@ -1,4 +1,6 @@
 """Parameters of the parameter server, bound to a node both ways."""
+import functools
+
 import rosgraph
 
 from pharos.blocks import check_block
@@ -73,12 +75,16 @@ class Parameter:
 
     def _changed(self, value):
         for block in tuple(self._blocks):
-            try:
-                if value == {}:
-                    value = self._get()    # a master says so of a deleted one, too
-                block(self._checked(value))
-            except Exception as error:
-                self.node._report(error, block, 'parameter %s' % self.name)
+            self._run(block, value)
+
+    def _run(self, block, value):
+        try:
+            if value == {}:
+                value = self._get()    # a master says so of a deleted one, too
+            block(self._checked(value))
+        except BaseException as error:
+            self.node._report(error, block, 'parameter %s' % self.name, message=value,
+                              again=functools.partial(self._run, block))
 
     def _checked(self, value):
         if value is None or self._kind in (type(None), type(value)):

@@ -11,6 +11,7 @@ import threading
 
 from pharos.blocks import check_block, name_of
 from pharos.errors import UnknownNodeError
+from pharos.failures import Failures
 from pharos.transcript import Transcript
 
 # What they print is wanted line by line, as on a terminal, and not in blocks of 4 KiB
@@ -26,6 +27,7 @@ class RosProcess:
     def __init__(self, command, master_url, on_line=None):
         self.command = command
         self._on_line = check_block(on_line, 'on_line', ('text',))
+        self._failures = Failures(lambda line, details: Transcript.show(line))
         self._lines = collections.deque(maxlen=10000)
         environ = {**LINE_BY_LINE, **os.environ, 'ROS_MASTER_URI': master_url}
         # a session of its own, so that what it starts ends with it, and Ctrl-C is the program's to handle
@@ -49,9 +51,9 @@ class RosProcess:
     def _show(self, line):
         try:
             self._on_line(line)
-        except Exception as error:    # the program's output goes on
-            Transcript.show('block %s for the output of %s raised %s: %s' % (
-                name_of(self._on_line), self.command[0], type(error).__name__, error))
+        except BaseException as error:    # the program's output goes on
+            where = f'block {name_of(self._on_line)} for the output of {self.command[0]}'
+            self._failures.report(error, self._on_line, where, message=line)
 
     @property
     def pid(self):

@@ -2,7 +2,7 @@
 import sys
 import threading
 
-from pharos.blocks import check_block
+from pharos.blocks import attempt, check_block, ends_program, name_of, text_of
 
 
 class _Transcript:
@@ -17,15 +17,34 @@ class _Transcript:
     def __init__(self):
         self._lock = threading.RLock()    # an RLock: what receives a line may show something itself
         self._receiver = None
+        self._is_failing = False          # whether the receiver has raised something
 
     def show(self, *things):
-        """Show one line: ``things`` as text, separated by blanks."""
-        text = ' '.join(map(str, things))
+        """Show one line: ``things`` as text, separated by blanks. Raises nothing.
+
+        Where the receiver of :meth:`on_show` raises something, the line goes to standard output, the first one with a
+        word about it. A line that cannot be written there either, to a closed pipe for example, is lost.
+        """
+        text = ' '.join(map(text_of, things))
         with self._lock:
-            if self._receiver is not None:
-                self._receiver(text)
-            else:
-                print(text, file=sys.stdout, flush=True)
+            receiver = self._receiver
+            if receiver is None or not self._is_taken(text, receiver):
+                attempt(lambda: _print(text))
+
+    def _is_taken(self, text, receiver):
+        """Have the receiver take the line; returns whether it did."""
+        try:
+            receiver(text)
+            return True
+        except BaseException as error:
+            if ends_program(error):
+                raise
+            if not self._is_failing:
+                self._is_failing = True
+                why = (f'the receiver {name_of(receiver)} of the Transcript raised {type(error).__name__}: '
+                       f'{text_of(error)}: what it does not take is shown here')
+                attempt(lambda: _print(why))
+            return False
 
     def on_show(self, receiver):
         """Send lines to ``receiver(text)`` from now on; ``None`` means standard output again.
@@ -35,10 +54,19 @@ class _Transcript:
         check_block(receiver, 'receiver', ('text',))
         with self._lock:
             before, self._receiver = self._receiver, receiver
+            self._is_failing = False
         return before
 
     def __repr__(self):
         return '<Transcript to %s>' % ('standard output' if self._receiver is None else self._receiver)
+
+
+def _print(text):
+    try:
+        print(text, flush=True)
+    except UnicodeEncodeError:    # as on a terminal that knows ASCII only
+        encoding = sys.stdout.encoding
+        print(text.encode(encoding, 'backslashreplace').decode(encoding), flush=True)
 
 
 Transcript = _Transcript()

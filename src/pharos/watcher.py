@@ -9,6 +9,7 @@ import time
 
 from pharos.blocks import name_of
 from pharos.errors import MasterUnreachableError, NodeStoppedError
+from pharos.failures import Failures
 from pharos.private_rospy.lifetime import SIGNAL_LATENCY, Interruption
 from pharos.transcript import Transcript
 
@@ -149,7 +150,10 @@ class Watcher:
         if self.reachable_since is None:
             self.reachable_since = time.time()
         for node in nodes:
-            node._rospy.repair(state, was_away)
+            try:
+                node._rospy.repair(state, was_away)
+            except Exception as error:    # the watch over the other nodes goes on
+                node._report(error, node._rospy.repair, 'registration')
         return _graph(state)
 
 
@@ -168,6 +172,7 @@ class _Listener:
 
     def __init__(self, block, graph):
         self._block, self._known = block, graph
+        self._failures = Failures(lambda line, details: Transcript.show(line))
         self.ended = False
 
     def tell(self, graph):
@@ -178,9 +183,8 @@ class _Listener:
                 return
             try:
                 self._block(kind, name, (kind, name) in graph)
-            except Exception as error:    # the other listeners go on, and so does the watch over our nodes
-                Transcript.show('block %s for the change of %s %s raised %s: %s' % (
-                    name_of(self._block), kind, name, type(error).__name__, error))
+            except BaseException as error:    # the other listeners go on, and so does the watch over our nodes
+                self._failures.report(error, self._block, f'block {name_of(self._block)} for changes')
 
 
 def _graph(state):

@@ -1,0 +1,594 @@
+"""A block that fails, however it does, fails alone; it is kept, told, counted, and run again."""
+import asyncio
+import dataclasses
+import gc
+import io
+import os
+import pdb
+import sys
+import threading
+import time
+import traceback
+
+import pytest
+
+import pharos
+from conftest import TIMEOUT, Mailbox
+from pharos import BlockNode, Transcript, failures
+from programs import Program, run, until
+
+
+class OfMyOwn(BaseException):
+    """Derived from no Exception, as nothing should be but often is."""
+
+
+OUTCASTS = [SystemExit, KeyboardInterrupt, GeneratorExit, asyncio.CancelledError, pytest.fail.Exception, OfMyOwn]
+
+
+def create(master, name='/node', **kwargs):
+    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
+
+
+class Raising:
+    """A block that raises one error after the other, and when there are none left takes what it gets."""
+
+    def __init__(self, *errors):
+        self._errors = list(errors)
+        self.taken = Mailbox()
+
+    def __call__(self, *args):
+        if self._errors:
+            raise self._errors.pop(0)
+        self.taken(args[0], None)
+
+
+def classes_of(errors):
+    return [type(error) for error in errors]
+
+
+@pytest.fixture
+def dead_threads(monkeypatch):
+    """The exceptions by which threads ended."""
+    dead = []
+    monkeypatch.setattr(threading, 'excepthook', lambda arguments: dead.append(arguments.exc_value))
+    return dead
+
+
+# -- whatever it raises, no thread and no caller ends ------------------------------------------------------------------
+
+@pytest.mark.parametrize('inline', [False, True])
+def test_a_delegate_may_raise_anything(master, transcript, inline):
+    block = Raising(*[outcast('out') for outcast in OUTCASTS])
+    node = create(master, delegate=block)
+    node.interested_in('/failing', 'std_msgs/Int32', inline=inline)
+    for number in range(len(OUTCASTS) + 1):
+        create(master, '/sender%d' % number).send_to('/failing', data=number)
+    assert block.taken.get().data == len(OUTCASTS)
+    assert classes_of(node.errors) == OUTCASTS
+    assert [line.split(' raised ')[1] for line in transcript] == [outcast.__name__ + ': out' for outcast in OUTCASTS]
+
+
+def test_a_delegate_of_an_external_publisher_may_raise_anything(master, transcript):
+    block = Raising(*[outcast('out') for outcast in OUTCASTS])
+    node = create(master, delegate=block)
+    node.interested_in('/failing_outside', 'std_msgs/Int32')
+    with Program(master.url, 'rostopic', 'pub', '-r', '50', '/failing_outside', 'std_msgs/Int32', '5'):
+        block.taken.take(20)
+    assert classes_of(node.errors) == OUTCASTS
+
+
+@pytest.mark.parametrize('outcast', OUTCASTS)
+def test_a_soul_may_raise_anything(master, transcript, dead_threads, outcast):
+    def soul(me):
+        raise outcast('out')
+    node = create(master, soul=soul)
+    assert node.execute() is None
+    node.fork().join(TIMEOUT)
+    failure, = node.failures
+    assert type(failure.error) is outcast and failure.count == 2 and failure.block is soul and not dead_threads
+
+
+@pytest.mark.parametrize('outcast', OUTCASTS)
+@pytest.mark.parametrize('timeout', [None, TIMEOUT])
+def test_a_service_block_may_raise_anything(master, transcript, dead_threads, outcast, timeout):
+    block = Raising(outcast('out'))
+    node = create(master)
+    node.serve('/fails', 'std_srvs/Empty', block)
+    service = master.lookup_service('/fails')
+    begin = time.monotonic()
+    with pytest.raises(pharos.ServiceCallError, match='/fails failed: .*%s: out' % outcast.__name__):
+        service.call(timeout=timeout)
+    assert time.monotonic() - begin < TIMEOUT    # it is not waited for in vain
+    service.call(timeout=timeout)
+    assert classes_of(node.errors) == [outcast] and not dead_threads
+
+
+def test_a_service_block_called_from_outside_may_raise_anything(master, transcript, dead_threads):
+    node = create(master)
+    node.serve('/fails_outside', 'std_srvs/Empty', Raising(SystemExit('out')))
+    done = run(master.url, 'rosservice', 'call', '/fails_outside')
+    assert 'SystemExit: out' in done.stderr and 'not able to' not in done.stderr
+    assert run(master.url, 'rosservice', 'call', '/fails_outside').returncode == 0
+    assert classes_of(node.errors) == [SystemExit] and not dead_threads
+
+
+def test_a_parameter_block_may_raise_anything(master, transcript):
+    node = create(master)
+    parameter = node.parameter('~failing', 0)
+    block = Raising(*[outcast('out') for outcast in OUTCASTS * 2])
+    parameter.on_change(block)
+    for number in range(len(OUTCASTS)):
+        parameter.set(number)                            # runs it here
+        master.parameters['/node/failing'] = number      # runs it in a thread of the XML-RPC server
+        until(lambda: node.health().errors == 2 * number + 2)
+    parameter.set(99)
+    assert block.taken.get() == 99
+    assert set(classes_of(node.errors)) == set(OUTCASTS)
+
+
+def test_a_block_for_changes_may_raise_anything(master, transcript):
+    watched, events = Mailbox(), {}
+
+    def block(kind, name, is_there):
+        if name in events:
+            events.pop(name)
+            raise SystemExit('out')
+    end = master.on_change(block)
+    also = master.on_change(lambda kind, name, is_there: watched((kind, name), None))
+    for name in '/first', '/second':
+        events[name] = True
+        create(master, name)
+        until(lambda: name not in events)
+        while watched.get() != ('node', name):
+            pass
+    end()
+    also()
+    assert any('block' in line and 'raised SystemExit: out' in line for line in transcript)
+
+
+def test_a_node_whose_registration_fails_leaves_the_others_watched(master, transcript):
+    node, watched = create(master), Mailbox()
+    node._rospy.repair = lambda *arguments: 1 / 0
+    end = master.on_change(lambda kind, name, is_there: watched((kind, name), None))
+    create(master, '/another')
+    while watched.get() != ('node', '/another'):
+        pass
+    end()
+    assert classes_of(node.errors) == [ZeroDivisionError]
+
+
+def test_on_line_may_raise_anything(master, transcript):
+    lines = Mailbox()
+
+    def on_line(text):
+        lines(text, None)
+        raise SystemExit(text)
+    with master.run('topic_tools', 'relay', on_line=on_line) as process:
+        process.wait(TIMEOUT)
+    printed = process.output.split('\n')
+    assert len(printed) > 1 and lines.take(len(printed)) == printed
+    assert 'block' in transcript[0] and 'for the output of' in transcript[0] and 'raised SystemExit' in transcript[0]
+
+
+# -- nor by what the report of it raises -------------------------------------------------------------------------------
+
+class Unspeakable(Exception):
+    def __str__(self):
+        raise SystemExit('no text')
+
+    __repr__ = __str__
+
+
+class UnnameableBlock:
+    def __init__(self, block):
+        self._block = block
+
+    def __call__(self, message, channel):
+        self._block(message, channel)
+
+    def __repr__(self):
+        raise SystemExit('no name')
+
+    def __getattr__(self, name):
+        raise SystemExit('no name') if name == '__qualname__' else AttributeError(name)
+
+
+def fails_on_bad(mailbox, error):
+    def delegate(message, channel):
+        if message.data == 'bad':
+            raise error
+        mailbox(message, channel)
+    return delegate
+
+
+def send_bad_and_good(node, inline=False):
+    node.interested_in('/reported', 'std_msgs/String', inline=inline)
+    node.send_to('/reported', data='bad')
+    node.send_to('/reported', data='good')
+
+
+@pytest.mark.parametrize('make', [Unspeakable, lambda: SystemExit(Unspeakable())], ids=['itself', 'what it holds'])
+def test_an_error_that_cannot_be_shown_is_kept_all_the_same(master, transcript, mailbox, make):
+    error = make()
+    error.__cause__ = Unspeakable()
+    node = create(master, delegate=fails_on_bad(mailbox, error))
+    send_bad_and_good(node)
+    assert mailbox.get().data == 'good' and node.errors[0] is error
+    assert 'raised %s' % type(error).__name__ in transcript[0]
+    assert repr(node.failures)
+
+
+def test_a_block_that_cannot_be_named_is_told_all_the_same(master, transcript, mailbox):
+    node = create(master, delegate=UnnameableBlock(fails_on_bad(mailbox, ValueError('bad one'))))
+    send_bad_and_good(node)
+    assert mailbox.get().data == 'good' and classes_of(node.errors) == [ValueError]
+    assert 'UnnameableBlock' in transcript[0] and 'bad one' in transcript[0]
+
+
+@pytest.mark.parametrize('inline', [False, True])
+@pytest.mark.parametrize('outcast', [SystemExit, OSError])
+def test_a_log_and_a_transcript_that_fail_change_nothing(master, mailbox, capsys, inline, outcast):
+    class Mute(BlockNode):
+        def log(self, text, level='info'):
+            raise outcast('no log')
+
+    def receiver(text):
+        raise outcast('no line')
+    before = Transcript.on_show(receiver)
+    try:
+        node = master.create(Mute, named='/mute', delegate=fails_on_bad(mailbox, ValueError('bad one')))
+        send_bad_and_good(node, inline)
+        assert mailbox.get().data == 'good' and classes_of(node.errors) == [ValueError]
+        Transcript.show('another', Unspeakable())
+    finally:
+        Transcript.on_show(before)
+    about, line, another = capsys.readouterr().out.splitlines()
+    assert 'receiver' in about and 'raised %s: no line' % outcast.__name__ in about
+    assert line.endswith('raised ValueError: bad one')
+    assert another == 'another <Unspeakable that cannot be shown>'
+
+
+@pytest.mark.parametrize('output', ['/dev/full', 'a closed pipe', 'a closed file'])
+def test_an_output_that_cannot_be_written_changes_nothing(master, mailbox, monkeypatch, output):
+    if output == '/dev/full':
+        file = open(output, 'w')
+    else:
+        read, write = os.pipe()
+        os.close(read)
+        file = os.fdopen(write, 'w')
+        if output == 'a closed file':
+            file.close()
+    with monkeypatch.context() as patched:
+        patched.setattr(sys, 'stdout', file)
+        patched.setattr(sys, 'stderr', file)
+        node = create(master, delegate=fails_on_bad(mailbox, ValueError('bad one')))
+        send_bad_and_good(node)
+        assert mailbox.get().data == 'good' and classes_of(node.errors) == [ValueError]
+        node.fork(lambda me: 1 / 0).join(TIMEOUT)
+        assert classes_of(node.errors) == [ValueError, ZeroDivisionError]
+        with pytest.raises((OSError, ValueError)):
+            file.write('x')
+            file.flush()
+    try:
+        file.close()
+    except OSError:
+        pass
+
+
+def test_a_line_is_shown_on_a_terminal_that_knows_ascii_only(monkeypatch):
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, 'stdout', io.TextIOWrapper(written, encoding='ascii'))
+    Transcript.show('gr\xfcn')
+    assert written.getvalue() == b'gr\\xfcn\n'
+
+
+def test_a_receiver_that_works_again_gets_the_lines_again(capsys):
+    receiver = Raising(ValueError('not yet'))
+    before = Transcript.on_show(receiver)
+    try:
+        Transcript.show('first')
+        Transcript.show('second')
+    finally:
+        Transcript.on_show(before)
+    assert receiver.taken.get() == 'second'
+    assert capsys.readouterr().out.splitlines()[1:] == ['first']
+
+
+# -- kept, told, counted -----------------------------------------------------------------------------------------------
+
+def failing(node, error_of, count, topic='/counted'):
+    """Have a delegate of the node raise ``error_of(message.data)`` on each of so many messages; returns the channel."""
+    def delegate(message, channel):
+        raise error_of(message.data)
+    before = node.health().errors
+    channel = node.interested_in(topic, 'std_msgs/Int32', delegate=delegate, inline=True)
+    for number in range(count):
+        node.send_to(topic, data=number)
+    assert node.health().errors == before + count
+    return channel
+
+
+def test_identical_failures_are_one_told_once_and_then_counted(master, transcript):
+    node = create(master)
+    channel = failing(node, lambda number: ValueError('the same'), 250)
+    error, = node.errors
+    failure, = node.failures
+    assert isinstance(failure, pharos.Failure) and failure.error is error and failure.count == 250
+    assert failure.channel is channel and failure.message.data == 249 and abs(failure.time - time.time()) < 100
+    assert 'ValueError: the same, 250 times' in repr(failure) and 'raise error_of' in failure.traceback
+    first, tenth, hundredth = transcript
+    assert first.endswith('on /counted raised ValueError: the same')
+    assert tenth == first + ', 10 times by now' and hundredth == first + ', 100 times by now'
+    assert '250 errors' in repr(node)
+
+
+def test_the_log_has_the_traceback_of_a_failure_once(master, transcript):
+    lines = []
+    create(master, '/auditor', delegate=lambda line, channel: lines.append(line.msg)).interested_in(
+        '/rosout', 'rosgraph_msgs/Log', inline=True)
+    failing(create(master), lambda number: ValueError('the same'), 50)
+
+    def told():
+        return ['Traceback' in text for text in lines if 'ValueError: the same' in text]
+    until(lambda: len(told()) == 2)    # the listener may connect later than the first line
+    assert told() == [True, False]
+
+
+def test_failures_differ_in_block_channel_class_place_and_text(master, transcript):
+    node = create(master)
+    for topic, error_of in [('/one', lambda number: ValueError('a')), ('/two', lambda number: ValueError('a')),
+                            ('/two', lambda number: ValueError('b')), ('/two', lambda number: KeyError('a'))]:
+        failing(node, error_of, 2, topic).close()
+    assert [failure.count for failure in node.failures] == [2] * 4 and len(transcript) == 4
+
+
+def test_failures_of_ever_changing_text_are_told_a_few_times(master, transcript):
+    node = create(master)
+    failing(node, lambda number: ValueError(f'no transform at {number}'), 1000)
+    assert [line.split('no transform at ')[1] for line in transcript] == [
+        '0', '1', '2', '9, 10 times by now', '99, 100 times by now', '999, 1000 times by now']
+    assert len(node.errors) == len(node.failures) == failures.KEPT
+    assert str(node.errors[0]) == 'no transform at 0' and str(node.errors[-1]) == 'no transform at 999'
+
+
+def test_a_flood_of_failures_displaces_no_other(master, transcript):
+    node = create(master)
+    failing(node, lambda number: ValueError(f'first, at {number}'), 300, '/flood')
+    failing(node, lambda number: KeyError('the cause, perhaps'), 1, '/rare')
+    failing(node, lambda number: ValueError(f'then, at {number}'), 300, '/flood_too')
+    assert [str(error) for error in node.errors if isinstance(error, KeyError)] == ["'the cause, perhaps'"]
+    assert any('/rare' in line for line in transcript) and len(node.errors) == failures.KEPT
+
+
+def test_the_newest_failure_is_the_last(master, transcript):
+    node = create(master)
+    failing(node, lambda number: ValueError(number % 2), 4)
+    assert [(str(failure.error), failure.count) for failure in node.failures] == [('0', 2), ('1', 2)]
+    failing(node, lambda number: ValueError('more'), 1, '/more')
+    assert [str(error) for error in node.errors] == ['0', '1', 'more']
+    assert [str(error) for error in node.errors[1:]] == ['1', 'more'] and repr(node.errors).startswith('[ValueError(0)')
+
+
+def test_errors_that_have_been_seen_to_may_be_taken_out(master, transcript):
+    node = create(master)
+    failing(node, ValueError, 3)
+    assert str(node.errors.pop()) == '2' and str(node.errors.pop(0)) == '0'
+    assert [str(failure.error) for failure in node.failures] == ['1']
+    node.errors.clear()
+    assert not node.errors and not node.failures
+    failing(node, lambda number: ValueError('new'), 1, '/new')
+    assert len(node.errors) == 1 and 'new' in transcript[-1]
+
+
+# -- what is large is kept for the newest alone ------------------------------------------------------------------------
+
+SIZE = 200000
+
+
+@dataclasses.dataclass(frozen=True)
+class Frozen(Exception):
+    """Its attributes cannot be set, not even __traceback__ by its name."""
+    what: object
+
+
+def throw(error):
+    raise error
+
+
+def with_attribute(message):
+    error = ValueError('bad image')
+    error.image = message
+    return error
+
+
+def in_a_chain(message):
+    try:
+        data = message.data
+        raise KeyError(data[:5])
+    except KeyError as error:
+        raise ValueError('bad image') from error
+
+
+def in_a_group(message):
+    try:
+        in_a_chain(message)
+    except ValueError as error:
+        raise ExceptionGroup('bad images', [error])    # noqa: F821: of Python 3.11
+
+
+WAYS = {
+    'the same': lambda message: int('x'),
+    'another text': lambda message: int(f'x{message.height}'),
+    'the message in the error': lambda message: throw(ValueError('bad image', message, message.height)),
+    'its data in the error': lambda message: throw(ValueError(message.height, message.data)),
+    'the message an attribute': lambda message: throw(with_attribute(message)),
+    'in a frozen error': lambda message: throw(Frozen(message)),
+    'in a chain': in_a_chain,
+    'in a group': in_a_group,
+    'undecodable': lambda message: message.data.decode(),
+}
+if sys.version_info < (3, 11):
+    del WAYS['in a group']
+
+
+def held(datas):
+    """How many of them something holds on to but their list."""
+    gc.collect()
+    return sum(sys.getrefcount(datas[index]) > 2 for index in range(len(datas)))
+
+
+@pytest.mark.parametrize('inline', [False, True])
+@pytest.mark.parametrize('way', WAYS.values(), ids=WAYS)
+def test_a_delegate_that_fails_on_images_holds_on_to_few(master, transcript, way, inline):
+    node, sender = create(master, delegate=lambda message, channel: way(message)), create(master, '/sender')
+    node.interested_in('/failing_images', 'sensor_msgs/Image', inline=inline)
+    datas = [b'x' * (number + 1) + b'\xff' * SIZE for number in range(30)]    # each decodes up to another place
+    assert held(datas) == 0
+    for number in range(len(datas)):
+        sender.send_to('/failing_images', data=datas[number], height=number)
+    until(lambda: node.health().errors == len(datas))
+    assert 1 <= held(datas) <= failures.WHOLE
+    assert node.failures[-1].message.height == len(datas) - 1
+    assert all('Traceback' in failure.traceback for failure in node.failures)
+    node.errors.clear()
+    until(lambda: held(datas) == 0)
+
+
+def test_an_error_that_is_raised_again_and_again_does_not_collect_frames(master, transcript):
+    node, error = create(master), ValueError('always this one')
+    failing(node, lambda number: error, 100)
+    assert len(list(traceback.walk_tb(node.errors[0].__traceback__))) == 2
+
+
+def test_long_texts_are_cut(master, transcript):
+    node = create(master)
+    failing(node, lambda number: ValueError('x' * 10000000), 1)
+    assert len(transcript[0]) < 5000 and len(node.failures[0].traceback) < 50000
+
+
+# -- again -------------------------------------------------------------------------------------------------------------
+
+def test_a_delegate_is_run_again_as_it_is_now_on_the_same_message(master, transcript, mailbox):
+    node = create(master, delegate=lambda message, channel: 1 / 0)
+    channel = node.interested_in('/again', 'std_msgs/String', inline=True)
+    node.send_to('/again', data='bad')
+    failure, = node.failures
+    assert failure.retry() is False and failure.count == 2 and len(transcript) == 2    # told, for somebody waits for it
+    node.delegate = mailbox
+    assert failure.retry() is True
+    assert mailbox.get_with_channel() == (failure.message, channel) and failure.message.data == 'bad'
+    assert (failure.count, channel.received) == (2, 1)
+    channel.delegate = Raising(SystemExit('out'))
+    assert failure.retry() is False and classes_of(node.errors) == [ZeroDivisionError, SystemExit]
+
+
+def test_a_delegate_is_run_again_when_no_other_runs(master, transcript, mailbox):
+    node = create(master)
+    node.interested_in('/again', 'std_msgs/String', delegate=Raising(ValueError('bad')))
+    node.send_to('/again', data='bad')
+    until(lambda: node.failures)
+    busy, go_on, ran = threading.Event(), threading.Event(), []
+
+    def slow(message, channel):
+        busy.set()
+        go_on.wait(TIMEOUT)
+        ran.append('slow')
+    node.interested_in('/slow', 'std_msgs/Empty', delegate=slow)
+    node.send_to('/slow')
+    assert busy.wait(TIMEOUT)
+    node.failures[0].channel.delegate = lambda message, channel: ran.append('again')
+    retrying = threading.Thread(target=lambda: mailbox(node.failures[0].retry(), None))
+    retrying.start()
+    assert mailbox.empty() and not ran
+    go_on.set()
+    assert mailbox.get() is True and ran == ['slow', 'again']
+
+
+@pytest.mark.parametrize('inline', [False, True])
+def test_a_delegate_may_have_another_one_run_again(master, transcript, mailbox, inline):
+    node, failing_once = create(master), Raising(ValueError('bad'))
+    node.interested_in('/again', 'std_msgs/String', delegate=failing_once, inline=inline)
+    node.interested_in('/retry', 'std_msgs/Empty', inline=inline,
+                       delegate=lambda message, channel: mailbox(node.failures[-1].retry(), channel))
+    node.send_to('/again', data='bad')
+    until(lambda: node.failures)
+    node.send_to('/retry')
+    assert mailbox.get() is True and failing_once.taken.get().data == 'bad'
+
+
+def test_what_came_inline_while_a_delegate_was_run_again_is_not_left_lying(master, transcript, mailbox):
+    node, sender = create(master), create(master, '/sender')
+    channel = node.interested_in('/again', 'std_msgs/String', delegate=Raising(ValueError('bad')), inline=True)
+    sender.send_to('/again', data='bad')
+    failure, = node.failures
+
+    def again(message, channel):
+        mailbox(message, channel)
+        if message.data == 'bad':
+            meanwhile = threading.Thread(target=sender.send_to, args=('/again',), kwargs={'data': 'meanwhile'})
+            meanwhile.start()
+            meanwhile.join(TIMEOUT)
+    channel.delegate = again
+    assert failure.retry() is True
+    assert [message.data for message in mailbox.take(2)] == ['bad', 'meanwhile']
+
+
+def test_a_soul_is_run_again_as_it_is_now(master, transcript, mailbox):
+    node, forked = create(master, soul=lambda me: 1 / 0), Raising(ValueError('bad'))
+    node.execute()
+    node.fork(forked).join(TIMEOUT)
+    node.soul = lambda me: mailbox('again', None)
+    of_soul, of_fork = node.failures
+    assert of_soul.retry() is True and mailbox.get() == 'again' and of_soul.message is of_soul.channel is None
+    assert of_fork.retry() is True and forked.taken.get() is node and mailbox.empty()
+
+
+def test_a_service_block_is_run_again_on_the_same_request(master, transcript, mailbox):
+    node = create(master)
+    offered = node.serve('/fails_again', 'std_srvs/SetBool', lambda request: 1 / 0)
+    with pytest.raises(pharos.ServiceCallError):
+        master.lookup_service('/fails_again').call(data=True)
+    failure, = node.failures
+    assert failure.message.data is True and failure.retry() is False and failure.count == 2
+    offered.block = lambda request: mailbox(request, None) or {'success': True}
+    assert failure.retry() is True and mailbox.get() is failure.message
+
+
+def test_a_parameter_block_is_run_again_on_the_same_value(master, transcript):
+    node, block = create(master), Raising(ValueError('bad'))
+    parameter = node.parameter('~again')
+    parameter.on_change(block)
+    parameter.set(5)
+    failure, = node.failures
+    assert failure.message == 5 and failure.block is block
+    assert failure.retry() is True and block.taken.get() == 5
+    failing(node, ValueError, failures.WHOLE)
+    with pytest.raises(pharos.PharosError, match='newest 5'):
+        failure.retry()
+
+
+def test_the_newest_failures_alone_are_run_again_and_looked_at(master, transcript, monkeypatch):
+    looked_at = []
+    monkeypatch.setattr(pdb, 'post_mortem', looked_at.append)
+    node = create(master)
+    failing(node, lambda number: ValueError(f'bad {number}'), 10)
+    assert [failure.is_whole for failure in node.failures] == [False] * 5 + [True] * 5
+    old, new = node.failures[0], node.failures[-1]
+    new.debug()
+    *_, (innermost, _) = traceback.walk_tb(looked_at.pop())
+    assert innermost.f_locals['message'].data == 9
+    assert old.message is None and old.error.__traceback__ is None and 'bad 0' in old.traceback
+    for do in old.retry, old.debug:
+        with pytest.raises(pharos.PharosError, match='of /node on /counted.* newest 5'):
+            do()
+    assert not looked_at
+
+
+def test_a_delegate_of_a_stopped_node_is_not_run_again(master, transcript):
+    node = create(master)
+    failing(node, lambda number: ValueError('bad'), 1)
+    failure, = node.failures
+    node.stop()
+    with pytest.raises(pharos.NodeStoppedError):
+        failure.retry()
+    assert failure.message.data == 0
