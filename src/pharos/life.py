@@ -4,7 +4,7 @@ import enum
 import threading
 
 from pharos import running, signals, stopping
-from pharos.blocks import Souls
+from pharos.blocks import Souls, check_runs
 from pharos.dispatcher import Dispatcher
 from pharos.errors import NodeStoppedError, PharosError
 from pharos.private_rospy.host import rospy
@@ -44,6 +44,8 @@ class Life:
 
     def __init_subclass__(cls, **kwargs):
         super().__init_subclass__(**kwargs)
+        for method in cls.start, cls.stop:
+            check_runs(method, f'{cls.__name__}.{method.__name__}')
         if not stopping.is_once(cls.stop):
             cls.stop = stopping.once(cls.stop)
 

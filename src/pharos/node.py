@@ -1,7 +1,7 @@
 """Nodes: real ROS nodes of this process, written with blocks."""
 import threading
 
-from pharos.blocks import attempt, check_block, check_delegate, check_runs, check_soul, name_of
+from pharos.blocks import attempt, check_block, check_delegate, check_soul, name_of
 from pharos.errors import NodeStoppedError, PharosError
 from pharos.external_node import ExternalNode
 from pharos.failures import Failures
@@ -309,8 +309,6 @@ def make(node_class, master, named, soul, delegate, init, **settings):
     """A new node of ``node_class``, configured and not yet started."""
     if not (isinstance(node_class, type) and issubclass(node_class, Node)):
         raise TypeError('a node is made of a subclass of Node, or BlockNode; not %r' % (node_class,))
-    for method in node_class.start, node_class.stop:
-        check_runs(method, f'{node_class.__name__}.{method.__name__}')
     node = node_class.__new__(node_class)
     node._configure(master, Settings(named, master.url, **settings), soul, delegate)
     node.__init__(**init)
