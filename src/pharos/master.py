@@ -101,7 +101,10 @@ class Master:
         :param xmlrpc_port: XML-RPC port, 0 for any free one
         :param soul: block that says what the node does, called as ``soul(node)``
         :param delegate: block run for each message, called as ``delegate(message, channel)``
-        :param argv: ROS remappings and private parameters for this node (a script passes ``sys.argv``)
+        :param argv: ROS remappings and private parameters (a script passes ``sys.argv``). Of several nodes with the same
+            ``argv`` the first takes the ``__name`` in it, for good; the others keep ``named``, in the namespace of
+            ``__ns``; all else holds for all. ``eye:image:=/camera/image``, ``eye:__name:=left`` and ``eye:_rate:=5``
+            are for the one whose ``named`` ends in 'eye'.
         :param kwargs: for the node's ``__init__``
         :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: and nothing is left behind
         :raises ValueError: if a name, port or address cannot be one, also an address in ROS_HOSTNAME or ROS_IP

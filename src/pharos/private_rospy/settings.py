@@ -9,6 +9,7 @@ import rosgraph.names
 from rosgraph.rosenv import ROS_HOSTNAME, ROS_IP, ROS_MASTER_URI, ROS_NAMESPACE
 
 from pharos.private_rospy.addresses import check_domain, check_environment, check_port, default_domain
+from pharos.private_rospy.arguments import mappings_for, takes_name
 from pharos.private_rospy.host import rospy
 from pharos.private_rospy.names import check_name
 from pharos.private_rospy.parameters import carried
@@ -23,29 +24,46 @@ class Settings:
         ROS_HOSTNAME, ROS_IP or the host's name say
     :param tcp_port: TCPROS port, 0 for any free one
     :param xmlrpc_port: XML-RPC port, 0 for any free one
-    :param argv: ROS remappings and private parameters; what is no remapping is ignored
+    :param argv: ROS remappings and private parameters, see :mod:`.arguments`; what is no remapping is ignored
+    :raises TypeError: if ``argv`` is no list of strings
     :raises ValueError: if a name, port or address cannot be one, or the value of a private parameter
     """
 
     def __init__(self, name, master_url, domain=None, tcp_port=0, xmlrpc_port=0, argv=None):
-        mappings = [arg for arg in argv or () if rosgraph.names.REMAP in arg and not arg.startswith('__master:=')]
-        check_private_parameters(mappings)
-        special = rosgraph.names.load_mappings(mappings)
-        self.environ = dict(os.environ)
-        self.environ[ROS_MASTER_URI] = master_url
-        self._set_domain(domain, special)
-        namespace, _, base = check_name(name, 'node').rpartition('/')
-        if name.startswith('/'):
-            self.environ[ROS_NAMESPACE] = namespace or '/'
-        elif namespace:
-            self.environ[ROS_NAMESPACE] = rosgraph.names.ns_join(rosgraph.names.get_ros_namespace(argv=[]), namespace)
-        self.base_name = check_name(special.get('__name', base), 'node', base=True)
-        self.namespace = rosgraph.names.get_ros_namespace(self.environ, mappings)
-        self.name = self.namespace + self.base_name
-        self.argv = [self.base_name, *mappings]
         self.master_url = master_url
         self.tcp_port = check_port('tcp_port', tcp_port)
         self.xmlrpc_port = check_port('xmlrpc_port', xmlrpc_port)
+        arguments = [] if argv is None else argv
+        for_all, for_one = mappings_for(arguments, check_name(name, 'node').rpartition('/')[2])
+        mappings = {**for_all, **for_one}
+        self.environ = dict(os.environ)
+        self.environ[ROS_MASTER_URI] = master_url
+        self._set_domain(domain, mappings)
+        is_named_there = self._set_name(name, arguments, for_all, for_one)
+        self.environ[ROS_NAMESPACE] = self.namespace.rstrip('/') or '/'
+        for left in '__master', '__ns', '__name':    # the settings say this
+            mappings.pop(left, None)
+        if '__name' in for_all and not is_named_there:
+            mappings.pop('__log', None)    # roslaunch has named this file after the other node
+        self.argv = [self.base_name, *map(rosgraph.names.REMAP.join, mappings.items())]
+        check_private_parameters(self.argv)
+
+    def _set_name(self, name, arguments, for_all, for_one):
+        """Find the node's name; returns whether it is the ``__name`` that is given for all."""
+        given = {**for_all, **for_one}.get('__ns')
+        if given is None and '__log' in for_all:    # roslaunch, which knows the node by its own idea of the namespace
+            given = self.environ.get(ROS_NAMESPACE, '/')
+        self.namespace = _namespace(name, given)
+        base = for_one.get('__name', name.rpartition('/')[2])
+        is_named_there = '__name' in for_all and '__name' not in for_one and takes_name(
+            self.master_url, arguments, self.namespace + base)
+        if is_named_there:
+            base = for_all['__name']
+            if given is not None:
+                self.namespace = _namespace('', given)
+        self.base_name = check_name(base, 'node', base=True)
+        self.name = self.namespace + base
+        return is_named_there
 
     def _set_domain(self, domain, mappings):
         """Have rosgraph find the address to advertise, which is checked."""
@@ -58,6 +76,15 @@ class Settings:
                 return
         if check_environment(self.environ) is None:
             self.environ[ROS_IP] = default_domain()
+
+
+def _namespace(name, given):
+    """The namespace of a node of that name, with a closing slash: its own, within the one given."""
+    if given is None:
+        given = '/' if name.startswith('/') else os.environ.get(ROS_NAMESPACE, '/')
+    if given.strip('/'):
+        check_name(given, 'namespace')
+    return rosgraph.names.make_global_ns(rosgraph.names.ns_join(given or '/', name.lstrip('/').rpartition('/')[0]))
 
 
 def check_private_parameters(arguments):

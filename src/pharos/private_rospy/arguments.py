@@ -1,0 +1,59 @@
+"""The arguments that rosrun and roslaunch give to one node, shared out among the nodes of a process.
+
+``__name:=``, ``__ns:=``, remappings and private parameters are for the node that is the whole program. Here the first
+node created with them takes the name, and all else is for all. What is for one alone says so as in ROS 2:
+``detector:image:=/camera/image``.
+"""
+import re
+import threading
+
+import rosgraph.names
+
+from pharos.private_rospy.addresses import is_same_master
+
+_FOR_ONE = re.compile(r'([A-Za-z]\w*):(?!=)(.*)', re.ASCII | re.DOTALL)
+_takers = []    # (master URL, arguments, node that takes the __name in them): for good, since nodes start again
+_lock = threading.Lock()    # guards it
+
+
+def mappings_for(arguments, node):
+    """``({left: right} for all nodes, {left: right} for that one alone)`` of the ``left:=right`` among the arguments.
+
+    What is no such mapping is ignored, as by rosgraph.
+
+    :param node: the last part of the name that the program gives it
+    :raises TypeError: if the arguments are no list of strings
+    :raises ValueError: if a mapping has several right sides
+    """
+    if isinstance(arguments, (str, bytes)) or not all(isinstance(argument, str) for argument in arguments):
+        raise TypeError(f"argv is a list of strings, such as sys.argv or ['__name:=eye'], not {arguments!r}")
+    for_all, for_one = {}, {}
+    for argument in arguments:
+        mappings = for_all
+        match = _FOR_ONE.fullmatch(argument)
+        if match:
+            if match.group(1) != node:
+                continue
+            mappings, argument = for_one, match.group(2)
+        if not rosgraph.names.is_legal_remap(argument):
+            continue
+        left, right, *more = (side.strip() for side in argument.split(rosgraph.names.REMAP))
+        if more:
+            raise ValueError(f'{argument!r} in argv maps to several names or values: there is to be one :=')
+        if left and right:
+            mappings[left] = right
+    return for_all, for_one
+
+
+def takes_name(master_url, arguments, node):
+    """Whether the ``__name`` in the arguments is for the node: it is for the first that asks, now and later.
+
+    :param node: the full name that the node has without it
+    """
+    arguments = tuple(arguments)
+    with _lock:
+        for url, others, taker in _takers:
+            if others == arguments and is_same_master(url, master_url):
+                return taker == node
+        _takers.append((master_url, arguments, node))
+        return True
