@@ -48,6 +48,13 @@ class Mailbox:
         return self._messages.empty()
 
 
+def speak_tcpros_only(node):
+    """Have the node connect by sockets alone, as those of other processes do; returns it."""
+    handlers = node._rospy._lifetime.xmlrpc.handler.protocol_handlers
+    handlers[:] = [handler for handler in handlers if handler.get_supported()[0][0] == 'TCPROS']
+    return node
+
+
 class InProcessMaster:
     """rosmaster's own master, in this process."""
 

@@ -19,7 +19,7 @@ import rosnode
 import std_msgs.msg
 from rosgraph.network import encode_ros_handshake_header
 
-from conftest import TIMEOUT, Mailbox
+from conftest import TIMEOUT, Mailbox, speak_tcpros_only
 from fuzz import Fuzz
 from pharos import BlockNode
 from pharos.private_rospy import door, registration, servers, xmlrpc_server
@@ -121,7 +121,7 @@ def test_hundreds_of_silent_clients_keep_nobody_out(master, mailbox, node, warni
     with Program(master.url, sys.executable, '-c', HANG, str(node.tcp_port), str(node.xmlrpc_port)) as crowd:
         crowd.wait_for('there')
         receiver = create(master, '/receiver')
-        receiver.ros.Subscriber('/clients/out', STRING, lambda message: mailbox(message, None))    # through TCPROS
+        speak_tcpros_only(receiver).ros.Subscriber('/clients/out', STRING, lambda message: mailbox(message, None))    # through TCPROS
         assert mailbox.get().data == 'hello'
         assert answers(node) and rosnode.rosnode_ping('/node', max_count=1)
         assert master.lookup_service('/clients/set').call(data=True, timeout=TIMEOUT).success
@@ -378,7 +378,8 @@ def test_a_publisher_that_announces_4_gib_is_left_and_found_again(master, mailbo
     """With rospy, what was received stays in the buffer, and no later message of that connection is understood."""
     other = create(master, '/other')
     sent = other.output_channel('/clients/in', STRING)
-    node.ros.Subscriber('/clients/in', STRING, lambda message: mailbox(message, None))    # through TCPROS
+    speak_tcpros_only(node)
+    node.ros.Subscriber('/clients/in', STRING, lambda message: mailbox(message, None))
     for said, logged in (struct.pack('<I', 0xffffffff), '4294967295'), (struct.pack('<I', 0), 'cannot deserialize'):
         assert sent.wait_for_subscribers(1, TIMEOUT)
         connection, = other._rospy.publisher('/clients/in').connections

@@ -10,7 +10,7 @@ import genpy
 import pytest
 
 import pharos
-from conftest import TIMEOUT, InProcessMaster, Mailbox
+from conftest import TIMEOUT, InProcessMaster, Mailbox, speak_tcpros_only
 from pharos import BlockNode, Master, dispatcher
 from pharos.life import Lifecycle
 
@@ -30,9 +30,9 @@ def pair(master, topic, type_, **kwargs):
 
 
 def by_tcpros(master, name, topic, type_):
-    """What a plain rospy subscriber, which knows TCPROS only, gets."""
+    """What a subscriber gets that knows TCPROS only."""
     mailbox = Mailbox()
-    node = create(master, name)
+    node = speak_tcpros_only(create(master, name))
     node.ros.Subscriber(topic, pharos.message_class(type_), lambda message: mailbox(message, None))
     return mailbox
 
@@ -215,9 +215,9 @@ def test_a_full_queue_drops_the_oldest_and_counts(master, transport):
         release.wait(TIMEOUT)
         mailbox(message, channel)
     node = create(master, '/receiver', delegate=slow)
-    received = node.interested_in('/t', 'std_msgs/Int32', queue_size=3)
     if transport == 'TCPROS':
-        node.ros.Subscriber('/t', received.message_class, lambda message: None)
+        speak_tcpros_only(node)
+    received = node.interested_in('/t', 'std_msgs/Int32', queue_size=3)
     sent = create(master, '/sender').output_channel('/t', 'std_msgs/Int32')
     assert connected(sent, 1) == [('/receiver', transport)]
     sent.send(data=0)
@@ -473,9 +473,7 @@ def test_a_plain_rospy_subscriber_beside_a_channel_gets_everything_too(master, m
     sent = create(master, '/sender').output_channel('/t', STRING)
     assert connected(sent, 1) == [('/both', 'INTRAPROCESS')]
     node.ros.Subscriber('/t', channel.message_class, lambda message: plain(message, None))
-    pause = threading.Event()
-    while channel.connections != [('/sender', 'TCPROS')] or sent.connections != [('/both', 'TCPROS')]:
-        pause.wait(0.01)
+    assert connected(sent, 1) == [('/both', 'INTRAPROCESS')]
     sent.send(data='to both')
     assert mailbox.get().data == plain.get().data == 'to both'
 

@@ -4,7 +4,7 @@ import rospy
 import std_msgs.msg
 
 import pharos
-from conftest import TIMEOUT, InProcessMaster, Mailbox
+from conftest import TIMEOUT, InProcessMaster, Mailbox, speak_tcpros_only
 from pharos import BlockNode, Master
 from programs import Program, until
 
@@ -19,7 +19,7 @@ def come(request, master):
         mailbox = Mailbox()
         node = master.create(BlockNode, named=name, domain='127.0.0.1')
         if request.param == 'TCPROS':
-            node.ros.Subscriber(topic, std_msgs.msg.String, lambda message: mailbox(message, None))
+            speak_tcpros_only(node).ros.Subscriber(topic, std_msgs.msg.String, lambda message: mailbox(message, None))
         else:
             node.interested_in(topic, STRING, delegate=mailbox)
         return mailbox, node

@@ -16,7 +16,7 @@ import threading
 import pytest
 from rosgraph.network import encode_ros_handshake_header
 
-from conftest import TIMEOUT, Mailbox
+from conftest import TIMEOUT, Mailbox, speak_tcpros_only
 from pharos import BlockNode
 from programs import ROOT, Program
 
@@ -437,10 +437,9 @@ def test_a_delegate_is_not_run_beside_another(master, transport):
         if message.data == 'wait':
             go_on.wait(TIMEOUT)
     topics = '/pains/left', '/pains/right'
-    left, right = (node.interested_in(topic, STRING, delegate, queue_size=1) for topic in topics)
     if transport == 'TCPROS':
-        for channel in left, right:
-            node.ros.Subscriber(channel.topic, channel.message_class, lambda message: None)
+        speak_tcpros_only(node)
+    left, right = (node.interested_in(topic, STRING, delegate, queue_size=1) for topic in topics)
     to_left, to_right = (sender.output_channel(topic, STRING) for topic in topics)
     for channel in to_left, to_right:
         until(lambda: channel.connections == [('/careful', transport)])

@@ -4,7 +4,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import pharos
-from conftest import TIMEOUT, Mailbox
+from conftest import TIMEOUT, Mailbox, speak_tcpros_only
 from pharos import BlockNode
 from test_copier import CLASSES, messages, told
 
@@ -22,13 +22,15 @@ def send(channel, message, mailbox):
 
 @pytest.mark.parametrize('message_class', CLASSES, ids=lambda cls: cls._type)
 def test_a_message_arrives_alike(master, message_class):
-    nodes = [master.create(BlockNode, named=name, domain='127.0.0.1') for name in ('/receiver', '/sender')]
+    receiver, remote, sender = (master.create(BlockNode, named=name, domain='127.0.0.1')
+                                for name in ('/receiver', '/remote', '/sender'))
     in_process, through_tcpros = Mailbox(), Mailbox()
-    nodes[0].interested_in('/in_process', message_class, delegate=in_process)
-    nodes[0].ros.Subscriber('/through_tcpros', message_class, lambda message: through_tcpros(message, None))
-    channels = [nodes[1].output_channel(topic, message_class) for topic in ('/in_process', '/through_tcpros')]
-    for channel, transport in zip(channels, ('INTRAPROCESS', 'TCPROS')):
-        assert channel.wait_for_subscribers(1, TIMEOUT) and channel.connections == [('/receiver', transport)]
+    receiver.interested_in('/in_process', message_class, delegate=in_process)
+    speak_tcpros_only(remote).interested_in('/through_tcpros', message_class, delegate=through_tcpros)
+    channels = [sender.output_channel(topic, message_class) for topic in ('/in_process', '/through_tcpros')]
+    for channel, link in zip(channels, [('/receiver', 'INTRAPROCESS'), ('/remote', 'TCPROS')]):
+        assert channel.wait_for_subscribers(1, TIMEOUT)
+        assert channel.connections == [link]
 
     @settings(max_examples=10, deadline=None, suppress_health_check=list(HealthCheck), database=None)
     @given(st.booleans().flatmap(lambda wrong: messages(message_class, wrong)))

@@ -2,12 +2,11 @@
 import io
 import threading
 
-import geometry_msgs.msg
 import pytest
 import rosgraph
 import rospy
 
-from conftest import Mailbox
+from conftest import Mailbox, speak_tcpros_only
 from pharos import BlockNode
 from programs import until
 
@@ -30,9 +29,8 @@ def listen(master, name, topic, transport):
     mailbox = Mailbox()
     node = master.create(BlockNode, named=name, domain='127.0.0.1')
     if transport == 'TCPROS':
-        node.ros.Subscriber(topic, geometry_msgs.msg.PointStamped, lambda message: mailbox(message, None))
-    else:
-        node.interested_in(topic, POINT, delegate=mailbox)
+        speak_tcpros_only(node)
+    node.interested_in(topic, POINT, delegate=mailbox)
     return mailbox, node
 
 

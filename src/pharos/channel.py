@@ -9,7 +9,7 @@ from pharos import message_types
 from pharos.blocks import check_delegate, check_runs
 from pharos.dispatcher import Inbox, SocketInbox
 from pharos.errors import MessageTypeError, NodeStoppedError, PharosError
-from pharos.private_rospy.copier import copier_for
+from pharos.private_rospy import copier
 from pharos.private_rospy.fanout import Latch
 
 ANSWER_TIMEOUT = 0.5      # seconds in which the master has told a live subscriber; then it is asked whether it lives
@@ -93,7 +93,7 @@ class InputChannel(_Channel):
         self.shared = shared
         self.from_ = None if from_ is None else str(node._name_of(from_))
         self.received = 0
-        self._size = copier_for(message_class).size
+        self._size = copier.copier_for(message_class).size
         self._inboxes, self._dropped_before = [], 0
         self._open()
 
@@ -159,8 +159,18 @@ class InputChannel(_Channel):
     def _offer(self, message):
         """Take a message from rospy, which runs the dispatcher after a batch of them."""
         if self.from_ is None or message._connection_header.get('callerid') == self.from_:
+            if message.__class__ is not self.message_class:
+                message = self._of_own_class(message)
             with self._lock:    # TCPROS connections offer side by side
                 self._tcpros.put(message, self._size(message) if self._size else 0)
+
+    _offer.is_of_channel = True    # unlike other callbacks of rospy's
+
+    def _of_own_class(self, message):
+        """The message, where the first subscriber of the node, which rospy goes by, wants another class: AnyMsg, say."""
+        own = self.message_class().deserialize(copier.serialized(message))
+        own._connection_header = message._connection_header
+        return own
 
 
 class OutputChannel(_Channel):

@@ -57,6 +57,10 @@ class Inbox:
     def is_empty(self):
         return not self._queue
 
+    def close(self):
+        """Nothing more arrives."""
+        self.closed = True
+
     def put(self, value, size=0):
         """Add a message; the dispatcher is to be told afterwards.
 
@@ -214,9 +218,13 @@ class Dispatcher:
         if self.idle:
             self.wake()
 
+    def is_run_here(self):
+        """Whether it is this thread that runs delegates just now."""
+        return self._runner == _thread.get_ident()
+
     def wait_for_delegate(self, timeout):
         """Wait until the delegate that another thread runs just now has ended, for up to ``timeout`` seconds."""
-        if self._runner == _thread.get_ident():
+        if self.is_run_here():
             return
         if self._running.acquire(True, timeout):
             self._running.release()

@@ -20,7 +20,7 @@ class Fanout:
     # a message that comes alone meets cold caches: all that it needs lies together
     __slots__ = ('_lock', '_closed', '_seq', '_has_header', '_freeze', '_inboxes', '_remote', '_dispatchers',
                  '_inline', '_last', '_size', '_mark', '_publisher', '_module', '_thaw', '_buffer', '_latches',
-                 '_early', '_links')
+                 '_early')
 
     def __init__(self, publisher, module):
         self._publisher, self._module = publisher, module
@@ -35,13 +35,12 @@ class Fanout:
 
     def set_connections(self, connections):
         """Sort the connections out, whenever they change: by how a message goes to them."""
-        self._links = [connection.link for connection in connections if connection.transport_type == 'INTRAPROCESS']
-        inboxes = [inbox for link in self._links for inbox in link.all_inboxes()]
-        self._remote = [connection for connection in connections if connection.transport_type != 'INTRAPROCESS']
+        inboxes, self._remote = _split(connections)
         self._inboxes, self._dispatchers = inboxes, _dispatchers(inboxes)
         self._inline = list({inbox.dispatcher for inbox in inboxes if inbox.inline})
-        # of the messages that receivers share
-        self._mark = sharing.Mark(self._links[0].header) if any(inbox.shared for inbox in inboxes) else None
+        self._mark = None    # of the messages that receivers share
+        if any(inbox.shared for inbox in inboxes):
+            self._mark = sharing.Mark(links_of(connections)[0].header)
 
     def publish(self, message, by=None, to=None, connection=None):
         """Send a message to all; returns whether there is anybody.
@@ -113,12 +112,9 @@ class Fanout:
 
     def _only(self, name, connection):
         """The inboxes and the TCPROS connections of a node, or of a connection."""
-        if connection is None:
-            links = [link for link in self._links if link.sending.endpoint_id == name]
-            return ([inbox for link in links for inbox in link.all_inboxes()],
-                    [connection for connection in self._remote if connection.endpoint_id == name])
-        link = getattr(connection, 'link', None)
-        return (link.all_inboxes(), ()) if link else ((), [connection])
+        if connection is not None:
+            return _split([connection])
+        return _split([other for other in self._publisher.connections if other.endpoint_id == name])
 
     def _serialized(self, message, seq):
         buffer = self._buffer
@@ -219,6 +215,17 @@ class Latch:
     def of(self, receiver):
         """The last message for the node of that name, frozen; none or one."""
         return self._to_one.get(receiver, self._to_all)
+
+
+def links_of(connections):
+    """The links among the connections of a publisher or a subscription, as rospy has them."""
+    return [connection.link for connection in connections if connection.transport_type == 'INTRAPROCESS']
+
+
+def _split(connections):
+    """The inboxes behind those that are INTRAPROCESS, and the others."""
+    inboxes = [inbox for link in links_of(connections) for inbox in link.all_inboxes()]
+    return inboxes, [connection for connection in connections if connection.transport_type != 'INTRAPROCESS']
 
 
 def _dispatchers(inboxes):

@@ -4,11 +4,13 @@ A subscriber offers its protocols to the publisher, which picks the first that i
 process and offered before TCPROS: another process does not know the name and falls back to TCPROS. Discovery stays the
 master's, and getBusInfo shows the connections.
 """
+import contextlib
 import uuid
 
 import rospy.impl.transport
 
 from pharos.private_rospy import copier
+from pharos.private_rospy.callbacks import CallbackInbox, is_of_channel
 from pharos.private_rospy.statistics import Statistics
 
 PROTOCOL = 'INTRAPROCESS-%s' % uuid.uuid4().hex
@@ -23,45 +25,71 @@ class Link:
         self.header = other.connection_header(publisher)
         self.publisher_name = other.name
         self.thaw = copier.thawer(publisher.data_class, subscriber.data_class)
-        self.inboxes = {}    # channel of the subscription -> its Inbox for this link
-        self.statistics = None    # where somebody wants them
+        self.inboxes = {}    # receiver -> its inbox: channels, CallbackInbox for plain callbacks, and Statistics
         self.sending = _End(self, rospy.impl.transport.OUTBOUND, publisher.resolved_name, instance.name)
         self.receiving = _End(self, rospy.impl.transport.INBOUND, subscriber.resolved_name, other.uri)
         self.receiving.callerid_pub = other.name
 
     def open(self):
         """Add the ends to the subscription and the publisher; returns whether both are open still."""
-        self.match_channels()
-        if self._subscriber.statistics_logger is not None:
-            self.statistics = Statistics(self._subscriber, self.publisher_name, self.thaw, self._instance.start_thread)
+        self.match_receivers()
         return self._subscriber.add_connection(self.receiving) and self._publisher.add_connection(self.sending)
 
-    def match_channels(self):
-        """Have an inbox for each channel of the subscription; returns the new ones."""
-        channels = [channel for channel in self._instance.wiring.channels_on(self._subscriber.resolved_name)
+    def match_receivers(self):
+        """Have an inbox for each receiver that the subscription has; returns the new ones."""
+        subscriber, before, start_thread = self._subscriber, self.inboxes, self._instance.start_thread
+        channels = [channel for channel in self._instance.wiring.channels_on(subscriber.resolved_name)
                     if channel.from_ in (None, self.publisher_name)]
-        new = {channel: channel._new_inbox(self.thaw, self.header) for channel in channels
-               if channel not in self.inboxes}
-        self.inboxes = {**{channel: inbox for channel, inbox in self.inboxes.items() if channel in channels}, **new}
-        return list(new.values())
+        inboxes = {channel: before.get(channel) or self._channel_inbox(channel) for channel in channels}
+        if subscriber.has_plain_callbacks():
+            inboxes[CallbackInbox] = (self._open_callback_inbox()
+                                      or CallbackInbox(self, self._publisher, subscriber, start_thread))
+        if subscriber.statistics_logger is not None:
+            inboxes[Statistics] = (before.get(Statistics)
+                                   or Statistics(subscriber, self.publisher_name, self.thaw, start_thread))
+        self.inboxes = inboxes
+        return [inbox for receiver, inbox in inboxes.items() if before.get(receiver) is not inbox]
 
     def all_inboxes(self):
         """Where the publisher is to put its messages."""
-        return [*self.inboxes.values(), *([self.statistics] if self.statistics else ())]
+        return list(self.inboxes.values())
 
-    def channels_changed(self):
-        """The subscription has other channels now."""
-        self._publisher.channels_changed(self)
+    def _channel_inbox(self, channel):
+        thaw = copier.thawer(self._publisher.data_class, channel.message_class)
+        return channel._new_inbox(thaw, self.header)
+
+    def _open_callback_inbox(self):
+        inbox = self.inboxes.get(CallbackInbox)
+        return None if inbox is None or inbox.closed else inbox
+
+    def callback_added(self, callback):
+        """The subscription has a callback more; returns the latched messages that it has missed."""
+        inbox = self._open_callback_inbox()
+        if inbox is None or is_of_channel(callback):
+            self._channels_changed()
+        elif inbox.latched is not None:
+            return [inbox.latched]
+        return []
+
+    def callback_removed(self):
+        """The subscription has a callback less."""
+        inbox = self._open_callback_inbox()
+        if inbox is not None and not self._subscriber.has_plain_callbacks():
+            inbox.close()
+        self._channels_changed()
+
+    def _channels_changed(self):
+        inbox = self._open_callback_inbox()
+        with inbox.unbounded() if inbox else contextlib.nullcontext():
+            self._publisher.channels_changed(self)
 
     def close(self, end):
         """One end was closed: the other goes too.
 
         In a thread of its own, for rospy closes ends under the lock of their topic, and the other's topic has its own.
         """
-        for inbox in self.inboxes.values():
-            inbox.closed = True
-        if self.statistics is not None:
-            self.statistics.end()
+        for inbox in self.all_inboxes():
+            inbox.close()
         other, instance = ((self.receiving, self._instance) if end is self.sending else (self.sending, self._other))
         if not other.done:
             instance.start_thread(other.close, name='closing')
@@ -71,7 +99,7 @@ class _End(rospy.impl.transport.Transport):
     """One end of a link, as rospy's topics keep it among their connections."""
 
     transport_type = 'INTRAPROCESS'
-    latch = None    # late channels get latched messages from the publisher itself
+    latch = None    # those who come late get latched messages from the link
 
     def __init__(self, link, direction, topic, peer):
         super().__init__(direction, topic)
@@ -95,7 +123,7 @@ def protocol_handler(instance):
             return protocol == PROTOCOL
 
         def get_supported(self):
-            return [[PROTOCOL]] if instance.wiring.connects_in_process() else []
+            return [[PROTOCOL]]
 
         def init_publisher(self, topic, protocol):
             return 1, 'ready', [PROTOCOL]

@@ -75,7 +75,7 @@ def mend_publisher(module, start_thread):
         if lock is None:
             return
         with lock:
-            new = link.match_channels()
+            new = link.match_receivers()
             _refresh(self)
             self.fanout.send_latched(new, link.sending.endpoint_id)
         self.fanout.run()

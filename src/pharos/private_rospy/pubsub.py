@@ -2,6 +2,8 @@
 import time
 
 from pharos.private_rospy import registration
+from pharos.private_rospy.callbacks import is_of_channel
+from pharos.private_rospy.fanout import links_of
 from pharos.private_rospy.intraprocess import protocol_handler
 from pharos.private_rospy.lifetime import keep_alive
 from pharos.private_rospy.publishing import mend_publisher
@@ -99,7 +101,8 @@ def _close_pollers(topic):
 
 def _mend_subscriber(subscriber, instance):
     """rospy.topics._SubscriberImpl."""
-    receive, remove, add = subscriber.receive_callback, subscriber.remove_connection, subscriber.add_callback
+    receive, remove = subscriber.receive_callback, subscriber.remove_connection
+    add, discard = subscriber.add_callback, subscriber.remove_callback
     subscriber.publishers = ()    # URIs, as the master last said
 
     def receive_callback(self, messages, connection):
@@ -125,13 +128,29 @@ def _mend_subscriber(subscriber, instance):
     subscriber.remove_connection = remove_connection
 
     def add_callback(self, callback, arguments):
-        """A plain rospy callback beside channels: links know channels only, so all come through TCPROS from now on."""
+        """Links have inboxes for channels and one for all other callbacks, and know what was latched."""
         add(self, callback, arguments)
-        if not instance.wiring.only_channels(self):
-            for connection in self.connections:
-                if connection.transport_type == 'INTRAPROCESS':
-                    connection.close()
+        for link in links_of(self.connections or ()):
+            for message in link.callback_added(callback):
+                self._invoke_callback(message, callback, arguments)
     subscriber.add_callback = add_callback
+
+    def remove_callback(self, callback, arguments):
+        discard(self, callback, arguments)
+        for link in links_of(self.connections or ()):
+            link.callback_removed()
+    subscriber.remove_callback = remove_callback
+
+    def has_plain_callbacks(self):
+        return not all(is_of_channel(callback) for callback, _ in self.callbacks or ())
+    subscriber.has_plain_callbacks = has_plain_callbacks
+
+    def run_callbacks(self, message):
+        """Run the callbacks that are no channels' for a message of a link."""
+        for callback, arguments in self.callbacks or ():
+            if not is_of_channel(callback):
+                self._invoke_callback(message, callback, arguments)
+    subscriber.run_callbacks = run_callbacks
 
 
 def _reconnect(instance, subscriber, uri, delay):

@@ -31,7 +31,7 @@ class Statistics:
         if self._waiting.qsize() < WAITING:
             self._waiting.put((frozen,))
 
-    def end(self):
+    def close(self):
         """The link has been closed."""
         self._waiting.put(None)
 

@@ -44,7 +44,6 @@ class Wiring:
         with self._lock:
             self._channels[topic] = (*self.channels_on(topic), channel)
         endpoint = self._instance.rospy.Subscriber(Resolved(topic), channel.message_class, channel._offer, **options)
-        self._channels_changed(topic)
         publishers = [other for other in self._neighbours() if other.publisher(topic)]
         for other in publishers:
             self._instance.connect(topic, other.uri)
@@ -57,7 +56,6 @@ class Wiring:
         topic = channel.topic
         with self._lock:
             self._channels[topic] = tuple(c for c in self.channels_on(topic) if c is not channel)
-        self._channels_changed(topic)
         endpoint.unregister()
 
     def advertise(self, channel, **options):
@@ -115,17 +113,6 @@ class Wiring:
         """The channels of the node that receive from the topic."""
         return self._channels.get(topic, ())
 
-    def connects_in_process(self):
-        """Whether the connection that this thread negotiates may be INTRAPROCESS: only channels know that."""
-        topic = self.connecting.topic
-        subscriber = self._instance.subscriber(topic)
-        return bool(self.channels_on(topic)) and subscriber is not None and self.only_channels(subscriber)
-
-    def only_channels(self, subscriber):
-        """Whether a rospy subscription has no callbacks but our channels'."""
-        channels = self.channels_on(subscriber.resolved_name)
-        return all(getattr(callback, '__self__', None) in channels for callback, _ in subscriber.callbacks or ())
-
     def sends_to(self, name, topic):
         """Whether the node, if it publishes on the topic at all, is connected to the subscriber of that name."""
         publisher = self._instance.publisher(topic)
@@ -140,12 +127,6 @@ class Wiring:
         """The nodes of this process at the same master, this one among them."""
         master = self._instance.settings.master_url
         return [other for other in running_here() if is_same_master(other.settings.master_url, master)]
-
-    def _channels_changed(self, topic):
-        subscriber = self._instance.subscriber(topic)
-        for connection in subscriber.connections if subscriber else ():    # None: the node stops
-            if connection.transport_type == 'INTRAPROCESS':
-                connection.link.channels_changed()
 
 
 # a process that was forked has none of these nodes, whose sockets are its parent's

@@ -1,0 +1,398 @@
+"""Plain rospy subscriptions of this process: through INTRAPROCESS like channels, to their users as over TCPROS."""
+import threading
+
+import pytest
+import rospy
+import std_msgs.msg
+from rospy.numpy_msg import numpy_msg
+
+from conftest import TIMEOUT, Mailbox, speak_tcpros_only
+from pharos import BlockNode
+from pharos.private_rospy import callbacks
+from programs import until
+
+INT, STRING, ARRAY = std_msgs.msg.Int32, std_msgs.msg.String, std_msgs.msg.UInt8MultiArray
+NUMBERS = std_msgs.msg.Float64MultiArray
+
+
+def create(master, name, **kwargs):
+    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
+
+
+def in_thread(block, *args):
+    thread = threading.Thread(target=block, args=args, daemon=True)
+    thread.start()
+    return thread
+
+
+def ended(thread):
+    thread.join(TIMEOUT)
+    return not thread.is_alive()
+
+
+def listen(node, topic, message_class, **kwargs):
+    """A plain Subscriber of the node, and what it gets."""
+    mailbox = Mailbox()
+    return node.ros.Subscriber(topic, message_class, lambda message: mailbox(message, None), **kwargs), mailbox
+
+
+def link_threads(node):
+    return [thread for thread in threading.enumerate() if thread.name == node.name + ' dispatcher']
+
+
+# -- beside channels ---------------------------------------------------------------------------------------------------
+
+def test_nothing_is_lost_when_a_plain_subscriber_comes_and_goes_beside_a_channel(master, mailbox):
+    """The link used to go down, and TCPROS to take its place 50 ms later."""
+    both, sender = create(master, '/both'), create(master, '/sender')
+    channel = both.interested_in('/beside/numbers', INT, delegate=mailbox, queue_size=100000)
+    sent = sender.output_channel('/beside/numbers', INT)
+    over = threading.Event()
+
+    def come_and_go():
+        while not over.is_set():
+            subscriber, _ = listen(both, '/beside/numbers', INT)
+            both.ros.wait_for_message('/beside/numbers', INT, timeout=TIMEOUT)
+            subscriber.unregister()
+    thread = in_thread(come_and_go)
+    count = 0
+    while count < 5000 or not over.is_set():
+        sent.send(data=count)
+        count += 1
+        if count == 5000:
+            over.set()
+    while thread.is_alive():    # it may wait for one more message
+        sent.send(data=count)
+        count += 1
+    assert [message.data for message in mailbox.take(count)] == list(range(count))
+    assert channel.dropped == 0
+    assert sent.connections == [('/both', 'INTRAPROCESS')]
+    assert channel.connections == [('/sender', 'INTRAPROCESS')]
+
+
+def test_nothing_is_lost_when_channels_open_and_close_beside_another(master, mailbox):
+    both, sender = create(master, '/both'), create(master, '/sender')
+    channel = both.interested_in('/beside/others', INT, delegate=mailbox, queue_size=100000)
+    sent = sender.output_channel('/beside/others', INT)
+    over = threading.Event()
+
+    def come_and_go():
+        while not over.is_set():
+            both.interested_in('/beside/others', INT, delegate=lambda message, channel: None).close()
+    threads = [in_thread(come_and_go) for _ in range(3)]
+    for number in range(5000):
+        sent.send(data=number)
+    over.set()
+    assert all(map(ended, threads))
+    assert [message.data for message in mailbox.take(5000)] == list(range(5000))
+    assert channel.dropped == 0
+    assert sent.connections == [('/both', 'INTRAPROCESS')]
+    assert both.channels == [channel]
+
+
+def test_a_channel_gets_its_own_type_beside_a_subscriber_of_any_type(master, mailbox):
+    for name, transport in ('/here', 'INTRAPROCESS'), ('/there', 'TCPROS'):
+        node = create(master, name)
+        if transport == 'TCPROS':
+            speak_tcpros_only(node)
+        _, anything = listen(node, '/beside/any', rospy.AnyMsg)
+        node.interested_in('/beside/any', STRING, delegate=mailbox)
+        sent = create(master, name + '_sender').output_channel('/beside/any', STRING)
+        assert sent.wait_for_subscribers(1, TIMEOUT)
+        assert (name, transport) in sent.connections
+        sent.send(data='text')
+        assert mailbox.get().data == 'text'
+        assert anything.get()._buff == b'\4\0\0\0text'
+        sent.node.stop()
+        node.stop()
+
+
+# -- as over TCPROS ----------------------------------------------------------------------------------------------------
+
+@pytest.fixture(params=['INTRAPROCESS', 'TCPROS'])
+def pair(request, master):
+    """A node that publishes and one that subscribes, connected by the transport named."""
+    nodes = create(master, '/publisher'), create(master, '/subscriber')
+    if request.param == 'TCPROS':
+        speak_tcpros_only(nodes[1])
+    nodes[1].transport = request.param
+    return nodes
+
+
+def connected(publisher, count=1):
+    until(lambda: publisher.get_num_connections() == count)
+    return {connection.transport_type for connection in publisher.impl.connections}
+
+
+def test_a_publisher_and_a_subscriber_of_plain_rospy(pair):
+    publishing, subscribing = pair
+    publisher = publishing.ros.Publisher('/plain/text', STRING, queue_size=100)
+    subscriber, mailbox = listen(subscribing, '/plain/text', STRING)
+    assert connected(publisher) == {subscribing.transport}
+    assert subscriber.get_num_connections() == 1
+    for number in range(100):
+        publisher.publish(str(number))
+    messages = mailbox.take(100)
+    assert [message.data for message in messages] == [str(number) for number in range(100)]
+    header = messages[0]._connection_header
+    assert header['callerid'] == '/publisher' and header['type'] == 'std_msgs/String'
+    assert header['latching'] == '0'
+    subscriber.unregister()
+    connected(publisher, 0)
+
+
+def test_callbacks_of_one_subscription_get_the_same_message_and_it_is_their_nodes_own(pair):
+    publishing, subscribing = pair
+    publisher = publishing.ros.Publisher('/plain/same', STRING, queue_size=1)
+    mailboxes = [listen(subscribing, '/plain/same', STRING)[1] for _ in range(2)]
+    connected(publisher)
+    sent = STRING('text')
+    publisher.publish(sent)
+    first, second = (mailbox.get() for mailbox in mailboxes)
+    assert first is second
+    assert first is not sent
+    assert first.data == 'text'
+
+
+def test_arrays_arrive_as_numpy_arrays_where_asked_for(pair):
+    publishing, subscribing = pair
+    publisher = publishing.ros.Publisher('/plain/array', NUMBERS, queue_size=1)
+    _, arrays = listen(subscribing, '/plain/array', numpy_msg(NUMBERS))
+    connected(publisher)
+    publisher.publish(data=[1, 2])
+    array = arrays.get().data
+    assert (type(array).__name__, list(array)) == ('ndarray', [1, 2])
+
+
+def test_a_latched_message_reaches_each_callback_that_comes_late(pair):
+    publishing, subscribing = pair
+    publisher = publishing.ros.Publisher('/plain/latched', STRING, latch=True, queue_size=1)
+    publisher.publish('latched')
+    for _ in range(3):
+        _, mailbox = listen(subscribing, '/plain/latched', STRING)
+        message = mailbox.get()
+        assert (message.data, message._connection_header['latching']) == ('latched', '1')
+        assert mailbox.empty()
+    # a channel beside them gets it too, once
+    delegate = Mailbox()
+    subscribing.interested_in('/plain/latched', STRING, delegate=delegate)
+    assert delegate.get().data == 'latched'
+    publisher.publish('next')
+    assert delegate.get().data == 'next'
+
+
+def test_callbacks_run_in_a_thread_for_each_connection_so_that_they_may_wait_for_each_other(pair, master):
+    publishing, subscribing = pair
+    other = create(master, '/other_publisher')
+    publishers = [node.ros.Publisher('/plain/meet', STRING, queue_size=1) for node in (publishing, other)]
+    meeting, met = threading.Barrier(2), threading.Semaphore(0)
+
+    def meet(message):
+        meeting.wait(TIMEOUT)
+        met.release()
+    subscribing.ros.Subscriber('/plain/meet', STRING, meet)
+    for publisher in publishers:
+        connected(publisher)
+        publisher.publish('come')
+    assert met.acquire(timeout=TIMEOUT) and met.acquire(timeout=TIMEOUT)
+
+
+def test_a_callback_that_fails_ends_nothing(pair):
+    publishing, subscribing = pair
+    publisher = publishing.ros.Publisher('/plain/failing', INT, queue_size=10)
+    mailbox = Mailbox()
+
+    def fail(message):
+        if message.data == 0:
+            raise ValueError('zero')
+        mailbox(message, None)
+    subscribing.ros.Subscriber('/plain/failing', INT, fail)
+    connected(publisher)
+    for number in range(3):
+        publisher.publish(number)
+    assert [message.data for message in mailbox.take(2)] == [1, 2]
+
+
+def test_a_subscriber_with_a_queue_of_one_gets_the_newest(pair):
+    publishing, subscribing = pair
+    publisher = publishing.ros.Publisher('/plain/newest', INT, queue_size=100)
+    entered, release, mailbox = threading.Event(), threading.Event(), Mailbox()
+
+    def slow(message):
+        entered.set()
+        release.wait(TIMEOUT)
+        mailbox(message, None)
+    subscribing.ros.Subscriber('/plain/newest', INT, slow, queue_size=1, buff_size=1 << 20)
+    connected(publisher)
+    publisher.publish(0)
+    assert entered.wait(TIMEOUT)
+    for number in range(1, 50):
+        publisher.publish(number)
+    release.set()
+    assert mailbox.get().data == 0
+    following = [mailbox.get().data]
+    while following[-1] != 49:
+        following.append(mailbox.get().data)
+    assert following == sorted(following)
+    if subscribing.transport == 'INTRAPROCESS':    # else some may not have come yet when the callback ended
+        assert following == [49]
+
+
+def test_messages_that_come_faster_than_they_are_taken_are_kept_as_sockets_do(pair):
+    """With queue_size=1, too: a hundred small messages fit into the sockets between two processes."""
+    publishing, subscribing = pair
+    publisher = publishing.ros.Publisher('/plain/burst', INT, queue_size=1)
+    entered, release, mailbox = threading.Event(), threading.Event(), Mailbox()
+
+    def slow(message):
+        entered.set()
+        release.wait(TIMEOUT)
+        mailbox(message, None)
+    subscribing.ros.Subscriber('/plain/burst', INT, slow)
+    connected(publisher)
+    for number in range(100):
+        publisher.publish(number)
+    assert entered.wait(TIMEOUT)
+    release.set()
+    assert [message.data for message in mailbox.take(100)] == list(range(100))
+
+
+@pytest.mark.filterwarnings('ignore:The publisher should be created')
+def test_a_publisher_without_a_queue_waits_for_a_slow_callback_and_loses_nothing(pair):
+    publishing, subscribing = pair
+    publisher = publishing.ros.Publisher('/plain/waits', ARRAY)
+    entered, release, sizes = threading.Event(), threading.Event(), Mailbox()
+
+    def slow(message):
+        entered.set()
+        release.wait(TIMEOUT)
+        sizes(len(message.data), None)
+    subscribing.ros.Subscriber('/plain/waits', ARRAY, slow)
+    connected(publisher)
+    published = []
+
+    def publish():
+        for number in range(40):
+            publisher.publish(data=bytes((1 << 20) + number))
+            published.append(number)
+    thread = in_thread(publish)
+    assert entered.wait(TIMEOUT)
+    thread.join(0.5)
+    assert thread.is_alive()    # memory is bounded
+    assert len(published) < 30
+    release.set()
+    assert ended(thread)
+    assert sizes.take(40) == [(1 << 20) + number for number in range(40)]
+
+
+@pytest.mark.filterwarnings('ignore:The publisher should be created')
+@pytest.mark.parametrize('ends', ['unregister', 'stop'])
+def test_a_publisher_that_waits_goes_on_when_the_subscriber_ends(pair, ends):
+    publishing, subscribing = pair
+    publisher = publishing.ros.Publisher('/plain/waits_for_end', ARRAY)
+    entered, release = threading.Event(), threading.Event()
+
+    def stuck(message):
+        entered.set()
+        release.wait(TIMEOUT)
+    subscriber = subscribing.ros.Subscriber('/plain/waits_for_end', ARRAY, stuck)
+    connected(publisher)
+    thread = in_thread(lambda: [publisher.publish(data=bytes(1 << 20)) for _ in range(40)])
+    assert entered.wait(TIMEOUT)
+    ending = in_thread(subscriber.unregister if ends == 'unregister' else subscribing.stop)
+    assert ended(thread)
+    release.set()
+    assert ended(ending)
+
+
+@pytest.mark.filterwarnings('ignore:The publisher should be created')
+def test_a_callback_may_unregister_subscribe_and_publish(pair):
+    publishing, subscribing = pair
+    publisher = publishing.ros.Publisher('/plain/busy', ARRAY)
+    back = subscribing.ros.Publisher('/plain/back', STRING, queue_size=1)
+    _, answers = listen(publishing, '/plain/back', STRING)
+    connected(back)
+    subscribers = []
+
+    def change(message):
+        subscribers.pop().unregister()
+        _, mailbox = listen(subscribing, '/plain/busy', ARRAY)
+        mailboxes.append(mailbox)
+        back.publish('changed')
+    mailboxes = []
+    subscribers.append(subscribing.ros.Subscriber('/plain/busy', ARRAY, change))
+    listen(subscribing, '/plain/busy', ARRAY)    # so that the connection stays
+    connected(publisher)
+    thread = in_thread(lambda: [publisher.publish(data=bytes(1 << 20)) for _ in range(20)])
+    assert answers.get().data == 'changed'
+    assert ended(thread)
+    publisher.publish(data=b'last')
+    while mailboxes[0].get().data != b'last':
+        pass
+
+
+def test_a_listener_greets_each_subscriber(pair):
+    publishing, subscribing = pair
+
+    class Greeter(rospy.SubscribeListener):
+        def peer_subscribe(self, topic_name, topic_publish, peer_publish):
+            peer_publish(STRING('welcome'))
+    publishing.ros.Publisher('/plain/greeted', STRING, subscriber_listener=Greeter(), queue_size=1)
+    assert subscribing.ros.wait_for_message('/plain/greeted', STRING, TIMEOUT).data == 'welcome'
+
+
+# -- what is left ------------------------------------------------------------------------------------------------------
+
+def test_a_link_has_a_thread_for_callbacks_only_while_there_are_some(master, mailbox):
+    node = create(master, '/subscriber')
+    publisher = create(master, '/publisher').ros.Publisher('/plain/threads', STRING, queue_size=1)
+    channel = node.interested_in('/plain/threads', STRING, delegate=mailbox)
+    connected(publisher)
+    assert len(link_threads(node)) == 1    # the channels'
+    subscribers = [listen(node, '/plain/threads', STRING)[0] for _ in range(3)]
+    assert len(link_threads(node)) == 2
+    for subscriber in subscribers:
+        subscriber.unregister()
+    until(lambda: len(link_threads(node)) == 1)
+    publisher.publish('text')
+    assert mailbox.get().data == 'text'
+    assert channel.dropped == 0
+
+
+def test_what_was_published_before_the_publisher_left_still_arrives(pair):
+    publishing, subscribing = pair
+    publisher = publishing.ros.Publisher('/plain/leaving', INT, queue_size=1000)
+    entered, release, mailbox = threading.Event(), threading.Event(), Mailbox()
+
+    def slow(message):
+        entered.set()
+        release.wait(TIMEOUT)
+        mailbox(message, None)
+    subscribing.ros.Subscriber('/plain/leaving', INT, slow)
+    connected(publisher)
+    for number in range(100):
+        publisher.publish(number)
+    assert entered.wait(TIMEOUT)
+    publisher.unregister()
+    release.set()
+    assert [message.data for message in mailbox.take(100)] == list(range(100))
+    until(lambda: not link_threads(subscribing))
+
+
+def test_large_messages_are_dropped_from_a_full_queue_the_oldest_first(master):
+    publishing, subscribing = create(master, '/publisher'), create(master, '/subscriber')
+    publisher = publishing.ros.Publisher('/plain/full', ARRAY, queue_size=2)
+    entered, release, sizes = threading.Event(), threading.Event(), Mailbox()
+
+    def slow(message):
+        entered.set()
+        release.wait(TIMEOUT)
+        sizes(len(message.data), None)
+    subscribing.ros.Subscriber('/plain/full', ARRAY, slow)
+    connected(publisher)
+    publisher.publish(data=b'')
+    assert entered.wait(TIMEOUT)
+    for number in range(10):
+        publisher.publish(data=bytes(callbacks.UNDER_WAY + number))
+    release.set()
+    assert sizes.take(3) == [0, callbacks.UNDER_WAY + 8, callbacks.UNDER_WAY + 9]
