@@ -41,6 +41,8 @@ class PrivateRospy:
         self._on_stop_request, self.allows_remote_shutdown = on_stop_request, allows_remote_shutdown
         self._lifetime = Lifetime(self.name)
         self._stopping = threading.Lock()
+        # whether a newer node has it: what registers this one again would end that one
+        self.has_lost_name = False
         self.on_received = lambda: None    # called after the callbacks of a batch of messages, in its thread
         self.uri = None
         self.wiring = Wiring(self)

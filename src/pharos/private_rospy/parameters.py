@@ -19,6 +19,7 @@ class WatchedParameters:
         self._initialized = {}    # global name -> its first value
         self._subscribed = set()  # of those listened to, the outermost: of what is in them, the master tells for each
         self._cached = set()      # global names of which rospy itself has the master tell
+        self._closed = False
         self._lock = threading.Lock()           # guards _listeners
         self._subscribing = threading.Lock()    # guards _subscribed
 
@@ -44,7 +45,21 @@ class WatchedParameters:
                 set_(self_, key, value)
             module.ParamServerCache.set = set
             self._cache = module.get_param_server_cache
-        return {'rospy.impl.masterslave': tell_listeners, 'rospy.impl.paramserver': note_subscriptions}
+
+        def subscribe_while_running(module):
+            """rospy.msproxy: a line of the log subscribes to a parameter, which registers the node anew."""
+            get_cached = module.MasterProxy.get_param_cached
+
+            def get_param_cached(self_, key):
+                if self._may_subscribe():
+                    return get_cached(self_, key)
+                return self_[key]
+            module.MasterProxy.get_param_cached = get_param_cached
+        return {'rospy.impl.masterslave': tell_listeners, 'rospy.impl.paramserver': note_subscriptions,
+                'rospy.msproxy': subscribe_while_running}
+
+    def _may_subscribe(self):
+        return not (self._closed or self._instance.has_lost_name)
 
     def initialize(self, name, value):
         """Set the parameter where it has no value, also after a restart of the master."""
@@ -70,6 +85,8 @@ class WatchedParameters:
     def _subscribe(self, name):
         master, uri = self._master(), self._instance.uri
         with self._subscribing:
+            if not self._may_subscribe():
+                return
             if any(_holds(other, name) for other in self._subscribed):
                 return
             master.subscribeParam(uri, name)
@@ -125,6 +142,7 @@ class WatchedParameters:
 
     def close(self):
         """Watch no longer: a master keeps the name of a node that does."""
+        self._closed = True
         subscribed = self._subscribed | self._cached
         if not subscribed:
             return

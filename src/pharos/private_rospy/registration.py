@@ -83,6 +83,7 @@ def hooks(instance):
             if 'new node registered with same name' in str(msg):    # the master knows, whoever says so
                 if not _name_is_anothers(self):    # it meant an earlier owner of this URI (ros_comm #2241)
                     return 1, 'the name %s is still this node\'s' % self.name, 0
+                instance.has_lost_name = True
             elif not (instance.allows_remote_shutdown() or is_call_from_nearby(self.masterUri)):
                 return -1, REFUSED + 'only this host and the master\'s may stop it, unless its ' \
                     'allow_remote_shutdown is set', 0
@@ -95,6 +96,8 @@ def hooks(instance):
         manager = module.RegManager
 
         def reg_added(self, name, type_or_uri, kind):
+            if instance.has_lost_name:
+                return
             master, me = module.xmlrpcapi(self.master_uri), module.get_caller_id()
             call = {'pub': master.registerPublisher, 'sub': master.registerSubscriber,
                     'srv': master.registerService}[kind]
@@ -125,6 +128,8 @@ def hooks(instance):
                 return
             module.get_registration_listeners().clear()
             topics, services, me = module.get_topic_manager(), module.get_service_manager(), module.get_caller_id()
+            if topics.lock.acquire(timeout=UNREGISTER_TIMEOUT):
+                topics.lock.release()    # what another thread was just registering is registered
             calls = xmlrpc.client.MultiCall(ServerProxy(self.master_uri, UNREGISTER_TIMEOUT))
             for name, _ in topics.get_subscriptions():
                 calls.unregisterSubscriber(me, name, self.uri)
@@ -150,8 +155,8 @@ class _NotWanted(Exception):
 def _name_is_anothers(handler):
     """Whether the master gives the node's name to another node than this one."""
     try:
-        return master_api(handler.masterUri, handler.name, PING_TIMEOUT).lookupNode(handler.name) != handler.uri
-    except Exception:    # MasterError: the name is unknown; or no master, which then did not call either
+        return _belongs_to_another(master_api(handler.masterUri, handler.name, PING_TIMEOUT), handler.name, handler.uri)
+    except Exception:    # there is no master, which then did not call either
         return False
 
 
@@ -168,7 +173,7 @@ def claim_name(master_url, name, timeout):
     try:
         ServerProxy(uri, PING_TIMEOUT).getPid(name)
     except ConnectionRefusedError:
-        _unregister_all(master, name, uri)    # nobody is left at that URI
+        unregister_all(master, name, uri)    # nobody is left at that URI
     except OSError as error:
         raise NodeNameInUseError('the node name %s is taken by a node at %s that does not answer (%s): choose another '
                                  'name, or run rosnode cleanup if that node is gone' % (name, uri, error)) from error
@@ -177,7 +182,7 @@ def claim_name(master_url, name, timeout):
                                  'that node (rosnode kill %s)' % (name, uri, name))
 
 
-def _unregister_all(master, name, uri):
+def unregister_all(master, name, uri):
     """Remove the registrations of a node that is gone; rosnode's own function asks the environment's master."""
     publishers, subscribers, services = master.getSystemState()
     for names, unregister in (publishers, master.unregisterPublisher), (subscribers, master.unregisterSubscriber):
@@ -187,6 +192,14 @@ def _unregister_all(master, name, uri):
     for service, nodes in services:
         if name in nodes:
             master.unregisterService(service, master.lookupService(service))
+
+
+def _belongs_to_another(master, name, uri):
+    """Whether another node than the one at that URI has the name."""
+    try:
+        return master.lookupNode(name) != uri
+    except rosgraph.MasterError:    # unknown to the master
+        return False
 
 
 def repair(instance, handler, topics, services, state, was_away):
@@ -201,6 +214,14 @@ def repair(instance, handler, topics, services, state, was_away):
              (topics.get_subscriptions, state[1], master.registerSubscriber, master.unregisterSubscriber)]
     # every node offers this from its start on; a channel may have been opened with a restarted master already
     forgotten = name not in state[2].get(instance.rospy.resolve_name('~get_loggers'), ())
+    offered = [(topics.get_publications(), state[0]), (topics.get_subscriptions(), state[1]),
+               (services.get_services(), state[2])]
+    is_whole = all(name in theirs.get(each, ()) for ours, theirs in offered for each, _ in ours)
+    if not is_whole and _belongs_to_another(master, name, uri):
+        # To register again would take the name back, and end the newer node.
+        instance.has_lost_name = True
+        instance.request_stop('another node has taken its name')
+        return False
     for ours, theirs, register, unregister in kinds:
         for topic, type_ in ours():
             if name not in theirs.get(topic, ()) or was_away and ours == topics.get_subscriptions:
