@@ -5,6 +5,7 @@ process and offered before TCPROS: another process does not know the name and fa
 master's, and getBusInfo shows the connections.
 """
 import contextlib
+import os
 import uuid
 
 import rospy.impl.transport
@@ -13,7 +14,16 @@ from pharos.private_rospy import copier
 from pharos.private_rospy.callbacks import CallbackInbox, is_of_channel
 from pharos.private_rospy.statistics import Statistics
 
-PROTOCOL = 'INTRAPROCESS-%s' % uuid.uuid4().hex
+PROTOCOL = None    # its name, of this process alone
+
+
+def _name_protocol():
+    global PROTOCOL
+    PROTOCOL = f'INTRAPROCESS-{uuid.uuid4().hex}'
+
+
+_name_protocol()
+os.register_at_fork(after_in_child=_name_protocol)
 
 
 class Link:

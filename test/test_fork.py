@@ -1,0 +1,104 @@
+"""A process forked off one with nodes has none of them, however it ends: they, and what they hold, are its parent's."""
+import sys
+
+import pytest
+
+from pharos import BlockNode
+from programs import Program
+
+CODE = '''
+import multiprocessing, os, signal, sys, threading
+import pharos
+from pharos import BlockNode, Master
+
+heard, embedded = threading.Event(), Master.embedded()
+
+def tell(message, channel):
+    print('heard', message.data, flush=True)
+    heard.set()
+
+me = Master().create(BlockNode, named='/program', domain='127.0.0.1', delegate=tell)
+other = embedded.create(BlockNode, named='/other')
+channel = me.interested_in('/forks', 'std_msgs/String')
+back = me.output_channel('/forks_back', 'std_msgs/String')
+me.output_channel('/forks_said', 'std_msgs/String', latch=True).send(data='said by the parent')
+started = embedded.run('topic_tools', 'relay', '/a', '/b', name='relay')
+embedded.wait_for_node('/relay', 60)
+parameter = me.parameter('~rate', 1)
+service = me.serve('~serve', 'std_srvs/Empty', lambda request: None)
+
+def child():
+    {child}
+
+heard.wait()
+{fork}
+print('still', me.lifecycle.value, other.health().registered, started.poll(), embedded.is_reachable(), flush=True)
+back.send(data='back')
+pharos.spin()
+'''
+
+FORK = '''
+pid = os.fork()
+if not pid:
+    child()
+    sys.exit()
+os.waitpid(pid, 0)
+'''
+
+CHILDREN = {
+    'sys.exit': 'sys.exit(3)',
+    'an exception': '1 / 0',
+    'os._exit': 'os._exit(3)',
+    'SIGTERM': 'os.kill(os.getpid(), signal.SIGTERM)',
+    'SIGINT': 'os.kill(os.getpid(), signal.SIGINT)',
+    'stop()': 'me.stop(); pharos.running.stop_all()',
+    'with': '''
+    with embedded, other, me, started:
+        sys.exit()''',
+    'Master.stop()': 'embedded.stop()',
+    'terminate()': 'started.terminate()',
+    'close()': 'channel.close(); back.close(); service.close()',
+    'spin()': 'pharos.spin()',
+    'nodes of its own': '''
+    mine = Master().create(BlockNode, named='/program_child', domain='127.0.0.1')
+    got = threading.Event()
+    mine.interested_in('/forks_said', 'std_msgs/String', delegate=lambda message, channel: got.set())
+    mine.send_to('/forks_back', data='from the child')
+    assert got.wait(60)
+    assert mine.master.nodes() and mine.health().registered''',
+}
+
+
+@pytest.mark.parametrize('fork', [FORK, 'c = multiprocessing.get_context("fork").Process(target=child)\nc.start()\nc.join()'],
+                         ids=['os.fork', 'multiprocessing'])
+@pytest.mark.parametrize('child', CHILDREN.values(), ids=CHILDREN)
+def test_the_end_of_a_child_leaves_its_parents_nodes_alone(master, mailbox, child, fork):
+    node = master.create(BlockNode, named='/tester', domain='127.0.0.1', delegate=mailbox)
+    node.interested_in('/forks_back', 'std_msgs/String')
+    with Program(master.url, sys.executable, '-c', CODE.format(child=child, fork=fork)) as program:
+        out = node.output_channel('/forks', 'std_msgs/String')
+        assert out.wait_for_subscribers(timeout=60)
+        out.send(data='first')
+        program.wait_for('heard first')
+        assert program.wait_for('still') == 'still running True None True\n'
+        if 'from the child' in child:
+            assert mailbox.get().data == 'from the child'
+        assert mailbox.get().data == 'back'
+        out.send(data='second')
+        program.wait_for('heard second')
+        assert program.end() == 0
+
+
+@pytest.mark.parametrize('use', ['me.send_to("/forks_back", data="x")', 'back.send(data="x")', 'me.sleep(1)', 'me.ros',
+                                 'me.execute()', 'me.interested_in("/c", "std_msgs/String")'])
+def test_a_node_of_the_parent_is_stopped_in_the_child(master, use):
+    child = """
+    try:
+        %s
+    except pharos.NodeStoppedError as error:
+        print('refused', error, repr(me), flush=True)""" % use
+    with Program(master.url, sys.executable, '-c', CODE.format(child=child, fork=FORK)) as program:
+        node = master.create(BlockNode, named='/tester', domain='127.0.0.1')
+        node.output_channel('/forks', 'std_msgs/String', latch=True).send(data='go')
+        assert '/program' in program.wait_for('refused')
+        program.wait_for('still running')
