@@ -49,6 +49,8 @@ def test_a_node_that_stopped(master):
     node = create(master, '/over')
     node.stop()
     assert node.health() == (False, None, {}, 0, 0, 0)
+    assert str(node.health()) == 'not registered, 0 dropped, 0 errors, 0 threads'
+    assert repr(node) == '<BlockNode /over stopped, 0 channels>'
 
 
 def test_a_master_that_goes_and_comes_back(monkeypatch):
@@ -75,9 +77,10 @@ def test_a_master_that_goes_and_comes_back(monkeypatch):
 
 
 @pytest.mark.parametrize('health, line', [
-    ((True, None, {}, 0, 0, 4), 'registered, master away, 0 dropped, 0 errors, 4 threads'),
+    ((None, None, {}, 0, 0, 4), 'master away, 0 dropped, 0 errors, 4 threads'),
+    ((True, None, {}, 0, 0, 4), 'registered, 0 dropped, 0 errors, 4 threads'),
     ((False, None, {'TCPROS': 2, 'INTRAPROCESS': 1}, 3, 4, 5),
-     'not registered, master away, 1 INTRAPROCESS, 2 TCPROS, 3 dropped, 4 errors, 5 threads')])
+     'not registered, 1 INTRAPROCESS, 2 TCPROS, 3 dropped, 4 errors, 5 threads')])
 def test_it_is_told_in_a_line(health, line):
     from pharos.health import Health
     assert str(Health(*health)) == line

@@ -2,6 +2,7 @@
 import os
 import queue
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -174,6 +175,100 @@ def test_a_roscpp_node_unregisters_when_it_is_ended(master):
             threading.Event().wait(0.01)
     with pytest.raises(UnknownNodeError):
         master.node('/passes_on')
+
+
+NO_HANDLER = """#!/usr/bin/python3
+import signal, sys, rospy, std_msgs.msg
+signal.signal(signal.SIGINT, signal.%s)
+rospy.init_node('robot', disable_signals=True)
+sent = rospy.Publisher('robot_says', std_msgs.msg.String, queue_size=1, latch=True)
+print('up', flush=True)
+while %s:
+    rospy.rostime.wallsleep(0.05)
+"""
+
+NO_HANDLER_IN_ROSCPP = """
+#include <ros/ros.h>
+#include <roscpp/Empty.h>
+#include <cstdio>
+static bool answer(roscpp::Empty::Request&, roscpp::Empty::Response&) { return true; }
+int main(int argc, char** argv) {
+  ros::init(argc, argv, "robot", ros::init_options::NoSigintHandler);
+  ros::NodeHandle node;
+  ros::ServiceServer server = node.advertiseService("robot_serves", answer);
+  puts("up"), fflush(stdout);
+  ros::spin();
+}
+"""
+
+
+def names_registered(master):
+    return {name for kind in master.system_state() for names in kind.values() for name in names}
+
+
+@pytest.mark.parametrize('obeys', ['not rospy.is_shutdown()', 'True'], ids=['obeys ROS', 'obeys nobody'])
+@pytest.mark.parametrize('handler', ['SIG_DFL', 'SIG_IGN'])
+def test_nothing_of_a_node_without_handlers_stays_registered(master, package, handler, obeys):
+    """As turtlesim: it ends at a signal without unregistering."""
+    write(package / 'scripts' / 'robot', NO_HANDLER % (handler, obeys), 0o755)
+    lines = queue.SimpleQueue()
+    process = master.run('fake_robot', 'robot', on_line=lines.put)
+    assert lines.get(timeout=TIMEOUT) == 'up'
+    assert '/robot' in names_registered(master)
+    status = process.terminate(timeout=3)
+    assert (status == 0) == (obeys != 'True')
+    assert '/robot' not in names_registered(master)
+    with pytest.raises(UnknownNodeError):
+        master.wait_for_node('/robot', 0.1)
+
+
+def test_a_roscpp_node_without_handlers_is_ended_through_ros(master, package, tmp_path):
+    if not (shutil.which('g++') and os.path.exists('/usr/include/ros/ros.h')):
+        pytest.skip('needs g++ and the headers of roscpp')
+    source, robot = tmp_path / 'robot.cpp', package / 'scripts' / 'robot'
+    source.write_text(NO_HANDLER_IN_ROSCPP)
+    subprocess.run(['g++', '-O0', source, '-o', robot, '-lroscpp', '-lrosconsole', '-lrostime',
+                    '-lroscpp_serialization', '-lpthread'], check=True)
+    lines = queue.SimpleQueue()
+    process = master.run('fake_robot', 'robot', on_line=lines.put)
+    assert lines.get(timeout=TIMEOUT) == 'up'
+    master.wait_for_node('/robot', TIMEOUT)
+    assert process.terminate() == 0
+    assert '/robot' not in names_registered(master) and '/robot_serves' not in master.services()
+
+
+def test_the_nodes_of_a_launch_file_are_ended_through_ros(master, package):
+    write(package / 'scripts' / 'robot', NO_HANDLER % ('SIG_DFL', 'not rospy.is_shutdown()'), 0o755)
+    write(package / 'robots.launch', """<launch><node name="a" pkg="fake_robot" type="robot" />
+        <node name="b" pkg="fake_robot" type="robot" respawn="true" /></launch>""")
+    process = master.launch('fake_robot', 'robots.launch')
+    for name in '/a', '/b':
+        master.wait_for_node(name, TIMEOUT)
+    process.terminate()
+    assert not {'/a', '/b'} & names_registered(master)
+
+
+def test_other_nodes_are_not_ended_with_a_program(master, package):
+    write(package / 'scripts' / 'robot', NO_HANDLER % ('SIG_DFL', 'not rospy.is_shutdown()'), 0o755)
+    ours = master.create(BlockNode, named='/ours')
+    with master.run('fake_robot', 'robot', name='other'):
+        other = master.wait_for_node('/other', TIMEOUT)
+        with master.run('fake_robot', 'robot'):
+            master.wait_for_node('/robot', TIMEOUT)
+        assert ours.is_running and other.is_alive()
+
+
+def test_a_node_that_is_registered_and_dead_is_not_waited_for_in_vain(master, package):
+    write(package / 'scripts' / 'robot', NO_HANDLER % ('SIG_DFL', 'True'), 0o755)
+    for _ in range(2):
+        process = master.run('fake_robot', 'robot')
+        node = master.wait_for_node('/robot', TIMEOUT)
+        assert node.pid == process.pid    # and not the one before
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait(TIMEOUT)
+    with pytest.raises(UnknownNodeError, match='/robot'):
+        master.wait_for_node('/robot', 0.3)
+    master.create(BlockNode, named='/robot').stop()
 
 
 def test_a_program_that_ignores_ctrl_c_is_terminated(master, package):

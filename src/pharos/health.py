@@ -20,12 +20,18 @@ class Health(NamedTuple):
     threads: int                        # of the node
 
     def __str__(self):
-        since = self.reachable_since
         return ', '.join([
             *([] if self.registered is None else ['registered' if self.registered else 'not registered']),
-            'master reachable since ' + time.strftime('%H:%M:%S', time.localtime(since)) if since else 'master away',
+            *self._of_master(),
             *('%d %s' % (count, transport) for transport, count in sorted(self.connections.items())),
             '%d dropped' % self.dropped, '%d errors' % self.errors, '%d threads' % self.threads])
+
+    def _of_master(self):
+        """What to say of the master, if anything is known."""
+        if self.reachable_since:
+            yield 'master reachable since ' + time.strftime('%H:%M:%S', time.localtime(self.reachable_since))
+        elif self.registered is None:    # else it has just answered
+            yield 'master away'
 
 
 def health_of(node, ask):

@@ -1,5 +1,4 @@
 """The proxy of a ROS master."""
-import atexit
 import difflib
 import threading
 import time
@@ -59,7 +58,7 @@ class Master:
         child, url = embedded_master.start(check_port('port', port))
         master = cls(url)
         master._child = child
-        atexit.register(master.stop)    # the child would end by itself, but perhaps after us
+        running.at_end(master.stop)    # the child would end by itself, but perhaps after us
         return master
 
     def stop(self):
@@ -70,7 +69,7 @@ class Master:
         from pharos import embedded_master
         if self._child is None:
             raise PharosError('%s is not embedded in this program: stop it where it was started' % self)
-        atexit.unregister(self.stop)
+        running.not_at_end(self.stop)
         for node in self.own_nodes():
             node.stop()
         if self._child.returncode is None:

@@ -291,8 +291,8 @@ class Node(Life):
         return health_of(self, ask=True)
 
     def __repr__(self):
-        return '<%s %s %s, %d channels: %s>' % (type(self).__name__, self.name, self._lifecycle.value,
-                                                len(self.channels), health_of(self, ask=False))
+        health = f': {health_of(self, ask=False)}' if self.is_running else ''
+        return f'<{type(self).__name__} {self.name} {self._lifecycle.value}, {len(self.channels)} channels{health}>'
 
 
 class BlockNode(Node):

@@ -1,21 +1,25 @@
 """ROS programs run as processes of their own."""
-import atexit
 import collections
 import contextlib
 import glob
 import os
+import select
 import signal
 import subprocess
 import sys
 import threading
 
+from pharos import running
 from pharos.blocks import check_block, name_of
 from pharos.errors import UnknownNodeError
 from pharos.failures import Failures
+from pharos.process_nodes import ProcessNodes
 from pharos.transcript import Transcript
 
 # What they print is wanted line by line, as on a terminal, and not in blocks of 4 KiB
 LINE_BY_LINE = {'PYTHONUNBUFFERED': '1', 'ROSCONSOLE_STDOUT_LINE_BUFFERED': '1'}
+
+KILL_TIMEOUT = 1.0    # seconds that a process may take to end when it is killed
 
 
 class RosProcess:
@@ -33,7 +37,8 @@ class RosProcess:
         # a session of its own, so that what it starts ends with it, and Ctrl-C is the program's to handle
         self._process = subprocess.Popen(command, env=environ, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
                                          stderr=subprocess.STDOUT, text=True, errors='replace', start_new_session=True)
-        atexit.register(self.terminate)
+        self._nodes = ProcessNodes(master_url)
+        running.at_end(self.terminate)
         self._reader = threading.Thread(target=self._read, name='output of %s' % command[0], daemon=True)
         self._reader.start()
 
@@ -46,7 +51,7 @@ class RosProcess:
                     self._show(line)
         self._process.wait()
         self._signal(signal.SIGKILL)    # what it left behind; not later, when its number may be another's
-        atexit.unregister(self.terminate)
+        running.not_at_end(self.terminate)
 
     def _show(self, line):
         try:
@@ -81,23 +86,37 @@ class RosProcess:
     def terminate(self, timeout=5.0):
         """Ask it, and what it has started, to end, and end them after ``timeout`` seconds; returns its exit status.
 
-        It is asked as by Ctrl-C, for at SIGTERM a roscpp node ends without unregistering; half way by SIGTERM. Done at
-        the end of this program, too.
+        The nodes in it are asked through ROS, for where roscpp has no handler, a node ends at a signal without
+        unregistering; then the program is asked as by Ctrl-C, and then by SIGTERM. What is still registered of the
+        nodes afterwards goes. Done at the end of this program, too.
         """
-        atexit.unregister(self.terminate)
+        running.not_at_end(self.terminate)
         if self.poll() is None:
-            started = _descendants(self.pid)    # roslaunch gives each node a session of its own
-            for number in signal.SIGINT, signal.SIGTERM:
-                self._signal(number)
+            numbers = [signal.SIGINT, signal.SIGTERM]
+            started = self._look()
+            if self._nodes.shut_down():
+                numbers.insert(0, None)
+            for number in numbers:
+                if number is not None:
+                    started += self._look()    # roslaunch may have started some again
+                    self._signal(number)
                 with contextlib.suppress(subprocess.TimeoutExpired):
-                    self._process.wait(timeout / 2)
+                    self._process.wait(timeout / len(numbers))
                     break
             for process in started:
                 with process:
                     process.kill()
         if self._reader.is_alive():    # else it has done so
             self._signal(signal.SIGKILL)
-        return self.wait()
+        status = self.wait()
+        self._nodes.clear()
+        return status
+
+    def _look(self):
+        """See where the nodes are; returns what the program has started. roslaunch gives each a session of its own."""
+        started = _descendants(self.pid)
+        self._nodes.look([self.pid, *(process.pid for process in started)])
+        return started
 
     def _signal(self, number):
         try:
@@ -171,6 +190,7 @@ class _Started:
     """A process that a program has started, held by a descriptor: its number may be another's later."""
 
     def __init__(self, pid):
+        self.pid = pid
         self._descriptor = os.pidfd_open(pid)
 
     def kill(self):
@@ -179,6 +199,9 @@ class _Started:
             signal.pidfd_send_signal(self._descriptor, signal.SIGKILL)
         except ProcessLookupError:
             pass
+        end = select.poll()
+        end.register(self._descriptor, select.POLLIN)
+        end.poll(1000 * KILL_TIMEOUT)
 
     def __enter__(self):
         return self
