@@ -569,3 +569,128 @@ def test_code_in_a_constant_of_text_is_text(master, tmp_path, monkeypatch):
     with Publisher(master, '/types/text', 'text_msgs/Text', f'string X={CODE}\nstring x # {CODE}'):
         cls = master.topic('/types/text').message_class(create(master, '/node'))
     assert cls.X == CODE and cls(CODE).x == CODE and list(tmp_path.iterdir()) == []
+
+
+# -- several definitions of one type -----------------------------------------------------------------------------------
+
+@contextlib.contextmanager
+def publishing(master, topic, type_, text, **values):
+    """A rospy node in another process that publishes such a message, latched."""
+    name = 'defines' + topic.replace('/', '_')
+    with Program(master.url, sys.executable, '-c', ROSPY_PEER, name, topic, type_, text, json.dumps(values)) as peer:
+        peer.wait_for('published')
+        yield
+
+
+@pytest.mark.parametrize('type_, define', [('given_msgs/Reading', True), ('turtlesim/Pose', False)],
+                         ids=['given', 'shipped'])
+@pytest.mark.parametrize('typed', [True, False], ids=['by name', 'without a type'])
+def test_a_subscriber_takes_a_live_publishers_definition_before_one_given_or_shipped(master, mailbox, type_, define,
+                                                                                      typed):
+    here = define_message(type_, 'string level\n') if define else message_class(type_)
+    topic = '/types/live_%d' % next(topic_numbers)
+    node = create(master, '/node', delegate=mailbox)
+    with publishing(master, topic, type_, 'int32 level\nint32 more\n', level=7, more=8):
+        channel = node.interested_in(topic, *[type_] * typed)
+        message = mailbox.get()
+    assert (message.level, message.more) == (7, 8)
+    assert channel.message_class is not here and message_class(type_) is here    # nothing is defined for others
+
+
+def test_who_asks_for_a_class_gets_that_one(master):
+    here = define_message('given_msgs/Reading', 'string level\n')
+    topic = '/types/live_%d' % next(topic_numbers)
+    with publishing(master, topic, 'given_msgs/Reading', 'int32 level\n', level=7):
+        assert create(master, '/node').interested_in(topic, here).message_class is here
+
+
+def test_an_installed_type_goes_before_a_publishers(master):
+    topic = '/types/live_%d' % next(topic_numbers)
+    with publishing(master, topic, 'std_msgs/Int32', 'int8 data\n', data=7):
+        channel = create(master, '/node').interested_in(topic, 'std_msgs/Int32')
+    assert channel.message_class is message_class('std_msgs/Int32')
+
+
+def test_a_type_in_a_msg_file_goes_before_a_publishers(master, tmp_path, monkeypatch):
+    (tmp_path / 'file_msgs/msg').mkdir(parents=True)
+    (tmp_path / 'file_msgs/package.xml').write_text('<package><name>file_msgs</name></package>')
+    (tmp_path / 'file_msgs/msg/Reading.msg').write_text('string level')
+    monkeypatch.setenv('ROS_PACKAGE_PATH', str(tmp_path))
+    topic = '/types/live_%d' % next(topic_numbers)
+    with publishing(master, topic, 'file_msgs/Reading', 'int32 level\n', level=7):
+        channel = create(master, '/node').interested_in(topic, 'file_msgs/Reading')
+    assert describe(channel) == 'string'
+    define_message('file_msgs/Reading', 'string level')    # the same, which makes it no other
+    with publishing(master, topic, 'file_msgs/Reading', 'int32 level\n', level=7):
+        assert describe(create(master, '/other').interested_in(topic, 'file_msgs/Reading')) == 'string'
+
+
+def describe(channel):
+    return channel.message_class._slot_types[0]
+
+
+def test_who_sends_takes_the_definition_given(master, mailbox):
+    here = define_message('given_msgs/Reading', 'string level\n')
+    topic = '/types/live_%d' % next(topic_numbers)
+    with publishing(master, topic, 'given_msgs/Reading', 'int32 level\n', level=7):
+        assert type(create(master, '/node').send_to(topic, typed_as='given_msgs/Reading', level='low')) is here
+
+
+def test_a_publisher_of_this_process_is_taken_at_its_word_too(master, mailbox):
+    define_message('given_msgs/Reading', 'string level\n')
+    other = genpy.dynamic.generate_dynamic('given_msgs/Reading', 'int32 level\n')['given_msgs/Reading']
+    topic = '/types/live_%d' % next(topic_numbers)
+    sender, node = create(master, '/sender'), create(master, '/node', delegate=mailbox)
+    sender.output_channel(topic, other, latch=True).send(level=7)
+    assert node.interested_in(topic, 'given_msgs/Reading').message_class is other
+    assert mailbox.get().level == 7
+
+
+@pytest.mark.parametrize('given, taken', [('int32 level\n', 'int32'), ('int8 level\n', 'int8'),
+                                          ('string level\n', 'int32')])
+def test_of_several_publishers_the_one_that_agrees_with_what_was_given_counts(master, given, taken):
+    type_ = 'given_msgs/Reading%d' % next(topic_numbers)
+    topic = '/types/live_%d' % next(topic_numbers)
+    define_message(type_, given)
+    with publishing(master, topic, type_, 'int32 level\n', level=1):
+        with Publisher(master, topic, type_, 'int8 level\n'):
+            assert describe(create(master, '/node').interested_in(topic, type_)) == taken
+
+
+@pytest.mark.parametrize('publisher', [
+    dict(definition='complete nonsense!'), dict(definition='int8 a', md5sum='0' * 32), dict(definition=None),
+    dict(said=b''), dict(answer=[0, 'not today', 0])], ids=str)
+def test_a_publisher_that_does_not_tell_leaves_what_was_given(master, publisher, monkeypatch):
+    here = define_message('given_msgs/Reading', 'string level\n')
+    topic = '/types/live_%d' % next(topic_numbers)
+    with Publisher(master, topic, 'given_msgs/Reading', **publisher):
+        assert create(master, '/node').interested_in(topic, 'given_msgs/Reading').message_class is here
+
+
+def test_publishers_that_hang_are_waited_for_together_not_one_by_one(master, monkeypatch):
+    here = define_message('given_msgs/Reading', 'string level\n')
+    topic, node = '/types/live_%d' % next(topic_numbers), create(master, '/node')
+    waited = []
+    monkeypatch.setattr(graph_types, 'TIMEOUT', 0.2)
+    monkeypatch.setattr(graph_types, '_header', lambda topic, uri, timeout: waited.append(timeout) or hang(timeout))
+    with contextlib.ExitStack() as there:
+        for number in range(20):
+            there.enter_context(Publisher(master, topic, 'given_msgs/Reading', name='/hangs_%d' % number))
+        assert graph_types.confirmed(master.topic(topic), here) is here
+    assert waited and sum(waited) < 20 * 0.2 / 2 and node.is_running
+
+
+def hang(timeout):
+    threading.Event().wait(timeout)
+    raise socket.timeout
+
+
+def test_a_channel_keeps_the_class_that_it_was_opened_with(master, mailbox):
+    here = define_message('given_msgs/Reading', 'string level\n')
+    topic, early, late = '/types/live_%d' % next(topic_numbers), create(master, '/early'), create(master, '/late')
+    opened = early.interested_in(topic, 'given_msgs/Reading')
+    with publishing(master, topic, 'given_msgs/Reading', 'int32 level\n', level=7):
+        assert describe(late.interested_in(topic, 'given_msgs/Reading', delegate=mailbox)) == 'int32'
+        assert mailbox.get().level == 7
+        assert early.interested_in(topic, 'given_msgs/Reading').message_class is opened.message_class is here
+    early.send_to(topic, level='low')

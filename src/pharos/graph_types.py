@@ -13,39 +13,75 @@ TIMEOUT = 2.0               # seconds that one publisher may take
 CALLER_ID = '/pharos_types'    # not the node's: a publisher closes an earlier connection of the same name
 
 
-def class_from_publishers(topic, type_=None):
+def class_from_publishers(topic, type_):
     """The class of a topic's messages by the definition that a live publisher sends in its connection header.
 
-    :param type_: the type name that it must have; None: any
+    :param type_: the type name that it must have
     :returns: None if no publisher tells it
     :raises UnknownTypeError, MessageTypeError: if those who tell it give nonsense, or not what has the md5sum they give
     """
     refused = None
-    for name in topic.publishers:
-        try:
-            header = _header(topic, topic.master._api().lookupNode(name))
-        except (rosgraph.MasterException, *COMMUNICATION_ERRORS, TypeError, ValueError, OverflowError):
-            continue    # the next one may answer, and as agreed
-        if header.get('message_definition') and type_ in (None, header.get('type')):
-            try:
-                return message_types.class_from_definition(header['type'], header['message_definition'],
-                                                           header.get('md5sum'))
-            except PharosError as error:
-                refused = type(error)('%s publishes on %s what cannot be read here: %s' % (name, topic.name, error))
-                refused.__cause__ = error
+    for told in _told(topic, type_, None):
+        if not isinstance(told, PharosError):
+            return told
+        refused = told
     if refused:
         raise refused
     return None
 
 
-def _header(topic, uri):
+def confirmed(topic, cls):
+    """``cls`` where a live publisher defines its type alike, or none tells; else what the first of them says it is.
+
+    All of them are given TIMEOUT together: there is a class to go on with.
+    """
+    first = None
+    for told in _told(topic, cls._type, time.monotonic() + TIMEOUT):
+        if isinstance(told, PharosError):
+            continue
+        if told._md5sum == cls._md5sum:
+            return cls
+        first = first or told
+    return first or cls
+
+
+def _told(topic, type_, deadline):
+    """The class of that type as each live publisher defines it, or the error by which it cannot be read.
+
+    :param deadline: by ``time.monotonic()``; None: each of them is given TIMEOUT
+    """
+    own = {node.name: node for node in topic.master.own_nodes()}
+    for name in topic.publishers:
+        if name in own:    # asked without a socket
+            rospy = own[name]._rospy    # None: it is just being started
+            publisher = rospy and rospy.publisher(topic.name)
+            if publisher is not None and publisher.data_class._type == type_:
+                yield publisher.data_class
+            continue
+        left = TIMEOUT if deadline is None else min(TIMEOUT, deadline - time.monotonic())
+        if left <= 0:
+            return
+        try:
+            header = _header(topic, topic.master._api(timeout=left).lookupNode(name), left)
+        except (rosgraph.MasterException, *COMMUNICATION_ERRORS, TypeError, ValueError, OverflowError):
+            continue    # the next one may answer, and as agreed
+        if header.get('message_definition') and header.get('type') == type_:
+            try:
+                yield message_types.class_from_definition(type_, header['message_definition'], header.get('md5sum'))
+            except PharosError as error:
+                refused = type(error)('%s publishes on %s what cannot be read here: %s' % (name, topic.name, error))
+                refused.__cause__ = error
+                yield refused
+
+
+def _header(topic, uri, timeout):
     """The connection header of the publisher at that URI, as a subscriber of any type gets it."""
-    code, _, protocol = ServerProxy(uri, TIMEOUT).requestTopic(CALLER_ID, topic.name, [['TCPROS']])
+    deadline = time.monotonic() + timeout
+    code, _, protocol = ServerProxy(uri, timeout).requestTopic(CALLER_ID, topic.name, [['TCPROS']])
     if code != 1:
         return {}
     _, host, port = protocol
     connection = TcprosConnection((host, port), {
-        'topic': topic.name, 'callerid': CALLER_ID, 'md5sum': '*', 'type': '*', 'tcp_nodelay': '0'},
-        time.monotonic() + TIMEOUT)
+        'topic': topic.name, 'callerid': CALLER_ID, 'md5sum': '*', 'type': '*', 'tcp_nodelay': '0'}, deadline)
     connection.close()
     return connection.header

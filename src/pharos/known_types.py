@@ -18,6 +18,7 @@ _TYPE = re.compile('%s/%s' % (NAME.pattern, NAME.pattern))
 _KINDS = {'msg': 'message', 'srv': 'service'}
 
 found = {}  # (kind, type): class answered before or defined, so that two asks give the same one
+provisional = set()  # keys of found that no package here has: to a subscriber, a live publisher knows better
 
 
 def check_name(kind, type_):
@@ -33,6 +34,8 @@ def seek(kind, type_, must=True):
     for look in _LOOKS:
         known = look(kind, type_)
         if known is not None:
+            if look is _shipped:
+                provisional.add((kind, type_))
             return known
     if not must:
         return None

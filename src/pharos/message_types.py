@@ -13,7 +13,7 @@ from pharos.errors import MessageTypeError, UnknownTypeError
 from pharos.message_fields import build, check_fits, describe_fields, explain, fill
 
 __all__ = ['message_class', 'service_class', 'define_message', 'define_service', 'class_from_definition',
-           'known_service_classes', 'describe_fields', 'describe_service', 'build', 'fill', 'check_fits', 'explain']
+           'known_service_classes', 'is_provisional', 'describe_fields', 'describe_service', 'build', 'fill', 'check_fits', 'explain']
 
 _lock = threading.RLock()
 _given = {}  # (kind, type): class from define_message or define_service
@@ -23,11 +23,18 @@ def message_class(type_or_class):
     """Return the class of a message type, ``'package/Type'`` or ``'Header'``; a message class is returned as it is.
 
     Sought in this order: installed Python packages, ``.msg`` files on ROS_PACKAGE_PATH, what :func:`define_message` was
-    given, and what this package ships for turtlesim. Raises `UnknownTypeError`.
+    given, and what this package ships for turtlesim. A subscriber asks the live publishers of its topic before it takes
+    one of the last two. Raises `UnknownTypeError`.
     """
     if isinstance(type_or_class, type) and issubclass(type_or_class, genpy.Message):
         return type_or_class
     return _class('msg', 'std_msgs/Header' if type_or_class == 'Header' else type_or_class)
+
+
+def is_provisional(cls):
+    """Whether the class is that of its type here, but of no package: given at run time, or shipped for turtlesim."""
+    key = 'msg', cls._type
+    return key in known_types.provisional and known_types.found.get(key) is cls
 
 
 def service_class(type_or_class):
@@ -100,15 +107,19 @@ def _define(kind, type_, text):
     known_types.check_name(kind, type_)
     with _lock:
         cls = message_definition.make(kind, type_, text)
-        before = _given.get((kind, type_)) or known_types.installed(kind, type_) or known_types.file_text(kind, type_)
+        key = kind, type_
+        before = _given.get(key) or known_types.installed(kind, type_) or known_types.file_text(kind, type_)
+        if before is None:
+            known_types.provisional.add(key)
         if isinstance(before, str):
             before = message_definition.make(kind, type_, before)
         if before not in (None, cls):
             raise MessageTypeError(f'{type_} is known already, with md5sum {before._md5sum} and other fields or '
                                    'constants than in the text now given: give the same text, or define another type')
-        _given[kind, type_] = known_types.found[kind, type_] = cls
+        _given[key] = known_types.found[key] = cls
         classes = getattr(getattr(cls, '_request_class', cls), '_classes', {})
         for nested in classes.keys() & message_definition.split(type_, text).keys() - {type_}:
             if known_types.seek('msg', nested, must=False) is None:
                 _given['msg', nested] = known_types.found['msg', nested] = classes[nested]
+                known_types.provisional.add(('msg', nested))
         return cls

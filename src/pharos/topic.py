@@ -57,16 +57,20 @@ class Topic:
     def input_channel(self, node, typed_as=None, delegate=None, queue_size=QUEUE_SIZE, inline=False, shared=False,
                       from_=None, wait=0):
         """A new :class:`~pharos.InputChannel` of ``node``; see :meth:`Node.interested_in`."""
-        return InputChannel(node, self.name, self.message_class(node, typed_as, wait), delegate=delegate,
-                            queue_size=queue_size, inline=inline, shared=shared, from_=from_)
+        message_class = self.message_class(node, typed_as, wait, receives=True)
+        return InputChannel(node, self.name, message_class, delegate=delegate, queue_size=queue_size, inline=inline,
+                            shared=shared, from_=from_)
 
     def output_channel(self, node, typed_as=None, latch=False, queue_size=QUEUE_SIZE, connect_timeout=None, wait=0):
         """A new :class:`~pharos.OutputChannel` of ``node``; see :meth:`Node.output_channel`."""
         return OutputChannel(node, self.name, self.message_class(node, typed_as, wait), latch=latch,
                              queue_size=queue_size, connect_timeout=connect_timeout)
 
-    def message_class(self, node, typed_as=None, wait=0):
+    def message_class(self, node, typed_as=None, wait=0, receives=False):
         """The message class of the topic for ``node``: ``typed_as``, else what the node knows, else the master's.
+
+        Where no package here has the type, one who receives takes a live publisher's definition before one that was
+        given at run time or is shipped: another would never connect.
 
         :param wait: seconds to wait until somebody has given it a type, and its definition where it is not known here
         :raises MessageTypeError: if the node uses the topic with another type already
@@ -76,25 +80,29 @@ class Topic:
         if known and typed_as in (None, known._type):
             return known
         if typed_as is None:
-            return self._class_in_time(node, time.monotonic() + wait)
-        asked = self._class_of(typed_as)
+            return self._class_in_time(node, time.monotonic() + wait, receives)
+        asked = self._class_of(typed_as, receives)
         if known and asked._md5sum != known._md5sum:
-            raise MessageTypeError('%s uses %s with the type %s already and cannot use it as %s too: close that '
-                                   'channel first' % (node.name, self.name, known._type, asked._type))
+            raise MessageTypeError(
+                '%s uses %s with the type %s [%s] already and cannot use it as %s [%s] too: close that channel first'
+                % (node.name, self.name, known._type, known._md5sum, asked._type, asked._md5sum))
         return asked
 
-    def _class_of(self, type_or_class):
+    def _class_of(self, type_or_class, receives):
         """The class of a type: known here, or as the topic's publishers define it."""
         try:
-            return message_types.message_class(type_or_class)
+            known = message_types.message_class(type_or_class)
         except UnknownTypeError:
             return graph_types.class_from_publishers(self, type_or_class) or message_types.message_class(type_or_class)
+        if receives and known is not type_or_class and message_types.is_provisional(known):
+            return graph_types.confirmed(self, known)
+        return known
 
-    def _class_in_time(self, node, deadline):
+    def _class_in_time(self, node, deadline, receives):
         """The class of the master's type, which may come until the deadline."""
         while True:
             try:
-                return self._class_of(self.type)
+                return self._class_of(self.type, receives)
             except (UnknownTopicError, UnknownTypeError):    # only subscribers are there
                 if time.monotonic() >= deadline:
                     raise
