@@ -256,6 +256,62 @@ pharos.spin()
     assert running.end(signal.SIGINT) == 0
 
 
+# -- while the main thread runs a block --------------------------------------------------------------------------------
+
+BLOCKS = {
+    'a soul': 'me.soul = lambda me: busy()\nme.execute()',
+    'a delegate': """
+me.interested_in('/busy', 'std_msgs/Empty', delegate=lambda message, channel: busy(), inline=True)
+me.send_to('/busy')""",
+    'a service block': """
+me.serve('/busy', 'std_srvs/Empty', lambda request: busy())
+me.master.lookup_service('/busy').call()""",
+    'a service of rospy': """
+me.ros.Service('/busy', pharos.service_class('std_srvs/Empty'), lambda request: busy())
+me.master.lookup_service('/busy').call()""",
+    'a parameter block': 'me.parameter("~busy").on_change(lambda value: busy())\nme.parameter("~busy").set(1)',
+    'a receiver': 'pharos.Transcript.on_show(lambda text: busy())\npharos.Transcript.show("it")',
+}
+BUSY = '''
+def busy():
+    ready()
+    while True: pass
+me = node()
+'''
+
+
+@SIGNALS
+@pytest.mark.parametrize('block', BLOCKS.values(), ids=BLOCKS)
+def test_a_signal_ends_the_program_out_of_a_block(program, with_signal, block):
+    assert program(BUSY + block).end(with_signal) == ended_by(with_signal)
+
+
+@pytest.mark.parametrize('block', BLOCKS.values(), ids=BLOCKS)
+def test_what_a_handler_of_the_programs_own_raises_ends_it_out_of_a_block(program, block):
+    handled = BUSY + 'signal.signal(signal.SIGTERM, lambda *signal: sys.exit(3))\n'
+    assert program(handled + block).end(signal.SIGTERM) == 3
+
+
+def test_ctrl_c_as_python_has_it_ends_a_block(program):
+    handled = BUSY + 'signal.signal(signal.SIGINT, signal.default_int_handler)\n'
+    running = program(handled + 'me.soul = lambda me: busy()\nme.execute()')
+    assert running.end(signal.SIGINT) == -signal.SIGINT
+
+
+def test_a_block_that_raises_what_a_signal_would_ends_nothing(program):
+    running = program("""
+def block(*args):
+    raise KeyboardInterrupt
+me = node(soul=block, delegate=block)
+me.execute()
+me.interested_in('/interrupts', 'std_msgs/Empty', inline=True)
+me.send_to('/interrupts')
+print('went on', *map(type, me.errors))
+ready()
+""")
+    assert running.read_to_the_end().count("<class 'KeyboardInterrupt'>") == 2 and running.process.wait(60) == 0
+
+
 # -- ends without a signal ---------------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize('code, status', [
