@@ -14,7 +14,7 @@ import pytest
 
 import pharos
 from conftest import TIMEOUT, Mailbox
-from pharos import BlockNode, Transcript, failures
+from pharos import BlockNode, Transcript, failures, running
 from programs import Program, run, until
 
 
@@ -168,6 +168,99 @@ def test_on_line_may_raise_anything(master, transcript):
     printed = process.output.split('\n')
     assert len(printed) > 1 and lines.take(len(printed)) == printed
     assert 'block' in transcript[0] and 'for the output of' in transcript[0] and 'raised SystemExit' in transcript[0]
+
+
+# -- plain rospy, and what else a thread of ours runs ------------------------------------------------------------------
+
+@pytest.mark.parametrize('timeout', [None, TIMEOUT])
+@pytest.mark.parametrize('outcast', OUTCASTS)
+def test_a_service_of_plain_rospy_may_raise_anything(master, dead_threads, outcast, timeout):
+    node, told = create(master), []
+
+    def tell(error, *information):
+        told.append(type(error))
+        raise SystemExit('cannot tell')
+    block = Raising(outcast('out'))
+    node.ros.Service('/plain', pharos.service_class('std_srvs/Empty'),
+                     lambda request: block(request) or {}, error_handler=tell)
+    service = master.lookup_service('/plain')
+    with pytest.raises(pharos.ServiceCallError, match='/plain failed: error processing request: out'):
+        service.call(timeout=timeout)
+    service.call(timeout=timeout)
+    assert told == [outcast] and not dead_threads
+
+
+def test_a_service_of_plain_rospy_called_from_outside_may_raise_anything(master, dead_threads):
+    node, block = create(master), Raising(SystemExit('out'))
+    node.ros.Service('/plain_outside', pharos.service_class('std_srvs/Empty'), lambda request: block(request) or {})
+    assert 'error processing request: out' in run(master.url, 'rosservice', 'call', '/plain_outside').stderr
+    assert run(master.url, 'rosservice', 'call', '/plain_outside').returncode == 0
+    assert not dead_threads
+
+
+def test_a_callback_of_plain_rospy_takes_nothing_from_a_channel_whatever_it_raises(master, mailbox, dead_threads):
+    node, plain = create(master), Raising(*[outcast('out') for outcast in OUTCASTS])
+    type_ = pharos.message_class('std_msgs/Int32')
+    node.ros.Subscriber('/plain_topic', type_, plain)
+    node.interested_in('/plain_topic', type_, delegate=mailbox)
+    sender = create(master, '/sender')
+    for number in range(len(OUTCASTS) + 1):
+        sender.send_to('/plain_topic', data=number)
+    assert [message.data for message in mailbox.take(len(OUTCASTS) + 1)] == list(range(len(OUTCASTS) + 1))
+    assert plain.taken.get().data == len(OUTCASTS) and not dead_threads
+
+
+@pytest.mark.parametrize('outcast', [SystemExit, ValueError])
+def test_a_hook_of_on_shutdown_may_raise_anything(master, transcript, monkeypatch, outcast):
+    read, write = os.pipe()
+    os.close(read)
+    node, hook = create(master), Raising(outcast('out'))
+    node.ros.on_shutdown(lambda: hook('out'))
+    node.ros.on_shutdown(lambda: hook('the other'))
+    with monkeypatch.context() as patched, io.TextIOWrapper(io.FileIO(write, 'w'), write_through=True) as closed:
+        patched.setattr(sys, 'stderr', closed)    # where rospy would print it
+        node.stop()
+    assert hook.taken.get() == 'the other' and classes_of(node.errors) == [outcast]
+    assert '/node' not in [other.name for other in master.nodes()]
+
+
+class Failing(pharos.Node):
+    def start(self):
+        super().start()
+        if self.master.parameters.get('/fail_to_start'):
+            raise KeyError('start')
+
+    def stop(self):
+        raise SystemExit('stop')
+
+
+@pytest.mark.parametrize('how', ['asked by ROS', 'all are stopped'])
+def test_a_stop_that_fails_in_a_thread_of_ours_is_a_failure_and_the_node_stops(
+        master, transcript, dead_threads, how):
+    node = master.create(Failing, named='/failing_stop', domain='127.0.0.1')
+    if how == 'asked by ROS':
+        node.ros.signal_shutdown('enough')
+    else:
+        running.stop_all()
+    until(lambda: node.failures)
+    assert node.lifecycle.value == 'stopped' and classes_of(node.errors) == [SystemExit] and not dead_threads
+    assert transcript[-1] == 'Failing.stop of /failing_stop raised SystemExit: stop'
+    assert '/failing_stop' not in [other.name for other in master.nodes()]
+
+
+def test_a_stop_that_fails_keeps_no_embedded_master_from_its_end(transcript):
+    embedded = pharos.Master.embedded()
+    embedded.create(Failing, named='/failing_stop', domain='127.0.0.1')
+    embedded.stop()
+    assert not embedded.is_reachable() and 'SystemExit' in transcript[-1]
+
+
+def test_a_stop_that_fails_hides_no_failure_of_the_start(master, transcript):
+    master.parameters['/fail_to_start'] = True
+    with pytest.raises(KeyError, match='start'):
+        master.create(Failing, named='/failing_stop', domain='127.0.0.1')
+    del master.parameters['/fail_to_start']
+    assert '/failing_stop' not in [other.name for other in master.nodes()]
 
 
 # -- nor by what the report of it raises -------------------------------------------------------------------------------

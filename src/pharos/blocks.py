@@ -1,12 +1,11 @@
 """Blocks: the callables that a node is made of, and the souls among them that run in threads of their own."""
 import functools
 import inspect
-import signal
 import threading
-import traceback
 
 from pharos import running
 from pharos.errors import NodeStoppedError
+from pharos.signals import code_of, is_from_signal
 
 _ASYNC = inspect.CO_COROUTINE | inspect.CO_ITERABLE_COROUTINE | inspect.CO_ASYNC_GENERATOR
 
@@ -35,7 +34,7 @@ def check_runs(block, what):
     function = block
     while isinstance(function, functools.partial):
         function = function.func
-    flags = getattr(_code_of(function), 'co_flags', 0)
+    flags = getattr(code_of(function), 'co_flags', 0)
     if flags & _ASYNC:
         raise TypeError(f'{what} is called and not awaited, so that {block!r}, which is async, would never run: write '
                         'a plain function that calls asyncio.run_coroutine_threadsafe(coroutine, loop) or '
@@ -56,32 +55,15 @@ def check_soul(block):
     return check_block(block, 'soul', ('node',))
 
 
-def _code_of(function):
-    """The code object that runs when the function, or another object, is called; None where it is not Python's."""
-    return getattr(function, '__code__', None) or getattr(getattr(type(function), '__call__', None), '__code__', None)
-
-
-def ends_program(error):
-    """Whether a signal raised the exception, to end what the main thread does, and not a block by itself.
-
-    That includes what the program's own handlers of signals raise: it is for those who installed them.
-    """
-    if running.is_from_signal(error):
-        return True
-    if threading.current_thread() is not threading.main_thread():
-        return False
-    if isinstance(error, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        return True
-    handlers = [_code_of(signal.getsignal(number)) for number in signal.valid_signals()]
-    return any(frame.f_code in handlers for frame, _ in traceback.walk_tb(error.__traceback__))
-
-
 def attempt(function, otherwise=None):
-    """What ``function()`` returns, or ``otherwise`` where it raises, whatever that is; a signal still ends the program."""
+    """What ``function()`` returns, or ``otherwise`` where it raises, whatever that is.
+
+    A signal ends the program all the same.
+    """
     try:
         return function()
     except BaseException as error:
-        if ends_program(error):
+        if is_from_signal(error):
             raise
         return otherwise
 
@@ -93,7 +75,8 @@ def text_of(thing):
 
 def name_of(block):
     """How logs name a block."""
-    return text_of(attempt(lambda: getattr(block, '__qualname__', None) or repr(block), f'a {type(block).__name__}'))
+    name = attempt(lambda: getattr(block, '__qualname__', None) or repr(block))
+    return text_of(name or f'a {type(block).__name__}')
 
 
 class Souls:
@@ -107,14 +90,15 @@ class Souls:
     def run(self, block, present):
         """Run a soul in this thread; an exception in it is reported and ends nothing else.
 
-        :param present: ``present()`` is the soul as it is then, to be run where this one is to be run again
+        :param present: ``present()`` is the soul as it is then, to be run in its place again
         """
         self._here.depth = self._depth() + 1
         try:
             with self._node._live_rospy().here():
                 return block(self._node)
         except BaseException as error:
-            self._node._report(error, block, 'soul', again=lambda nothing: self.run(present(), present))
+            self._node._report(error, block, 'soul',
+                               again=lambda nothing: self.run(present(), present))
             return None
         finally:
             self._here.depth -= 1

@@ -125,14 +125,15 @@ class InputChannel(_Channel):
         self._delegate = check_delegate(block)
 
     def _run_again(self, message):
-        """Run the delegate, as it is now, on a message on which it failed, when no other of the node runs."""
+        """Run the delegate, as it is now, on a message, when no other of the node runs."""
         self.node._live_rospy()
         self.node._dispatcher.run_in_turn(lambda: self._run(message))
 
     def _run(self, message):
         block = self.node._delegate if self._delegate is None else self._delegate
         if block is None:
-            raise PharosError(f'{self.topic} has no delegate any more: give {self.node.name} or its channel one first')
+            raise PharosError(f'{self.topic} has no delegate any more: give {self.node.name} or its '
+                              'channel one first')
         try:
             block(message, self)
         except BaseException as error:

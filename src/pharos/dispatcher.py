@@ -232,7 +232,7 @@ class Dispatcher:
                 self._leave_to_thread()
 
     def run_in_turn(self, job):
-        """Run ``job()`` in this thread when no delegate runs; within one that this thread runs, at once."""
+        """Run ``job()`` in this thread when no delegate runs; at once in one that it runs."""
         if self._runner == _thread.get_ident():
             job()
             return

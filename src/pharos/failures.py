@@ -8,12 +8,13 @@ import traceback
 
 import genpy
 
-from pharos.blocks import attempt, ends_program, text_of
+from pharos.blocks import attempt, text_of
 from pharos.errors import PharosError
+from pharos.signals import is_from_signal
 
-KEPT = 100           # failures of a node; the oldest go, but for the first, which may be the cause of the others
+KEPT = 100           # failures of a node; the oldest go, but for the first, which may be the cause
 WHOLE = 5            # of them, the newest, whose messages and frames are kept
-TEXTS = 3            # different texts of failures at one place that are told; then only the 10th, 100th ... there
+TEXTS = 3            # texts of failures at one place that are told; then the 10th, 100th ... there
 PLACES = 1000        # at which failures are counted
 TEXT_LIMIT = 2000    # characters of the text of an exception
 LARGE = 10000        # bytes of a thing that an exception without its frames may hold on to
@@ -22,13 +23,15 @@ LARGE = 10000        # bytes of a thing that an exception without its frames may
 class Failure:
     """A failure of a block, as often as it came: one of :attr:`Node.failures`.
 
-    :attr:`error` is the exception, :attr:`block` what raised it, :attr:`message` what the block was run on (a message,
-    a service's request, a parameter's value; None for a soul), :attr:`channel` where that came from (None where it is
-    no message), :attr:`count` how many times it came, and :attr:`time` when that was last, in seconds as of
-    ``time.time()``; error and message are of that time. Failures are identical, and one, where block, channel, class
-    and text of the exception, and the line that raised it, are the same.
+    :attr:`error` is the exception, :attr:`block` what raised it, :attr:`message` what the block was
+    run on (a message, a service's request, a parameter's value; None for a soul), :attr:`channel`
+    where that came from (None where it is no message), :attr:`count` how many times it came, and
+    :attr:`time` when that was last, in seconds as of ``time.time()``; error and message are of that
+    time. Failures are identical, and one, where block, channel, class and text of the exception,
+    and the line that raised it, are the same.
 
-    Of the newest 5 failures of a node, message and frames are kept; of older ones the text of the :attr:`traceback`.
+    Of the newest 5 failures of a node, message and frames are kept; of older ones the text of the
+    :attr:`traceback`.
     """
 
     def __init__(self, failures, block, where, channel, place, text):
@@ -41,7 +44,7 @@ class Failure:
         self._traceback = None    # the text of what was let go
 
     def _happened(self, error, message, again):
-        if error is self.error:    # an object raised again and again collects the frames of each time
+        if error is self.error:    # one raised again and again collects the frames of each time
             _cut(error.__traceback__, self._frames)
         self.error, self.message, self._frames = error, message, error.__traceback__
         self._again, self._traceback = again, None
@@ -69,16 +72,17 @@ class Failure:
     def retry(self):
         """Run the block again, as it is now, on the same message; returns whether it did not fail.
 
-        A delegate, which may have been replaced since, runs when no other of its node does; other blocks run at once,
-        all of them in this thread. What it raises is a failure like any other, and told in any case.
+        A delegate, which may have been replaced since, runs when no other of its node does; other
+        blocks run at once, all of them in this thread. What it raises is a failure like any other,
+        and told in any case.
 
         :raises PharosError: if the message has been let go, or the block cannot be run again
         """
         if self._again is None:
             raise PharosError(f'{self._where} cannot be run again: do by hand what made it run')
         if not self.is_whole and self._had_message:
-            raise PharosError(f'{self._where} cannot be run again: messages are kept of the newest {WHOLE} failures '
-                              'of a node only; retry() one of those')
+            raise PharosError(f'{self._where} cannot be run again: messages are kept of the newest '
+                              f'{WHOLE} failures of a node only; retry() one of those')
         return self._failures._retry(self)
 
     def debug(self):
@@ -87,8 +91,9 @@ class Failure:
         :raises PharosError: if they have been let go
         """
         if self._frames is None:
-            raise PharosError(f'the frames of this failure of {self._where} are gone: they are kept of the newest '
-                              f'{WHOLE} failures of a node only; debug() one of those, or read its .traceback')
+            raise PharosError(f'the frames of this failure of {self._where} are gone: they are kept '
+                              f'of the newest {WHOLE} failures of a node only; debug() one of those, '
+                              'or read its .traceback')
         import pdb    # only here: it is slow to import
         pdb.post_mortem(self._frames)
 
@@ -98,7 +103,10 @@ class Failure:
 
 
 class Errors(collections.abc.Sequence):
-    """The exceptions of failures, the newest last; who has seen to them may ``pop`` or ``clear`` them."""
+    """The exceptions of failures, the newest last.
+
+    Who has seen to them may ``pop`` or ``clear`` them.
+    """
 
     def __init__(self, failures):
         self._failures = failures
@@ -128,19 +136,21 @@ class Errors(collections.abc.Sequence):
 
 
 class Failures:
-    """The failures of the blocks of one node, or of something else that runs blocks. For use from any thread.
+    """The failures of the blocks of one node, or of something else that runs blocks; for any thread.
 
-    :param tell: called as ``tell(line, details)`` for those that are worth it; what it raises changes nothing
+    :param tell: called as ``tell(line, details)`` for those that are worth it; what it raises
+        changes nothing
     """
 
     def __init__(self, tell):
         self._tell = tell
-        self._lock = threading.RLock()    # an RLock: what is freed, or shown as text, may run code of the user's
+        # an RLock: what is freed, or shown as text, may run code of the user's
+        self._lock = threading.RLock()
         self._kept = {}                   # (place, text) -> Failure, the newest last
         self._first = None
         self._times = collections.Counter()    # place -> how many failures there were at it
         self._texts = collections.Counter()    # place -> of how many texts of them was told
-        self._retrying = threading.local()     # .failed: whether what this thread runs again has failed
+        self._retrying = threading.local()     # .failed: whether what the thread runs again has
         self.count = 0                         # of all failures, identical ones too
         self.errors = Errors(self)
 
@@ -158,12 +168,14 @@ class Failures:
                 self._first = None
 
     def report(self, error, block, where, channel=None, message=None, again=None):
-        """Keep a failure of a block, and tell of it if it is new. Raises nothing but what a signal raises.
+        """Keep a failure of a block, and tell of it if it is new.
+
+        Raises nothing but what a signal raises.
 
         :param where: how it is told, such as 'delegate on_pose of /node on /pose'
         :param again: ``again(message)`` runs the block as it is then, and reports what it raises
         """
-        if ends_program(error):
+        if is_from_signal(error):
             raise error
         attempt(lambda: self._report(error, block, where, channel, message, again))
 
@@ -191,7 +203,7 @@ class Failures:
             self._tell(f'{line}, {times} times by now', '')
 
     def _count_at(self, place, is_new):
-        """Count a failure at a place; returns how many there were at it, and whether this one is to be told of."""
+        """Count a failure; returns how many there were at its place, and whether it is to be told."""
         self._times[place] += 1
         is_told = is_new and self._texts[place] < TEXTS
         if is_told:
@@ -202,7 +214,7 @@ class Failures:
         return self._times[place], is_told
 
     def _make_room(self):
-        """Let go what is large but of the newest; and where there are too many, one of those of which most are alike."""
+        """Let go what is large but of the newest; of too many, one of those that are most alike."""
         kept = list(self._kept.values())
         if len(kept) > WHOLE:
             kept[-WHOLE - 1]._let_go()
@@ -232,7 +244,7 @@ def _raised_at(frames):
 def _formatted(error, frames):
     """A traceback as text."""
     lines = attempt(lambda: traceback.format_exception(type(error), error, frames))
-    if lines is None:    # its __str__, or that of one in its chain, raises what traceback does not expect
+    if lines is None:    # its __str__, or that of its cause, raises what traceback does not expect
         lines = attempt(lambda: traceback.format_tb(frames), [])
     return _brief(''.join(lines), 10 * TEXT_LIMIT)
 
@@ -260,8 +272,9 @@ def _release(error):
         set_attribute(error, name, _small(value))
     for inner in getattr(error, 'exceptions', ()):    # of an ExceptionGroup
         _release(inner)
-    if isinstance(error, (UnicodeEncodeError, UnicodeDecodeError)) and _small(error.object) is not error.object:
-        error.object = error.object[:0]
+    if isinstance(error, (UnicodeEncodeError, UnicodeDecodeError)):
+        if _small(error.object) is not error.object:
+            error.object = error.object[:0]
 
 
 def _small(value):

@@ -16,7 +16,7 @@ class Health(NamedTuple):
     reachable_since: Optional[float]    # since when the master answers, in seconds as of time.time(); None: it does not
     connections: Dict[str, int]         # transport -> how many the node's channels have
     dropped: int                        # messages that its input channels have dropped
-    errors: int                         # times that its blocks have failed; of identical ones, node.errors has one
+    errors: int                         # times that its blocks failed; node.errors has identical ones once
     threads: int                        # of the node
 
     def __str__(self):

@@ -4,7 +4,7 @@ import enum
 import threading
 
 from pharos import running, signals, stopping
-from pharos.blocks import Souls, check_runs
+from pharos.blocks import Souls, attempt, check_runs, name_of
 from pharos.dispatcher import Dispatcher
 from pharos.errors import NodeStoppedError, PharosError
 from pharos.private_rospy.host import rospy
@@ -113,6 +113,7 @@ class Life:
                 self._settings.tcp_port, self._settings.xmlrpc_port = instance.tcp_port, instance.xmlrpc_port
                 self._dispatcher = Dispatcher(instance.start_thread)
                 instance.on_received = self._dispatcher.run
+                instance.on_failure = self._hook_failed
                 self._become(Lifecycle.RUNNING)
                 return
         instance.stop(0)
@@ -192,9 +193,19 @@ class Life:
             channel._stopped()
         self._channels, self._services = [], []
 
+    def _hook_failed(self, error):
+        self._failures.report(error, None, f'a hook of on_shutdown of {self.name}')
+
     def _asked_to_stop(self, reason):
-        self.log('stops: %s' % (reason,))
-        self.stop()
+        attempt(lambda: self.log('stops: %s' % (reason,)))
+        self._stop_for_others()
+
+    def _stop_for_others(self):
+        """Stop where no code of the user's asked for it, who would get what an overriding stop() raises."""
+        try:
+            self.stop()
+        except BaseException as error:
+            self._failures.report(error, self.stop, f'{name_of(self.stop)} of {self.name}')
 
     @property
     def lifecycle(self):

@@ -71,7 +71,7 @@ class Master:
             raise PharosError('%s is not embedded in this program: stop it where it was started' % self)
         running.not_at_end(self.stop)
         for node in self.own_nodes():
-            node.stop()
+            node._stop_for_others()
         if self._child.returncode is None:
             embedded_master.end(self._child)
 
@@ -113,7 +113,7 @@ class Master:
         try:
             node.start()
         except BaseException:
-            node.stop()
+            node._stop_for_others()
             raise
         return node
 

@@ -90,19 +90,23 @@ class Node(Life):
 
     @property
     def errors(self):
-        """The exceptions that blocks raised, the newest last: of identical ones the newest alone, and 100 in all.
+        """The exceptions that blocks raised, the newest last: of identical ones the newest alone.
 
-        The first is kept, for it may be the cause of the others. Who has seen to them may ``pop`` or ``clear`` them.
+        100 are kept, among them the first, for it may be the cause of the others. Who has seen to
+        them may ``pop`` or ``clear`` them.
         """
         return self._failures.errors
 
     @property
     def failures(self):
-        """For each of :attr:`errors` its :class:`~pharos.Failure`: what failed, on what, how often, and to try again."""
+        """For each of :attr:`errors` its :class:`~pharos.Failure`: what failed, on what, how often."""
         return self._failures.all()
 
     def _report(self, error, block, what, channel=None, message=None, again=None):
-        """Keep and tell an exception in a block, which ends nothing but that run of it; see :meth:`Failures.report`."""
+        """Keep and tell what a block raised, which ends nothing but that run of it.
+
+        See :meth:`Failures.report`.
+        """
         if not self.is_running and isinstance(error, (NodeStoppedError, rospy.ROSInterruptException)):
             return    # that is how the stop of a node ends its souls
         where = f'{what} {name_of(block)} of {self.name}'

@@ -48,8 +48,10 @@ class OfferedService:
         try:
             return self._as_response(block(request))
         except BaseException as error:
-            self.node._report(error, block, 'service %s' % self.name, message=request, again=self._answer_again)
-            raise rospy.ServiceException('%s: %s' % (type(error).__name__, text_of(error))) from error
+            self.node._report(error, block, f'service {self.name}', message=request,
+                              again=self._answer_again)
+            why = f'{type(error).__name__}: {text_of(error)}'
+            raise rospy.ServiceException(why) from error
 
     def _answer_again(self, request):
         with contextlib.suppress(rospy.ServiceException):    # it is reported

@@ -82,7 +82,7 @@ def stop_all():
     Returns when each has ended its ``stop()``, or after ``stopping.LIMIT`` seconds.
     """
     deadline = time.monotonic() + stopping.LIMIT
-    threads = [threading.Thread(target=node.stop, name=node.name + ' stop', daemon=True) for node in nodes()]
+    threads = [threading.Thread(target=node._stop_for_others, name=node.name + ' stop', daemon=True) for node in nodes()]
     for thread in threads:
         thread.start()
     join(threads, stopping.LIMIT)

@@ -4,6 +4,7 @@ import os
 import signal
 import threading
 import time
+import traceback
 import _thread
 
 _DEFAULTS = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
@@ -30,8 +31,26 @@ class _Hold:
 
 
 def is_from_signal(error):
-    """Whether a signal ends the program with this exception, and not what a block raised by itself."""
-    return error is _raised
+    """Whether a signal ends the program with this exception, and not what a block raised by itself.
+
+    What the program's own handlers of signals raise in the main thread is for who installed them.
+    """
+    if error is _raised:
+        return True
+    if threading.current_thread() is not threading.main_thread():
+        return False
+    handlers = [signal.getsignal(number) for number in signal.valid_signals()]
+    if isinstance(error, KeyboardInterrupt) and signal.default_int_handler in handlers:
+        return True
+    codes = [code_of(handler) for handler in handlers]
+    return any(frame.f_code in codes for frame, _ in traceback.walk_tb(error.__traceback__))
+
+
+def code_of(function):
+    """The code object that runs when a function, or another object, is called; None if not Python's."""
+    if hasattr(function, '__code__'):
+        return function.__code__
+    return getattr(getattr(type(function), '__call__', None), '__code__', None)
 
 
 def serve(is_needed, end):

@@ -2,7 +2,8 @@
 import sys
 import threading
 
-from pharos.blocks import attempt, check_block, ends_program, name_of, text_of
+from pharos.blocks import attempt, check_block, name_of, text_of
+from pharos.signals import is_from_signal
 
 
 class _Transcript:
@@ -22,8 +23,9 @@ class _Transcript:
     def show(self, *things):
         """Show one line: ``things`` as text, separated by blanks. Raises nothing.
 
-        Where the receiver of :meth:`on_show` raises something, the line goes to standard output, the first one with a
-        word about it. A line that cannot be written there either, to a closed pipe for example, is lost.
+        Where the receiver of :meth:`on_show` raises something, the line goes to standard output, the
+        first one with a word about it. A line that cannot be written there either, to a closed pipe
+        for example, is lost.
         """
         text = ' '.join(map(text_of, things))
         with self._lock:
@@ -37,12 +39,12 @@ class _Transcript:
             receiver(text)
             return True
         except BaseException as error:
-            if ends_program(error):
+            if is_from_signal(error):
                 raise
             if not self._is_failing:
                 self._is_failing = True
-                why = (f'the receiver {name_of(receiver)} of the Transcript raised {type(error).__name__}: '
-                       f'{text_of(error)}: what it does not take is shown here')
+                why = (f'the receiver {name_of(receiver)} of the Transcript raised '
+                       f'{type(error).__name__}: {text_of(error)}: what it does not take is shown here')
                 attempt(lambda: _print(why))
             return False
 

@@ -183,8 +183,9 @@ class _Listener:
                 return
             try:
                 self._block(kind, name, (kind, name) in graph)
-            except BaseException as error:    # the other listeners go on, and so does the watch over our nodes
-                self._failures.report(error, self._block, f'block {name_of(self._block)} for changes')
+            except BaseException as error:    # the other listeners and the watch over our nodes go on
+                where = f'block {name_of(self._block)} for changes'
+                self._failures.report(error, self._block, where)
 
 
 def _graph(state):

@@ -8,6 +8,7 @@ import socket
 import sys
 import threading
 import time
+import traceback
 import xmlrpc
 import xmlrpc.client
 import _thread
@@ -43,6 +44,7 @@ class PrivateRospy:
         self._stopping = threading.Lock()
         # whether a newer node has it: what registers this one again would end that one
         self.has_lost_name = False
+        self.on_failure = lambda error: None    # called with what a hook of rospy.on_shutdown raised
         self.on_received = lambda: None    # called after the callbacks of a batch of messages, in its thread
         self.uri = None
         self.wiring = Wiring(self)
@@ -97,6 +99,8 @@ class PrivateRospy:
         is_shutdown = module.is_shutdown
         module.is_shutdown = lambda: is_shutdown() or self._lifetime.ended.is_set()
         self.is_shut_down = is_shutdown
+        # of hooks of on_shutdown; where that cannot be printed, rospy would stop half way
+        module.traceback = Substitute(traceback, print_exc=lambda: self.on_failure(sys.exc_info()[1]))
 
     def import_library(self, name):
         """A library written on rospy, such as 'actionlib', bound to this node."""

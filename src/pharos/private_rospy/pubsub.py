@@ -1,5 +1,6 @@
 """What a node publishes and hears: mended where rospy loses messages or links."""
 import time
+import traceback
 
 from pharos.private_rospy import registration
 from pharos.private_rospy.callbacks import is_of_channel
@@ -7,6 +8,7 @@ from pharos.private_rospy.fanout import links_of
 from pharos.private_rospy.intraprocess import protocol_handler
 from pharos.private_rospy.lifetime import keep_alive
 from pharos.private_rospy.publishing import mend_publisher
+from pharos.signals import is_from_signal
 
 RECONNECT_DELAY = 0.05    # seconds; a publisher that accepts and closes at once is not to be stormed
 CONNECT_TIMEOUT = 10.0    # seconds that one attempt may take
@@ -110,6 +112,18 @@ def _mend_subscriber(subscriber, instance):
         receive(self, messages, connection)
         instance.on_received()
     subscriber.receive_callback = receive_callback
+
+    invoke = subscriber._invoke_callback
+
+    def _invoke_callback(self, message, callback, arguments):
+        """Where a callback raises what is no Exception, rospy loses it for the other callbacks, and those after it."""
+        try:
+            invoke(self, message, callback, arguments)
+        except BaseException as error:
+            if is_from_signal(error):
+                raise
+            instance.rospy.logerr('bad callback: %s\n%s', callback, traceback.format_exc())
+    subscriber._invoke_callback = _invoke_callback
 
     def remove_connection(self, connection):
         """rospy lets a link that broke go, though its publisher may be there, or there again under its old URI.

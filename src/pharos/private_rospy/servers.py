@@ -2,6 +2,7 @@
 import io
 import socket
 import struct
+import sys
 import time
 
 from pharos.private_rospy import xmlrpc_server
@@ -87,6 +88,19 @@ def hooks(lifetime, warn, debug):
             if not isinstance(error, _CLIENT_GONE):    # that it did not wait for its answer is no error of ours
                 tell(self, error, *information)
         service.error_handler = error_handler
+
+        handle_request = service._handle_request
+
+        def _handle_request(self, transport, request):
+            """rospy leaves a caller without an answer where the handler raises what is no Exception."""
+            try:
+                handle_request(self, transport, request)
+            except Exception:
+                raise
+            except BaseException as error:
+                self.error_handler(error, *sys.exc_info())
+                self._write_service_error(transport, 'error processing request: %s' % error)
+        service._handle_request = _handle_request
 
         def handle(self, transport, header):
             sock, persistent = transport.socket, header.get('persistent', '').lower() in ('1', 'true')

@@ -10,6 +10,7 @@ from pharos.private_rospy.host import rospy
 from pharos.private_rospy.lifetime import Interruption
 from pharos.private_rospy.sharing import numbered
 from pharos.private_rospy.wiring import running_here
+from pharos.signals import is_from_signal
 
 NESTED = 64     # service calls of one thread within one another: a cycle, which would only end with the stack
 IDLE = 1.0      # seconds that a thread with nothing to do is kept
@@ -99,11 +100,21 @@ class LocalService:
         # the caller gets the text alone, as from elsewhere: the reason's traceback is its node's to report
         except rospy.ServiceException as error:
             raise Failed('service cannot process request: %s' % error) from None
-        except Exception as error:
-            service.error_handler(error, *sys.exc_info())
+        except BaseException as error:
+            if is_from_signal(error):
+                raise
+            self._tell_handler(error)
             raise Failed('error processing request: %s' % error) from None
         finally:
             _nested.depth = before
+
+    def _tell_handler(self, error):
+        try:
+            self._service.error_handler(error, *sys.exc_info())
+        except BaseException as another:
+            if is_from_signal(another):
+                raise
+            self._instance.warn('the error handler of %s raised %r' % (self._name, another))
 
 
 def serialize(request):
@@ -164,6 +175,8 @@ class Workers:
                 result = job()
             except Failed as failure:
                 result = failure
+            except BaseException as error:    # of what makes the answer; this thread and its caller go on
+                result = Failed('error processing request: %s' % type(error).__name__)
             self._idle.append(jobs)    # before the caller goes on, who may call again at once
             outcome.put(result)
             job = outcome = result = None    # they are not this thread's to keep alive
