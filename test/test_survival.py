@@ -72,17 +72,6 @@ def test_everything_is_registered_again_when_the_master_comes_back_empty(mortal_
     assert changes.get() == 2
 
 
-def test_what_a_node_opens_while_the_master_is_away_is_registered_later(mortal_master, mailbox):
-    master = Master(mortal_master.url)
-    receiver, sender = create(master, '/receiver', delegate=mailbox), create(master, '/sender')
-    mortal_master.end()
-    receiver.interested_in('/t', 'std_msgs/String')
-    mortal_master.come_back()
-    until(lambda: registrations(master, '/receiver')[1] == ['/t'])
-    sender.send_to('/t', data='found')
-    assert mailbox.get().data == 'found'
-
-
 def test_a_node_stops_while_the_master_is_away(mortal_master):
     node = create(Master(mortal_master.url), '/node')
     node.interested_in('/t', 'std_msgs/String')

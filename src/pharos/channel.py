@@ -8,7 +8,7 @@ import genpy
 from pharos import message_types
 from pharos.blocks import check_delegate, check_runs
 from pharos.dispatcher import Inbox, SocketInbox
-from pharos.errors import MessageTypeError, NodeStoppedError, PharosError
+from pharos.errors import MasterUnreachableError, MessageTypeError, NodeStoppedError, PharosError
 from pharos.private_rospy import copier
 from pharos.private_rospy.fanout import Latch
 
@@ -29,6 +29,14 @@ class _Channel:
         self.closed = False      # whether close() was called
         self._endpoint = None    # rospy's Publisher or Subscriber while the channel is open
         self._lock = threading.Lock()    # guards the above against two threads that close it, and what a subclass has
+
+    def _begin(self, *arguments):
+        """Open it for the first time; where that fails, nothing is left behind."""
+        try:
+            self._open(*arguments)
+        except BaseException:
+            self.close()
+            raise
 
     @property
     def type(self):
@@ -95,7 +103,7 @@ class InputChannel(_Channel):
         self.received = 0
         self._size = copier.copier_for(message_class).size
         self._inboxes, self._dropped_before = [], 0
-        self._open()
+        self._begin()
 
     def _open(self):
         dispatcher = self.node._dispatcher
@@ -186,7 +194,7 @@ class OutputChannel(_Channel):
         self.latched = Latch()
         self.sent = 0
         self._uninterested = set()    # names of nodes of which the log says so
-        self._open(connect_timeout)
+        self._begin(connect_timeout)
 
     def _open(self, connect_timeout=None):
         endpoint, self._send = self.node._rospy.wiring.advertise(self, tcp_nodelay=True, queue_size=self.queue_size)
@@ -269,7 +277,10 @@ class OutputChannel(_Channel):
         """
         missing = self.node._rospy.wiring.known_subscribers(self.topic)
         if missing is None:    # not always: a large graph's state takes long to read
-            missing = set(self.node.master.topic(self.topic).subscribers)
+            try:
+                missing = set(self.node.master.topic(self.topic).subscribers)
+            except MasterUnreachableError:    # the topic is registered already
+                return
 
         def connected():
             missing.difference_update(name for name, _ in self.connections)

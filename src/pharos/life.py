@@ -53,7 +53,8 @@ class Life:
         """Register with the master. A subclass overrides this, calls ``super().start()``, then makes its channels.
 
         Runs in the thread that creates the node. A stopped node starts again, under the same name and ports. Where a
-        class has no ``start`` of its own, the channels, services and parameters that it had come back too.
+        class has no ``start`` of its own, the channels, services and parameters that it had come back too, also where a
+        start in between was interrupted.
 
         :raises PharosError: if the node is running already
         :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: and the node is then as it was
@@ -62,13 +63,28 @@ class Life:
         with signals.held(stopping.LIMIT):
             former = self._rospy
             self._start_run()
-        kept, self._channels = self._channels, []
-        services, self._services = self._services, []
-        if type(self).start is Life.start:
-            for opened in (*kept, *services):
-                opened._open()
-            if former:
+            if type(self).start is not Life.start:
+                self._channels, self._services = [], []
+            elif former:
                 self._rospy.parameters.take_over(former.parameters)
+        try:
+            self._reopen()
+        except BaseException as error:
+            is_ended = not self.is_running
+            self._stop_run()
+            for channel in self._channels:
+                channel._stopped()    # opened after another thread had stopped the node
+            if is_ended and isinstance(error, Exception):
+                raise NodeStoppedError('%s was stopped while it started' % self.name) from error
+            raise
+
+    def _reopen(self):
+        """Open what the node had; it keeps all of that for its next start if this one is interrupted."""
+        for opened in (*self._channels, *self._services):
+            self._live_rospy()
+            opened._open()
+        with self.master._reached():
+            self._rospy.parameters.renew()
 
     def _start_run(self):
         before = self._begin_start()

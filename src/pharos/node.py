@@ -142,6 +142,7 @@ class Node(Life):
         :param wait: without ``typed_as``, seconds to wait until somebody has given the topic a type
         :raises UnknownTopicError, UnknownTypeError, MessageTypeError: if there is no type, or another
         :raises ValueError: if ``topic`` or ``from_`` cannot be a name
+        :raises MasterUnreachableError: if the master does not answer; nothing is left behind then
         """
         return self._topic(topic).input_channel(self, typed_as, delegate, queue_size, inline, shared, from_, wait)
 
@@ -153,6 +154,7 @@ class Node(Life):
             one sent ``to=`` a node is for that node alone
         :param queue_size: messages kept for each slow receiver; the oldest are dropped
         :param wait: as in :meth:`interested_in`
+        :raises MasterUnreachableError: if the master does not answer; nothing is left behind then
         """
         return self._topic(topic).output_channel(self, typed_as, latch, queue_size, wait=wait)
 
@@ -221,7 +223,8 @@ class Node(Life):
 
     def _remember_channel(self, channel):
         with self._opening:
-            self._channels = [*self._channels, channel]    # replaced, so that others may iterate meanwhile
+            if channel not in self._channels:
+                self._channels = [*self._channels, channel]    # replaced, so that others may iterate meanwhile
 
     def _forget_channel(self, channel):
         with self._opening:
@@ -236,6 +239,7 @@ class Node(Life):
         its only field. An exception in it goes to the caller, and is reported as a delegate's.
 
         :param typed_as: service type name, such as 'std_srvs/Empty', or class
+        :raises MasterUnreachableError: if the master does not answer; nothing is left behind then
         """
         return OfferedService(self, self._resolve(name, 'service'), typed_as, block)
 

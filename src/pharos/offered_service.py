@@ -8,7 +8,6 @@ from pharos.blocks import check_block, text_of
 from pharos.errors import MessageTypeError, PharosError
 from pharos.private_rospy import services
 from pharos.private_rospy.host import rospy
-from pharos.private_rospy.names import Resolved
 
 
 class OfferedService:
@@ -24,8 +23,9 @@ class OfferedService:
         self._open()
 
     def _open(self):
-        self._service = self.node.ros.Service(Resolved(self.name), self.service_class, self._answer)
-        self.node._services = [*self.node._services, self]
+        self._service = services.offer(self.node._live_rospy(), self.name, self.service_class, self._answer)
+        if self not in self.node._services:
+            self.node._services = [*self.node._services, self]
 
     @property
     def block(self):

@@ -64,13 +64,20 @@ class Parameter:
 
         It gets None when the parameter is deleted. It runs in a thread of the node's XML-RPC server, or where
         :meth:`set` is called. An exception in it is reported as a delegate's, as is a value of another type.
+
+        :raises MasterUnreachableError: if there is no answer; the block is not run then
         """
         if block is None:
             raise TypeError('%s needs a block to run when it changes, called as block(value)' % self.name)
-        self._blocks.append(check_block(block, 'parameter block', ('value',)))
+        check_block(block, 'parameter block', ('value',))
         watched = self.node._live_rospy().parameters
-        with self.node.master._reached():
-            watched.watch(self.name, self._changed)
+        self._blocks.append(block)
+        try:
+            with self.node.master._reached():
+                watched.watch(self.name, self._changed)
+        except BaseException:
+            self._blocks.remove(block)
+            raise
         return block
 
     def _changed(self, value):

@@ -63,24 +63,42 @@ class WatchedParameters:
 
     def initialize(self, name, value):
         """Set the parameter where it has no value, also after a restart of the master."""
-        self._initialized[name] = value
         self._set_where_missing(name, value)
+        self._initialized[name] = value
 
     def take_over(self, former):
-        """Go on where those of the node's former run ended."""
-        for name, value in former._initialized.items():
-            self.initialize(name, value)
-        for name, listeners in former._listeners.items():
-            for listener in listeners:
-                self.watch(name, listener)
+        """Know what those of the node's former run knew; :meth:`renew` tells the master."""
+        self._initialized = dict(former._initialized)
+        self._listeners = {name: list(listeners) for name, listeners in former._listeners.items()}
+
+    def renew(self):
+        """Have the master know the first values, and what is watched."""
+        for name, value in dict(self._initialized).items():
+            self._set_where_missing(name, value)
+        with self._lock:
+            watched = sorted(self._listeners)    # namespaces before what is in them
+        for name in watched:
+            self._subscribe(name)
 
     def watch(self, name, listener):
         """Call ``listener(value)`` whenever the parameter is set; once more for the same listener is no more."""
         with self._lock:
             listeners = self._listeners.setdefault(name, [])
-            if listener not in listeners:
+            is_new = listener not in listeners
+            if is_new:
                 listeners.append(listener)
-        self._subscribe(name)
+        try:
+            self._subscribe(name)
+        except BaseException:
+            if is_new:
+                self._unwatch(name, listener)
+            raise
+
+    def _unwatch(self, name, listener):
+        with self._lock:
+            self._listeners[name].remove(listener)
+            if not self._listeners[name]:
+                del self._listeners[name]
 
     def _subscribe(self, name):
         master, uri = self._master(), self._instance.uri
@@ -110,17 +128,12 @@ class WatchedParameters:
         client = self._instance.rospy.client
         for name, value in client.load_command_line_node_params(self._instance.settings.argv).items():
             self._instance.rospy.set_param('~' + name, value)
-        for name, value in dict(self._initialized).items():
-            self._set_where_missing(name, value)
         for name in list(self._cached):
             with contextlib.suppress(KeyError):
                 self._cache().delete(name)    # rospy subscribes anew when it is asked for it
         with self._subscribing:
             self._subscribed.clear()
-        with self._lock:
-            watched = sorted(self._listeners)    # namespaces before what is in them
-        for name in watched:
-            self._subscribe(name)
+        self.renew()
 
     def tell_of_own(self, key, value):
         """The node itself has set a parameter, of which a master tells all but the one who sets."""

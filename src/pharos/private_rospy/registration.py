@@ -7,7 +7,7 @@ import xmlrpc.client
 
 import rosgraph
 
-from pharos.errors import NodeNameInUseError
+from pharos.errors import MasterUnreachableError, NodeNameInUseError
 from pharos.private_rospy.loader import Substitute
 from pharos.private_rospy.proxies import ServerProxy, master_api
 from pharos.private_rospy.xmlrpc_server import REFUSED, is_call_from_nearby
@@ -18,6 +18,8 @@ PUBLISHER_LIMIT = 1000      # publishers of a topic that a call may name; a thre
 RETRY_DELAY = 2.0           # seconds between attempts to reach a publisher, for as long as the master knows it
 # the last where something answers that does not speak XML-RPC
 COMMUNICATION_ERRORS = (OSError, xmlrpc.client.Error, http.client.HTTPException, xml.parsers.expat.ExpatError)
+_KINDS = {'pub': 'the publisher on', 'sub': 'the subscriber to', 'srv': 'the service'}
+_attempt = threading.local()    # .failure: of what this thread registers, where it waits for that
 
 
 def hooks(instance):
@@ -106,12 +108,19 @@ def hooks(instance):
             except COMMUNICATION_ERRORS as error:
                 code, message = 0, error
             if code != 1:
-                module.logerr('cannot register %s %s with the master %s: %s' % (kind, name, self.master_uri, message))
+                _tell_failure(module, f'cannot register {_KINDS[kind]} {name} of {me} with the master '
+                                      f'{self.master_uri}: {message}')
             elif kind == 'sub':
                 self.publisher_update(name, value)
             elif kind == 'pub':
                 instance.wiring.told_subscribers[name] = value
         manager.reg_added = reg_added
+
+        def reg_removed(self, name, type_or_uri, kind):
+            """rospy's, but for what could not be registered: a master that is away is not asked twice."""
+            if not hasattr(_attempt, 'failure'):
+                remove(self, name, type_or_uri, kind)
+        remove, manager.reg_removed = manager.reg_removed, reg_removed
 
         def publisher_update(self, topic, uris):
             subscriber = instance.subscriber(topic)
@@ -146,6 +155,33 @@ def hooks(instance):
         manager.cleanup = cleanup
 
     return {'rospy.impl.masterslave': obey_only_the_master_of_the_name, 'rospy.impl.registration': register_once}
+
+
+def registered(make, undo):
+    """What ``make()`` returns, a rospy Publisher, Subscriber or Service that is registered with the master.
+
+    rospy itself does not say that it could not register one: whoever uses it plainly gets one that the watcher
+    registers when the master is back, and a line in the log.
+
+    :raises MasterUnreachableError: where that failed; ``undo(what was made)`` has been called
+    """
+    _attempt.failure = None
+    try:
+        made = make()
+        if _attempt.failure is not None:
+            undo(made)
+            raise _attempt.failure
+        return made
+    finally:
+        del _attempt.failure
+
+
+def _tell_failure(module, text):
+    """Tell of a registration that failed: who waits for it in :func:`registered`, or else the log."""
+    if hasattr(_attempt, 'failure'):
+        _attempt.failure = MasterUnreachableError(text + ': is it running? Nothing was opened: try again when it is')
+    else:
+        module.logerr(text + ': this is done as soon as it answers')
 
 
 class _NotWanted(Exception):
@@ -206,7 +242,8 @@ def repair(instance, handler, topics, services, state, was_away):
     """Register again what the master has forgotten of a node: a restarted one knows nothing, another a part.
 
     :param state: ``(publishers, subscribers, services)`` of the master, each ``{name: [node names]}``
-    :param was_away: whether the master was out of reach: what it had to say of publishers then is asked for again
+    :param was_away: whether the master was out of reach: what it had to say of publishers then is asked for again, and
+        what the node closed then is unregistered
     :returns: whether it had forgotten the node altogether
     """
     name, uri, master = instance.name, instance.uri, master_api(instance.settings.master_url, instance.name)
@@ -230,9 +267,17 @@ def repair(instance, handler, topics, services, state, was_away):
                     unregister(topic, uri)    # closed while we registered it
                 elif ours == topics.get_subscriptions:
                     handler.reg_man.publisher_update(topic, publishers)
+        if was_away:
+            for topic, nodes in theirs.items():
+                if name in nodes and topic not in dict(ours()):
+                    unregister(topic, uri)
     for service, service_uri in services.get_services():
         if name not in state[2].get(service, ()):
             master.registerService(service, service_uri, uri)
             if instance.ended.is_set() or services.get_service(service) is None:
                 master.unregisterService(service, service_uri)
+    if was_away:
+        for service, nodes in state[2].items():
+            if name in nodes and services.get_service(service) is None:
+                master.unregisterService(service, services.get_services()[0][1])    # one URI for all of them
     return forgotten

@@ -8,6 +8,8 @@ import time
 from pharos.private_rospy import copier
 from pharos.private_rospy.host import rospy
 from pharos.private_rospy.lifetime import Interruption
+from pharos.private_rospy.names import Resolved
+from pharos.private_rospy.registration import registered
 from pharos.private_rospy.sharing import numbered
 from pharos.private_rospy.wiring import running_here
 from pharos.signals import is_from_signal
@@ -41,6 +43,15 @@ def _offered_here(name, uri):
         if service is not None and service.uri == uri:
             return instance, service
     return None, None
+
+
+def offer(instance, name, service_class, answer):
+    """A rospy Service of that node.
+
+    :raises MasterUnreachableError: if it cannot be registered
+    """
+    return registered(lambda: instance.rospy.Service(Resolved(name), service_class, answer),
+                      lambda service: service.shutdown('it is not registered'))
 
 
 class LocalService:

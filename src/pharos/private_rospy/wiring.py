@@ -5,6 +5,7 @@ import threading
 
 from pharos.private_rospy.addresses import is_same_master
 from pharos.private_rospy.names import Resolved
+from pharos.private_rospy.registration import registered
 
 _running = {}    # URI -> the PrivateRospy that runs there, in this process
 
@@ -39,32 +40,51 @@ class Wiring:
         """rospy's Subscriber for an InputChannel, connected to the publishers in this process.
 
         The master's word of them takes its time.
+
+        :raises MasterUnreachableError: if it cannot be registered
         """
         topic = channel.topic
         with self._lock:
             self._channels[topic] = (*self.channels_on(topic), channel)
-        endpoint = self._instance.rospy.Subscriber(Resolved(topic), channel.message_class, channel._offer, **options)
+        endpoint = None
+        try:
+            endpoint = registered(lambda: self._instance.rospy.Subscriber(
+                Resolved(topic), channel.message_class, channel._offer, **options), _unregister)
+            self._connect(channel)
+        except BaseException:
+            self._forget(channel)
+            if endpoint is not None:
+                endpoint.unregister()
+            raise
+        return endpoint
+
+    def _connect(self, channel):
+        topic = channel.topic
         publishers = [other for other in self._neighbours() if other.publisher(topic)]
         for other in publishers:
             self._instance.connect(topic, other.uri)
         self._instance.wait_until(lambda: all(other.wiring.sends_to(self._instance.name, topic)
                                               for other in publishers), channel.node.connect_timeout)
-        return endpoint
 
     def unsubscribe(self, channel, endpoint):
         """End what :meth:`subscribe` began."""
+        self._forget(channel)
+        endpoint.unregister()
+
+    def _forget(self, channel):
         topic = channel.topic
         with self._lock:
             self._channels[topic] = tuple(c for c in self.channels_on(topic) if c is not channel)
-        endpoint.unregister()
 
     def advertise(self, channel, **options):
         """rospy's Publisher for an OutputChannel, and its way; subscribers in this process are told at once.
 
         rosmaster tells them in steps of 0.1 s.
+
+        :raises MasterUnreachableError: if it cannot be registered
         """
-        endpoint = self._instance.rospy.Publisher(Resolved(channel.topic), channel.message_class, latch=channel.latch,
-                                                  **options)
+        endpoint = registered(lambda: self._instance.rospy.Publisher(
+            Resolved(channel.topic), channel.message_class, latch=channel.latch, **options), _unregister)
         endpoint.impl.queue_bytes = channel.queue_bytes
         if channel.latch:
             endpoint.impl.fanout.resume(channel)
@@ -131,6 +151,10 @@ class Wiring:
 
 # a process that was forked has none of these nodes, whose sockets are its parent's
 os.register_at_fork(after_in_child=_running.clear)
+
+
+def _unregister(endpoint):
+    endpoint.unregister()
 
 
 def _is_done(connection):

@@ -1,0 +1,234 @@
+"""What cannot be done because the master is away, or the start ends early, leaves nothing behind and loses nothing."""
+import signal
+import socket
+import threading
+
+import pytest
+import std_msgs.msg
+import std_srvs.srv
+
+import pharos
+from conftest import TIMEOUT, Mailbox
+from pharos import BlockNode, Master, running, watcher
+from pharos.private_rospy import proxies
+from programs import until
+
+STRING = 'std_msgs/String'
+
+
+def create(master, name, **kwargs):
+    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
+
+
+def registrations(master, name):
+    return [sorted(topic for topic, nodes in kind.items() if name in nodes) for kind in master.system_state()]
+
+
+@pytest.fixture
+def away(monkeypatch):
+    """A Master whose process a test may end, stop for a while, or start again."""
+    monkeypatch.setattr(watcher, 'PERIOD', 0.1)
+    embedded = Master.embedded()
+    monkeypatch.setenv('ROS_MASTER_URI', embedded.url)
+
+    class Away(Master):
+        def end(self):
+            """kill -9"""
+            embedded._child.kill()
+            embedded._child.wait()
+
+        def come_back(self):
+            nonlocal embedded
+            embedded = Master.embedded(port=int(self.url.rsplit(':', 1)[1].strip('/')))
+
+        def hang(self):
+            embedded._child.send_signal(signal.SIGSTOP)
+
+        def go_on(self):
+            embedded._child.send_signal(signal.SIGCONT)
+    master = Away(embedded.url)
+    yield master
+    master.go_on()
+    running.stop_all()
+    master.end()
+
+
+# -- the master is away -----------------------------------------------------------------------------------------------
+
+OPENERS = {
+    'interested_in': lambda node: node.interested_in('/interrupted/opened', STRING),
+    'output_channel': lambda node: node.output_channel('/interrupted/opened', STRING),
+    'send_to': lambda node: node.send_to('/interrupted/opened', typed_as=STRING, data='x'),
+    'serve': lambda node: node.serve('/interrupted/opened', 'std_srvs/Empty', lambda request: None),
+    'parameter': lambda node: node.parameter('/interrupted/opened', 5),
+    'on_change': lambda node: node.parameter('/interrupted/opened').on_change(print),
+}
+
+
+@pytest.mark.parametrize('opener', OPENERS)
+def test_what_is_opened_while_the_master_is_away_raises_and_leaves_nothing_behind(away, opener):
+    node = create(away, '/node')
+    before = registrations(away, '/node')
+    away.end()
+    for _ in range(2):
+        with pytest.raises(pharos.MasterUnreachableError, match=away.url):
+            OPENERS[opener](node)
+    assert (node.channels, node._services) == ([], []) and not node.errors
+    away.come_back()
+    until(lambda: registrations(away, '/node') == before)
+    assert '/interrupted/opened' not in away.parameters
+    OPENERS[opener](node)    # it can be done as if nothing had been
+    assert sum(map(len, registrations(away, '/node'))) == sum(map(len, before)) + (opener not in ('parameter', 'on_change'))
+    node.stop()
+    assert registrations(away, '/node') == [[], [], []]
+    assert away._api('/test').subscribeParam('http://127.0.0.1:1/', '/interrupted/opened') in ({}, 5)
+
+
+def test_a_second_channel_on_a_topic_needs_no_master(away, mailbox):
+    receiver, sender = create(away, '/receiver', delegate=mailbox), create(away, '/sender')
+    receiver.interested_in('/interrupted/second', STRING)
+    sender.output_channel('/interrupted/second', STRING)
+    away.end()
+    other = Mailbox()
+    receiver.interested_in('/interrupted/second', delegate=other)
+    sender.output_channel('/interrupted/second').send(data='still')
+    assert mailbox.get().data == other.get().data == 'still'
+
+
+def test_what_plain_rospy_opens_while_the_master_is_away_is_registered_later(away):
+    node, mailbox = create(away, '/node'), Mailbox()
+    away.end()
+    node.ros.Subscriber('/interrupted/plain', std_msgs.msg.String, lambda message: mailbox(message, None))
+    publisher = node.ros.Publisher('/interrupted/plain', std_msgs.msg.String, queue_size=5)
+    node.ros.Service('/interrupted/plain_service', std_srvs.srv.Empty, lambda request: None)
+    away.come_back()
+    until(lambda: publisher.get_num_connections())
+    publisher.publish('found')
+    assert mailbox.get().data == 'found'
+    until(lambda: '/interrupted/plain_service' in registrations(away, '/node')[2])
+
+
+def test_what_is_closed_while_the_master_hangs_is_unregistered_when_it_goes_on(away, monkeypatch):
+    monkeypatch.setattr(proxies.ServerProxy.__init__, '__defaults__', (0.2,))    # seconds that a call may take
+    node = create(away, '/node')
+    before = registrations(away, '/node')
+    opened = [node.interested_in('/interrupted/in', STRING), node.output_channel('/interrupted/out', STRING),
+              node.serve('/interrupted/service', 'std_srvs/Empty', lambda request: None)]
+    away.hang()
+    for closed in opened:
+        closed.close()
+    with pytest.raises(pharos.MasterUnreachableError, match='timed out'):
+        node.output_channel('/interrupted/later', STRING)
+    until(lambda: watcher.watcher_of(away).reachable_since is None)
+    away.go_on()
+    until(lambda: registrations(away, '/node') == before)
+
+
+# -- the start is interrupted -----------------------------------------------------------------------------------------
+
+@pytest.fixture
+def stopped(away, mailbox):
+    """A node that was stopped, which had of everything something."""
+    node = create(away, '/node', delegate=mailbox)
+    node.interested_in('/interrupted/in', STRING)
+    node.output_channel('/interrupted/out', STRING, latch=True).send(data='kept')
+    node.serve('/interrupted/service', 'std_srvs/SetBool', lambda request: {'message': 'kept'})
+    node.changes = Mailbox()
+    node.parameter('/interrupted/parameter', 1).on_change(lambda value: node.changes(value, None))
+    node.stop()
+    return node
+
+
+def assert_all_is_back(master, node, mailbox):
+    peer = create(master, '/peer')
+    peer.send_to('/interrupted/in', typed_as=STRING, data='hello')
+    assert mailbox.get().data == 'hello'
+    late = Mailbox()
+    peer.interested_in('/interrupted/out', STRING, delegate=late)
+    assert late.get().data == 'kept'
+    assert master.lookup_service('/interrupted/service').call(data=True).message == 'kept'
+    peer.parameter('/interrupted/parameter').set(2)
+    assert node.changes.get() == 2
+    assert len(node.channels) == 2
+
+
+def test_a_start_without_a_master_loses_nothing(away, stopped, mailbox):
+    away.end()
+    for _ in range(2):
+        with pytest.raises(pharos.MasterUnreachableError):
+            stopped.start()
+    away.come_back()
+    stopped.start()
+    assert_all_is_back(away, stopped, mailbox)
+
+
+def test_a_start_at_a_busy_port_loses_nothing(away, stopped, mailbox):
+    with socket.socket() as busy:
+        busy.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        busy.bind(('127.0.0.1', stopped.tcp_port))
+        busy.listen()
+        with pytest.raises(pharos.PortInUseError):
+            stopped.start()
+    stopped.start()
+    assert_all_is_back(away, stopped, mailbox)
+
+
+@pytest.mark.parametrize('what', ['interested_in', 'output_channel', 'serve', 'parameter'])
+@pytest.mark.parametrize('error', [pharos.MasterUnreachableError('gone'), KeyboardInterrupt()], ids=type)
+def test_a_start_that_is_interrupted_while_it_opens_what_it_had_loses_nothing(away, stopped, mailbox, monkeypatch,
+                                                                              what, error):
+    def interrupt(*args, **kwargs):
+        raise error
+    with monkeypatch.context() as patch:
+        if what == 'parameter':
+            patch.setattr('pharos.private_rospy.parameters.WatchedParameters._subscribe', interrupt)
+        elif what == 'serve':
+            patch.setattr('pharos.offered_service.OfferedService._open', interrupt)
+        else:
+            kind = 'InputChannel' if what == 'interested_in' else 'OutputChannel'
+            patch.setattr(f'pharos.channel.{kind}._open', interrupt)
+        for _ in range(2):
+            with pytest.raises(type(error)):
+                stopped.start()
+            assert stopped.lifecycle.value == 'stopped'
+            assert registrations(away, '/node') == [[], [], []]
+    stopped.start()
+    assert_all_is_back(away, stopped, mailbox)
+
+
+def test_a_start_during_which_the_master_goes_loses_nothing(away, stopped, mailbox, monkeypatch):
+    begin = pharos.InputChannel._open
+
+    def open_when_it_has_gone(self):
+        away.end()
+        begin(self)
+    with monkeypatch.context() as patch:
+        patch.setattr(pharos.InputChannel, '_open', open_when_it_has_gone)
+        with pytest.raises(pharos.MasterUnreachableError):
+            stopped.start()
+    away.come_back()
+    stopped.start()
+    assert_all_is_back(away, stopped, mailbox)
+
+
+def test_a_start_that_is_stopped_while_it_opens_what_it_had_loses_nothing(away, stopped, mailbox, monkeypatch):
+    begin = pharos.OutputChannel._open
+
+    def open_when_it_was_stopped(self, *args):
+        stopper = threading.Thread(target=self.node.stop)
+        stopper.start()
+        stopper.join(TIMEOUT)
+        begin(self, *args)
+    with monkeypatch.context() as patch:
+        patch.setattr(pharos.OutputChannel, '_open', open_when_it_was_stopped)
+        with pytest.raises(pharos.NodeStoppedError, match='stopped while it started'):
+            stopped.start()
+    stopped.start()
+    assert_all_is_back(away, stopped, mailbox)
+
+
+def test_a_channel_closed_while_its_node_is_stopped_does_not_come_back(away, stopped):
+    for channel in list(stopped._channels):
+        channel.close()
+    stopped.start()
+    assert stopped.channels == [] and '/interrupted/in' not in registrations(away, '/node')[1]
