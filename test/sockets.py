@@ -5,6 +5,8 @@ import select
 import socket
 import struct
 
+from rosgraph.network import encode_ros_handshake_header
+
 LISTEN = '0A'    # the state, in /proc/net/tcp
 
 
@@ -55,3 +57,14 @@ def wait_for_end(pid, timeout):
         return bool(select.select([descriptor], [], [], timeout)[0])
     finally:
         os.close(descriptor)
+
+
+def subscribe(port, topic, name='/raw'):
+    """A subscriber of no client library: its socket, on which a connection header and messages will come."""
+    sock = socket.socket()
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 16)    # little more goes to who does not read
+    sock.settimeout(20)
+    sock.connect(('127.0.0.1', port))
+    sock.sendall(encode_ros_handshake_header(
+        {'callerid': name, 'topic': topic, 'type': '*', 'md5sum': '*', 'tcp_nodelay': '0'}))
+    return sock

@@ -14,11 +14,11 @@ import sys
 import threading
 
 import pytest
-from rosgraph.network import encode_ros_handshake_header
 
 from conftest import TIMEOUT, Mailbox, speak_tcpros_only
 from pharos import BlockNode
 from programs import ROOT, Program
+from sockets import subscribe
 
 STRING = 'std_msgs/String'
 DOCUMENT = ROOT / 'doc' / 'robustness.md'
@@ -36,17 +36,6 @@ def until(condition):
             return
         pause.wait(0.01)
     raise RuntimeError('it did not come to be')
-
-
-def subscribe(port, topic, name='/raw'):
-    """A subscriber of no client library: its socket, on which a connection header and messages will come."""
-    sock = socket.socket()
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 16)    # little more goes to who does not read
-    sock.settimeout(20)
-    sock.connect(('127.0.0.1', port))
-    sock.sendall(encode_ros_handshake_header(
-        {'callerid': name, 'topic': topic, 'type': '*', 'md5sum': '*', 'tcp_nodelay': '0'}))
-    return sock
 
 
 def receive(sock):

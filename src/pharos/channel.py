@@ -197,9 +197,21 @@ class OutputChannel(_Channel):
         self._begin(connect_timeout)
 
     def _open(self, connect_timeout=None):
-        endpoint, self._send = self.node._rospy.wiring.advertise(self, tcp_nodelay=True, queue_size=self.queue_size)
-        self._opened(endpoint)
-        self._wait_for_known_subscribers(self.node.connect_timeout if connect_timeout is None else connect_timeout)
+        self._opener, self._connected = threading.current_thread(), threading.Event()
+        try:
+            endpoint, self._send = self.node._rospy.wiring.advertise(self, tcp_nodelay=True, queue_size=self.queue_size)
+            self._opened(endpoint)
+            self._wait_for_known_subscribers(self.node.connect_timeout if connect_timeout is None else connect_timeout)
+        finally:
+            self._connected.set()
+
+    def wait_until_connected(self, timeout):
+        """Wait while another thread opens the channel and connects it to the subscribers that the master knows.
+
+        :param timeout: seconds
+        """
+        if self._opener is not threading.current_thread():
+            self._connected.wait(timeout)
 
     def publish(self, message, to=None):
         """Send ``message`` to all who are interested, or to the node ``to`` alone.
@@ -292,6 +304,18 @@ class OutputChannel(_Channel):
             # those that do not answer any more, killed for example, are not worth the wait
             missing.intersection_update(filter(self.node.master.answers, tuple(missing)))
             wait_until(connected, deadline - time.monotonic())
+            if timeout and not connected() and self.node.is_running:
+                self._tell_who_is_late(missing, timeout)
+
+    def _tell_who_is_late(self, names, timeout):
+        """Say in the log, once for each topic, which subscribers may miss the first message."""
+        told = self.node._rospy.wiring.told_late
+        if self.topic not in told:
+            told.add(self.topic)
+            self.node.log(f'{self.topic}: {", ".join(sorted(names))} did not connect within {timeout:g} s, though the '
+                          f'master has them as subscribers, and may miss the first messages of {self.node.name}: can '
+                          'they reach this host, and are they of the same type? A longer connect_timeout waits longer',
+                          level='warning')
 
     def _stopped(self):
         super()._stopped()

@@ -36,6 +36,7 @@ class Node(Life):
         super()._configure(master, settings)
         self.soul, self.delegate = soul, delegate
         self._opening = threading.Lock()    # held to change _channels
+        self._first_sends = {}              # topic name -> the lock of the thread that opens its channel
         self._failures = Failures(self._tell_failure)
 
     # -- blocks -------------------------------------------------------------------------------------------------------
@@ -182,13 +183,30 @@ class Node(Life):
         if to is not None:
             to = self._name_of(to)
         topic = self._topic(topic)
-        channel = next((channel for channel in self.channels if channel.topic == topic.name
-                        and hasattr(channel, 'publish')), None)
+        channel = self._sending_channel(topic)
         if channel is None:
-            channel = topic.output_channel(self, typed_as, connect_timeout=connect_timeout, wait=wait)
+            channel = self._open_sending_channel(topic, typed_as, connect_timeout, wait)
         elif typed_as is not None:
             topic.message_class(self, typed_as)    # refuses another type
+        # another thread may be opening it just now
+        channel.wait_until_connected(self.connect_timeout if connect_timeout is None else connect_timeout)
         return channel.send(block, to=to, **fields)
+
+    def _sending_channel(self, topic):
+        return next((channel for channel in self.channels if channel.topic == topic.name
+                     and hasattr(channel, 'publish')), None)
+
+    def _open_sending_channel(self, topic, typed_as, connect_timeout, wait):
+        """Open a channel for :meth:`send_to`; of several threads that come at once, one does, and the others wait."""
+        opening = self._first_sends.setdefault(topic.name, threading.RLock())
+        limit = wait + (self.connect_timeout if connect_timeout is None else connect_timeout)
+        is_mine = opening.acquire(timeout=limit)
+        try:
+            return self._sending_channel(topic) or topic.output_channel(self, typed_as, connect_timeout=connect_timeout,
+                                                                        wait=wait)
+        finally:
+            if is_mine:
+                opening.release()
 
     @property
     def channels(self):

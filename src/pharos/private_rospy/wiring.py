@@ -23,6 +23,7 @@ class Wiring:
         self._channels = {}                    # topic -> the channels that receive from it
         self._lock = threading.Lock()          # held to change that
         self.told_subscribers = {}             # topic -> URIs, of which the master told a new publisher
+        self.told_late = set()                 # topics of which the log says that subscribers did not connect in time
         self.connecting = threading.local()    # .topic: of the connection that this thread negotiates
 
     def open(self):
