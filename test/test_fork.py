@@ -65,7 +65,14 @@ CHILDREN = {
     mine.interested_in('/forks_said', 'std_msgs/String', delegate=lambda message, channel: got.set())
     mine.send_to('/forks_back', data='from the child')
     assert got.wait(60)
-    assert mine.master.nodes() and mine.health().registered''',
+    assert mine.master.nodes() and mine.health().registered
+    def live(me):
+        for _ in me.every(3600):
+            lives.set()
+        me.send_to('/forks_back', data='good-bye')
+    lives = threading.Event()
+    mine.fork(live)
+    assert lives.wait(60)''',
 }
 
 
@@ -83,6 +90,8 @@ def test_the_end_of_a_child_leaves_its_parents_nodes_alone(master, mailbox, chil
         assert program.wait_for('still') == 'still running True None True\n'
         if 'from the child' in child:
             assert mailbox.get().data == 'from the child'
+            assert mailbox.get().data == 'good-bye'
+            assert '/program_child' not in [node.name for node in master.nodes()]
         assert mailbox.get().data == 'back'
         out.send(data='second')
         program.wait_for('heard second')

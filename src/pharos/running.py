@@ -2,6 +2,7 @@
 import atexit
 import gc
 import os
+import sys
 import threading
 import time
 
@@ -15,6 +16,7 @@ from pharos.signals import is_from_signal  # noqa: F401: for those who know the 
 COLLECT_EVERY = 20
 _stops = 0     # since it ran
 _nodes = {}    # (master, name) -> Node: those that the master may know, in the order of their starts
+_finalizer = None    # what multiprocessing runs at the end of its processes
 _others = []   # functions that end what else the program has started: programs, masters
 
 
@@ -23,6 +25,7 @@ def claim(node):
 
     :raises NodeNameInUseError: if another node of this process has its name at its master
     """
+    _end_with_multiprocessing()
     with stopping.changed:
         other = _nodes.setdefault((node.master, node.name), node)
     if other is not node:
@@ -58,6 +61,7 @@ def nodes():
 
 def at_end(function):
     """Run ``function()`` when the program ends, after the nodes have stopped; the last that was given first."""
+    _end_with_multiprocessing()
     _others.append(function)
 
 
@@ -105,6 +109,14 @@ def join(threads, timeout):
         thread.join(max(0.0, deadline - time.monotonic()))
 
 
+def _end_with_multiprocessing():
+    """Have a process of multiprocessing end as others do: one that was forked runs nothing that atexit knows."""
+    global _finalizer
+    multiprocessing = sys.modules.get('multiprocessing')
+    if _finalizer is None and multiprocessing and multiprocessing.parent_process():
+        _finalizer = multiprocessing.util.Finalize(None, _end, exitpriority=0)
+
+
 def _end():
     """The program ends."""
     stop_all()
@@ -114,6 +126,8 @@ def _end():
 
 def _forget():
     """In a process that was forked: the nodes are its parent's, as are the programs, and it must not end them."""
+    global _finalizer
+    _finalizer = None    # its parent's, which multiprocessing has dropped
     former = list(_nodes.values())
     _nodes.clear()
     _others.clear()
