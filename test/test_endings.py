@@ -1,4 +1,5 @@
 """One life at a time: a node is known here first, its stop() runs once, and what waits for it ends with it."""
+import socket
 import threading
 import time
 
@@ -291,11 +292,21 @@ def loop(me):
         pass
 
 
+def silent():
+    """The URL of something that never answers."""
+    listener = socket.create_server(('127.0.0.1', 0))
+    LISTENERS.append(listener)
+    return 'http://127.0.0.1:%d/' % listener.getsockname()[1]
+
+
+LISTENERS = []
 WAITS = {
     'wait_for_subscribers': lambda me: me.output_channel('/nobody', 'std_msgs/Empty').wait_for_subscribers(),
     'wait_for_subscribers in a loop': loop,
     'wait_for_node': lambda me: me.master.wait_for_node('/nobody'),
     'Master.wait': lambda me: Master(refused_url()).wait(),
+    'Master.wait for one that says nothing': lambda me: Master(silent()).wait(),
+    'a subscriber that says nothing': lambda me: me.output_channel('/mute', 'std_msgs/Empty'),
     'the type of a topic': lambda me: me.interested_in('/untold', wait=TIMEOUT),
     'a publisher that does not connect': lambda me: me.interested_in('/slow', 'std_msgs/Empty'),
     'a subscriber that does not connect': lambda me: me.send_to('/fast', typed_as='std_msgs/Empty'),
@@ -310,6 +321,10 @@ def waiting(master, monkeypatch):
     peer, waiting, over = create(master, '/slow_peer'), threading.Event(), threading.Event()
     peer.output_channel('/slow', 'std_msgs/Empty')
     peer.interested_in('/fast', 'std_msgs/Empty')
+    mute = silent()
+    master._api('/mute_one').registerSubscriber('/mute', 'std_msgs/Empty', mute)
+    monkeypatch.setattr('pharos.master.PING_TIMEOUT', TIMEOUT)
+    monkeypatch.setattr('pharos.master.TIMEOUT', TIMEOUT)
 
     def sleep(request):
         waiting.set()
@@ -322,6 +337,9 @@ def waiting(master, monkeypatch):
         find(name, uri, cls) if name == '/sleep' else None))
     yield waiting
     over.set()
+    master._api('/mute_one').unregisterSubscriber('/mute', mute)
+    while LISTENERS:
+        LISTENERS.pop().close()
 
 
 @pytest.mark.parametrize('where, name', [

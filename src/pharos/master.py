@@ -15,7 +15,7 @@ from pharos.parameters import Parameters
 from pharos.private_rospy.addresses import check_port, check_url, is_same_master
 from pharos.private_rospy.lifetime import Interruption
 from pharos.private_rospy.names import check_name, global_name
-from pharos.private_rospy.proxies import ServerProxy, master_api
+from pharos.private_rospy.proxies import ServerProxy, interruption, master_api
 from pharos.private_rospy.registration import COMMUNICATION_ERRORS, PING_TIMEOUT
 from pharos.service import Service
 from pharos.topic import Topic
@@ -200,8 +200,10 @@ class Master:
             uri = self._api().lookupNode(name)
         except (rosgraph.MasterException, *COMMUNICATION_ERRORS):
             return None
+        node = ServerProxy(uri, PING_TIMEOUT)
         try:
-            ServerProxy(uri, PING_TIMEOUT).getPid('/pharos')
+            with interruption(node):
+                node.getPid('/pharos')
         except ConnectionRefusedError:
             return None
         except COMMUNICATION_ERRORS:
@@ -299,7 +301,9 @@ class Master:
     def answers(self, name):
         """Whether the node of that name is registered and its XML-RPC server answers."""
         try:
-            ServerProxy(self._api().lookupNode(name), PING_TIMEOUT).getPid('/pharos')
+            node = ServerProxy(self._api().lookupNode(name), PING_TIMEOUT)
+            with interruption(node):
+                node.getPid('/pharos')
         except (rosgraph.MasterException, *COMMUNICATION_ERRORS):
             return False
         return True
@@ -313,8 +317,14 @@ class Master:
         return master_api(self.url, caller_id, timeout)
 
     def _ask(self, method, timeout=TIMEOUT):
-        with self._reached():
-            return getattr(self._api(timeout=timeout), method)()
+        api = self._api(timeout=timeout)
+        with self._reached(), interruption(api.handle) as stop:
+            try:
+                return getattr(api, method)()
+            except COMMUNICATION_ERRORS as error:
+                if stop.came:
+                    raise NodeStoppedError(f'the node that asked the master {self.url} stops') from error
+                raise
 
     def _reached(self):
         return _Reached(self.url)
