@@ -427,6 +427,21 @@ def test_the_log_has_the_traceback_of_a_failure_once(master, transcript):
     assert told() == [True, False]
 
 
+def test_a_listener_to_the_log_that_fails_does_not_hear_of_itself_for_ever(master, transcript, mailbox):
+    def delegate(line, channel):
+        mailbox(line, channel)
+        raise ValueError(f'cannot read {line.msg}')
+    node = create(master, delegate=delegate)
+    node.interested_in('/rosout', 'rosgraph_msgs/Log')
+    speaker = create(master, '/speaker')
+    speaker.log('the last')
+    while mailbox.get().msg != 'the last':
+        pass
+    speaker.log('one more')
+    until(lambda: any('one more' in failure.text for failure in node.failures))
+    assert len(transcript) <= failures.TEXTS + 2    # and for the 10th and 100th, should it come to that
+
+
 def test_failures_differ_in_block_channel_class_place_and_text(master, transcript):
     node = create(master)
     for topic, error_of in [('/one', lambda number: ValueError('a')), ('/two', lambda number: ValueError('a')),

@@ -181,7 +181,8 @@ class Failures:
 
     def _report(self, error, block, where, channel, message, again):
         text, frames = _brief(text_of(error)), error.__traceback__
-        place = where, channel, type(error), _raised_at(frames)
+        # not the channel itself, which may be closed, and should not be kept for being counted
+        place = where, id(channel), type(error), _raised_at(frames)
         with self._lock:
             failure = self._kept.pop((place, text), None)
             is_new = failure is None
