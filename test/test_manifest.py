@@ -1,0 +1,80 @@
+"""package.xml names what is used, and nothing else."""
+import ast
+import pathlib
+import re
+import sysconfig
+import xml.etree.ElementTree
+from importlib.util import find_spec
+
+ROOT = pathlib.Path(__file__).resolve().parent.parent
+STANDARD_LIBRARY = sysconfig.get_path('stdlib')
+
+#: the module of each package that is called otherwise
+KEYS = {'PIL': 'python3-pil', 'hypothesis': 'python3-hypothesis', 'numpy': 'python3-numpy', 'pytest': 'python3-pytest',
+        'rospkg': 'python3-rospkg', 'tkinter': 'python3-tk', 'yaml': 'python3-yaml'}
+#: what is part of this package: its modules, those of its tests, and types that it defines itself
+OWN = {'pharos', 'nested', 'turtlesim', *(path.stem for path in (ROOT / 'test').glob('*.py'))}
+
+
+def sources(*folders):
+    """The Python files there, scripts without a suffix among them."""
+    files = [path for folder in folders for path in (ROOT / folder).rglob('*') if path.suffix in ('', '.py')]
+    return [path for path in files if path.is_file()]
+
+
+def imports(source):
+    """The top-level modules that it imports, in its functions and in the programs that it has in strings, too."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name.partition('.')[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            yield node.module.partition('.')[0]
+        elif isinstance(node, ast.Constant) and re.match(r'\s*(import|from) \w', str(node.value)):
+            yield from program_imports(node.value)
+
+
+def program_imports(text):
+    try:
+        return list(imports(text))
+    except SyntaxError:    # a sentence that begins so, or half a program
+        return []
+
+
+def types(source):
+    """The packages of the message and service types that it names."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Constant) and re.fullmatch(r'[a-z]\w*/[A-Z]\w*', str(node.value)):
+            yield node.value.partition('/')[0]
+
+
+def is_standard(module):
+    if module in KEYS:    # tkinter is a package of its own in Debian
+        return False
+    spec = find_spec(module)
+    if spec is None or spec.origin in (None, 'built-in', 'frozen'):
+        return spec is not None
+    return spec.origin.startswith(STANDARD_LIBRARY) and '-packages' not in spec.origin
+
+
+def keys(modules):
+    return {KEYS.get(module, module) for module in set(modules) - OWN if not is_standard(module)}
+
+
+def declared(*tags):
+    manifest = xml.etree.ElementTree.parse(ROOT / 'package.xml').getroot()
+    return {depend.text for tag in tags for depend in manifest.findall(tag)}
+
+
+def test_what_is_used_at_run_time_is_declared_and_nothing_else():
+    texts = [path.read_text() for path in sources('src', 'scripts')]
+    used = keys(name for text in texts for found in (imports, types) for name in found(text))
+    assert used == declared('depend', 'exec_depend')
+
+
+def test_what_the_tests_import_is_declared():
+    used = keys(name for path in sources('test') for name in imports(path.read_text()))
+    assert used - declared('depend', 'exec_depend', 'test_depend') == set()
+
+
+def test_nothing_is_declared_twice():
+    assert declared('exec_depend') & declared('test_depend') == set()
