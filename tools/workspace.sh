@@ -15,6 +15,8 @@ fi
 # rospy, or another one. The address is the loopback's, whatever the host's name resolves to.
 unset "${!ROS@}" PYTHONPATH PYTHONHOME CMAKE_PREFIX_PATH
 export PATH=/usr/sbin:/usr/bin:/sbin:/bin PYTHONNOUSERSITE=1 PYTHONUNBUFFERED=1
+# Debian's catkin asks for CMake 3.0.2 in the file that it puts at the top of a workspace, which CMake 4 refuses.
+export CMAKE_POLICY_VERSION_MINIMUM=3.5
 export ROS_HOSTNAME=127.0.0.1 ROS_HOME=$ws/ros_home ROS_LOG_DIR=$ws/ros_home/log
 
 say() { printf '== %s\n' "$*"; }

@@ -137,7 +137,8 @@ def _generate(context, types_, installed):
     classes = {}
     for type_, alias in aliases.items():
         spec = context.get_registered(type_)
-        field_types = [re.sub(r'[^[]+', lambda match: aliases.get(match[0], match[0]), t, 1) for t in spec.types]
+        field_types = [re.sub(r'[^[]+', lambda match: aliases.get(match[0], match[0]), t, count=1)
+                       for t in spec.types]
         plain.register(alias, genmsg.MsgSpec(field_types, spec.names, [], '', alias))
         genmsg.msg_loader.load_depends(context, spec, {})
         md5sum = genmsg.compute_md5(context, spec)
