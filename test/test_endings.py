@@ -378,3 +378,27 @@ def test_what_waits_ends_with_the_node(master, waiting, monkeypatch, where, name
     assert time.monotonic() - begin < TIMEOUT / 2
     assert not [thread for thread in threading.enumerate() if thread.name.startswith('/waiter ')]
     assert not node.errors
+
+
+class StartsSlowly(threading.Event):
+    """The event by which a thread tells that it has begun: it has an identity long before."""
+
+    def __init__(self):
+        super().__init__()
+        self.reached, self.allowed = threading.Event(), threading.Event()
+
+    def set(self):
+        self.reached.set()
+        assert self.allowed.wait(TIMEOUT)
+        super().set()
+
+
+def test_a_thread_that_is_only_just_beginning_is_not_waited_for():
+    life = lifetime.Lifetime('/slow')
+    thread = life.Thread(target=lambda: None)
+    thread._started = started = StartsSlowly()
+    starter, _ = in_thread(thread.start)
+    assert started.reached.wait(TIMEOUT) and thread.ident is not None
+    assert life.end() == []
+    started.allowed.set()
+    assert ended(starter)

@@ -95,7 +95,7 @@ class Lifetime:
         threads = [thread for thread in list(self.threads) if thread is not me and thread not in given_up]
         deadline = time.monotonic() + JOIN_TIMEOUT
         for thread in threads:
-            if thread.ident is not None:    # None: it is only just being started, and will see that all has ended
+            if thread.is_alive():    # else it has ended, or is only just being started, and will see that all has
                 thread.join(max(0.0, deadline - time.monotonic()))
         return [thread for thread in threads if thread.is_alive()]
 
