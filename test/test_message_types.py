@@ -342,7 +342,7 @@ def test_the_former_package_of_header_is_understood():
     assert type(cls().header) is std_msgs.msg.Header and cls._has_header
 
 
-@pytest.mark.parametrize('cls', installed_classes(), ids=lambda cls: cls._type)
+@pytest.mark.parametrize('cls', list(installed_classes()), ids=lambda cls: cls._type)
 def test_a_class_made_from_an_installed_ones_text_is_like_it(cls):
     made = class_from_definition(cls._type + 'Made', cls._full_text)
     assert made is not cls

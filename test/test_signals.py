@@ -188,7 +188,33 @@ os.execv(sys.executable, [sys.executable, '-c', 'import signal; signal.signal(si
     'print("ready", flush=True); pharos.spin()'])
 """)
     running.process.send_signal(signal.SIGHUP)
-    assert running.end(signal.SIGTERM) == 0
+    assert running.end(signal.SIGTERM) in (0, ended_by(signal.SIGTERM))    # in spin(), or just before
+
+
+@SIGNALS
+def test_what_a_signal_has_ended_is_not_kept(program, with_signal):
+    running = program("""
+import weakref
+
+class Thing:
+    pass
+
+def work():
+    node()
+    thing = Thing()
+    kept.append(weakref.ref(thing))
+    ready()
+    wait_for(threading.Event())
+
+kept = []
+try:
+    work()
+except (KeyboardInterrupt, SystemExit):
+    pass
+print('freed' if kept[0]() is None else 'kept')
+""")
+    assert running.end(with_signal) == 0
+    assert 'freed' in running.read_to_the_end()
 
 
 CAREFUL = """

@@ -9,8 +9,11 @@ import _thread
 
 _DEFAULTS = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
 
+#: The attribute of an exception by which a signal ends the main thread. Kept here itself, it would keep the frames of
+#: the program, and what is in them, until Python takes its modules apart.
+_MARK = '_pharos_signal'
+
 _is_needed = _end = None    # see :func:`serve`
-_raised = None    # the last exception by which a signal ends the main thread, and with it the program
 _waiting = 0      # how deep the main thread is in a wait of ours, which ends with the nodes
 _held = []        # of each start and stop that the main thread runs, the _Hold
 
@@ -35,7 +38,7 @@ def is_from_signal(error):
 
     What the program's own handlers of signals raise in the main thread is for who installed them.
     """
-    if error is _raised:
+    if hasattr(error, _MARK):
         return True
     if threading.current_thread() is not threading.main_thread():
         return False
@@ -120,12 +123,17 @@ def _on_signal(number, frame):
 
 def _raise(number):
     """End what the main thread does, if it does not end by itself, at once or when the hold ends."""
-    global _raised
     if _held and _held[-1].take(number) or _waiting:
         return
+    raise _exception(number)
+
+
+def _exception(number):
+    """What a signal raises. Not made where it is raised: with its own frame it would be a cycle."""
     # the status is the shell's for a process that the signal ended
-    _raised = KeyboardInterrupt() if number == signal.SIGINT else SystemExit(128 + number)
-    raise _raised
+    error = KeyboardInterrupt() if number == signal.SIGINT else SystemExit(128 + number)
+    setattr(error, _MARK, number)
+    return error
 
 
 def _do_default(number, frame):
