@@ -28,6 +28,7 @@ from std_msgs.msg import ByteMultiArray, Empty, Float32, Float64, Header, String
 from std_msgs.msg import Bool, Duration, Float32MultiArray, Time, UInt8MultiArray
 from tf2_msgs.msg import TFMessage
 
+from conftest import serializes_numpy
 from pharos.private_rospy.copier import copier_for, serialized, thawer
 
 # Among the wrong values are some that numpy, or genpy on its way, warns of.
@@ -490,6 +491,7 @@ def test_any_msg_forwards_what_it_got():
     assert copier_for(Float64).thaw(copier_for(Float64).freeze(message)).data == 0.1
 
 
+@serializes_numpy
 def test_numpy_msg_takes_and_gives_arrays():
     cls = numpy_msg(Float32MultiArray)
     message = cls(data=numpy.array([1, 2], 'f4'))
