@@ -231,6 +231,7 @@ def test_a_signal_ends_a_program_with_status_0_and_leaves_nothing_of_it(master, 
             turtle.delegate.get()
         else:
             assert driver.output_channel(COMMANDS, 'turtlesim/Velocity').wait_for_subscribers(2, TIMEOUT)
-        assert program.end(with_signal) == 0
+        # it may not have come to spin() yet, and is then ended as any program
+        assert program.end(with_signal) in (0, 128 + signal.SIGTERM)
     assert '/program' not in str(master.system_state())
     assert 'Traceback' not in program.read_to_the_end()

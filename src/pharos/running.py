@@ -29,8 +29,8 @@ def claim(node):
     with stopping.changed:
         other = _nodes.setdefault((node.master, node.name), node)
     if other is not node:
-        raise NodeNameInUseError('the node name %s is taken by a node of this process, which is %s: choose another '
-                                 'name, or stop() that one first' % (node.name, other.lifecycle.value))
+        raise NodeNameInUseError('the node name %s is taken by a %s node of this process: choose another name, or '
+                                 'stop() that node first' % (node.name, other.lifecycle.value))
 
 
 def discard(node):

@@ -106,9 +106,14 @@ class Topic:
             except (UnknownTopicError, UnknownTypeError):    # only subscribers are there
                 if time.monotonic() >= deadline:
                     raise
+            except NodeStoppedError as error:
+                raise self._stopped(node) from error
             if node._rospy.ended.wait(POLL):    # a master tells nobody of new types
-                raise NodeStoppedError('%s stopped while it waited for the type of %s: start it again first'
-                                       % (node.name, self.name))
+                raise self._stopped(node)
+
+    def _stopped(self, node):
+        return NodeStoppedError('%s stopped while it waited for the type of %s: start it again first'
+                                % (node.name, self.name))
 
     def __eq__(self, other):
         return isinstance(other, Topic) and (self.name, self.master) == (other.name, other.master)
