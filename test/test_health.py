@@ -50,7 +50,7 @@ def test_dropped_messages_and_errors_are_counted(master):
 def test_a_node_that_stopped(master):
     node = create(master, '/over')
     node.stop()
-    assert node.health() == (False, None, {}, 0, 0, 0)
+    assert node.health() == (False, None, {}, 0, 0, 0, 0)
     assert str(node.health()) == 'not registered, 0 dropped, 0 errors, 0 threads'
     assert repr(node) == '<BlockNode /over stopped, 0 channels>'
 

@@ -19,6 +19,8 @@ BUFFER_SIZE = 1 << 20     # bytes read from a socket at once; rospy's 64 KiB let
 class _Channel:
     """What the two ends have in common."""
 
+    refused = 0
+
     def __init__(self, node, topic, message_class, queue_size):
         if isinstance(queue_size, bool) or not isinstance(queue_size, int) or queue_size < 1:
             raise ValueError('queue_size must be a number of messages, 1 or more, not %r' % (queue_size,))
@@ -82,6 +84,8 @@ class _Channel:
 
     def __repr__(self):
         counts = collections.Counter(transport for _, transport in self.connections)
+        if self.refused:
+            counts['refused'] = self.refused
         state = ', '.join('%d %s' % (count, transport) for transport, count in sorted(counts.items()))
         return '<%s %s %s of %s: %s>' % (type(self).__name__, self.topic, self.type, self.node.name,
                                          (state or 'not connected') if self.is_open else 'closed')
@@ -122,6 +126,11 @@ class InputChannel(_Channel):
         super()._stopped()
         # an inbox holds on to the run of the node that it was made for
         self._dropped_before, self._inboxes = self.dropped, []
+
+    @property
+    def refused(self):
+        """How many publishers the channel cannot hear, for they publish another type; see the node's errors."""
+        return self.node._rospy.refusals.count(self.topic) if self.is_open else 0
 
     @property
     def delegate(self):
@@ -297,6 +306,7 @@ class OutputChannel(_Channel):
         def connected():
             missing.difference_update(name for name, _ in self.connections)
             missing.difference_update(node.name for node in self.node.master.own_nodes() if node._is_ending())
+            missing.difference_update(self.node._rospy.refusals.subscribers(self.topic))
             return not missing or not self.is_open
         deadline, wait_until = time.monotonic() + timeout, self.node._rospy.wait_until
         wait_until(connected, min(timeout, ANSWER_TIMEOUT))

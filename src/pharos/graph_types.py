@@ -7,10 +7,9 @@ from pharos import message_types
 from pharos.errors import PharosError
 from pharos.private_rospy.proxies import ServerProxy
 from pharos.private_rospy.registration import COMMUNICATION_ERRORS
-from pharos.tcpros_connection import TcprosConnection
+from pharos.tcpros_connection import CALLER_ID, publisher_header
 
-TIMEOUT = 2.0               # seconds that one publisher may take
-CALLER_ID = '/pharos_types'    # not the node's: a publisher closes an earlier connection of the same name
+TIMEOUT = 2.0    # seconds that one publisher may take
 
 
 def class_from_publishers(topic, type_):
@@ -81,7 +80,31 @@ def _header(topic, uri, timeout):
     if code != 1:
         return {}
     _, host, port = protocol
-    connection = TcprosConnection((host, port), {
-        'topic': topic.name, 'callerid': CALLER_ID, 'md5sum': '*', 'type': '*', 'tcp_nodelay': '0'}, deadline)
-    connection.close()
-    return connection.header
+    return publisher_header((host, port), topic.name, deadline)
+
+
+def explain(name, refusal):
+    """Why the node of that name cannot hear a publisher.
+
+    :param refusal: a :class:`~pharos.private_rospy.refusals.Refusal`
+    """
+    wanted, offered = refusal.wanted, refusal.offered
+    type_, md5sum = offered.get('type'), offered.get('md5sum')
+    if md5sum == '*':
+        theirs, advice = 'messages of any type', 'only subscribers of any type (rospy.AnyMsg) can be'
+    else:
+        theirs = f'{type_} [{md5sum}] ({_fields_in(offered)})'
+        advice = ('have both sides use the same %s.msg' % type_.rpartition('/')[2] if type_ == wanted._type
+                  else 'use one type, or another topic')
+    return (f'{name} wants {refusal.topic} as {wanted._type} [{wanted._md5sum}] '
+            f'({message_types.describe_fields(wanted)}), but {refusal.publisher} publishes {theirs}, and is not heard: '
+            f'{advice}')
+
+
+def _fields_in(header):
+    """What a publisher's connection header says of the fields of its messages."""
+    try:
+        return message_types.describe_fields(message_types.class_from_definition(
+            header.get('type'), header.get('message_definition'), header.get('md5sum')))
+    except PharosError:
+        return 'its fields are not known here'

@@ -18,13 +18,14 @@ class Health(NamedTuple):
     dropped: int                        # messages that its input channels have dropped
     errors: int                         # times that its blocks failed; node.errors has identical ones once
     threads: int                        # of the node
+    refused: int = 0                    # publishers that its channels cannot hear, for they publish another type
 
     def __str__(self):
         return ', '.join([
             *([] if self.registered is None else ['registered' if self.registered else 'not registered']),
             *self._of_master(),
             *('%d %s' % (count, transport) for transport, count in sorted(self.connections.items())),
-            '%d dropped' % self.dropped, '%d errors' % self.errors, '%d threads' % self.threads])
+            *(['%d refused' % self.refused] if self.refused else []), '%d dropped' % self.dropped, '%d errors' % self.errors, '%d threads' % self.threads])
 
     def _of_master(self):
         """What to say of the master, if anything is known."""
@@ -40,7 +41,7 @@ def health_of(node, ask):
     reachable_since = watcher_of(node.master).reachable_since if node.is_running else None
     return Health(_is_registered(node) if ask else None, reachable_since,
                   dict(connections), sum(getattr(channel, 'dropped', 0) for channel in node.channels), node._failures.count,
-                  node._rospy.thread_count if node._rospy else 0)
+                  node._rospy.thread_count if node._rospy else 0, node._rospy.refusals.count() if node.is_running else 0)
 
 
 def _is_registered(node):

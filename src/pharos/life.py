@@ -130,6 +130,7 @@ class Life:
                 self._dispatcher = Dispatcher(instance.start_thread)
                 instance.on_received = self._dispatcher.run
                 instance.on_failure = self._hook_failed
+                instance.refusals.on_refused = self._report_refusal
                 self._become(Lifecycle.RUNNING)
                 return
         instance.stop(0)

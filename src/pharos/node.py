@@ -1,8 +1,9 @@
 """Nodes: real ROS nodes of this process, written with blocks."""
 import threading
 
+from pharos import graph_types
 from pharos.blocks import attempt, check_block, check_delegate, check_soul, name_of
-from pharos.errors import NodeStoppedError, PharosError
+from pharos.errors import MessageTypeError, NodeStoppedError, PharosError
 from pharos.external_node import ExternalNode
 from pharos.failures import Failures
 from pharos.health import health_of
@@ -115,6 +116,11 @@ class Node(Life):
             where += f' on {channel.topic}'
             again = channel._run_again
         self._failures.report(error, block, where, channel, message, again)
+
+    def _report_refusal(self, refusal):
+        """Keep and tell, once, that a publisher's messages do not come, for they are of another type."""
+        error = MessageTypeError(graph_types.explain(self.name, refusal))
+        self._failures.report(error, None, f'connection of {self.name} to {refusal.publisher} for {refusal.topic}')
 
     def _tell_failure(self, line, details):
         attempt(lambda: self.log(f'{line}\n{details}' if details else line, level='error'))

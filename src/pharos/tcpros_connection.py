@@ -11,6 +11,7 @@ import rosgraph.network
 
 from pharos.private_rospy.lifetime import Interruption, keep_alive, shut
 
+CALLER_ID = '/pharos_types'    # not a node's: a publisher closes an earlier connection of the same name
 _HEADER_LIMIT = 1 << 22    # bytes of a connection header; it holds a message definition
 _LIMIT = 1 << 30           # bytes of a response; a length beyond is a broken stream
 
@@ -97,3 +98,16 @@ class TcprosConnection:
         if left <= 0:
             raise socket.timeout('time is up')
         return left
+
+
+def publisher_header(address, topic, deadline):
+    """The connection header of a publisher, as a subscriber of any type gets it; 'error' is in it where it refuses.
+
+    :param address: (host, port)
+    :param deadline: by ``time.monotonic()``
+    :raises OSError: if there is no answer
+    """
+    connection = TcprosConnection(address, {'topic': topic, 'callerid': CALLER_ID, 'md5sum': '*', 'type': '*',
+                                            'tcp_nodelay': '0'}, deadline)
+    connection.close()
+    return connection.header

@@ -16,7 +16,7 @@ import _thread
 import rosgraph
 
 from pharos.errors import MasterUnreachableError, NodeStoppedError, PortInUseError
-from pharos.private_rospy import host, logs, names, publishing, pubsub, registration, servers
+from pharos.private_rospy import host, logs, names, publishing, pubsub, refusals, registration, servers
 from pharos.private_rospy.lifetime import Lifetime
 from pharos.private_rospy.loader import PrivateImports, Substitute
 from pharos.private_rospy.parameters import WatchedParameters
@@ -48,6 +48,7 @@ class PrivateRospy:
         self.on_received = lambda: None    # called after the callbacks of a batch of messages, in its thread
         self.uri = None
         self.wiring = Wiring(self)
+        self.refusals = refusals.Refusals(self)
         self.parameters = WatchedParameters(self)
         self.workers = Workers(self._lifetime.start_thread)
         self._modules = self._load()
@@ -61,7 +62,7 @@ class PrivateRospy:
         for part in ({'rospy.service': _share_service_exception, 'rospy.impl.init': self._poll_quickly,
                       'rospy.core': self._shut_down_early},
                      names.hooks(), logs.hooks(), servers.hooks(lifetime, self.warn, self.debug),
-                     registration.hooks(self), pubsub.hooks(self),
+                     registration.hooks(self), pubsub.hooks(self), refusals.hooks(self),
                      self.parameters.hooks()):
             for name, hook in part.items():
                 hooks[name].append(hook)

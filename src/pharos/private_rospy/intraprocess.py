@@ -146,9 +146,12 @@ def protocol_handler(instance):
                 return 0, '%s has gone from %s' % (topic, uri), 0
             refusal = _refusal(publisher, subscriber, other, instance)
             if refusal:
-                other.warn(refusal)
-                instance.warn(refusal)
+                other.refusals.subscriber_refused(publisher, instance.name, refusal, refusal)
+                instance.refusals.publisher_refused(subscriber, uri, refusal,
+                                                    lambda: other.connection_header(publisher))
                 return 0, refusal, 0
+            instance.refusals.publisher_connected(topic, uri)
+            other.refusals.subscriber_connected(topic, instance.name)
             link = Link(publisher, subscriber, instance, other)
             if link.open():
                 return 1, 'connected to %s' % other.name, 0

@@ -64,7 +64,7 @@ def mend_publisher(module, start_thread):
         for listener in self.subscriber_listeners or ():
             listener.peer_subscribe(self.resolved_name, self.publish,
                                     functools.partial(self.publish, connection_override=connection))
-        _notify()
+        notify()
         self.fanout.run()
         return True
     publisher.add_connection = add_connection
@@ -86,13 +86,13 @@ def mend_publisher(module, start_thread):
         _refresh(self)
         for listener in self.subscriber_listeners or ():    # rospy trips over None: closed meanwhile
             listener.peer_unsubscribe(self.resolved_name, len(self.connections))
-        _notify()
+        notify()
     publisher.remove_connection = remove_connection
 
     def close(self):
         shut(self)
         self.fanout.close()
-        _notify()
+        notify()
     publisher.close = close
 
 
@@ -101,7 +101,8 @@ def _refresh(publisher):
         publisher.fanout.set_connections(publisher.connections)
 
 
-def _notify():
+def notify():
+    """Have those who wait look again."""
     with _changed:
         _changed.notify_all()
 
@@ -112,7 +113,7 @@ def wait_until(predicate, timeout, lifetime):
     :param timeout: seconds, None: no limit
     :param lifetime: of the node with whose stop the wait ends
     """
-    with Interruption(_notify, lifetime) as stop, _changed:
+    with Interruption(notify, lifetime) as stop, _changed:
         _changed.wait_for(lambda: stop.came or predicate(), None if timeout is None else max(0.0, timeout))
 
 

@@ -2,7 +2,7 @@
 import time
 import traceback
 
-from pharos.private_rospy import registration
+from pharos.private_rospy import refusals, registration
 from pharos.private_rospy.callbacks import is_of_channel
 from pharos.private_rospy.fanout import links_of
 from pharos.private_rospy.intraprocess import protocol_handler
@@ -67,11 +67,15 @@ def hooks(instance):
         """rospy.impl.tcpros_pubsub: after a failure, rospy gives up silently, or waits for what it never connected."""
 
         def connect(connection, host, port, uri, receive, topic):
+            wanted = connection.protocol.recv_data_class
             try:
                 connection.connect(host, port, uri, timeout=CONNECT_TIMEOUT)
+                refusals.check_md5sum(connection, wanted)
             except module.rospy.exceptions.TransportInitError:
                 connection.close()    # remove_connection then sees to the next attempt
+                refusals.examine(instance, connection, topic, uri)
             else:
+                instance.refusals.publisher_connected(topic, uri)
                 connection.receive_loop(receive)
         module.robust_connect_subscriber = connect
 

@@ -64,8 +64,10 @@ class Wiring:
         publishers = [other for other in self._neighbours() if other.publisher(topic)]
         for other in publishers:
             self._instance.connect(topic, other.uri)
-        self._instance.wait_until(lambda: all(other.wiring.sends_to(self._instance.name, topic)
-                                              for other in publishers), channel.node.connect_timeout)
+        name, refuses = self._instance.name, self._instance.refusals.refuses
+        self._instance.wait_until(
+            lambda: all(other.wiring.sends_to(name, topic) or refuses(topic, other.uri) for other in publishers),
+            channel.node.connect_timeout)
 
     def unsubscribe(self, channel, endpoint):
         """End what :meth:`subscribe` began."""
