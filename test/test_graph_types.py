@@ -10,7 +10,9 @@ import socket
 import struct
 import sys
 import threading
+import time
 import xmlrpc.server
+from xmlrpc.client import ServerProxy
 
 import genpy
 import pytest
@@ -24,6 +26,7 @@ from genpy.generator import MsgGenerator
 from conftest import TIMEOUT, Mailbox
 from pharos import (BlockNode, Master, MessageTypeError, NodeStoppedError, PharosError, UnknownTopicError,
                     UnknownTypeError, define_message, graph_types, message_class)
+from pharos.tcpros_connection import publisher_header
 from programs import Program, run, until
 from sockets import refused_url
 
@@ -627,6 +630,18 @@ def test_a_type_in_a_msg_file_goes_before_a_publishers(master, tmp_path, monkeyp
 
 def describe(channel):
     return channel.message_class._slot_types[0]
+
+
+def test_who_asks_for_a_definition_is_no_subscriber(master):
+    """Else one who waits for a subscriber sends to nobody."""
+    topic = '/types/live_%d' % next(topic_numbers)
+    channel = create(master, '/sender').output_channel(topic, 'std_msgs/Int32', latch=True)
+    channel.send(data=7)
+    asked = ServerProxy(channel.node.uri).requestTopic('/asks', topic, [['TCPROS']])
+    header = publisher_header(tuple(asked[2][1:]), topic, time.monotonic() + TIMEOUT)
+    assert (header['type'], header['callerid']) == ('std_msgs/Int32', '/sender')
+    assert 'int32 data' in header['message_definition']
+    assert channel.connections == [] and not channel.node._rospy.publisher(topic).connections
 
 
 def test_who_sends_takes_the_definition_given(master, mailbox):

@@ -8,7 +8,7 @@ import rosgraph
 from pharos.private_rospy import publishing
 from pharos.private_rospy.door import brief
 from pharos.private_rospy.host import rospy
-from pharos.tcpros_connection import publisher_header
+from pharos.tcpros_connection import CALLER_ID, publisher_header
 
 TIMEOUT = 1.0        # seconds in which a publisher that refused says what it publishes
 REMEMBERED = 1000    # refusals of a node on each side; beyond, the oldest is told again when it is repeated
@@ -131,8 +131,13 @@ def hooks(instance):
         handle = handler.topic_connection_handler
 
         def topic_connection_handler(self, sock, address, header):
-            said = handle(self, sock, address, header)
             topic, name = header['topic'], header.get('callerid')
+            asked_for = instance.publisher(topic) if name == CALLER_ID else None
+            if asked_for is not None:    # who only asks for the definition is no subscriber, and misses no message
+                rosgraph.network.write_ros_handshake_header(sock, instance.connection_header(asked_for))
+                sock.close()
+                return None
+            said = handle(self, sock, address, header)
             if not said:
                 instance.refusals.subscriber_connected(topic, name)
                 return said
