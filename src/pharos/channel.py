@@ -11,6 +11,8 @@ from pharos.dispatcher import Inbox, SocketInbox
 from pharos.errors import MasterUnreachableError, MessageTypeError, NodeStoppedError, PharosError
 from pharos.private_rospy import copier
 from pharos.private_rospy.fanout import Latch
+from pharos.private_rospy.proxies import time_limit
+from pharos.private_rospy.registration import REGISTER_TIMEOUT
 
 ANSWER_TIMEOUT = 0.5      # seconds in which the master has told a live subscriber; then it is asked whether it lives
 BUFFER_SIZE = 1 << 20     # bytes read from a socket at once; rospy's 64 KiB let subscribers of images fall behind
@@ -206,11 +208,14 @@ class OutputChannel(_Channel):
         self._begin(connect_timeout)
 
     def _open(self, connect_timeout=None):
+        timeout = self.node.connect_timeout if connect_timeout is None else connect_timeout
+        deadline = time.monotonic() + timeout
         self._opener, self._connected = threading.current_thread(), threading.Event()
         try:
-            endpoint, self._send = self.node._rospy.wiring.advertise(self, tcp_nodelay=True, queue_size=self.queue_size)
+            endpoint, self._send = self.node._rospy.wiring.advertise(self, timeout, tcp_nodelay=True,
+                                                                     queue_size=self.queue_size)
             self._opened(endpoint)
-            self._wait_for_known_subscribers(self.node.connect_timeout if connect_timeout is None else connect_timeout)
+            self._wait_for_known_subscribers(timeout, deadline)
         finally:
             self._connected.set()
 
@@ -247,7 +252,8 @@ class OutputChannel(_Channel):
         endpoint = self._endpoint
         if endpoint is None or self.node._rospy.wiring.reaches(endpoint, name):
             return
-        self.node.master._find(name, self.node.connect_timeout)
+        with time_limit(self.node.connect_timeout):
+            self.node.master._find(name)
         if name not in self._uninterested and not self.latch:
             self._uninterested.add(name)
             self.node.log(f'{name} is not interested in {self.topic}, or not connected yet: what {self.node.name} sends '
@@ -291,15 +297,16 @@ class OutputChannel(_Channel):
         self.node._end_soul()
         return self.is_open and len(self.connections) >= count
 
-    def _wait_for_known_subscribers(self, timeout):
-        """Wait until those that the master knows are connected, for up to ``timeout`` seconds.
+    def _wait_for_known_subscribers(self, timeout, deadline):
+        """Wait until those that the master knows are connected, until the deadline, ``timeout`` after the beginning.
 
         rospy loses what is published before (ros_comm #176, #286).
         """
         missing = self.node._rospy.wiring.known_subscribers(self.topic)
         if missing is None:    # not always: a large graph's state takes long to read
             try:
-                missing = set(self.node.master.topic(self.topic).subscribers)
+                with time_limit(max(REGISTER_TIMEOUT, deadline - time.monotonic())):
+                    missing = set(self.node.master.topic(self.topic).subscribers)
             except MasterUnreachableError:    # the topic is registered already
                 return
 
@@ -308,11 +315,12 @@ class OutputChannel(_Channel):
             missing.difference_update(node.name for node in self.node.master.own_nodes() if node._is_ending())
             missing.difference_update(self.node._rospy.refusals.subscribers(self.topic))
             return not missing or not self.is_open
-        deadline, wait_until = time.monotonic() + timeout, self.node._rospy.wait_until
-        wait_until(connected, min(timeout, ANSWER_TIMEOUT))
+        wait_until = self.node._rospy.wait_until
+        wait_until(connected, min(deadline - time.monotonic(), ANSWER_TIMEOUT))
         if not connected() and self.node.is_running:
             # those that do not answer any more, killed for example, are not worth the wait
-            missing.intersection_update(filter(self.node.master.answers, tuple(missing)))
+            with time_limit(deadline - time.monotonic()):
+                missing.intersection_update(filter(self.node.master.answers, tuple(missing)))
             wait_until(connected, deadline - time.monotonic())
             if timeout and not connected() and self.node.is_running:
                 self._tell_who_is_late(missing, timeout)

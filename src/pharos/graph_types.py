@@ -5,7 +5,7 @@ import rosgraph
 
 from pharos import message_types
 from pharos.errors import PharosError
-from pharos.private_rospy.proxies import ServerProxy
+from pharos.private_rospy.proxies import ServerProxy, deadline_in
 from pharos.private_rospy.registration import COMMUNICATION_ERRORS
 from pharos.tcpros_connection import CALLER_ID, publisher_header
 
@@ -75,7 +75,7 @@ def _told(topic, type_, deadline):
 
 def _header(topic, uri, timeout):
     """The connection header of the publisher at that URI, as a subscriber of any type gets it."""
-    deadline = time.monotonic() + timeout
+    deadline = deadline_in(timeout)
     code, _, protocol = ServerProxy(uri, timeout).requestTopic(CALLER_ID, topic.name, [['TCPROS']])
     if code != 1:
         return {}

@@ -15,7 +15,7 @@ from pharos.parameters import Parameters
 from pharos.private_rospy.addresses import check_port, check_url, is_same_master
 from pharos.private_rospy.lifetime import Interruption
 from pharos.private_rospy.names import check_name, global_name
-from pharos.private_rospy.proxies import ServerProxy, interruption, master_api
+from pharos.private_rospy.proxies import MARGIN, ServerProxy, interruption, master_api, time_limit
 from pharos.private_rospy.registration import COMMUNICATION_ERRORS, PING_TIMEOUT
 from pharos.service import Service
 from pharos.topic import Topic
@@ -160,15 +160,14 @@ class Master:
             raise self._unknown(name, known)
         return known[name]
 
-    def _find(self, name, timeout=TIMEOUT):
+    def _find(self, name):
         """The URI of the node of that name.
 
-        :param timeout: seconds that the master may take
         :raises UnknownNodeError: if the master knows none
         """
         with self._reached():
             try:
-                return self._api(timeout=timeout).lookupNode(name)
+                return self._api().lookupNode(name)
             except rosgraph.MasterError:
                 pass
         raise self._unknown(name, [node.name for node in self.nodes()])
@@ -184,9 +183,10 @@ class Master:
         :raises MasterUnreachableError: if the master has not answered in that time either
         """
         name = global_name(name, 'node')
-        node = watcher_of(self).wait_for_node(name, timeout)
+        with time_limit(timeout):
+            node = watcher_of(self).wait_for_node(name, timeout)
         if node is None:
-            self._ask('getPid')
+            self._ask('getPid', MARGIN)
             raise UnknownNodeError('no node %s came to %s within %g s: is it started, with that '
                                    'master, and under that name?' % (name, self.url, timeout))
         return node

@@ -8,6 +8,8 @@ from pharos.blocks import check_block, text_of
 from pharos.errors import MessageTypeError, PharosError
 from pharos.private_rospy import services
 from pharos.private_rospy.host import rospy
+from pharos.private_rospy.proxies import time_limit
+from pharos.private_rospy.registration import REGISTER_TIMEOUT, UNREGISTER_TIMEOUT
 
 
 class OfferedService:
@@ -23,7 +25,8 @@ class OfferedService:
         self._open()
 
     def _open(self):
-        self._service = services.offer(self.node._live_rospy(), self.name, self.service_class, self._answer)
+        with time_limit(max(REGISTER_TIMEOUT, self.node.connect_timeout)):
+            self._service = services.offer(self.node._live_rospy(), self.name, self.service_class, self._answer)
         if self not in self.node._services:
             self.node._services = [*self.node._services, self]
 
@@ -85,7 +88,8 @@ class OfferedService:
         """Offer it no longer. Harmless when done twice."""
         if self in self.node._services:
             self.node._services = [other for other in self.node._services if other is not self]
-            self._service.shutdown('closed')
+            with time_limit(UNREGISTER_TIMEOUT):
+                self._service.shutdown('closed')
 
     def __repr__(self):
         return '<OfferedService %s %s of %s>' % (self.name, self.type, self.node.name)

@@ -11,6 +11,7 @@ from pharos.blocks import check_block
 from pharos.errors import NodeStoppedError, ServiceCallError, ServiceTypeError, UnknownServiceError
 from pharos.private_rospy import services
 from pharos.private_rospy.host import rospy
+from pharos.private_rospy.proxies import time_limit
 from pharos.private_rospy.lifetime import Interruption
 from pharos.tcpros_connection import TcprosConnection
 
@@ -43,10 +44,9 @@ class Service:
 
     def _look_up(self, deadline):
         """Find the provider, which may have moved; returns its URI."""
-        timeout = TIMEOUT if deadline is None else min(TIMEOUT, max(0.001, deadline - time.monotonic()))
-        with self.master._reached():
+        with time_limit(None if deadline is None else deadline - time.monotonic()), self.master._reached():
             try:
-                self.uri = self.master._api(self.caller_id, timeout).lookupService(self.name)
+                self.uri = self.master._api(self.caller_id, TIMEOUT).lookupService(self.name)
             except rosgraph.MasterError:
                 raise UnknownServiceError('no node of %s offers the service %s%s: see rosservice list' % (
                     self.master.url, self.name, self.master.near(self.name, self.master.services()))) from None

@@ -6,6 +6,7 @@ import rosgraph
 from pharos import graph_types, message_types
 from pharos.channel import InputChannel, OutputChannel
 from pharos.errors import MessageTypeError, NodeStoppedError, UnknownTopicError, UnknownTypeError
+from pharos.private_rospy.proxies import MARGIN, time_limit
 
 POLL = 0.05          # seconds between two looks at the master's types
 QUEUE_SIZE = 1000    # messages kept for a slow receiver, where nothing else is said
@@ -76,6 +77,10 @@ class Topic:
         :raises MessageTypeError: if the node uses the topic with another type already
         :raises NodeStoppedError: if the node stops meanwhile
         """
+        with time_limit(wait + MARGIN if wait else None):
+            return self._message_class(node, typed_as, wait, receives)
+
+    def _message_class(self, node, typed_as, wait, receives):
         known = next((channel.message_class for channel in node.channels if channel.topic == self.name), None)
         if known and typed_as in (None, known._type):
             return known

@@ -1,6 +1,7 @@
 """One node's rospy: loaded, started and stopped."""
 import atexit
 import collections
+import contextlib
 import errno
 import logging.config
 import os
@@ -20,7 +21,7 @@ from pharos.private_rospy import host, logs, names, publishing, pubsub, refusals
 from pharos.private_rospy.lifetime import Lifetime
 from pharos.private_rospy.loader import PrivateImports, Substitute
 from pharos.private_rospy.parameters import WatchedParameters
-from pharos.private_rospy.proxies import ServerProxy, master_api
+from pharos.private_rospy.proxies import ServerProxy, is_time_up, master_api, time_limit
 from pharos.private_rospy.services import Workers
 from pharos.private_rospy.wiring import Wiring
 
@@ -87,8 +88,7 @@ class PrivateRospy:
         def sleep(seconds):
             self._check_not_ended()
             if time.monotonic() > self._deadline:
-                raise MasterUnreachableError('the ROS master %s stopped answering while %s registered'
-                                             % (self.settings.master_url, self.name))
+                raise self._stopped_answering()
             time.sleep(min(seconds, POLL))
         module.time = Substitute(time, sleep=sleep)
 
@@ -118,21 +118,24 @@ class PrivateRospy:
         """
         settings = self.settings
         self._deadline = time.monotonic() + timeout
-        try:
-            master_api(settings.master_url, self.name, timeout).getPid()
-        except registration.COMMUNICATION_ERRORS as error:
-            raise MasterUnreachableError(
-                'no ROS master answers at %s (%s): start one with roscore or Master.embedded(), or set ROS_MASTER_URI'
-                % (settings.master_url, error)) from error
-        registration.claim_name(settings.master_url, self.name, timeout)
+        with time_limit(timeout):
+            try:
+                master_api(settings.master_url, self.name, timeout).getPid()
+            except registration.COMMUNICATION_ERRORS as error:
+                raise MasterUnreachableError(
+                    'no ROS master answers at %s (%s): start one with roscore or Master.embedded(), or set '
+                    'ROS_MASTER_URI' % (settings.master_url, error)) from error
+            with self._reached():
+                registration.claim_name(settings.master_url, self.name, timeout)
         core = self._modules.load('rospy.core')
         core._shutdown_hooks.insert(0, self._wake)    # the first, so that the threads that rospy waits for end at once
         try:
             with _ports_checked('tcp_port', settings.tcp_port):
                 self.tcp_port = servers.listen(self._modules.load('rospy.impl.tcpros_base'), settings.tcp_port)
             with _ports_checked('xmlrpc_port', settings.xmlrpc_port):
-                self.rospy.init_node(settings.base_name, argv=settings.argv, disable_signals=True,
-                                     xmlrpc_port=settings.xmlrpc_port, tcpros_port=settings.tcp_port)
+                with time_limit(2 * timeout), self._reached():    # half of it until rospy is registered
+                    self.rospy.init_node(settings.base_name, argv=settings.argv, disable_signals=True,
+                                         xmlrpc_port=settings.xmlrpc_port, tcpros_port=settings.tcp_port)
             self._check_not_ended()
         except BaseException:
             self.stop(0)
@@ -140,6 +143,20 @@ class PrivateRospy:
         self.xmlrpc_port = self._lifetime.xmlrpc.port
         self.domain = self._modules.load('rosgraph.network').get_host_name()
         core.add_preshutdown_hook(self.request_stop)    # rospy.signal_shutdown called by the node's own code
+
+    @contextlib.contextmanager
+    def _reached(self):
+        """Turns what rospy raises where the time is up into an error that names the master."""
+        try:
+            yield
+        except (*registration.COMMUNICATION_ERRORS, host.rospy.ROSInitException) as error:
+            if not is_time_up():
+                raise
+            raise self._stopped_answering() from error
+
+    def _stopped_answering(self):
+        return MasterUnreachableError('the ROS master %s stopped answering while %s registered: is its host busy, or '
+                                      'gone?' % (self.settings.master_url, self.name))
 
     def _check_not_ended(self):
         if self.ended.is_set():

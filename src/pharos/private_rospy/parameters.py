@@ -6,8 +6,7 @@ import xmlrpc.client
 
 import rosgraph
 
-from pharos.private_rospy.proxies import ServerProxy, master_api
-from pharos.private_rospy.registration import COMMUNICATION_ERRORS, UNREGISTER_TIMEOUT
+from pharos.private_rospy.proxies import master_api
 
 
 class WatchedParameters:
@@ -154,20 +153,13 @@ class WatchedParameters:
         return bool(told)
 
     def close(self):
-        """Watch no longer: a master keeps the name of a node that does."""
+        """Watch nothing from now on."""
         self._closed = True
-        subscribed = self._subscribed | self._cached
-        if not subscribed:
-            return
-        instance = self._instance
-        calls = xmlrpc.client.MultiCall(ServerProxy(instance.settings.master_url, UNREGISTER_TIMEOUT))
-        for name in subscribed:
-            calls.unsubscribeParam(instance.name, instance.uri, name)
-        try:
-            calls()
-        except COMMUNICATION_ERRORS as error:
-            instance.rospy.logdebug('cannot tell the master %s that no parameter is watched any more: %s',
-                                    instance.settings.master_url, error)
+
+    def unsubscribe(self, calls):
+        """Add to the calls those that end the watch: a master keeps the name of a node that does not."""
+        for name in self._subscribed | self._cached:
+            calls.unsubscribeParam(self._instance.name, self._instance.uri, name)
 
     def _value(self, name):
         try:

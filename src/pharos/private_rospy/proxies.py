@@ -1,4 +1,9 @@
 """XML-RPC proxies with a time limit: the standard library's wait for ever for a peer that does not answer."""
+import contextlib
+import http.client
+import socket
+import threading
+import time
 import xmlrpc.client
 
 import rosgraph
@@ -6,20 +11,64 @@ import rosgraph
 from pharos.private_rospy.lifetime import Interruption, shut
 
 TIMEOUT = 10.0    # seconds for one call, where nothing else is said
+MARGIN = 0.5      # seconds beyond a time limit, to tell a master that does not answer from what did not come
+_limits = threading.local()    # .deadline: by which all calls of this thread are to end
+
+
+@contextlib.contextmanager
+def time_limit(seconds):
+    """Within this, all calls of this thread end by then, together: no user's code is to run in it.
+
+    :param seconds: None: no limit
+    """
+    before = getattr(_limits, 'deadline', None)
+    if seconds is not None:
+        _limits.deadline = deadline_in(max(0.0, seconds))
+    try:
+        yield
+    finally:
+        _limits.deadline = before
+
+
+def deadline_in(seconds):
+    """The time, by ``time.monotonic()``, in so many seconds, or when the :func:`time_limit` of this thread is over."""
+    deadline, limit = time.monotonic() + seconds, getattr(_limits, 'deadline', None)
+    return deadline if limit is None else min(deadline, limit)
+
+
+def is_time_up():
+    """Whether the :func:`time_limit` of this thread is over."""
+    deadline = getattr(_limits, 'deadline', None)
+    return deadline is not None and time.monotonic() >= deadline
 
 
 class _Transport(xmlrpc.client.Transport):
+    """Ends each call by a deadline, however slowly its answer comes."""
+
     def __init__(self, timeout):
         super().__init__()
         self._timeout = timeout
         self._is_shut = False
+        self._deadline = 0.0
+
+    def request(self, *args, **options):
+        self._deadline = deadline_in(self._timeout)
+        return super().request(*args, **options)
+
+    def left(self):
+        """The seconds left for the present call."""
+        left = self._deadline - time.monotonic()
+        if left <= 0:
+            raise socket.timeout('timed out')
+        return left
 
     def make_connection(self, host):
         if self._is_shut:
             raise ConnectionAbortedError('it is not waited for any more')
-        connection = super().make_connection(host)
-        connection.timeout = self._timeout
-        return connection
+        if not self._connection or self._connection[0] != host:
+            address, self._extra_headers, _ = self.get_host_info(host)
+            self._connection = host, _Connection(address, self)
+        return self._connection[1]
 
     def shut(self):
         """End the call under way in another thread; it raises an OSError."""
@@ -28,6 +77,30 @@ class _Transport(xmlrpc.client.Transport):
         sock = connection.sock if connection else None
         if sock is not None:
             shut(sock)
+
+
+class _Connection(http.client.HTTPConnection):
+    def __init__(self, address, transport):
+        super().__init__(address)
+        self._transport = transport
+
+    def connect(self):
+        self.timeout = self._transport.left()
+        super().connect()
+        self.sock = _Socket(fileno=self.sock.detach())
+        self.sock.transport = self._transport
+
+
+class _Socket(socket.socket):
+    """The standard library's has a limit for each part of an answer."""
+
+    def sendall(self, *args):
+        self.settimeout(self.transport.left())
+        return super().sendall(*args)
+
+    def recv_into(self, *args):
+        self.settimeout(self.transport.left())
+        return super().recv_into(*args)
 
 
 class ServerProxy(xmlrpc.client.ServerProxy):

@@ -13,7 +13,8 @@ from pharos.private_rospy.proxies import ServerProxy, master_api
 from pharos.private_rospy.xmlrpc_server import REFUSED, is_call_from_nearby
 
 PING_TIMEOUT = 1.0          # seconds in which a running node answers getPid
-UNREGISTER_TIMEOUT = 2.0    # seconds that a stop waits for the master
+REGISTER_TIMEOUT = 1.0      # seconds that the master has at least, to register what is opened
+UNREGISTER_TIMEOUT = 2.0    # seconds that it has, to unregister what is closed or stops
 PUBLISHER_LIMIT = 1000      # publishers of a topic that a call may name; a thread tries to reach each of them
 RETRY_DELAY = 2.0           # seconds between attempts to reach a publisher, for as long as the master knows it
 # the last where something answers that does not speak XML-RPC
@@ -146,6 +147,7 @@ def hooks(instance):
                 calls.unregisterPublisher(me, name, self.uri)
             for name, uri in services.get_services():
                 calls.unregisterService(me, name, uri)
+            instance.parameters.unsubscribe(calls)
             try:
                 calls()
             except COMMUNICATION_ERRORS as error:

@@ -5,7 +5,8 @@ import threading
 
 from pharos.private_rospy.addresses import is_same_master
 from pharos.private_rospy.names import Resolved
-from pharos.private_rospy.registration import registered
+from pharos.private_rospy.proxies import time_limit
+from pharos.private_rospy.registration import REGISTER_TIMEOUT, UNREGISTER_TIMEOUT, registered
 
 _running = {}    # URI -> the PrivateRospy that runs there, in this process
 
@@ -49,13 +50,14 @@ class Wiring:
             self._channels[topic] = (*self.channels_on(topic), channel)
         endpoint = None
         try:
-            endpoint = registered(lambda: self._instance.rospy.Subscriber(
-                Resolved(topic), channel.message_class, channel._offer, **options), _unregister)
+            with time_limit(max(REGISTER_TIMEOUT, channel.node.connect_timeout)):
+                endpoint = registered(lambda: self._instance.rospy.Subscriber(
+                    Resolved(topic), channel.message_class, channel._offer, **options), _unregister)
             self._connect(channel)
         except BaseException:
             self._forget(channel)
             if endpoint is not None:
-                endpoint.unregister()
+                _unregister(endpoint)
             raise
         return endpoint
 
@@ -72,22 +74,24 @@ class Wiring:
     def unsubscribe(self, channel, endpoint):
         """End what :meth:`subscribe` began."""
         self._forget(channel)
-        endpoint.unregister()
+        _unregister(endpoint)
 
     def _forget(self, channel):
         topic = channel.topic
         with self._lock:
             self._channels[topic] = tuple(c for c in self.channels_on(topic) if c is not channel)
 
-    def advertise(self, channel, **options):
+    def advertise(self, channel, timeout, **options):
         """rospy's Publisher for an OutputChannel, and its way; subscribers in this process are told at once.
 
         rosmaster tells them in steps of 0.1 s.
 
+        :param timeout: seconds that the master may take
         :raises MasterUnreachableError: if it cannot be registered
         """
-        endpoint = registered(lambda: self._instance.rospy.Publisher(
-            Resolved(channel.topic), channel.message_class, latch=channel.latch, **options), _unregister)
+        with time_limit(max(REGISTER_TIMEOUT, timeout)):
+            endpoint = registered(lambda: self._instance.rospy.Publisher(
+                Resolved(channel.topic), channel.message_class, latch=channel.latch, **options), _unregister)
         endpoint.impl.queue_bytes = channel.queue_bytes
         if channel.latch:
             endpoint.impl.fanout.resume(channel)
@@ -108,7 +112,7 @@ class Wiring:
     def unadvertise(self, channel, endpoint):
         """End what :meth:`advertise` began."""
         endpoint.impl.fanout.forget(channel)
-        endpoint.unregister()
+        _unregister(endpoint)
 
     @staticmethod
     def connections(endpoint):
@@ -157,7 +161,8 @@ os.register_at_fork(after_in_child=_running.clear)
 
 
 def _unregister(endpoint):
-    endpoint.unregister()
+    with time_limit(UNREGISTER_TIMEOUT):
+        endpoint.unregister()
 
 
 def _is_done(connection):
