@@ -124,6 +124,14 @@ class InputChannel(_Channel):
         self.node._rospy.wiring.unsubscribe(self, endpoint)
         self.node._dispatcher.wait_for_delegate(self.node.stop_timeout)
 
+    def _subscribe_as(self, message_class):
+        """Take another class than it was opened with, of which nothing has come."""
+        self._release()
+        self.node._forget_channel(self)
+        self._tcpros.close()
+        self.message_class, self._size = message_class, copier.copier_for(message_class).size
+        self._begin()
+
     def _stopped(self):
         super()._stopped()
         # an inbox holds on to the run of the node that it was made for

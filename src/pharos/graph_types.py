@@ -1,6 +1,4 @@
 """Message types as the publishers of a topic define them, for a subscriber that has no package of them."""
-import time
-
 import rosgraph
 
 from pharos import message_types
@@ -19,64 +17,62 @@ def class_from_publishers(topic, type_):
     :returns: None if no publisher tells it
     :raises UnknownTypeError, MessageTypeError: if those who tell it give nonsense, or not what has the md5sum they give
     """
+    own = classes_here(topic, type_)
+    if own:
+        return own[0]
     refused = None
-    for told in _told(topic, type_, None):
-        if not isinstance(told, PharosError):
-            return told
-        refused = told
+    for name in topic.publishers:
+        try:
+            header = _header(topic, topic.master._api().lookupNode(name))
+        except (rosgraph.MasterException, *COMMUNICATION_ERRORS, TypeError, ValueError, OverflowError):
+            continue    # the next one may answer, and as agreed
+        if header.get('message_definition') and header.get('type') == type_:
+            try:
+                return message_types.class_from_definition(type_, header['message_definition'], header.get('md5sum'))
+            except PharosError as error:
+                refused = type(error)('%s publishes on %s what cannot be read here: %s' % (name, topic.name, error))
+                refused.__cause__ = error
     if refused:
         raise refused
     return None
 
 
-def confirmed(topic, cls):
-    """``cls`` where a live publisher defines its type alike, or none tells; else what the first of them says it is.
+def classes_here(topic, type_):
+    """The classes with which nodes of this process publish that type on the topic."""
+    instances = [node._rospy for node in topic.master.own_nodes() if node._rospy]    # None: it is just being started
+    publishers = [publisher for publisher in (instance.publisher(topic.name) for instance in instances) if publisher]
+    return [publisher.data_class for publisher in publishers if publisher.data_class._type == type_]
 
-    All of them are given TIMEOUT together: there is a class to go on with.
+
+def agree_with_publishers(channel, refusals):
+    """Have an input channel take the definition of a publisher elsewhere, where none suits it as it is.
+
+    A publisher that is only asked for its definition takes that for a subscriber, and sends to nobody. So the channel
+    subscribes with the definition that is known here, and one who refuses is believed.
+
+    :param refusals: a list that grows with each that comes; of those in it afterwards is to be told
     """
-    first = None
-    for told in _told(topic, cls._type, time.monotonic() + TIMEOUT):
-        if isinstance(told, PharosError):
-            continue
-        if told._md5sum == cls._md5sum:
-            return cls
-        first = first or told
-    return first or cls
-
-
-def _told(topic, type_, deadline):
-    """The class of that type as each live publisher defines it, or the error by which it cannot be read.
-
-    :param deadline: by ``time.monotonic()``; None: each of them is given TIMEOUT
-    """
-    own = {node.name: node for node in topic.master.own_nodes()}
-    for name in topic.publishers:
-        if name in own:    # asked without a socket
-            rospy = own[name]._rospy    # None: it is just being started
-            publisher = rospy and rospy.publisher(topic.name)
-            if publisher is not None and publisher.data_class._type == type_:
-                yield publisher.data_class
-            continue
-        left = TIMEOUT if deadline is None else min(TIMEOUT, deadline - time.monotonic())
-        if left <= 0:
-            return
-        try:
-            header = _header(topic, topic.master._api(timeout=left).lookupNode(name), left)
-        except (rosgraph.MasterException, *COMMUNICATION_ERRORS, TypeError, ValueError, OverflowError):
-            continue    # the next one may answer, and as agreed
-        if header.get('message_definition') and header.get('type') == type_:
+    instance, topic = channel.node._rospy, channel.topic
+    instance.wait_until(lambda: instance.wiring.has_heard_from_publishers(topic), channel.node.connect_timeout)
+    if instance.wiring.hears(topic):
+        return
+    for refusal in list(refusals):
+        offered = refusal.offered
+        if offered.get('type') == channel.type:
             try:
-                yield message_types.class_from_definition(type_, header['message_definition'], header.get('md5sum'))
-            except PharosError as error:
-                refused = type(error)('%s publishes on %s what cannot be read here: %s' % (name, topic.name, error))
-                refused.__cause__ = error
-                yield refused
+                cls = message_types.class_from_definition(channel.type, offered.get('message_definition'),
+                                                          offered.get('md5sum'))
+            except PharosError:
+                continue    # it is told as one that cannot be heard
+            refusals.clear()    # those whom this does not suit either refuse again
+            channel._subscribe_as(cls)
+            return
 
 
-def _header(topic, uri, timeout):
+def _header(topic, uri):
     """The connection header of the publisher at that URI, as a subscriber of any type gets it."""
-    deadline = deadline_in(timeout)
-    code, _, protocol = ServerProxy(uri, timeout).requestTopic(CALLER_ID, topic.name, [['TCPROS']])
+    deadline = deadline_in(TIMEOUT)
+    code, _, protocol = ServerProxy(uri, TIMEOUT).requestTopic(CALLER_ID, topic.name, [['TCPROS']])
     if code != 1:
         return {}
     _, host, port = protocol

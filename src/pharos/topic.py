@@ -58,9 +58,15 @@ class Topic:
     def input_channel(self, node, typed_as=None, delegate=None, queue_size=QUEUE_SIZE, inline=False, shared=False,
                       from_=None, wait=0):
         """A new :class:`~pharos.InputChannel` of ``node``; see :meth:`Node.interested_in`."""
+        is_first = all(channel.topic != self.name for channel in node.channels)
         message_class = self.message_class(node, typed_as, wait, receives=True)
-        return InputChannel(node, self.name, message_class, delegate=delegate, queue_size=queue_size, inline=inline,
-                            shared=shared, from_=from_)
+        options = dict(delegate=delegate, queue_size=queue_size, inline=inline, shared=shared, from_=from_)
+        if not is_first or message_class is typed_as or not message_types.is_provisional(message_class):
+            return InputChannel(node, self.name, message_class, **options)
+        with node._rospy.refusals.held(self.name) as refusals:
+            channel = InputChannel(node, self.name, message_class, **options)
+            graph_types.agree_with_publishers(channel, refusals)
+        return channel
 
     def output_channel(self, node, typed_as=None, latch=False, queue_size=QUEUE_SIZE, connect_timeout=None, wait=0):
         """A new :class:`~pharos.OutputChannel` of ``node``; see :meth:`Node.output_channel`."""
@@ -100,7 +106,8 @@ class Topic:
         except UnknownTypeError:
             return graph_types.class_from_publishers(self, type_or_class) or message_types.message_class(type_or_class)
         if receives and known is not type_or_class and message_types.is_provisional(known):
-            return graph_types.confirmed(self, known)
+            own = graph_types.classes_here(self, known._type)
+            return next((cls for cls in own if cls._md5sum == known._md5sum), (own or [known])[0])
         return known
 
     def _class_in_time(self, node, deadline, receives):

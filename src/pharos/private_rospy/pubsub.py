@@ -7,7 +7,7 @@ from pharos.private_rospy.callbacks import is_of_channel
 from pharos.private_rospy.fanout import links_of
 from pharos.private_rospy.intraprocess import protocol_handler
 from pharos.private_rospy.lifetime import keep_alive
-from pharos.private_rospy.publishing import mend_publisher
+from pharos.private_rospy.publishing import mend_publisher, notify
 from pharos.signals import is_from_signal
 
 RECONNECT_DELAY = 0.05    # seconds; a publisher that accepts and closes at once is not to be stormed
@@ -76,6 +76,8 @@ def hooks(instance):
                 refusals.examine(instance, connection, topic, uri)
             else:
                 instance.refusals.publisher_connected(topic, uri)
+                connection.is_heard = True
+                notify()
                 connection.receive_loop(receive)
         module.robust_connect_subscriber = connect
 
@@ -110,6 +112,12 @@ def _mend_subscriber(subscriber, instance):
     receive, remove = subscriber.receive_callback, subscriber.remove_connection
     add, discard = subscriber.add_callback, subscriber.remove_callback
     subscriber.publishers = ()    # URIs, as the master last said
+    init = subscriber.__init__
+
+    def __init__(self, *args, **kwargs):
+        init(self, *args, **kwargs)
+        self.out_of_reach = set()    # those of them that the last attempt to connect to has not reached
+    subscriber.__init__ = __init__
 
     def receive_callback(self, messages, connection):
         """Channels only queue in their callbacks, so that of a batch the newest are kept; delegates run then."""

@@ -1,4 +1,5 @@
 """Connections refused because the types of the two ends differ: found out about once, and told once."""
+import contextlib
 import threading
 import time
 from typing import NamedTuple
@@ -37,6 +38,7 @@ class Refusals:
         self._lock = threading.Lock()
         self._publishers = {}     # (topic, URI) -> (rospy's subscription, what was said, the Refusal once it is known)
         self._subscribers = {}    # (topic, node name) -> (rospy's publisher, what was said)
+        self._held = {}           # topic -> the refusals of which is not told yet
         self.on_refused = lambda refusal: None
 
     # -- who cannot be heard -------------------------------------------------------------------------------------------
@@ -59,8 +61,27 @@ class Refusals:
         refusal = Refusal(key[0], header.get('callerid', uri), subscription.data_class, header)
         with self._lock:
             self._publishers[key] = subscription, said, refusal
+            held = self._held.get(key[0])
+            if held is not None:
+                held.append(refusal)
         publishing.notify()
-        self.on_refused(refusal)
+        if held is None:
+            self.on_refused(refusal)
+
+    @contextlib.contextmanager
+    def held(self, topic):
+        """Tell of the refusals of a topic only afterwards, and of those that are left then in the list that it gives."""
+        held = []
+        with self._lock:
+            self._held[topic] = held
+        try:
+            yield held
+        finally:
+            with self._lock:
+                if self._held.get(topic) is held:
+                    del self._held[topic]
+            for refusal in held:
+                self.on_refused(refusal)
 
     def publisher_connected(self, topic, uri):
         """Nothing is wrong with it now."""

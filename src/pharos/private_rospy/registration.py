@@ -8,6 +8,7 @@ import xmlrpc.client
 import rosgraph
 
 from pharos.errors import MasterUnreachableError, NodeNameInUseError
+from pharos.private_rospy import publishing
 from pharos.private_rospy.loader import Substitute
 from pharos.private_rospy.proxies import ServerProxy, master_api
 from pharos.private_rospy.xmlrpc_server import REFUSED, is_call_from_nearby
@@ -32,6 +33,13 @@ def hooks(instance):
         connect, lock = handler._connect_topic, threading.Lock()
         connecting = {}    # (topic, URI) -> whether it was asked for again meanwhile
         attempt = instance.wiring.connecting
+
+        def note_attempt(topic, uri, has_reached):
+            subscriber = instance.subscriber(topic)
+            if subscriber is not None:
+                change = subscriber.out_of_reach.discard if has_reached else subscriber.out_of_reach.add
+                change(uri)
+                publishing.notify()
 
         def _connect_topic(self, topic, uri):
             """rospy looks for a connection long before it adds one, and so may connect twice to one publisher."""
@@ -58,6 +66,7 @@ def hooks(instance):
                         connecting[topic, uri] = False
                         if not again:
                             del connecting[topic, uri]
+            note_attempt(topic, uri, answer[0] == 1)
             return answer
         handler._connect_topic = _connect_topic
 
@@ -127,6 +136,7 @@ def hooks(instance):
             subscriber = instance.subscriber(topic)
             if subscriber is not None:
                 subscriber.publishers = uris
+                subscriber.out_of_reach.intersection_update(uris)
             update(self, topic, uris)
         update, manager.publisher_update = manager.publisher_update, publisher_update
 

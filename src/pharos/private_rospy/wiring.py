@@ -145,6 +145,18 @@ class Wiring:
         publisher = self._instance.publisher(topic)
         return publisher is None or any(connection.endpoint_id == name for connection in publisher.connections)
 
+    def hears(self, topic):
+        """Whether the node is connected to a publisher that suits it."""
+        subscriber = self._instance.subscriber(topic)
+        return any(connection.transport_type == 'INTRAPROCESS' or hasattr(connection, 'is_heard')
+                   for connection in (subscriber and subscriber.connections or ()))
+
+    def has_heard_from_publishers(self, topic):
+        """Whether it is, or none of those that the master has named will suit it."""
+        subscriber, refuses = self._instance.subscriber(topic), self._instance.refusals.refuses
+        return subscriber is None or self.hears(topic) or all(
+            uri in subscriber.out_of_reach or refuses(topic, uri) for uri in subscriber.publishers)
+
     @staticmethod
     def neighbour(uri):
         """The PrivateRospy of this process at that URI, None if there is none."""
