@@ -206,6 +206,20 @@ def test_services_come_back_with_their_node(master):
         assert call_through_tcp(master, '/spawn', name=name).name == name
 
 
+def test_a_service_is_the_newest_nodes_that_offers_it_and_the_olders_again_when_that_has_gone(master):
+    def look_again():
+        for node in newer, older:
+            if node.is_running:
+                node._rospy.repair(master.system_state(), False)    # as the watcher does every second
+        return call_here(master, '/taken').message
+    older, newer = create(master, '/older'), create(master, '/newer')
+    for node in older, newer:
+        node.serve('/taken', SET_BOOL, lambda request, name=node.name: {'message': name})
+    assert [look_again(), look_again()] == ['/newer', '/newer']
+    newer.stop()
+    assert [look_again(), look_again()] == ['/older', '/older']
+
+
 def test_a_closed_service_does_not_come_back(master):
     node = create(master)
     node.serve('/clear', 'std_srvs/Empty', lambda request: None).close()

@@ -263,8 +263,10 @@ def repair(instance, handler, topics, services, state, was_away):
              (topics.get_subscriptions, state[1], master.registerSubscriber, master.unregisterSubscriber)]
     # every node offers this from its start on; a channel may have been opened with a restarted master already
     forgotten = name not in state[2].get(instance.rospy.resolve_name('~get_loggers'), ())
-    offered = [(topics.get_publications(), state[0]), (topics.get_subscriptions(), state[1]),
-               (services.get_services(), state[2])]
+    # A service that another node offers by now is that node's, as in ROS; both would take it back for ever.
+    lost_services = [(service, service_uri) for service, service_uri in services.get_services()
+                     if not state[2].get(service)]
+    offered = [(topics.get_publications(), state[0]), (topics.get_subscriptions(), state[1]), (lost_services, state[2])]
     is_whole = all(name in theirs.get(each, ()) for ours, theirs in offered for each, _ in ours)
     if not is_whole and _belongs_to_another(master, name, uri):
         # To register again would take the name back, and end the newer node.
@@ -283,11 +285,10 @@ def repair(instance, handler, topics, services, state, was_away):
             for topic, nodes in theirs.items():
                 if name in nodes and topic not in dict(ours()):
                     unregister(topic, uri)
-    for service, service_uri in services.get_services():
-        if name not in state[2].get(service, ()):
-            master.registerService(service, service_uri, uri)
-            if instance.ended.is_set() or services.get_service(service) is None:
-                master.unregisterService(service, service_uri)
+    for service, service_uri in lost_services:
+        master.registerService(service, service_uri, uri)
+        if instance.ended.is_set() or services.get_service(service) is None:
+            master.unregisterService(service, service_uri)
     if was_away:
         for service, nodes in state[2].items():
             if name in nodes and services.get_service(service) is None:
