@@ -169,6 +169,13 @@ def test_a_host_whose_name_does_not_resolve_is_reached_by_its_address(master, mo
     assert master.answers('/here')
 
 
+def test_the_hosts_name_is_taken_without_complaint(master, monkeypatch, capfd):
+    monkeypatch.delenv('ROS_HOSTNAME')
+    monkeypatch.setattr(socket, 'gethostname', lambda: 'localhost')
+    assert create(master, '/here', domain=None).domain == 'localhost'
+    assert 'invalid' not in capfd.readouterr().err    # rosgraph's word for a name in ROS_IP
+
+
 def test_an_empty_variable_says_nothing(master, monkeypatch):
     monkeypatch.setenv('ROS_HOSTNAME', '')
     monkeypatch.setenv('ROS_IP', '127.0.0.1')

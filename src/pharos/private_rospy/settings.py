@@ -75,7 +75,7 @@ class Settings:
                 check_domain(argument, mappings[argument])
                 return
         if check_environment(self.environ) is None:
-            self.environ[ROS_IP] = default_domain()
+            self.environ[ROS_HOSTNAME] = default_domain()    # rosgraph complains of a name in ROS_IP
 
 
 def _namespace(name, given):
