@@ -2,8 +2,10 @@
 import subprocess
 import sys
 import threading
+import xmlrpc.client
 
 import pytest
+import rosnode
 
 import pharos
 from conftest import TIMEOUT, Mailbox
@@ -141,6 +143,19 @@ def test_the_end_of_a_with_block_stops_the_node(master):
     with create(master, '/within') as node:
         assert node.is_running
     assert not node.is_running
+
+
+def test_who_asks_a_node_to_stop_finds_it_gone(master):
+    """As with rospy: rosnode asks the next thing at once."""
+    for number in range(5):
+        victim = create(master, '/victim')
+        victim.interested_in('/nodes/victim', 'std_msgs/Empty')
+        victim.fork(lambda me: me.sleep(60))
+        with xmlrpc.client.ServerProxy(victim.uri) as proxy:
+            assert proxy.shutdown('/test', 'enough') == [1, 'shutdown', 0]
+        assert not rosnode.rosnode_ping('/victim', max_count=1)
+        assert not any('/victim' in users for kind in master.system_state() for users in kind.values())
+        victim.stop()    # waits for the rest
 
 
 def test_rosnode_kill_stops_that_node_and_no_other(master):

@@ -248,6 +248,10 @@ class PrivateRospy:
         """
         publishing.wait_until(predicate, timeout, self._lifetime)
 
+    def wait_until_silent(self, timeout):
+        """Wait until the node is unregistered, and nobody can ask it anything, for up to ``timeout`` seconds."""
+        self._lifetime.silent.wait(timeout)
+
     @property
     def ended(self):
         """The event set when the stop begins."""

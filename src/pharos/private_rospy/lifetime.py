@@ -24,6 +24,7 @@ class Lifetime:
 
     def __init__(self, name):
         self.ended = threading.Event()
+        self.silent = threading.Event()    # set when the node is unregistered, and its XML-RPC server closed
         self._interruptions = set()    # of waits under way
         self.threads = weakref.WeakSet()
         self.xmlrpc = None    # the node's XML-RPC server, once it is bound
@@ -85,6 +86,10 @@ class Lifetime:
     def shut_at_end(self, sock):
         """Shut this socket down at the end: a thread that waits for what comes through it then ends."""
         self._sockets.add(sock)
+
+    def spare(self, sock):
+        """Do not shut this socket: its client is to hear that the node has stopped."""
+        self._sockets.discard(sock)
 
     def end(self, given_up=()):
         """Shut the sockets, wait for the threads but those given up; returns those that did not end in time."""

@@ -14,6 +14,7 @@ from pharos.private_rospy.proxies import ServerProxy, master_api
 from pharos.private_rospy.xmlrpc_server import REFUSED, is_call_from_nearby
 
 PING_TIMEOUT = 1.0          # seconds in which a running node answers getPid
+STOP_TIMEOUT = 5.0          # seconds that who asks the node to stop waits for that
 REGISTER_TIMEOUT = 1.0      # seconds that the master has at least, to register what is opened
 UNREGISTER_TIMEOUT = 2.0    # seconds that it has, to unregister what is closed or stops
 PUBLISHER_LIMIT = 1000      # publishers of a topic that a call may name; a thread tries to reach each of them
@@ -100,6 +101,7 @@ def hooks(instance):
                 return -1, REFUSED + 'only this host and the master\'s may stop it, unless its ' \
                     'allow_remote_shutdown is set', 0
             instance.request_stop('%s asked for it: %s' % (caller_id, msg))
+            instance.wait_until_silent(STOP_TIMEOUT)    # whoever asked finds it gone, as with rospy
             return 1, 'shutdown', 0
         handler.shutdown = shutdown
 

@@ -27,7 +27,8 @@ def hooks(lifetime, warn, debug):
     def limit_requests(module):
         """rosgraph.xmlrpc: a request may be silent or huge for ever, and runs in a thread that nobody knows."""
         door = Door('XML-RPC', lifetime, warn)
-        module.SilenceableXMLRPCRequestHandler = _request_handler(module.SilenceableXMLRPCRequestHandler, door)
+        module.SilenceableXMLRPCRequestHandler = _request_handler(
+            module.SilenceableXMLRPCRequestHandler, door, lifetime)
         server, node = module.ThreadingXMLRPCServer, module.XmlRpcNode
         dispatch = server._dispatch
 
@@ -75,6 +76,7 @@ def hooks(lifetime, warn, debug):
                 shut(server.socket)
                 self.accepting.join()    # closed any earlier, the socket could not wake it any more
                 server.server_close()
+            lifetime.silent.set()
         node.shutdown = shutdown
 
     def leave_complaints_to_the_server(module):
@@ -108,7 +110,7 @@ class _Reader(io.RawIOBase):
         return count
 
 
-def _request_handler(base, door):
+def _request_handler(base, door, lifetime):
     """The class that serves one client, derived from rosgraph's."""
     large = threading.BoundedSemaphore(LARGE_REQUESTS)
 
@@ -177,6 +179,9 @@ def _request_handler(base, door):
             if not door.heard(self.connection):
                 self.close_connection = True
                 return
+            if method == 'shutdown':
+                lifetime.spare(self.connection)
+                self.close_connection = True
             _call.client, _call.here = self.client_address, self.connection.getsockname()
             try:
                 answer = xmlrpc.client.dumps((self.server._dispatch(method, parameters),), methodresponse=True)
