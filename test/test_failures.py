@@ -454,9 +454,35 @@ def test_failures_of_ever_changing_text_are_told_a_few_times(master, transcript)
     node = create(master)
     failing(node, lambda number: ValueError(f'no transform at {number}'), 1000)
     assert [line.split('no transform at ')[1] for line in transcript] == [
-        '0', '1', '2', '9, 10 times by now', '99, 100 times by now', '999, 1000 times by now']
+        '0', '1', '2', '9, 10 times by now, with different texts', '99, 100 times by now, with different texts',
+        '999, 1000 times by now, with different texts']
     assert len(node.errors) == len(node.failures) == failures.KEPT
     assert str(node.errors[0]) == 'no transform at 0' and str(node.errors[-1]) == 'no transform at 999'
+
+
+def test_a_block_that_replaces_another_and_fails_as_that_did_is_told(master, transcript):
+    """At the prompt every block is in line 1 of <stdin>, and silence would look like success."""
+    node = create(master)
+    for text in 'lambda me: me.nothing()', 'lambda me: [me.nothing()]':
+        node.soul = eval(text)
+        node.execute()
+        node.execute()
+    assert len(transcript) == 2 and [failure.count for failure in node.failures] == [2, 2]
+
+
+def test_closures_of_one_place_that_fail_alike_are_told_once(master, transcript):
+    node = create(master)
+    for number in range(3):
+        node.soul = lambda me, number=number: me.nothing()
+        node.execute()
+    assert len(transcript) == 1 and node.failures[0].count == 3
+
+
+def test_what_nobody_raised_is_told_without_a_traceback_that_only_repeats_it():
+    told = []
+    kept = failures.Failures(lambda line, details: told.append((line, details)))
+    kept.report(ValueError('of another type'), print, 'connection of /a to /b')
+    assert told == [('connection of /a to /b raised ValueError: of another type', '')]
 
 
 def test_a_flood_of_failures_displaces_no_other(master, transcript):

@@ -10,7 +10,7 @@ import genpy
 
 from pharos.blocks import attempt, text_of
 from pharos.errors import PharosError
-from pharos.signals import is_from_signal
+from pharos.signals import code_of, is_from_signal
 
 KEPT = 100           # failures of a node; the oldest go, but for the first, which may be the cause
 WHOLE = 5            # of them, the newest, whose messages and frames are kept
@@ -181,8 +181,10 @@ class Failures:
 
     def _report(self, error, block, where, channel, message, again):
         text, frames = _brief(text_of(error)), error.__traceback__
-        # not the channel itself, which may be closed, and should not be kept for being counted
-        place = where, id(channel), type(error), _raised_at(frames)
+        # The code tells a block from the one that it replaces, typed anew at the prompt perhaps, but
+        # not two closures. Not the channel itself, which may be closed, and should not be kept for
+        # being counted.
+        place = where, attempt(lambda: code_of(block)), id(channel), type(error), _raised_at(frames)
         with self._lock:
             failure = self._kept.pop((place, text), None)
             is_new = failure is None
@@ -197,11 +199,14 @@ class Failures:
             times, is_told = self._count_at(place, is_new)
         if getattr(self._retrying, 'failed', None) is not None:
             self._retrying.failed = is_told = True
-        line = f'{where} raised {type(error).__name__}: {text}'
+        raised = f'{where} raised {type(error).__name__}'
         if is_told:
-            self._tell(line, _formatted(error, frames))
+            # what nobody raised has no traceback but its text, which is in the line
+            has_more = frames or error.__cause__ or error.__context__
+            self._tell(f'{raised}: {text}', _formatted(error, frames) if has_more else '')
         elif times >= 10 and str(times).strip('0') == '1':
-            self._tell(f'{line}, {times} times by now', '')
+            different = '' if failure.count == times else ', with different texts'
+            self._tell(f'{raised}: {text}, {times} times by now{different}', '')
 
     def _count_at(self, place, is_new):
         """Count a failure; returns how many there were at its place, and whether it is to be told."""
