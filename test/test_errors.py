@@ -9,8 +9,8 @@ from pharos import BlockNode, Master
 from pharos.private_rospy.host import rospy
 
 
-def create(master, name='/node', **kwargs):
-    return master.create(BlockNode, named=name, **{'domain': '127.0.0.1', **kwargs})
+def create(master, name='/node', node_class=BlockNode, **kwargs):
+    return master.create(node_class, named=name, **{'domain': '127.0.0.1', **kwargs})
 
 
 @pytest.fixture
@@ -178,6 +178,48 @@ def test_an_exception_in_start_stops_the_node(master, nothing_left):
             raise RuntimeError('broken')
     with pytest.raises(RuntimeError, match='broken'):
         master.create(Broken, named='/node')
+
+
+def test_a_node_that_no_master_made_is_refused():
+    with pytest.raises(TypeError, match=r'made by a master: .*create\(BlockNode, named=...\), not BlockNode\(\)'):
+        BlockNode()
+
+
+def test_a_start_that_does_not_call_super_is_told_so(master, nothing_left):
+    class Silent(pharos.Node):
+        def start(self):
+            pass
+
+    class Early(pharos.Node):
+        def start(self):
+            self.interested_in('/never', 'std_msgs/Empty')
+            super().start()
+
+    class Earlier(pharos.Node):
+        def __init__(self):
+            self.interested_in('/never', 'std_msgs/Empty')
+    with pytest.raises(pharos.PharosError, match=r'/node did not start: Silent.start.* call super\(\).start\(\)'):
+        create(master, '/node', node_class=Silent)
+    for node_class in Early, Earlier:
+        with pytest.raises(pharos.NodeStoppedError, match=r'/node is new: .* call super\(\).start\(\) before'):
+            create(master, '/node', node_class=node_class)
+
+
+@pytest.mark.parametrize('name', ['soul', 'delegate'])
+def test_a_soul_or_delegate_that_each_node_would_hide_is_refused(name):
+    """It was silent, and later an AttributeError: '_soul'."""
+    with pytest.raises(TypeError, match=f'Driver.{name} would never run.*set self.{name} in start'):
+        type('Driver', (pharos.Node,), {name: lambda self, *args: None})
+
+
+def test_a_method_for_a_soul_that_already_has_its_self_is_told_what_to_give(master):
+    class Driver(pharos.Node):
+        def loop(self):
+            pass
+    node = create(master, node_class=Driver)
+    with pytest.raises(TypeError, match=r'called as soul\(node\).*Give .*Driver.loop, whose self is the node'):
+        node.fork(node.loop)
+    node.fork(Driver.loop).join()
 
 
 def test_all_errors_are_ros_exceptions():

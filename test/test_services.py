@@ -181,7 +181,7 @@ def test_names_are_resolved_in_the_nodes_namespace(master):
 
 @pytest.mark.parametrize('block', [None, 7, lambda: None, lambda request, more: None])
 def test_a_service_needs_a_block_of_one_argument(master, block):
-    with pytest.raises(TypeError, match=r'service block\(request\)'):
+    with pytest.raises(TypeError, match=r'block\(request\)'):
         create(master).serve('/clear', 'std_srvs/Empty', block)
     assert '/clear' not in master.services()
 

@@ -14,9 +14,9 @@ def check_block(block, what, parameters):
     """``block`` if it can be called with so many arguments (or is None), else TypeError that says how it is called."""
     if block is None:
         return None
-    call = '%s(%s)' % (what, ', '.join(parameters))
+    call = '%s(%s)' % (what.split()[-1], ', '.join(parameters))
     if not callable(block):
-        raise TypeError('a %s is a block, called as %s; %r cannot be called' % (what, call, block))
+        raise TypeError('a %s is called as %s; %r cannot be called' % (what, call, block))
     check_runs(block, 'a ' + what)
     try:
         signature = inspect.signature(block)
@@ -52,7 +52,12 @@ def check_delegate(block):
 
 def check_soul(block):
     """``block`` if it can be a soul (or is None), else TypeError."""
-    return check_block(block, 'soul', ('node',))
+    try:
+        return check_block(block, 'soul', ('node',))
+    except TypeError as error:
+        if not inspect.ismethod(block):
+            raise
+        raise TypeError(f'{error}. Give {name_of(block)}, whose self is the node') from None
 
 
 def attempt(function, otherwise=None):

@@ -271,5 +271,8 @@ class Life:
 
     def _live_rospy(self):
         if self._lifecycle not in (Lifecycle.RUNNING, Lifecycle.STOPPING):
-            raise NodeStoppedError('%s is %s: start() it first' % (self.name, self._lifecycle.value))
+            hint = ''
+            if self._lifecycle is Lifecycle.NEW:
+                hint = '; a start() of its own has to call super().start() before anything else'
+            raise NodeStoppedError(f'{self.name} is {self._lifecycle.value}: start() it first{hint}')
         return self._rospy

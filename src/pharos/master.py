@@ -11,6 +11,7 @@ from pharos import ros_process, running
 from pharos.blocks import check_block
 from pharos.errors import MasterUnreachableError, NodeStoppedError, PharosError, UnknownNodeError
 from pharos.external_node import ExternalNode
+from pharos.life import Lifecycle
 from pharos.parameters import Parameters
 from pharos.private_rospy.addresses import check_port, check_url, is_same_master
 from pharos.private_rospy.lifetime import Interruption
@@ -112,6 +113,9 @@ class Master:
                                   xmlrpc_port=xmlrpc_port, argv=argv)
         try:
             node.start()
+            if node.lifecycle is Lifecycle.NEW:
+                raise PharosError(f'{node.name} did not start: {node_class.__name__}.start() has to call '
+                                  'super().start() before anything else')
         except BaseException:
             node._stop_for_others()
             raise

@@ -31,7 +31,16 @@ class Node(Life):
     """
 
     def __init__(self):
-        pass
+        if '_settings' not in vars(self):
+            name = type(self).__name__
+            raise TypeError(f'a node is made by a master: Master().create({name}, named=...), not {name}()')
+
+    def __init_subclass__(cls, **kwargs):
+        super().__init_subclass__(**kwargs)
+        for name in ('soul', 'delegate'):
+            if name in vars(cls) and not isinstance(vars(cls)[name], property):
+                raise TypeError(f'{cls.__name__}.{name} would never run: each node has a {name} of its own, given to '
+                                f'create() or set. Name it otherwise, and set self.{name} in start()')
 
     def _configure(self, master, settings, soul, delegate):
         super()._configure(master, settings)

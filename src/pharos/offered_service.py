@@ -38,7 +38,7 @@ class OfferedService:
     @block.setter
     def block(self, block):
         if block is None:
-            raise TypeError('%s needs a block that answers, called as service block(request)' % self.name)
+            raise TypeError('%s needs a block that answers, called as block(request)' % self.name)
         self._block = check_block(block, 'service block', ('request',))
 
     @property

@@ -212,7 +212,8 @@ class PrivateRospy:
         try:
             services = self._modules.load('rospy.impl.registration').get_service_manager()
             if registration.repair(self, handler, self._topic_manager(), services, state, was_away):
-                self.rospy.logwarn('the master %s had forgotten this node: registered again', self.settings.master_url)
+                self.rospy.logwarn('the master %s had forgotten %s: registered again',
+                                   self.settings.master_url, self.name)
                 self.parameters.put_back()
         except (rosgraph.MasterException, *registration.COMMUNICATION_ERRORS) as error:
             self.rospy.logdebug('cannot register with the master %s: %s', self.settings.master_url, error)
