@@ -12,6 +12,7 @@ from pharos.errors import MasterUnreachableError, MessageTypeError, NodeStoppedE
 from pharos.private_rospy import copier
 from pharos.private_rospy.fanout import Latch
 from pharos.private_rospy.proxies import time_limit
+from pharos.seconds import check_limit
 from pharos.private_rospy.registration import REGISTER_TIMEOUT
 
 ANSWER_TIMEOUT = 0.5      # seconds in which the master has told a live subscriber; then it is asked whether it lives
@@ -300,6 +301,7 @@ class OutputChannel(_Channel):
 
         Returns whether they are; ends early, with False, when the node stops; a soul of the node is ended by that.
         """
+        timeout = check_limit('timeout', timeout)
         if self.is_open:
             self.node._rospy.wait_until(lambda: len(self.connections) >= count or not self.is_open, timeout)
         self.node._end_soul()

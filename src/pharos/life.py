@@ -9,6 +9,7 @@ from pharos.dispatcher import Dispatcher
 from pharos.errors import NodeStoppedError, PharosError
 from pharos.private_rospy.host import rospy
 from pharos.private_rospy.instance import PrivateRospy
+from pharos.seconds import check_seconds
 from pharos.transcript import Transcript
 from pharos.watcher import watcher_of
 
@@ -245,6 +246,7 @@ class Life:
 
         The report: ``(Delay forSeconds: 1) wait``.
         """
+        seconds = check_seconds('a sleep', seconds)
         with signals.waiting(), contextlib.suppress(rospy.ROSInterruptException):
             self._live_rospy().rospy.sleep(seconds)
         self._end_soul()
@@ -259,8 +261,7 @@ class Life:
 
         A turn that takes longer than ``seconds`` delays the next, which then comes at once.
         """
-        if not seconds > 0:
-            raise ValueError('a period is a number of seconds above 0, not %r' % (seconds,))
+        seconds = check_seconds('a period', seconds, above=0)
         return self._turns(self.ros.Rate(1.0 / seconds, reset=True))
 
     def _turns(self, rate):

@@ -18,6 +18,7 @@ from pharos.private_rospy.lifetime import Interruption
 from pharos.private_rospy.names import check_name, global_name
 from pharos.private_rospy.proxies import MARGIN, ServerProxy, interruption, master_api, time_limit
 from pharos.private_rospy.registration import COMMUNICATION_ERRORS, PING_TIMEOUT
+from pharos.seconds import check_limit
 from pharos.service import Service
 from pharos.topic import Topic
 from pharos.watcher import watcher_of
@@ -182,13 +183,16 @@ class Master:
     def wait_for_node(self, name, timeout=None):
         """Wait until a node of that name is there, which means registered and not dead; returns it.
 
-        :param timeout: seconds, None: without limit
+        :param timeout: seconds, None: without limit, 0: whether it is there now
         :raises UnknownNodeError: if it does not come in time
         :raises MasterUnreachableError: if the master has not answered in that time either
         """
-        name = global_name(name, 'node')
+        name, timeout = global_name(name, 'node'), check_limit('timeout', timeout)
         with time_limit(timeout):
             node = watcher_of(self).wait_for_node(name, timeout)
+        if node is None:    # there was no time to look
+            with time_limit(MARGIN):
+                node = self.live_node(name)
         if node is None:
             self._ask('getPid', MARGIN)
             raise UnknownNodeError('no node %s came to %s within %g s: is it started, with that '
@@ -221,6 +225,8 @@ class Master:
         may raise: that ends nothing. Returns a function that ends it. What is there by now has not come; a master that
         is away is taken for one that has nothing yet.
         """
+        if block is None:
+            raise TypeError('on_change needs a block to run, called as block(kind, name, is_there)')
         return watcher_of(self).listen(check_block(block, 'block', ('kind', 'name', 'is_there')))
 
     @property
@@ -287,6 +293,7 @@ class Master:
         :raises MasterUnreachableError: if it does not in time
         :raises NodeStoppedError: if the node whose soul or delegate waits stops meanwhile
         """
+        timeout = check_limit('timeout', timeout)
         deadline = None if timeout is None else time.monotonic() + timeout
         woken = threading.Event()
         with Interruption(woken.set) as stop:

@@ -13,6 +13,7 @@ from pharos.parameter import Parameter
 from pharos.private_rospy.host import rospy
 from pharos.private_rospy.names import Resolved, check_name
 from pharos.private_rospy.settings import Settings
+from pharos.seconds import check_seconds
 from pharos.topic import QUEUE_SIZE
 from pharos.transcript import Transcript
 
@@ -197,6 +198,12 @@ class Node(Life):
             check_block(block, 'block', ('message',))
         if to is not None:
             to = self._name_of(to)
+        if connect_timeout is None:
+            connect_timeout = self.connect_timeout
+        else:
+            connect_timeout = check_seconds('connect_timeout', connect_timeout)
+        if wait != 0:
+            wait = check_seconds('wait', wait)
         topic = self._topic(topic)
         channel = self._sending_channel(topic)
         if channel is None:
@@ -204,7 +211,7 @@ class Node(Life):
         elif typed_as is not None:
             topic.message_class(self, typed_as)    # refuses another type
         # another thread may be opening it just now
-        channel.wait_until_connected(self.connect_timeout if connect_timeout is None else connect_timeout)
+        channel.wait_until_connected(connect_timeout)
         return channel.send(block, to=to, **fields)
 
     def _sending_channel(self, topic):
@@ -214,8 +221,7 @@ class Node(Life):
     def _open_sending_channel(self, topic, typed_as, connect_timeout, wait):
         """Open a channel for :meth:`send_to`; of several threads that come at once, one does, and the others wait."""
         opening = self._first_sends.setdefault(topic.name, threading.RLock())
-        limit = wait + (self.connect_timeout if connect_timeout is None else connect_timeout)
-        is_mine = opening.acquire(timeout=limit)
+        is_mine = opening.acquire(timeout=max(0.0, wait + connect_timeout))
         try:
             return self._sending_channel(topic) or topic.output_channel(self, typed_as, connect_timeout=connect_timeout,
                                                                         wait=wait)
@@ -302,6 +308,8 @@ class Node(Life):
 
     def ros_import(self, name):
         """A library written on rospy ('actionlib', 'message_filters', 'tf2_ros'), bound to this run of the node."""
+        if not isinstance(name, str):
+            raise TypeError(f"a library is given by its name, such as 'actionlib', not as {name!r}")
         return self._live_rospy().import_library(name)
 
     @property

@@ -13,6 +13,7 @@ from pharos.private_rospy import services
 from pharos.private_rospy.host import rospy
 from pharos.private_rospy.proxies import time_limit
 from pharos.private_rospy.lifetime import Interruption
+from pharos.seconds import check_limit
 from pharos.tcpros_connection import TcprosConnection
 
 TIMEOUT = 5.0    # seconds in which the master, and a provider asked for its type, must answer
@@ -108,6 +109,7 @@ class Service:
         :raises ServiceCallError: if the provider fails, goes away or does not answer in time
         :raises NodeStoppedError: if the node whose soul or delegate waits for the answer stops meanwhile
         """
+        timeout = check_limit('timeout', timeout)
         deadline = None if timeout is None else time.monotonic() + timeout
         self.response = None
         if block is not None:

@@ -7,6 +7,7 @@ from pharos import graph_types, message_types
 from pharos.channel import InputChannel, OutputChannel
 from pharos.errors import MessageTypeError, NodeStoppedError, UnknownTopicError, UnknownTypeError
 from pharos.private_rospy.proxies import MARGIN, time_limit
+from pharos.seconds import check_seconds
 
 POLL = 0.05          # seconds between two looks at the master's types
 QUEUE_SIZE = 1000    # messages kept for a slow receiver, where nothing else is said
@@ -83,6 +84,7 @@ class Topic:
         :raises MessageTypeError: if the node uses the topic with another type already
         :raises NodeStoppedError: if the node stops meanwhile
         """
+        wait = check_seconds('wait', wait)
         with time_limit(wait + MARGIN if wait else None):
             return self._message_class(node, typed_as, wait, receives)
 
