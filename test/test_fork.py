@@ -7,10 +7,12 @@ from pharos import BlockNode
 from programs import Program
 
 CODE = '''
-import multiprocessing, os, signal, sys, threading
+import multiprocessing, os, signal, sys, threading, warnings
 import pharos
 from pharos import BlockNode, Master
 
+# Python 3.12 and later say in the middle of what is printed that they do not like what is tried here.
+warnings.filterwarnings('ignore', '.* is multi-threaded, use of fork', DeprecationWarning)
 heard, embedded = threading.Event(), Master.embedded()
 
 def tell(message, channel):
@@ -34,6 +36,13 @@ heard.wait()
 {fork}
 print('still', me.lifecycle.value, other.health().registered, started.poll(), embedded.is_reachable(), flush=True)
 back.send(data='back')
+
+def tell_of_the_wait():
+    while not pharos.signals._waiting:
+        threading.Event().wait(0.001)
+    print('waiting', flush=True)
+
+threading.Thread(target=tell_of_the_wait, daemon=True).start()
 pharos.spin()
 '''
 
@@ -93,6 +102,7 @@ def test_the_end_of_a_child_leaves_its_parents_nodes_alone(master, mailbox, chil
             assert mailbox.get().data == 'good-bye'
             assert '/program_child' not in [node.name for node in master.nodes()]
         assert mailbox.get().data == 'back'
+        program.wait_for('waiting')    # before that, Ctrl-C ends it with another status
         out.send(data='second')
         program.wait_for('heard second')
         assert program.end() == 0
