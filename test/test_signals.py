@@ -6,7 +6,7 @@ import pytest
 
 from conftest import Mailbox
 from pharos import BlockNode
-from programs import Program
+from programs import TIMEOUT, Program
 
 SIGNALS = pytest.mark.parametrize('with_signal', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP],
                                   ids=lambda number: number.name)
@@ -83,6 +83,36 @@ def test_a_wait_of_ours_ends_and_the_program_goes_on(program, with_signal, wait)
 def test_plain_code_is_ended_as_without_nodes(program, with_signal, busy):
     running = program('me = node()\nready()\n' + busy)
     assert running.end(with_signal) == ended_by(with_signal)
+
+
+@pytest.mark.parametrize('line', [
+    'ready()\n    wait_for(threading.Event())', 'ready_in_wait()\n    me.sleep(3600)',
+    'ready_in_wait()\n    me.execute()'])
+def test_ctrl_c_at_the_prompt_ends_the_line_and_no_node(program, line):
+    """It was silent, and all nodes were gone, when a line was mistyped and given up."""
+    running = program(f"""
+sys.ps1 = '>>> '
+me = node(soul=lambda me: [None for _ in me.every(3600)])
+try:
+    {line}
+except KeyboardInterrupt:
+    print('interrupted', me.lifecycle.value, flush=True)
+""")
+    running.process.send_signal(signal.SIGINT)
+    running.wait_for('interrupted running')
+    assert running.process.wait(TIMEOUT) == 0
+
+
+def test_ctrl_c_at_the_prompt_ends_spin_and_the_nodes(program):
+    running = program("""
+sys.ps1 = '>>> '
+me = node()
+ready_in_wait()
+pharos.spin()
+print('went on', me.lifecycle.value)
+""")
+    assert running.end(signal.SIGINT) == 0
+    assert 'went on stopped' in running.read_to_the_end()
 
 
 @SIGNALS

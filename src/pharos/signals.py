@@ -2,6 +2,7 @@
 import contextlib
 import os
 import signal
+import sys
 import threading
 import time
 import traceback
@@ -115,6 +116,11 @@ def held(limit):
 def _on_signal(number, frame):
     if not (_held or _is_needed()):
         _do_default(number, frame)
+        return
+    if number == signal.SIGINT and hasattr(sys, 'ps1'):
+        # at the prompt, it ends the line that runs or is typed, and not what goes on beside it
+        if not (_held and _held[-1].take(number)):
+            raise _exception(number)
         return
     # Not here, nor in a Thread, whose start takes a lock: the main thread may hold any lock just now.
     _thread.start_new_thread(_end, ())
