@@ -121,9 +121,18 @@ def test_the_part_before_the_colon_is_the_last_of_the_name_given(master, argv):
         assert create(master, named, argv=arguments).output_channel('image', STRING).topic == '/seen'
 
 
+@pytest.mark.parametrize('variable', [None, 'ROS_NAMESPACE'])
+@pytest.mark.parametrize('root', ['/', '//', '///'])
+def test_the_root_is_a_namespace_however_it_is_written(master, monkeypatch, variable, root):
+    if variable:
+        monkeypatch.setenv(variable, root)
+    assert create(master, 'eye', argv=[] if variable else [f'__ns:={root}']).name == '/eye'
+
+
 # -- what is none ------------------------------------------------------------------------------------------------------
 
-@pytest.mark.parametrize('arguments', ['__name:=eye', 'a:=b', b'__name:=eye', ['__name:=eye', 5], [None]])
+@pytest.mark.parametrize('arguments', ['__name:=eye', 'a:=b', b'__name:=eye', ['__name:=eye', 5], [None], 5, False,
+                                       {'a': 'b'}, iter(['__name:=eye']), (each for each in ['eye:a:=b'])])
 def test_what_is_no_list_of_strings_is_refused(master, arguments):
     with pytest.raises(TypeError, match=r'argv is a list of strings, such as sys\.argv'):
         create(master, '/refused', argv=arguments)

@@ -25,7 +25,8 @@ def mappings_for(arguments, node):
     :raises TypeError: if the arguments are no list of strings
     :raises ValueError: if a mapping has several right sides
     """
-    if isinstance(arguments, (str, bytes)) or not all(isinstance(argument, str) for argument in arguments):
+    is_list = isinstance(arguments, (list, tuple))    # an iterator is empty when the next one looks at it
+    if not is_list or not all(isinstance(argument, str) for argument in arguments):
         raise TypeError(f"argv is a list of strings, such as sys.argv or ['__name:=eye'], not {arguments!r}")
     for_all, for_one = {}, {}
     for argument in arguments:

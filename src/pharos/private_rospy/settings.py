@@ -82,9 +82,10 @@ def _namespace(name, given):
     """The namespace of a node of that name, with a closing slash: its own, within the one given."""
     if given is None:
         given = '/' if name.startswith('/') else os.environ.get(ROS_NAMESPACE, '/')
-    if given.strip('/'):
+    given = given if given.strip('/') else '/'
+    if given != '/':
         check_name(given, 'namespace')
-    return rosgraph.names.make_global_ns(rosgraph.names.ns_join(given or '/', name.lstrip('/').rpartition('/')[0]))
+    return rosgraph.names.make_global_ns(rosgraph.names.ns_join(given, name.lstrip('/').rpartition('/')[0]))
 
 
 def check_private_parameters(arguments):
