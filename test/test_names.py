@@ -57,6 +57,20 @@ def test_what_is_no_name_is_refused_wherever_one_is_given(node, use):
     assert not [channel for channel in node.channels if channel.topic != '/named']
 
 
+@pytest.mark.parametrize('use', USES)
+def test_a_name_too_long_for_other_nodes_is_refused(node, use):
+    with pytest.raises(ValueError, match='characters at the most, and .* has 1001'):
+        USES[use](node, '/' + 1000 * 'x')
+    assert not [channel for channel in node.channels if channel.topic != '/named']
+
+
+def test_a_nodes_name_can_be_that_of_its_log_file(master):
+    create(master, '/' + 249 * 'x').stop()
+    for name, argv in ('/' + 250 * 'x', []), ('/' + 125 * 'x', ['__ns:=/' + 125 * 'y']):
+        with pytest.raises(ValueError, match='a node name has 250 characters at the most'):
+            create(master, name, argv=argv)
+
+
 @pytest.mark.parametrize('name, at', [
     ('/1a', 1), ('1a', 0), ('a~b', 1), ('//', 1), ('a//b', 2), ('/a//', 3), ('a b', 1), ('/a/b-c', 4), ('_a', 0),
     ('~1', 1), ('~//', 2), ('/a/é', 3)])

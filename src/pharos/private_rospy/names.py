@@ -1,24 +1,30 @@
 """ROS names: what can be one, and how a name that is resolved already passes through rospy as it is."""
 import re
+import reprlib
 
 import rosgraph.names
 
 # rosgraph.names.is_legal_name, which tells no position; a name also begins with a letter, as rosgraph's comment has it
 _LEGAL = re.compile(r'(?:~/?|/)?(?:(?:[A-Za-z]|(?<=[~/])_)\w*(?:/\w+)*)?', re.ASCII)
 _EMPTY = '', '/', '~', '~/'
+NAME_LIMIT = 1000     # characters of a name, also in what other nodes send
+NODE_LIMIT = 250      # of that of a node of ours: its log file is named after it
 
 
-def check_name(name, what, private=False, base=False):
+def check_name(name, what, private=False, base=False, limit=NAME_LIMIT):
     """``name`` if it can be one, else ValueError with a caret under the first bad character.
 
     :param what: the name is for, 'topic' for example; that of a 'node' ends in a part that begins with a letter
     :param private: whether '~name' is one, since a node is there that it is private to
     :param base: whether it is one part only, without a namespace
+    :param limit: how many characters it has at the most
     """
     if not isinstance(name, str):
         raise ValueError(f'a {what} name is a string, not {name!r}')
     if name in _EMPTY:
         raise ValueError(f"a {what} needs a name, such as '{'driver' if base else '/robot1/driver'}', not {name!r}")
+    if len(name) > limit:
+        raise ValueError(f'a {what} name has {limit} characters at the most, and {reprlib.repr(name)} has {len(name)}')
     at = _bad_character(name, what == 'node', private, base)
     if at is None:
         return name

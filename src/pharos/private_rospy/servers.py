@@ -9,11 +9,11 @@ from pharos.private_rospy import xmlrpc_server
 from pharos.private_rospy.door import Door, brief
 from pharos.private_rospy.host import rospy
 from pharos.private_rospy.lifetime import shut
+from pharos.private_rospy.names import NAME_LIMIT
 from pharos.private_rospy.sharing import numbered
 
 HANDSHAKE_TIMEOUT = 5.0       # seconds for the whole handshake, however slowly it comes
 HANDSHAKE_LIMIT = 1 << 20     # bytes of a connection header; real ones hold a message definition
-NAME_LIMIT = 1000             # characters of a name in it
 MESSAGE_LIMIT = 1000000000    # bytes of a message; roscpp's limit
 
 _NAMES = {'callerid', 'topic', 'service', 'type', 'md5sum'}    # the fields of a header that are shown to others

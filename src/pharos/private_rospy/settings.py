@@ -11,7 +11,7 @@ from rosgraph.rosenv import ROS_HOSTNAME, ROS_IP, ROS_MASTER_URI, ROS_NAMESPACE
 from pharos.private_rospy.addresses import check_domain, check_environment, check_port, default_domain
 from pharos.private_rospy.arguments import mappings_for, takes_name
 from pharos.private_rospy.host import rospy
-from pharos.private_rospy.names import check_name
+from pharos.private_rospy.names import NODE_LIMIT, check_name
 from pharos.private_rospy.parameters import carried
 
 
@@ -62,7 +62,7 @@ class Settings:
             if given is not None:
                 self.namespace = _namespace('', given)
         self.base_name = check_name(base, 'node', base=True)
-        self.name = self.namespace + base
+        self.name = check_name(self.namespace + base, 'node', limit=NODE_LIMIT)
         return is_named_there
 
     def _set_domain(self, domain, mappings):
