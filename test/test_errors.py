@@ -156,6 +156,23 @@ def test_a_field_that_does_not_exist_or_does_not_fit(master, mailbox, block, fie
     assert not interested or mailbox.get().linear == 2.0
 
 
+def test_a_value_in_a_blocks_place_is_told_how_a_block_is_called(master):
+    node = create(master)
+    channel = node.output_channel('/t', 'std_msgs/String')
+    for send in channel.send, lambda block: node.send_to('/t', block):
+        with pytest.raises(TypeError, match=r"a block is called as block\(message\); 'hello' cannot be called"):
+            send('hello')
+
+
+def test_a_block_that_returns_a_message_of_its_own_is_told_that_it_would_not_be_sent(master):
+    """An empty message went out in silence."""
+    node, cls = create(master), pharos.message_class('std_msgs/String')
+    with pytest.raises(pharos.MessageTypeError, match='returned another std_msgs/String than it was given'):
+        node.send_to('/t', lambda message: cls('lost'), typed_as=cls)
+    assert node.send_to('/t', lambda message: message).data == ''
+    assert node.send_to('/t', lambda message: setattr(message, 'data', 'x')).data == 'x'
+
+
 def test_a_message_of_another_type(master):
     channel = create(master).output_channel('/t', 'turtlesim/Velocity')
     for wrong in pharos.message_class('std_msgs/String')(), {'linear': 1.0}, None:

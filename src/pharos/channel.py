@@ -6,7 +6,7 @@ import time
 import genpy
 
 from pharos import message_types
-from pharos.blocks import check_delegate, check_runs
+from pharos.blocks import check_block, check_delegate, check_runs
 from pharos.dispatcher import Inbox, SocketInbox
 from pharos.errors import MasterUnreachableError, MessageTypeError, NodeStoppedError, PharosError
 from pharos.private_rospy import copier
@@ -289,6 +289,8 @@ class OutputChannel(_Channel):
     def send(self, block=None, *, to=None, **fields):
         """Fill a fresh message with ``block(message)`` and by keywords, publish it, and return it."""
         if block is not None:
+            if not callable(block):
+                check_block(block, 'block', ('message',))    # says how it is called
             check_runs(block, 'a block')
         message = message_types.build(self.message_class, block, fields)
         if not self.connections:

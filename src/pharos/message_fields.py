@@ -26,15 +26,19 @@ def describe_fields(cls):
 def build(cls, block, fields):
     """Return a new message that ``block(message)``, if there is one, and then ``fields`` by name have filled.
 
-    Raises `MessageTypeError` for a field that does not exist, and for a value in ``fields`` that does not fit.
+    Raises `MessageTypeError` for a field that does not exist, for a value in ``fields`` that does not fit, and for a
+    block that returns a message of its own.
     """
     message = cls()
     if block is not None:
         try:
-            block(message)
+            made = block(message)
         except AttributeError as error:
             explain(error, message)
             raise
+        if isinstance(made, genpy.Message) and made is not message and made._type == message._type:
+            raise MessageTypeError(f'the block returned another {message._type} than it was given, which is the one '
+                                   'that is sent: fill the fields of that')
     return fill(message, fields) if fields else message
 
 
