@@ -115,6 +115,20 @@ def test_the_masters_pid_is_that_of_its_process(master):
     assert master.pid == os.getpid()    # rosmaster runs in this process, in these tests
 
 
+def test_parameters_that_others_have_named_oddly_are_in_the_mapping_too(bare):
+    names = ['/odd name', '/1st']
+    for name in names:
+        bare._api().setParam(name, 5)
+        with pytest.raises(ValueError, match='cannot be a parameter name'):
+            bare.parameters[name] = 6
+        assert name in bare.parameters
+    assert {name: value for name, value in bare.parameters.items() if name in names} == dict.fromkeys(names, 5)
+    for name in names:
+        del bare.parameters[name]
+        with pytest.raises(ValueError, match='cannot be a parameter name'):
+            bare.parameters[name]
+
+
 def test_parameters_are_a_mapping(bare):
     bare.parameters['/robot/name'] = 'r2'
     bare.parameters['/robot/wheels'] = {'left': 1.5, 'right': [1, 2]}

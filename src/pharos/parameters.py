@@ -18,13 +18,13 @@ class Parameters(collections.abc.MutableMapping):
         self._master = master
 
     def __getitem__(self, name):
-        return self._call('getParam', name)
+        return self._call('getParam', self._global_or_there(name))
 
     def __setitem__(self, name, value):
-        self._call('setParam', name, carried(name, value))
+        self._call('setParam', _global(name), carried(name, value))
 
     def __delitem__(self, name):
-        self._call('deleteParam', name)
+        self._call('deleteParam', self._global_or_there(name))
 
     def __iter__(self):
         return iter(sorted(self._master._ask('getParamNames')))
@@ -33,11 +33,20 @@ class Parameters(collections.abc.MutableMapping):
         return len(self._master._ask('getParamNames'))
 
     def __contains__(self, name):
+        name = self._global_or_there(name)
         with self._master._reached():
-            return self._master._api().hasParam(_global(name))
+            return self._master._api().hasParam(name)
+
+    def _global_or_there(self, name):
+        """The full form of a name, or one that cannot be a name and that somebody has set all the same."""
+        try:
+            return _global(name)
+        except ValueError:
+            if name in self._master._ask('getParamNames'):    # as rosparam and a YAML file may
+                return name
+            raise
 
     def _call(self, method, name, *args):
-        name = _global(name)
         with self._master._reached():
             try:
                 return getattr(self._master._api(), method)(name, *args)
