@@ -120,6 +120,20 @@ def test_masters_of_one_address_are_one(spellings):
     assert pharos.watcher.watcher_of(given) is pharos.watcher.watcher_of(other)
 
 
+def test_an_address_that_is_any_of_this_host_is_this_hosts(master):
+    everywhere = Master(master.url.replace('127.0.0.1', '0.0.0.0'))
+    assert everywhere == master
+    node = create(master, '/own')
+    assert everywhere.node('/own') is node
+
+
+@pytest.mark.parametrize('url', ['', 'robot1', 'http://robot1/'])
+def test_the_variable_that_gives_no_masters_url_is_named(monkeypatch, url):
+    monkeypatch.setenv('ROS_MASTER_URI', url)
+    with pytest.raises(ValueError, match=f"^ROS_MASTER_URI is '{url}', which is not the URL of a ROS master"):
+        Master()
+
+
 def test_nodes_at_one_master_are_neighbours_however_it_is_spelt(spellings):
     given, other = spellings
     heard = listen(given, '/spelt')

@@ -5,6 +5,7 @@ import time
 import urllib.parse
 
 import rosgraph
+from rosgraph.rosenv import ROS_MASTER_URI
 
 from pharos import node as nodes_of_ours
 from pharos import ros_process, running
@@ -43,7 +44,7 @@ class Master:
     """
 
     def __init__(self, url=None):
-        self.url = check_url(rosgraph.get_master_uri() if url is None else url)
+        self.url = check_url(rosgraph.get_master_uri(), ROS_MASTER_URI) if url is None else check_url(url)
         self._child = None    # the process of an embedded master
 
     @classmethod

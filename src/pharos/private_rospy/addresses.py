@@ -21,8 +21,11 @@ def check_port(what, port):
     return port
 
 
-def check_url(url):
-    """``url`` if it can be a master's, else ValueError; written as URLs should be, with a closing slash."""
+def check_url(url, source=''):
+    """``url`` if it can be a master's, else ValueError; written as URLs should be, with a closing slash.
+
+    :param source: the variable of the environment that it comes from, if it does
+    """
     try:
         parts = urllib.parse.urlsplit(url) if isinstance(url, str) else None
         if parts and parts.scheme == 'http' and parts.path in ('', '/') and not parts.query + parts.fragment:
@@ -32,7 +35,8 @@ def check_url(url):
                 return f'http://[{host}]:{port}/' if ':' in host else f'http://{host}:{port}/'
     except ValueError:
         pass    # the port is no number, for example
-    raise ValueError('%r is not the URL of a ROS master: it looks like http://127.0.0.1:11311/' % (url,))
+    where = f'{source} is {url!r}, which' if source else repr(url)
+    raise ValueError(f'{where} is not the URL of a ROS master: it looks like http://127.0.0.1:11311/')
 
 
 def check_domain(what, domain):
@@ -100,6 +104,7 @@ def _of_master(host):
     """The addresses of a host; this one has a master at all of its own."""
     found = _look_up(host, socket.AF_UNSPEC)
     here = {_address(own) for own in rosgraph.network.get_local_addresses()}
+    here |= {_address('0.0.0.0'), _address('::')}    # to which a client connects here
     for own in 'localhost', socket.gethostname():
         with contextlib.suppress(OSError, UnicodeError):
             here |= _look_up(own, socket.AF_UNSPEC)
