@@ -8,7 +8,7 @@ import pytest
 from conftest import TIMEOUT
 from pharos import BlockNode, ExternalNode, Lifecycle, Master, Node, NodeNameInUseError, NodeStoppedError, running
 from pharos import message_class, stopping
-from pharos.private_rospy import lifetime, services
+from pharos.private_rospy import lifetime, proxies, services
 from programs import until
 from sockets import refused_url, silent_peer
 
@@ -402,3 +402,32 @@ def test_a_thread_that_is_only_just_beginning_is_not_waited_for():
     assert life.end() == []
     started.allowed.set()
     assert ended(starter)
+
+
+def test_a_part_of_a_wait_that_begins_after_the_stop_began_ends_too():
+    life, woken, parts = lifetime.Lifetime('/node'), threading.Event(), threading.Event()
+    with life.here(), lifetime.Interruption(woken.set):
+        life.begin_end()
+        with lifetime.Interruption(parts.set) as part:
+            assert woken.is_set() and parts.is_set() and part.came
+    with life.here(), lifetime.Interruption(parts.set) as last_words:
+        assert not last_words.came
+
+
+def test_a_call_that_is_ended_before_it_has_connected_is_not_waited_for():
+    with silent_peer() as url:
+        proxy = proxies.ServerProxy(url, 10 * TIMEOUT)
+        connected = threading.Event()
+
+        class Shutting(proxies._Connection):
+            """What another thread may do just before there is a socket."""
+
+            def connect(self):
+                proxy('transport').shut()
+                connected.set()
+                super().connect()
+        address = url[len('http://'):-1]
+        proxy('transport')._connection = address, Shutting(address, proxy('transport'))
+        with pytest.raises(OSError):
+            proxy.getPid('/caller')
+        assert connected.is_set()

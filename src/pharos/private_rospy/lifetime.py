@@ -108,15 +108,18 @@ class Lifetime:
 class Interruption:
     """Within this, a wait ends when a node stops: the one on whose behalf this thread runs, or another one given.
 
-    A wait that begins only when the node stops already is for its last words, and is not ended.
+    A wait that begins only when the node stops already is for its last words, and is not ended, unless it is part of
+    one that began before.
 
     :param wake: ``wake()`` makes the wait end, in whatever thread; None where :attr:`came` is all that is wanted
     """
 
     def __init__(self, wake=None, lifetime=None):
         self.wake = wake
-        here = getattr(_thread, 'lifetime', None)
-        self._lifetimes = [each for each in {lifetime, here} if each is not None and not each.ended.is_set()]
+        here, self._outer = getattr(_thread, 'lifetime', None), getattr(_thread, 'interruption', None)
+        self._lifetimes = {each for each in (lifetime, here) if each is not None and not each.ended.is_set()}
+        if self._outer is not None:
+            self._lifetimes |= self._outer._lifetimes
 
     @property
     def came(self):
@@ -124,6 +127,7 @@ class Interruption:
         return any(lifetime.ended.is_set() for lifetime in self._lifetimes)
 
     def __enter__(self):
+        _thread.interruption = self
         for lifetime in self._lifetimes:
             lifetime._interruptions.add(self)
         if self.came:
@@ -131,6 +135,7 @@ class Interruption:
         return self
 
     def __exit__(self, *error):
+        _thread.interruption = self._outer
         for lifetime in self._lifetimes:
             lifetime._interruptions.discard(self)
 

@@ -62,9 +62,13 @@ class _Transport(xmlrpc.client.Transport):
             raise socket.timeout('timed out')
         return left
 
-    def make_connection(self, host):
+    def check(self):
+        """Raise an OSError if :meth:`shut` was called."""
         if self._is_shut:
             raise ConnectionAbortedError('it is not waited for any more')
+
+    def make_connection(self, host):
+        self.check()
         if not self._connection or self._connection[0] != host:
             address, self._extra_headers, _ = self.get_host_info(host)
             self._connection = host, _Connection(address, self)
@@ -89,6 +93,7 @@ class _Connection(http.client.HTTPConnection):
         super().connect()
         self.sock = _Socket(fileno=self.sock.detach())
         self.sock.transport = self._transport
+        self._transport.check()    # shut() may have come before there was a socket
 
 
 class _Socket(socket.socket):
