@@ -44,6 +44,33 @@ def connected(channel, count):
 
 # -- the transport ----------------------------------------------------------------------------------------------------
 
+@pytest.mark.parametrize('is_before', [True, False])
+def test_a_channel_that_opens_while_the_link_of_another_one_does_hears_all_of_it_once(
+        master, monkeypatch, is_before):
+    sender, receiver = create(master, '/sender'), create(master, '/receiver')
+    receiver.connect_timeout = 0    # the link is not waited for by who delays it
+    first, second = Mailbox(), Mailbox()
+    sent = sender.output_channel('/meanwhile', STRING, latch=True)
+    sent.send(data='latched')
+    subscription = receiver.ros_import('rospy.topics')._SubscriberImpl
+    add_connection = subscription.add_connection
+
+    def add_meanwhile(self, connection):
+        monkeypatch.undo()
+        if is_before:
+            receiver.interested_in('/meanwhile', STRING, delegate=second)
+        is_added = add_connection(self, connection)
+        if not is_before:
+            receiver.interested_in('/meanwhile', STRING, delegate=second)
+        return is_added
+    monkeypatch.setattr(subscription, 'add_connection', add_meanwhile)
+    receiver.interested_in('/meanwhile', STRING, delegate=first)
+    assert sent.wait_for_subscribers(1, TIMEOUT)
+    sent.send(data='sent')
+    for mailbox in first, second:
+        assert [message.data for message in mailbox.take(2)] == ['latched', 'sent']
+
+
 def test_no_socket_is_opened_and_nothing_serialized(master, monkeypatch):
     sent, _, mailbox = pair(master, '/t', TWIST)
     sent.send(linear={'x': 1})

@@ -41,12 +41,17 @@ class Link:
         self.receiving.callerid_pub = other.name
 
     def open(self):
-        """Add the ends to the subscription and the publisher; returns whether both are open still."""
-        self.match_receivers()
+        """Add the ends to the subscription and the publisher; returns whether both are open still.
+
+        The publisher matches the receivers. Those that come between the two know the link already.
+        """
         return self._subscriber.add_connection(self.receiving) and self._publisher.add_connection(self.sending)
 
     def match_receivers(self):
-        """Have an inbox for each receiver that the subscription has; returns the new ones."""
+        """Have an inbox for each receiver that the subscription has; returns the new ones.
+
+        The publisher calls this with its lock.
+        """
         subscriber, before, start_thread = self._subscriber, self.inboxes, self._instance.start_thread
         channels = [channel for channel in self._instance.wiring.channels_on(subscriber.resolved_name)
                     if channel.from_ in (None, self.publisher_name)]

@@ -56,6 +56,8 @@ def mend_publisher(module, start_thread):
             if not base.add_connection(self, connection):
                 connection.close()
                 return False
+            if link:
+                link.match_receivers()
             _refresh(self)
             if link:
                 self.fanout.send_latched(link.all_inboxes(), connection.endpoint_id)
@@ -77,7 +79,8 @@ def mend_publisher(module, start_thread):
         with lock:
             new = link.match_receivers()
             _refresh(self)
-            self.fanout.send_latched(new, link.sending.endpoint_id)
+            if link.sending in self.connections:    # else add_connection is yet to send it
+                self.fanout.send_latched(new, link.sending.endpoint_id)
         self.fanout.run()
     publisher.channels_changed = channels_changed
 
