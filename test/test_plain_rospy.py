@@ -1,5 +1,7 @@
 """Plain rospy subscriptions of this process: through INTRAPROCESS like channels, to their users as over TCPROS."""
+import collections
 import threading
+import types
 
 import pytest
 import rospy
@@ -377,6 +379,26 @@ def test_what_was_published_before_the_publisher_left_still_arrives(pair):
     release.set()
     assert [message.data for message in mailbox.take(100)] == list(range(100))
     until(lambda: not link_threads(subscribing))
+
+
+def test_what_is_put_while_another_thread_takes_is_counted():
+    class Sizes(collections.deque):
+        def popleft(self):
+            size = super().popleft()
+            if meanwhile:
+                inbox.put(meanwhile.pop(), size=1000)
+            return size
+    meanwhile = ['third']
+    publisher = types.SimpleNamespace(queue_size=10, queue_bytes=1 << 20)
+    subscriber = types.SimpleNamespace(queue_size=1, callbacks=None)
+    inbox = callbacks.CallbackInbox(None, publisher, subscriber, lambda target, name: None)
+    inbox._sizes = Sizes()
+    inbox.put('first', size=1000)
+    inbox.put('second', size=1000)
+    while not inbox.is_empty:
+        inbox.run_next()
+    assert not meanwhile
+    assert inbox._bytes == 0
 
 
 def test_large_messages_are_dropped_from_a_full_queue_the_oldest_first(master):

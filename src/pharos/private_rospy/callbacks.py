@@ -50,9 +50,9 @@ class CallbackInbox:
         self._sizes.append(size)
         queue, publisher = self._queue, self._publisher
         while self._bytes > UNDER_WAY and 0 < (publisher.queue_size or 0) <= len(queue):
-            self._drop_oldest()
+            self._make_room()
         while self._bytes > max(UNDER_WAY, publisher.queue_bytes) and queue:
-            self._drop_oldest()
+            self._make_room()
         queue.append(value)
         if not self._announced:
             self._announced = True
@@ -62,10 +62,20 @@ class CallbackInbox:
     def _bytes(self):
         return self._put_bytes - self._taken_bytes
 
-    def _drop_oldest(self):
+    def _make_room(self):
+        """Drop the oldest message; for the thread that puts."""
         with contextlib.suppress(IndexError):    # it has just been taken
             self._queue.popleft()
             self._put_bytes -= self._sizes.popleft()
+
+    def _take(self):
+        """Take the oldest message; for the thread that runs.
+
+        Each of the two threads has a count of its own: neither may overwrite what the other has just counted.
+        """
+        value = self._queue.popleft()
+        self._taken_bytes += self._sizes.popleft()
+        return value
 
     def _waits_for_room(self, size):
         return (self._publisher.queue_size is None and self._queue and self._bytes + size > UNDER_WAY
@@ -81,13 +91,12 @@ class CallbackInbox:
         """Run the callbacks for the oldest message, if there is one still."""
         self._announced = False    # before looking at the queue: what is put from now on announces itself
         queue, limit = self._queue, self._subscriber.queue_size
-        while limit and len(queue) > limit:
-            self._drop_oldest()
         try:
-            value = queue.popleft()
+            while limit and len(queue) > limit:
+                self._take()
+            value = self._take()
         except IndexError:
             return
-        self._taken_bytes += self._sizes.popleft()
         if self._waiting:
             self._notify()
         if queue and not self._announced:
