@@ -1,7 +1,9 @@
 """What ends or silences a rospy node does not end or silence this one."""
+import http.server
 import subprocess
 import sys
 import threading
+import xmlrpc.server
 
 import pytest
 
@@ -150,3 +152,48 @@ def test_a_node_stops_while_it_publishes_receives_and_calls(master):
         assert busy.wait(TIMEOUT)
         node.stop()
         assert not [error for error in node.errors if not isinstance(error, pharos.NodeStoppedError)]
+
+
+# -- peers that answer nonsense ---------------------------------------------------------------------------------------
+
+def test_a_publisher_that_once_answers_nonsense_is_asked_again(master):
+    node = create(master, '/node')
+    node.interested_in('/survival/nonsense', 'std_msgs/String', delegate=Mailbox())
+    handler = node._rospy._lifetime.xmlrpc.handler
+    asked, proceed = threading.Semaphore(0), threading.Event()
+
+    def request_topic(caller_id, topic, protocols):
+        asked.release()
+        proceed.wait(TIMEOUT)
+        return 1, 'a dict is no protocol', {'protocol': 'TCPROS'}
+    with xmlrpc.server.SimpleXMLRPCServer(('127.0.0.1', 0), logRequests=False) as publisher:
+        publisher.register_function(request_topic, 'requestTopic')
+        threading.Thread(target=publisher.serve_forever, daemon=True).start()
+        uri = 'http://127.0.0.1:%d/' % publisher.server_address[1]
+
+        def connect():
+            with pytest.raises(KeyError):
+                handler._connect_topic('/survival/nonsense', uri)
+        first = threading.Thread(target=connect, daemon=True)
+        first.start()
+        assert asked.acquire(timeout=TIMEOUT)
+        assert handler._connect_topic('/survival/nonsense', uri)[0] == 1    # it is being asked
+        proceed.set()
+        first.join(TIMEOUT)
+        connect()
+        assert asked.acquire(timeout=TIMEOUT)
+        publisher.shutdown()
+
+
+def test_a_name_whose_dead_node_left_its_port_to_another_server_is_refused_with_advice(master):
+    with http.server.HTTPServer(('127.0.0.1', 0), http.server.SimpleHTTPRequestHandler) as other:
+        threading.Thread(target=other.serve_forever, daemon=True).start()
+        uri = 'http://127.0.0.1:%d/' % other.server_address[1]
+        left_behind = master._api('/left_behind')
+        left_behind.registerPublisher('/survival/left', 'std_msgs/String', uri)
+        try:
+            with pytest.raises(pharos.NodeNameInUseError, match='rosnode cleanup'):
+                create(master, '/left_behind')
+        finally:
+            left_behind.unregisterPublisher('/survival/left', uri)
+            other.shutdown()

@@ -51,7 +51,6 @@ def hooks(instance):
                 connecting[topic, uri] = False
             again = True
             while again:
-                answer = 0, 'failed', 0
                 try:
                     attempt.topic, attempt.uri = topic, uri
                     answer = connect(self, topic, uri)
@@ -60,13 +59,16 @@ def hooks(instance):
                 except (UnboundLocalError, TypeError, AttributeError):
                     # rospy's, where it gave up because the node stops, or the subscription or the protocols have gone
                     answer = 0, '%s or its interest in %s ends' % (self.name, topic), 0
-                finally:
+                except BaseException:    # else nobody would ever connect to it again
                     with lock:
-                        # asked for again: what was no publisher a moment ago may be one now
-                        again = connecting[topic, uri] and answer[0] != 1
-                        connecting[topic, uri] = False
-                        if not again:
-                            del connecting[topic, uri]
+                        del connecting[topic, uri]
+                    raise
+                with lock:
+                    # asked for again: what was no publisher a moment ago may be one now
+                    again = connecting[topic, uri] and answer[0] != 1
+                    connecting[topic, uri] = False
+                    if not again:
+                        del connecting[topic, uri]
             note_attempt(topic, uri, answer[0] == 1)
             return answer
         handler._connect_topic = _connect_topic
@@ -224,7 +226,7 @@ def claim_name(master_url, name, timeout):
         ServerProxy(uri, PING_TIMEOUT).getPid(name)
     except ConnectionRefusedError:
         unregister_all(master, name, uri)    # nobody is left at that URI
-    except OSError as error:
+    except COMMUNICATION_ERRORS as error:
         raise NodeNameInUseError('the node name %s is taken by a node at %s that does not answer (%s): choose another '
                                  'name, or run rosnode cleanup if that node is gone' % (name, uri, error)) from error
     else:
