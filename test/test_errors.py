@@ -197,6 +197,15 @@ def test_an_exception_in_start_stops_the_node(master, nothing_left):
         master.create(Broken, named='/node')
 
 
+def test_a_name_is_given_to_create_and_not_set(master, nothing_left):
+    """The node went on as one of that name, and the master listed it as one of another process."""
+    class Arm(pharos.Node):
+        def __init__(self):
+            self.name = 'left arm'
+    with pytest.raises(AttributeError, match="/node is the name .*create.., as named='left arm'.*Arm is called"):
+        create(master, node_class=Arm)
+
+
 def test_a_node_that_no_master_made_is_refused():
     with pytest.raises(TypeError, match=r'made by a master: .*create\(BlockNode, named=...\), not BlockNode\(\)'):
         BlockNode()

@@ -33,7 +33,6 @@ class Life:
 
     def _configure(self, master, settings):
         self.master = master
-        self.name = settings.name
         self._settings = settings
         self._lifecycle = Lifecycle.NEW
         self._changing = stopping.changed         # guards _lifecycle
@@ -224,6 +223,16 @@ class Life:
             self.stop()
         except BaseException as error:
             self._failures.report(error, self.stop, f'{name_of(self.stop)} of {self.name}')
+
+    @property
+    def name(self):
+        """The node's name, as the master knows it: '/robot1/driver'."""
+        return self._settings.name
+
+    @name.setter
+    def name(self, value):
+        raise AttributeError(f'{self.name} is the name by which the master knows the node: give another one to create(), '
+                             f'as named={value!r}, and what else {type(self).__name__} is called to another attribute')
 
     @property
     def lifecycle(self):
