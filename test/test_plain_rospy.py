@@ -308,6 +308,41 @@ def test_a_publisher_that_waits_goes_on_when_the_subscriber_ends(pair, ends):
 
 
 @pytest.mark.filterwarnings('ignore:The publisher should be created')
+@pytest.mark.parametrize('comes', ['channel', 'wait_for_message', 'latched'])
+def test_nobody_waits_for_a_publisher_that_waits_for_another(pair, master, comes):
+    """It holds its lock, and interested_in() and wait_for_message(timeout=1) waited for that without end."""
+    publishing, subscribing = pair
+    latch = comes == 'latched'
+    if latch and subscribing.transport == 'TCPROS':
+        pytest.skip('as in rospy: what is latched is sent under the lock of a publisher that writes into a socket')
+    topic = f'/plain/others_wait/{comes}'
+    publisher = publishing.ros.Publisher(topic, ARRAY, latch=latch)
+    entered, release = threading.Event(), threading.Event()
+
+    def stuck(message):
+        entered.set()
+        release.wait(TIMEOUT)
+    subscribing.ros.Subscriber(topic, ARRAY, stuck)
+    connected(publisher)
+    thread = in_thread(lambda: [publisher.publish(data=bytes(1 << 20)) for _ in range(40)])
+    assert entered.wait(TIMEOUT)
+    thread.join(0.5)
+    assert thread.is_alive()
+    other = create(master, '/other')
+
+    def come():
+        if comes == 'wait_for_message':
+            with pytest.raises(rospy.ROSException):
+                other.ros.wait_for_message(topic, ARRAY, timeout=0.1)
+        else:
+            other.interested_in(topic, ARRAY).close()
+    coming = in_thread(come)
+    assert ended(coming)
+    release.set()
+    assert ended(thread)
+
+
+@pytest.mark.filterwarnings('ignore:The publisher should be created')
 def test_a_callback_may_unregister_subscribe_and_publish(pair):
     publishing, subscribing = pair
     publisher = publishing.ros.Publisher('/plain/busy', ARRAY)

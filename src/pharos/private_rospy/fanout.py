@@ -18,9 +18,8 @@ class Fanout:
     """
 
     # a message that comes alone meets cold caches: all that it needs lies together
-    __slots__ = ('_lock', '_closed', '_seq', '_has_header', '_freeze', '_inboxes', '_remote', '_dispatchers',
-                 '_inline', '_last', '_size', '_mark', '_publisher', '_module', '_thaw', '_buffer', '_latches',
-                 '_early')
+    __slots__ = ('_lock', '_closed', '_seq', '_has_header', '_freeze', '_ways', '_last', '_size', '_mark',
+                 '_publisher', '_module', '_thaw', '_buffer', '_latches', '_early')
 
     def __init__(self, publisher, module):
         self._publisher, self._module = publisher, module
@@ -35,12 +34,14 @@ class Fanout:
 
     def set_connections(self, connections):
         """Sort the connections out, whenever they change: by how a message goes to them."""
-        inboxes, self._remote = _split(connections)
-        self._inboxes, self._dispatchers = inboxes, _dispatchers(inboxes)
-        self._inline = list({inbox.dispatcher for inbox in inboxes if inbox.inline})
-        self._mark = None    # of the messages that receivers share
+        inboxes, remote = _split(connections)
+        inline = list({inbox.dispatcher for inbox in inboxes if inbox.inline})
+        mark = None    # of the messages that receivers share
         if any(inbox.shared for inbox in inboxes):
-            self._mark = sharing.Mark(links_of(connections)[0].header)
+            mark = sharing.Mark(links_of(connections)[0].header)
+        self._mark = mark
+        # all at once: somebody may be publishing
+        self._ways = inboxes, remote, _dispatchers(inboxes), inline, mark
 
     def publish(self, message, by=None, to=None, connection=None):
         """Send a message to all; returns whether there is anybody.
@@ -53,7 +54,7 @@ class Fanout:
         with self._lock:
             if self._closed:
                 raise self._module.ROSException('publish() to a closed topic')
-            inboxes, remote, dispatchers, mark = self._inboxes, self._remote, self._dispatchers, self._mark
+            inboxes, remote, dispatchers, inline, mark = self._ways
             if to is not None or connection is not None:
                 inboxes, remote = self._only(to, connection)
                 dispatchers = _dispatchers(inboxes)
@@ -94,7 +95,7 @@ class Fanout:
             if remote:
                 self._write(data, remote)
         if by is not None:
-            for dispatcher in self._inline:
+            for dispatcher in inline:
                 dispatcher.run()
         return True
 
@@ -103,7 +104,7 @@ class Fanout:
 
     def run(self):
         """Run the delegates that are inline, without the lock, which others may wait for."""
-        for dispatcher in self._inline:
+        for dispatcher in self._ways[3]:
             dispatcher.run()
 
     def reaches(self, name):
@@ -150,8 +151,10 @@ class Fanout:
 
         :param receiver: the name of the node whose inboxes they are
         """
-        for frozen in self._latched_for(receiver):
-            self._put_latched(frozen, inboxes)
+        if self._publisher.is_latch:
+            with self._lock:
+                for frozen in self._latched_for(receiver):
+                    self._put_latched(frozen, inboxes)
 
     def _put_latched(self, frozen, inboxes):
         for inbox in inboxes:
@@ -162,8 +165,10 @@ class Fanout:
 
     def write_latched(self, connection):
         """Write what is latched to a new TCPROS connection."""
-        for frozen in self._latched_for(connection.endpoint_id):
-            self._write_latched(frozen, connection)
+        if self._publisher.is_latch:
+            with self._lock:
+                for frozen in self._latched_for(connection.endpoint_id):
+                    self._write_latched(frozen, connection)
 
     def _write_latched(self, frozen, connection):
         message = self._thaw(frozen)

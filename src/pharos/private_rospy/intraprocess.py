@@ -81,7 +81,7 @@ class Link:
         """The subscription has a callback more; returns the latched messages that it has missed."""
         inbox = self._open_callback_inbox()
         if inbox is None or is_of_channel(callback):
-            self._channels_changed()
+            self._publisher.channels_changed(self)
         elif inbox.latched is not None:
             return [inbox.latched]
         return []
@@ -91,12 +91,12 @@ class Link:
         inbox = self._open_callback_inbox()
         if inbox is not None and not self._subscriber.has_plain_callbacks():
             inbox.close()
-        self._channels_changed()
+        self._publisher.channels_changed(self)
 
-    def _channels_changed(self):
+    def unbounded(self):
+        """Within this, no publisher waits for the callbacks of the subscription; see :class:`CallbackInbox`."""
         inbox = self._open_callback_inbox()
-        with inbox.unbounded() if inbox else contextlib.nullcontext():
-            self._publisher.channels_changed(self)
+        return inbox.unbounded() if inbox else contextlib.nullcontext()
 
     def close(self, end):
         """One end was closed: the other goes too.

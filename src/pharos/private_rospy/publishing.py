@@ -1,10 +1,11 @@
 """rospy's publishers, mended: they send through INTRAPROCESS too, and latch by value."""
+import contextlib
 import functools
 import math
 import os
 import threading
 
-from pharos.private_rospy.fanout import Fanout
+from pharos.private_rospy.fanout import Fanout, links_of
 from pharos.private_rospy.lifetime import Interruption
 from pharos.private_rospy.sender import Sender
 
@@ -48,17 +49,12 @@ def mend_publisher(module, start_thread):
         link = getattr(connection, 'link', None)
         if link is None and self.queue_size is not None:
             connection = Sender(connection, self.queue_size, start_thread, self.queue_bytes)
-        lock = self.publock
-        if lock is None:    # closed meanwhile
-            connection.close()
-            return False
-        with lock:    # so that the latched messages come before what is published now
-            if not base.add_connection(self, connection):
+        with _latched_first(self) as is_open:
+            if not is_open or not base.add_connection(self, connection):
                 connection.close()
                 return False
-            if link:
-                link.match_receivers()
-            _refresh(self)
+            # receivers may have come since the link was made, and have not seen it yet
+            _refresh(self, link)
             if link:
                 self.fanout.send_latched(link.all_inboxes(), connection.endpoint_id)
             else:
@@ -73,13 +69,11 @@ def mend_publisher(module, start_thread):
 
     def channels_changed(self, link):
         """The subscription at the other end of a link has other channels now."""
-        lock = self.publock
-        if lock is None:
-            return
-        with lock:
-            new = link.match_receivers()
-            _refresh(self)
-            if link.sending in self.connections:    # else add_connection is yet to send it
+        with _latched_first(self) as is_open:
+            if not is_open:
+                return
+            new = _refresh(self, link)
+            if link.sending in (self.connections or ()):    # otherwise it is just being added, and that sends it
                 self.fanout.send_latched(new, link.sending.endpoint_id)
         self.fanout.run()
     publisher.channels_changed = channels_changed
@@ -99,9 +93,31 @@ def mend_publisher(module, start_thread):
     publisher.close = close
 
 
-def _refresh(publisher):
-    with publisher.c_lock:
-        publisher.fanout.set_connections(publisher.connections)
+@contextlib.contextmanager
+def _latched_first(publisher):
+    """Within this, nothing is published that would come before what is latched; gives whether the publisher is open.
+
+    One that does not latch goes on: who comes need not wait for a publisher that itself waits for a slow subscriber,
+    since it has no queue. One that latches does not wait for those of this process meanwhile.
+    """
+    lock = publisher.publock
+    with contextlib.ExitStack() as stack:
+        if lock is not None and publisher.is_latch:
+            for link in links_of(publisher.connections or ()):
+                stack.enter_context(link.unbounded())
+            stack.enter_context(lock)
+        yield lock is not None
+
+
+def _refresh(publisher, link=None):
+    """Have the fan-out go by the connections, and a link by the receivers, that there are; returns its new inboxes."""
+    lock = publisher.c_lock
+    if lock is None:    # closed meanwhile
+        return []
+    with lock:
+        new = link.match_receivers() if link else []
+        publisher.fanout.set_connections(publisher.connections or ())
+        return new
 
 
 def notify():
