@@ -115,6 +115,21 @@ def test_the_masters_pid_is_that_of_its_process(master):
     assert master.pid == os.getpid()    # rosmaster runs in this process, in these tests
 
 
+@pytest.mark.parametrize('open_', [pharos.Topic.input_channel, pharos.Topic.output_channel])
+def test_a_topic_gives_channels_to_running_nodes_of_its_master_alone(master, open_):
+    topic = master.topic('/given')
+    node = create(master, '/taker')
+    for nobody in None, '/taker', master, ExternalNode(master, '/taker'):
+        with pytest.raises(TypeError, match='/given is given to a node of this process, not to'):
+            open_(topic, nobody, STRING)
+    with pytest.raises(ValueError, match='is at another master than /taker'):
+        open_(Master('http://127.0.0.1:1/').topic('/given'), node, STRING)
+    node.stop()
+    with pytest.raises(pharos.NodeStoppedError, match='/taker is stopped'):
+        open_(topic, node, STRING)
+    assert not topic.channels and '/given' not in (name for kind in master.system_state() for name in kind)
+
+
 def test_parameters_that_others_have_named_oddly_are_in_the_mapping_too(bare):
     names = ['/odd name', '/1st']
     for name in names:

@@ -6,6 +6,7 @@ import rosgraph
 from pharos import graph_types, message_types
 from pharos.channel import InputChannel, OutputChannel
 from pharos.errors import MessageTypeError, NodeStoppedError, UnknownTopicError, UnknownTypeError
+from pharos.life import Life
 from pharos.private_rospy.proxies import MARGIN, time_limit
 from pharos.seconds import check_seconds
 
@@ -58,7 +59,11 @@ class Topic:
 
     def input_channel(self, node, typed_as=None, delegate=None, queue_size=QUEUE_SIZE, inline=False, shared=False,
                       from_=None, wait=0):
-        """A new :class:`~pharos.InputChannel` of ``node``; see :meth:`Node.interested_in`."""
+        """A new :class:`~pharos.InputChannel` of ``node``; see :meth:`Node.interested_in`.
+
+        :raises TypeError, ValueError: if that is no node of this process, or one of another master
+        """
+        self._check_node(node)
         is_first = all(channel.topic != self.name for channel in node.channels)
         message_class = self.message_class(node, typed_as, wait, receives=True)
         options = dict(delegate=delegate, queue_size=queue_size, inline=inline, shared=shared, from_=from_)
@@ -70,7 +75,11 @@ class Topic:
         return channel
 
     def output_channel(self, node, typed_as=None, latch=False, queue_size=QUEUE_SIZE, connect_timeout=None, wait=0):
-        """A new :class:`~pharos.OutputChannel` of ``node``; see :meth:`Node.output_channel`."""
+        """A new :class:`~pharos.OutputChannel` of ``node``; see :meth:`Node.output_channel`.
+
+        :raises TypeError, ValueError: as :meth:`input_channel`
+        """
+        self._check_node(node)
         return OutputChannel(node, self.name, self.message_class(node, typed_as, wait), latch=latch,
                              queue_size=queue_size, connect_timeout=connect_timeout)
 
@@ -87,6 +96,13 @@ class Topic:
         wait = check_seconds('wait', wait)
         with time_limit(wait + MARGIN if wait else None):
             return self._message_class(node, typed_as, wait, receives)
+
+    def _check_node(self, node):
+        if not isinstance(node, Life):
+            raise TypeError(f'a channel on {self.name} is given to a node of this process, not to {node!r}')
+        if node.master != self.master:
+            raise ValueError(f'{self} is at another master than {node.name}: ask that for its topic')
+        node._live_rospy()
 
     def _message_class(self, node, typed_as, wait, receives):
         known = next((channel.message_class for channel in node.channels if channel.topic == self.name), None)
