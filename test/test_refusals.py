@@ -12,6 +12,7 @@ import pharos
 from conftest import TIMEOUT, Mailbox
 from pharos import BlockNode, MessageTypeError, message_types
 from pharos.private_rospy import refusals
+from pharos.private_rospy.intraprocess import Link
 from programs import Program, until
 from test_graph_types import Publisher
 from test_survival import mortal_master    # noqa: F401 (a fixture)
@@ -229,6 +230,33 @@ def test_a_publisher_of_any_type_is_told_as_one(master, topic):
     assert '/far publishes messages of any type, and is not heard: only subscribers of any' in str(node.errors[0])
 
 
+@pytest.mark.parametrize('publishing', [rospy_peer, publisher_here])
+@pytest.mark.parametrize('first', ['the subscribers', 'the publisher'])
+def test_a_channel_beside_a_subscriber_of_any_type_hears_its_own_type_alone(master, topic, publishing, first):
+    """rospy connects a node once to a publisher: by the md5sum of its first subscriber, which here is none."""
+    node, mailbox, anything = create(master, '/near'), Mailbox(), Mailbox()
+
+    def subscribe():
+        node.ros.Subscriber(topic, rospy.AnyMsg, lambda message: anything(message, None))
+        in_time(lambda: node.interested_in(topic, STRING, delegate=mailbox))
+    with contextlib.ExitStack() as there:
+        if first == 'the subscribers':
+            subscribe()
+        there.enter_context(publishing(master.url, topic, INT32, 'int32 data'))
+        if first == 'the publisher':
+            subscribe()
+        if publishing is publisher_here:
+            far, = [channel for channel in master.topic(topic).channels if hasattr(channel, 'send')]
+            far.send(data=0)    # which, read as a string, is an empty one
+        assert anything.get()._buff == bytes(4)
+        until(lambda: node.errors)
+        assert f'/near wants {topic} as {STRING}' in str(node.errors[0]) and len(node.errors) == 1
+        assert node.health().refused == 1
+        with rospy_peer(master.url, topic, STRING, 'string data', name='/right'):
+            assert mailbox.get()._connection_header['callerid'] == '/right'
+        assert mailbox.empty()
+
+
 def test_a_plain_rospy_subscriber_is_told_too(master, topic):
     node = create(master, '/near')
     node.ros.Subscriber(topic, std_msgs.msg.String)
@@ -245,6 +273,26 @@ def test_a_publisher_that_refuses_for_another_reason_is_no_matter_of_types(maste
         node.interested_in(topic, STRING)
         until(lambda: made)
     assert not node.errors and node.health().refused == 0
+
+
+def test_a_channel_that_is_opened_while_its_node_connects_hears_the_publisher(master, topic, monkeypatch):
+    """The subscription is connected already, but the link was made without the channel."""
+    node, sender, mailbox = create(master, '/near'), create(master, '/far'), Mailbox()
+    match, opened = Link.match_receivers, []
+
+    def match_and_open(self):
+        new = match(self)
+        if not opened:
+            opened.append(threading.Thread(target=lambda: node.interested_in(topic, STRING, delegate=mailbox)))
+            opened[0].start()
+            until(lambda: len(node._rospy.subscriber(topic).callbacks) == 2)
+        return new
+    monkeypatch.setattr(Link, 'match_receivers', match_and_open)
+    node.ros.Subscriber(topic, rospy.AnyMsg, lambda message: None)
+    channel = sender.output_channel(topic, STRING)
+    opened[0].join(TIMEOUT)
+    channel.send(data='heard')
+    assert mailbox.get().data == 'heard'
 
 
 # -- the publisher -----------------------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from pharos.blocks import check_block, check_delegate, check_runs
 from pharos.dispatcher import Inbox, SocketInbox
 from pharos.errors import MasterUnreachableError, MessageTypeError, NodeStoppedError, PharosError
 from pharos.private_rospy import copier
+from pharos.private_rospy.refusals import suits
 from pharos.private_rospy.fanout import Latch
 from pharos.private_rospy.proxies import time_limit
 from pharos.seconds import check_limit
@@ -190,13 +191,23 @@ class InputChannel(_Channel):
         if self.from_ is None or message._connection_header.get('callerid') == self.from_:
             if message.__class__ is not self.message_class:
                 message = self._of_own_class(message)
+                if message is None:
+                    return
             with self._lock:    # TCPROS connections offer side by side
                 self._tcpros.put(message, self._size(message) if self._size else 0)
 
     _offer.is_of_channel = True    # unlike other callbacks of rospy's
 
     def _of_own_class(self, message):
-        """The message, where the first subscriber of the node, which rospy goes by, wants another class: AnyMsg, say."""
+        """The message, where the first subscriber of the node, which rospy goes by, wants another class: AnyMsg, say.
+
+        None where it is of another type.
+        """
+        header, endpoint = message._connection_header, self._endpoint
+        if not suits(self.message_class, header['md5sum']):
+            if endpoint is not None:
+                self.node._rospy.refusals.message_refused(endpoint.impl, self.message_class, header)
+            return None
         own = self.message_class().deserialize(copier.serialized(message))
         own._connection_header = message._connection_header
         return own

@@ -12,6 +12,7 @@ import rospy.impl.transport
 
 from pharos.private_rospy import copier
 from pharos.private_rospy.callbacks import CallbackInbox, is_of_channel
+from pharos.private_rospy.refusals import suits
 from pharos.private_rospy.statistics import Statistics
 
 PROTOCOL = None    # its name, of this process alone
@@ -54,7 +55,7 @@ class Link:
         """
         subscriber, before, start_thread = self._subscriber, self.inboxes, self._instance.start_thread
         channels = [channel for channel in self._instance.wiring.channels_on(subscriber.resolved_name)
-                    if channel.from_ in (None, self.publisher_name)]
+                    if channel.from_ in (None, self.publisher_name) and self._suits(channel)]
         inboxes = {channel: before.get(channel) or self._channel_inbox(channel) for channel in channels}
         if subscriber.has_plain_callbacks():
             inboxes[CallbackInbox] = (self._open_callback_inbox()
@@ -68,6 +69,16 @@ class Link:
     def all_inboxes(self):
         """Where the publisher is to put its messages."""
         return list(self.inboxes.values())
+
+    def _suits(self, channel):
+        """Whether a channel can hear the publisher; the subscription that it shares with others may take any type."""
+        if suits(channel.message_class, self.header['md5sum']):
+            return True
+        refuse = self._instance.refusals.header_refused
+        # the publisher's lock may be held, and those who are told may publish
+        self._instance.start_thread(refuse, (self._subscriber, self._other.uri, channel.message_class, self.header),
+                                    'refusal')
+        return False
 
     def _channel_inbox(self, channel):
         thaw = copier.thawer(self._publisher.data_class, channel.message_class)

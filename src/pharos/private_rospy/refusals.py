@@ -43,22 +43,24 @@ class Refusals:
 
     # -- who cannot be heard -------------------------------------------------------------------------------------------
 
-    def publisher_refused(self, subscription, uri, said, ask):
+    def publisher_refused(self, subscription, uri, said, ask, wanted=None):
         """A connection to the publisher at that URI has failed with what it said.
 
         :param subscription: rospy's _SubscriberImpl
         :param ask: ``ask()`` returns the publisher's connection header, or None if the reason is no type
+        :param wanted: the message class, where it is not the subscription's
         """
+        wanted = wanted or subscription.data_class
         key = subscription.resolved_name, uri
         with self._lock:
             if self._publishers.get(key, ())[:2] == (subscription, said):
                 return
             _remember(self._publishers, key, (subscription, said, None))
         header = ask()
-        if header is None or header.get('md5sum') == subscription.data_class._md5sum:
+        if header is None or header.get('md5sum') == wanted._md5sum:
             self.publisher_connected(*key)    # it has gone, or changed its mind
             return
-        refusal = Refusal(key[0], header.get('callerid', uri), subscription.data_class, header)
+        refusal = Refusal(key[0], header.get('callerid', uri), wanted, header)
         with self._lock:
             self._publishers[key] = subscription, said, refusal
             held = self._held.get(key[0])
@@ -82,6 +84,19 @@ class Refusals:
                     del self._held[topic]
             for refusal in held:
                 self.on_refused(refusal)
+
+    def message_refused(self, subscription, wanted, header):
+        """A message came from a publisher that suits the subscription, which takes any type, but not a channel of it.
+
+        :param header: the message's ``_connection_header``
+        """
+        uri = next((connection.endpoint_id for connection in subscription.connections or ()
+                    if getattr(connection, 'callerid_pub', None) == header['callerid']), header['callerid'])
+        self.header_refused(subscription, uri, wanted, header)
+
+    def header_refused(self, subscription, uri, wanted, header):
+        """A publisher's connection header is of another type than a channel of the subscription."""
+        self.publisher_refused(subscription, uri, 'its md5sum is %s' % header['md5sum'], lambda: header, wanted)
 
     def publisher_connected(self, topic, uri):
         """Nothing is wrong with it now."""
@@ -177,6 +192,11 @@ def hooks(instance):
     return {'rospy.impl.tcpros_pubsub': tell_of_types}
 
 
+def suits(wanted, md5sum):
+    """Whether one who wants messages of that class may hear those of that md5sum: ROS's rule."""
+    return '*' in (wanted._md5sum, md5sum) or wanted._md5sum == md5sum
+
+
 def check_md5sum(connection, wanted):
     """Raise TransportInitError if the publisher that rospy's connection has shaken hands with is of another type.
 
@@ -185,7 +205,7 @@ def check_md5sum(connection, wanted):
     :param wanted: the message class of the subscription
     """
     header = connection.header
-    if '*' not in (wanted._md5sum, header['md5sum']) and wanted._md5sum != header['md5sum']:
+    if not suits(wanted, header['md5sum']):
         # as if it had said so itself: it is not to be tried again and again
         connection.header = {**header, 'error': 'its md5sum is %s' % header['md5sum']}
         raise rospy.exceptions.TransportInitError(connection.header['error'])
