@@ -312,6 +312,25 @@ print('PIDS', process.pid, lines.get(), flush=True)
         assert all(wait_for_end(int(pid), TIMEOUT) for pid in pids)
 
 
+@pytest.mark.parametrize('second', [signal.SIGINT, signal.SIGTERM])
+def test_nothing_is_left_behind_when_ctrl_c_comes_while_it_is_ended(master, package, second):
+    code = """
+import queue, threading
+from pharos import Master
+lines = queue.SimpleQueue()
+process = Master().run('fake_robot', %r, on_line=lines.put)
+print('PIDS', process.pid, lines.get(), flush=True)
+threading.Thread(target=lambda: print(lines.get(), flush=True), daemon=True).start()
+process.terminate(timeout=4)
+""" % (program(package, 'deaf', 'trap "echo heard" INT; trap "" TERM; echo $$; while :; do sleep 0.1; done'))
+    with Program(master.url, sys.executable, '-c', code) as started:
+        pids = started.wait_for('PIDS').split()[1:]
+        started.wait_for('heard')
+        started.process.send_signal(second)
+        started.process.wait(TIMEOUT)
+        assert all(wait_for_end(int(pid), TIMEOUT) for pid in pids)
+
+
 def test_a_program_that_ended_long_ago_is_not_signalled_again(master, package, monkeypatch):
     with master.run('fake_robot', program(package, 'ends', 'exit 0')) as process:
         process.wait(TIMEOUT)

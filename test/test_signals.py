@@ -312,6 +312,49 @@ pharos.spin()
     assert running.end(signal.SIGINT) == 0
 
 
+@SIGNALS
+@pytest.mark.parametrize('busy', ['', 'wait_for(threading.Event())'], ids=['at its end', 'ended by a signal'])
+def test_signals_while_the_program_ends_cut_nothing_off(program, with_signal, busy):
+    running = program(f"""
+def goes_on():
+    print('stopping', flush=True)
+    wait_for(go_on)
+    print('stopped', flush=True)
+go_on = threading.Event()
+me = node()
+me.ros.on_shutdown(goes_on)
+pharos.running.at_end(lambda: print('other ended', flush=True))
+def go():
+    while not (pharos.signals._held and pharos.signals._held[-1].came):
+        threading.Event().wait(0.001)
+    print('kept', flush=True)
+    go_on.set()
+threading.Thread(target=go, daemon=True).start()
+ready()
+{busy}
+""")
+    if busy:
+        running.process.send_signal(with_signal)
+    running.wait_for('stopping')
+    running.process.send_signal(with_signal)
+    running.wait_for('kept')
+    running.wait_for('other ended')
+    running.end(signal.SIGCONT)
+    printed = running.read_to_the_end()
+    assert 'stopped' in printed.split('\n')
+    assert 'atexit' not in printed
+
+
+def test_what_else_is_to_end_with_the_program_does_though_one_cannot(program):
+    running = program("""
+pharos.running.at_end(lambda: print('other ended', flush=True))
+pharos.running.at_end(lambda: 1 / 0)
+ready()
+""")
+    running.wait_for('other ended')
+    assert 'ZeroDivisionError' in running.read_to_the_end()
+
+
 # -- while the main thread runs a block --------------------------------------------------------------------------------
 
 BLOCKS = {

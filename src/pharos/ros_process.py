@@ -88,9 +88,8 @@ class RosProcess:
 
         The nodes in it are asked through ROS, for where roscpp has no handler, a node ends at a signal without
         unregistering; then the program is asked as by Ctrl-C, and then by SIGTERM. What is still registered of the
-        nodes afterwards goes. Done at the end of this program, too.
+        nodes afterwards goes. Done at the end of this program, too, also where Ctrl-C has cut it off.
         """
-        running.not_at_end(self.terminate)
         if self.poll() is None:
             numbers = [signal.SIGINT, signal.SIGTERM]
             started = self._look()
@@ -110,6 +109,7 @@ class RosProcess:
             self._signal(signal.SIGKILL)
         status = self.wait()
         self._nodes.clear()
+        running.not_at_end(self.terminate)
         return status
 
     def _look(self):

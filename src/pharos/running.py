@@ -1,5 +1,6 @@
 """The nodes of this process, and how they end with it."""
 import atexit
+import contextlib
 import gc
 import os
 import sys
@@ -118,10 +119,12 @@ def _end_with_multiprocessing():
 
 
 def _end():
-    """The program ends."""
-    stop_all()
-    while _others:
-        _others.pop()()
+    """The program ends, once: a signal that comes meanwhile asks for nothing more."""
+    with signals.held(stopping.LIMIT, is_end=True), contextlib.ExitStack() as others:
+        stop_all()
+        for function in _others:
+            others.callback(function)    # the last first, and each of them, whatever another one raises
+        _others.clear()
 
 
 def _forget():

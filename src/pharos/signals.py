@@ -91,12 +91,13 @@ def waiting():
 
 
 @contextlib.contextmanager
-def held(limit):
+def held(limit, is_end=False):
     """Within this, a signal raises nothing in the main thread, and afterwards what it would have raised.
 
-    A start or a stop that is torn up half way leaves registrations behind.
+    A start or a stop that is torn up half way leaves registrations behind, and the end of the program programs, too.
 
     :param limit: seconds after which a second signal raises all the same
+    :param is_end: whether it is the end of the program, so that there is nothing to raise afterwards
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -109,7 +110,7 @@ def held(limit):
     finally:
         if hold in _held:    # else the process was forked in it
             _held.remove(hold)
-        if hold.came is not None:
+        if hold.came is not None and not is_end:
             _raise(hold.came)
 
 
