@@ -196,6 +196,19 @@ def test_closed_channels_hold_no_descriptor(master):
             gc.enable()
 
 
+def test_questions_to_the_master_and_to_nodes_hold_no_descriptor(master):
+    with master.create(BlockNode, named='/questioner', domain='127.0.0.1') as node:
+        gc.collect()
+        gc.disable()
+        try:
+            before = len(os.listdir('/proc/self/fd'))
+            for _ in range(20):
+                master.nodes(), master.parameters.get('/none'), node.health()
+            assert len(os.listdir('/proc/self/fd')) < before + 20
+        finally:
+            gc.enable()
+
+
 @pytest.mark.parametrize('library', ['actionlib', 'tf2_ros', 'message_filters'])
 def test_a_library_of_a_stopped_node_is_freed(master, library):
     held = []

@@ -42,41 +42,51 @@ def is_time_up():
     return deadline is not None and time.monotonic() >= deadline
 
 
+class _Limits:
+    """When the calls of a proxy are to end.
+
+    Its transport and what that holds share them: if they knew each other, their sockets would stay open until Python's
+    collector of cycles comes by.
+    """
+
+    deadline = 0.0     # of the present call, by time.monotonic()
+    is_shut = False    # whether none is to go on
+
+    def left(self):
+        """The seconds left for the present call."""
+        left = self.deadline - time.monotonic()
+        if left <= 0:
+            raise socket.timeout('timed out')
+        return left
+
+    def check(self):
+        """Raise an OSError if the calls were ended."""
+        if self.is_shut:
+            raise ConnectionAbortedError('it is not waited for any more')
+
+
 class _Transport(xmlrpc.client.Transport):
     """Ends each call by a deadline, however slowly its answer comes."""
 
     def __init__(self, timeout):
         super().__init__()
         self._timeout = timeout
-        self._is_shut = False
-        self._deadline = 0.0
+        self._limits = _Limits()
 
     def request(self, *args, **options):
-        self._deadline = deadline_in(self._timeout)
+        self._limits.deadline = deadline_in(self._timeout)
         return super().request(*args, **options)
 
-    def left(self):
-        """The seconds left for the present call."""
-        left = self._deadline - time.monotonic()
-        if left <= 0:
-            raise socket.timeout('timed out')
-        return left
-
-    def check(self):
-        """Raise an OSError if :meth:`shut` was called."""
-        if self._is_shut:
-            raise ConnectionAbortedError('it is not waited for any more')
-
     def make_connection(self, host):
-        self.check()
+        self._limits.check()
         if not self._connection or self._connection[0] != host:
             address, self._extra_headers, _ = self.get_host_info(host)
-            self._connection = host, _Connection(address, self)
+            self._connection = host, _Connection(address, self._limits)
         return self._connection[1]
 
     def shut(self):
         """End the call under way in another thread; it raises an OSError."""
-        self._is_shut = True
+        self._limits.is_shut = True
         connection = self._connection[1]
         sock = connection.sock if connection else None
         if sock is not None:
@@ -84,27 +94,27 @@ class _Transport(xmlrpc.client.Transport):
 
 
 class _Connection(http.client.HTTPConnection):
-    def __init__(self, address, transport):
+    def __init__(self, address, limits):
         super().__init__(address)
-        self._transport = transport
+        self._limits = limits
 
     def connect(self):
-        self.timeout = self._transport.left()
+        self.timeout = self._limits.left()
         super().connect()
         self.sock = _Socket(fileno=self.sock.detach())
-        self.sock.transport = self._transport
-        self._transport.check()    # shut() may have come before there was a socket
+        self.sock.limits = self._limits
+        self._limits.check()    # shut() may have come before there was a socket
 
 
 class _Socket(socket.socket):
     """The standard library's has a limit for each part of an answer."""
 
     def sendall(self, *args):
-        self.settimeout(self.transport.left())
+        self.settimeout(self.limits.left())
         return super().sendall(*args)
 
     def recv_into(self, *args):
-        self.settimeout(self.transport.left())
+        self.settimeout(self.limits.left())
         return super().recv_into(*args)
 
 
