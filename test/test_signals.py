@@ -248,12 +248,13 @@ print('freed' if kept[0]() is None else 'kept')
 
 
 CAREFUL = """
+import os
 class Careful(pharos.Node):
     def stop(self):
-        print('begun', flush=True)
+        os.write(1, b'\\nbegun\\n')    # at once, and on a line of its own, beside a traceback of the main thread
         super().stop()
         threading.Event().wait(0.3)    # other threads go on meanwhile
-        print('ended', flush=True)
+        os.write(1, b'\\nended\\n')
 me = Master().create(Careful, named='/program', domain='127.0.0.1')
 """
 CAREFUL_ENDS = {
