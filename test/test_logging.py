@@ -6,9 +6,12 @@ import pathlib
 import subprocess
 import sys
 
+import pytest
+
 import pharos
-from conftest import Mailbox
+from conftest import TIMEOUT, Mailbox
 from pharos import BlockNode
+from programs import environment
 
 
 def create(master, name, **kwargs):
@@ -101,3 +104,32 @@ assert not rospy.is_shutdown() and a.lifecycle.value == 'stopped'
     assert result.returncode == 0, result.stdout
     assert result.stdout.count('the host speaks') == 1 and result.stdout.count('node a speaks') == 1
     assert 'caught' in result.stdout
+
+
+@pytest.mark.parametrize('closed', ['>&-', '2>&-', '>&- 2>&-', '<&- >&- 2>&-'])
+def test_a_program_started_without_a_screen_logs_all_the_same(master, tmp_path, closed):
+    code = """
+import sys
+from pharos import BlockNode, Master, Transcript
+me = Master().create(BlockNode, named='/screenless', domain='127.0.0.1')
+me.log('line')
+me.log('line', 'error')
+Transcript.show('line')
+me.stop()
+open(sys.argv[1], 'w').write('went on')
+"""
+    told = tmp_path / 'told'
+    status = subprocess.run(['sh', '-c', f'exec "$0" "$@" {closed}', sys.executable, '-c', code, told],
+                            env=environment(master.url), check=False, timeout=TIMEOUT).returncode
+    assert (status, told.read_text()) == (0, 'went on')
+
+
+def test_a_node_whose_log_file_finds_the_disk_full_stops_and_starts_again(master, monkeypatch, tmp_path, capsys):
+    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path))
+    (tmp_path / 'unwritten.log').symlink_to('/dev/full')
+    node = create(master, '/unwritten')
+    for _ in range(2):
+        node.log('line')
+        node.stop()
+        node.start()
+    assert node.is_running

@@ -5,6 +5,7 @@ handlers: with plain copies, a line of one node appears under another's name, tw
 module (own root, own manager, own list of handlers) lets rospy configure it unchanged. It is not a reload of the
 module: that would register exit and fork hooks.
 """
+import contextlib
 import logging
 import logging.handlers
 import types
@@ -60,6 +61,8 @@ def hooks():
         handler.emit = emit_what_can_be
 
         def write_message(self, file, line, color):
+            if file is None:    # the program was started without that one
+                return
             write(self, file, line.replace(_MESSAGE, self._message), color)
         handler._write = write_message
 
@@ -67,8 +70,9 @@ def hooks():
 
 
 def close_handlers(module):
-    """Flush and close every handler of a private logging module."""
+    """Flush and close every handler of a private logging module, as far as the disk takes what they hold."""
     for logger in [module.root, *module.root.manager.loggerDict.values()]:
         for handler in list(getattr(logger, 'handlers', ())):    # a PlaceHolder has none
             logger.removeHandler(handler)
-            handler.close()
+            with contextlib.suppress(OSError):
+                handler.close()
