@@ -331,6 +331,13 @@ process.terminate(timeout=4)
         assert all(wait_for_end(int(pid), TIMEOUT) for pid in pids)
 
 
+def test_a_program_may_be_ended_by_the_block_for_its_output(master, package):
+    ended = queue.SimpleQueue()
+    process = master.run('fake_robot', program(package, 'talks', 'echo enough; sleep 1000'),
+                         on_line=lambda text: ended.put((process.terminate(), process.wait())))
+    assert ended.get(timeout=TIMEOUT) == (-signal.SIGINT, -signal.SIGINT)
+
+
 def test_a_program_that_ended_long_ago_is_not_signalled_again(master, package, monkeypatch):
     with master.run('fake_robot', program(package, 'ends', 'exit 0')) as process:
         process.wait(TIMEOUT)

@@ -80,7 +80,8 @@ class RosProcess:
         :raises subprocess.TimeoutExpired: after ``timeout`` seconds
         """
         status = self._process.wait(timeout)
-        self._reader.join(1.0)
+        if self._reader is not threading.current_thread():    # which runs on_line
+            self._reader.join(1.0)
         return status
 
     def terminate(self, timeout=5.0):
