@@ -318,6 +318,8 @@ pharos.spin()
 def test_signals_while_the_program_ends_cut_nothing_off(program, with_signal, busy):
     running = program(f"""
 def goes_on():
+    while not pharos.signals._held:    # the main thread may be on its way to the end still
+        threading.Event().wait(0.001)
     print('stopping', flush=True)
     wait_for(go_on)
     print('stopped', flush=True)
