@@ -8,7 +8,7 @@ import pytest
 from conftest import TIMEOUT
 from pharos import BlockNode, ExternalNode, Lifecycle, Master, Node, NodeNameInUseError, NodeStoppedError, running
 from pharos import message_class, stopping
-from pharos.private_rospy import lifetime, proxies, services
+from pharos.private_rospy import door, lifetime, proxies, services, xmlrpc_server
 from programs import until
 from sockets import refused_url, silent_peer
 
@@ -273,6 +273,29 @@ def test_stops_at_any_time_of_the_start_leave_nothing(master):
         assert isinstance(outcome[0], (NodeStoppedError, BlockNode))
         assert running.nodes() == []
         assert '/premature' not in [each.name for each in master.nodes()]
+
+
+def test_a_node_stopped_before_it_accepts_anybody_ends_its_threads(master, monkeypatch):
+    """A socket that is shut and then told to listen would listen for ever."""
+    late, accept = threading.Event(), door.Door.accept
+
+    def accept_late(self, listener, serve):
+        late.wait(TIMEOUT)
+        accept(self, listener, serve)
+    monkeypatch.setattr(door.Door, 'accept', accept_late)
+    node = master.create(BlockNode, named='/late', domain='127.0.0.1')
+    accepting = [thread for thread in threading.enumerate() if thread.name.startswith('/late')]
+
+    def shut_and_tell(sock):
+        shut(sock)
+        late.set()
+    shut = xmlrpc_server.shut
+    monkeypatch.setattr(xmlrpc_server, 'shut', shut_and_tell)
+    stopping = threading.Thread(target=node.stop, daemon=True)
+    stopping.start()
+    stopping.join(TIMEOUT)
+    assert not stopping.is_alive()
+    assert not any(thread.is_alive() for thread in accepting)
 
 
 def test_a_stop_ends_a_start_at_a_master_that_says_nothing():

@@ -41,8 +41,9 @@ class Door:
         """Accept clients until the listener is shut; ``serve(socket, address)`` runs for each.
 
         Whatever it raises closes the client, and is logged as the reason.
+
+        :param listener: a socket that listens already: one that is shut before this runs would listen again
         """
-        listener.listen(BACKLOG)
         while True:
             self._make_room(wait=True)
             try:

@@ -6,7 +6,7 @@ import sys
 import time
 
 from pharos.private_rospy import xmlrpc_server
-from pharos.private_rospy.door import Door, brief
+from pharos.private_rospy.door import BACKLOG, Door, brief
 from pharos.private_rospy.host import rospy
 from pharos.private_rospy.lifetime import shut
 from pharos.private_rospy.names import NAME_LIMIT
@@ -197,5 +197,6 @@ def listen(tcpros_base, port):
     """Open a node's TCPROS server now, in this thread; rospy does so at the first connection and prints errors."""
     server = tcpros_base.init_tcpros_server(port)
     server.tcp_ros_server = tcpros_base.TCPServer(server._tcp_server_callback, port)
+    server.tcp_ros_server.server_sock.listen(BACKLOG)
     server.tcp_ros_server.start()
     return server.tcp_ros_server.port

@@ -8,7 +8,7 @@ import urllib.parse
 import xml.parsers.expat
 import xmlrpc.client
 
-from pharos.private_rospy.door import Door, brief
+from pharos.private_rospy.door import BACKLOG, Door, brief
 from pharos.private_rospy.lifetime import shut
 from pharos.private_rospy.loader import Substitute
 
@@ -62,6 +62,7 @@ def hooks(lifetime, warn, debug):
             """Bind here, in the caller's thread, where an error can be raised; rosgraph prints it in another."""
             lifetime.xmlrpc = self
             self._run_init()
+            self.server.socket.listen(BACKLOG)
             ways_in = self.server.socket, self.server.serve
             self.accepting = lifetime.start_thread(door.accept, ways_in, 'xmlrpc-accept')
         node.start = start
