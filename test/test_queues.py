@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from conftest import TIMEOUT, Mailbox
-from pharos import BlockNode, Node, dispatcher
+from pharos import BlockNode, Node, define_message, dispatcher
 from pharos.private_rospy import sender
 
 BYTES, NUMBERS = 'std_msgs/UInt8MultiArray', 'std_msgs/Float64MultiArray'
@@ -46,6 +46,19 @@ def test_large_messages_wait_up_to_so_many_bytes_and_the_oldest_are_dropped_and_
     gate.opened.set()
     assert [len_ for len_ in gate.sizes.take(5)] == [0, *range(MEGABYTE - 994, MEGABYTE - 990)]
     assert (received.received, received.dropped) == (5, 6)
+
+
+def test_messages_are_large_too_where_their_definition_fixes_their_size(master):
+    fixed = define_message('queues_test/Fixed', f'uint8[{MEGABYTE}] data')
+    gate = Gate()
+    received = create(master, '/receiver', Small, delegate=gate).interested_in('/fixed', fixed)
+    sent = create(master, '/sender').output_channel('/fixed', fixed)
+    sent.send()
+    assert gate.entered.wait(TIMEOUT)
+    for _ in range(10):
+        sent.send()
+    gate.opened.set()
+    assert received.dropped == 7    # three, and a little for each, are less than four megabytes
 
 
 def test_the_newest_message_has_room_however_large_it_is(master):

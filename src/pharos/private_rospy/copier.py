@@ -46,6 +46,7 @@ from pharos.nested_types import nested_class
 
 ARRIVAL_CODES = {**STRUCT_CODES, 'bool': '?'}   # genpy sends a bool as a number: 7 goes out, True arrives
 SMALL = 64     # bytes that a message is taken to have beside its texts and arrays
+FEW = 1024     # bytes; messages that all have one size, of so many, are not worth counting
 
 
 class Copier(NamedTuple):
@@ -166,11 +167,11 @@ def _generate(cls):
     # The wire canonizes the times that are the message's own, not those of its header or of other messages in it.
     canon = [f'message.{name}.canon()' for name, type_name in _fields(cls) if type_name in ('time', 'duration')]
     freeze, build = list(writer.freeze_lines()), list(writer.thaw_lines(cls))
-    sizes = writer.sizes()
+    size = writer.size()
     source = '\n'.join([
         'def freeze_fields(message):', *_indented(freeze), '',
         'def thaw_fields(frozen):', *_indented(build), '    return message', '',
-        'def size(message):', f'    return {" + ".join(sizes)}', '',
+        'def size(message):', f'    return {size}', '',
         # each of these again with all of it in one function: a message that comes alone meets cold caches
         'def freeze(message):', '    if type(message) is cls:', '        try:', *_indented(_indented(_indented(freeze))),
         '        except Exception:', '            pass', '    return serialized(message)', '',
@@ -178,8 +179,8 @@ def _generate(cls):
         *_indented([*build, *canon]), '    return message', ''])
     scope = {**writer.scope, 'cls': cls, 'serialized': serialized}
     exec(compile(source, '<copier of %s>' % cls.__name__, 'exec'), scope)
-    size = scope['size'] if len(sizes) > 1 else None
-    return Copier(scope['freeze'], scope['thaw'], size, scope['freeze_fields'], scope['thaw_fields'], source)
+    return Copier(scope['freeze'], scope['thaw'], size and scope['size'],
+                  scope['freeze_fields'], scope['thaw_fields'], source)
 
 
 def _indented(lines):
@@ -212,15 +213,15 @@ class _Writer:
         self._values = []               # the variables in the frozen tuple
         self._floats = []               # those of them that are float64
         self._numbers = []              # other numbers: (primitive type, where it is read, variable)
-        self._sizes = []                # expressions of size
+        self._sizes = []                # expressions of size, where it varies,
+        self._fixed_size = SMALL        # and what does not
 
     def add_object(self, cls, owner, path='message'):
         """Add the fields of the object of class cls that is in the variable owner, and at that path in a message."""
         for name, type_name in _fields(cls):
             base, is_array, length = parse_type(type_name)
             field, local = f'{owner}.{name}', self._unique(name)
-            if length is None:    # else it hardly varies
-                self._add_size(cls, base, is_array, f'{path}.{name}')
+            self._add_size(cls, base, is_array, length, f'{path}.{name}')
             if is_array:
                 self._add_array(cls, base, length, field, local)
             elif base in STRUCT_CODES or base == 'string':
@@ -231,7 +232,7 @@ class _Writer:
                 self._builds.append(f'{local} = {field} = new({self._refer(nested)})')
                 self.add_object(nested, local, f'{path}.{name}')
 
-    def _add_size(self, cls, base, is_array, path):
+    def _add_size(self, cls, base, is_array, length, path):
         """Add what may make a message large: an array or a text, unless that names a frame."""
         if not is_array:
             if base == 'string' and not path.endswith('frame_id'):
@@ -239,15 +240,26 @@ class _Writer:
         elif base == 'string':
             self._sizes.append(f'sum(map(len, {path}))')
         elif base in STRUCT_CODES:
-            self._sizes.append(f'len({path}) * {struct.calcsize("<" + STRUCT_CODES[base])}')
+            self._add_items(length, struct.calcsize('<' + STRUCT_CODES[base]), path)
         else:
             size = copier_for(nested_class(cls, base)).size
-            items = f'sum(map({self._refer(size)}, {path}))' if size else f'len({path}) * {SMALL}'
-            self._sizes.append(items)
+            if size:
+                self._sizes.append(f'sum(map({self._refer(size)}, {path}))')
+            else:
+                self._add_items(length, SMALL, path)
 
-    def sizes(self):
-        """The terms of a message's size."""
-        return [str(SMALL), *self._sizes]
+    def _add_items(self, length, size, path):
+        """Add an array of items that have that size each; ``length`` is None where it varies."""
+        if length is None:
+            self._sizes.append(f'len({path}) * {size}')
+        else:
+            self._fixed_size += length * size
+
+    def size(self):
+        """The expression of a message's size; None: always a few bytes."""
+        if not self._sizes and self._fixed_size <= FEW:
+            return None
+        return ' + '.join([str(self._fixed_size), *self._sizes])
 
     def _add_scalar(self, base, field, local):
         self._add_value(field, local, fresh=local)
