@@ -248,6 +248,18 @@ def test_the_nodes_of_a_launch_file_are_ended_through_ros(master, package):
     assert not {'/a', '/b'} & names_registered(master)
 
 
+def test_a_node_registered_with_a_port_that_cannot_be_keeps_no_program_from_ending(master):
+    liar, uri = master._api('/liar'), 'http://127.0.0.1:99999/'
+    liar.registerPublisher('/lies', 'std_msgs/String', uri)
+    try:
+        process = master.run('topic_tools', 'relay', '/untyped', '/b', name='passes_on')
+        master.wait_for_node('/passes_on', TIMEOUT)
+        process.terminate()
+        assert names_registered(master) >= {'/liar'} and '/passes_on' not in names_registered(master)
+    finally:
+        liar.unregisterPublisher('/lies', uri)
+
+
 def test_other_nodes_are_not_ended_with_a_program(master, package):
     write(package / 'scripts' / 'robot', NO_HANDLER % ('SIG_DFL', 'not rospy.is_shutdown()'), 0o755)
     ours = master.create(BlockNode, named='/ours')

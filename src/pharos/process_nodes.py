@@ -63,7 +63,11 @@ class ProcessNodes:
 
     def _is_ours(self, uri):
         address = urllib.parse.urlsplit(uri)
-        return address.port in self._ports and rosgraph.network.is_local_address(address.hostname)
+        try:
+            port = address.port
+        except ValueError:    # the master takes any number from anybody
+            return False
+        return port in self._ports and rosgraph.network.is_local_address(address.hostname)
 
 
 def _is_refused(uri):

@@ -68,7 +68,7 @@ def at_end(function):
 
 def not_at_end(function):
     """Do not run it then: what it ends has ended."""
-    if function in _others:
+    with contextlib.suppress(ValueError):    # done already, by another thread perhaps
         _others.remove(function)
 
 
