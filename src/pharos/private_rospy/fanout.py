@@ -144,7 +144,8 @@ class Fanout:
 
     def _latched_for(self, receiver):
         """What is latched for the node of that name, frozen."""
-        return self._early or [frozen for latch in self._latches.values() for frozen in latch.of(receiver)]
+        latches = tuple(self._latches.values())    # a channel may close meanwhile
+        return self._early or [frozen for latch in latches for frozen in latch.of(receiver)]
 
     def send_latched(self, inboxes, receiver):
         """Put what is latched into new inboxes; :meth:`run` is to be called when the lock is released.
