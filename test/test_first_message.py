@@ -136,3 +136,9 @@ def test_a_send_that_waits_for_another_threads_channel_ends_with_the_node(master
         for thread in threads:
             thread.join(TIMEOUT)
             assert not thread.is_alive()
+
+
+def test_a_first_message_may_wait_without_limit_for_its_type(master):
+    node = master.create(BlockNode, named='/sender', domain='127.0.0.1')
+    node.send_to('/first/unlimited', typed_as='std_msgs/String', wait=float('inf'), data='sent')
+    assert [channel.sent for channel in node.channels] == [1]

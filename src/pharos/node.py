@@ -14,7 +14,7 @@ from pharos.private_rospy.host import rospy
 from pharos.private_rospy.names import Resolved, check_name
 from pharos.private_rospy.settings import Settings
 from pharos.seconds import check_seconds
-from pharos.topic import QUEUE_SIZE
+from pharos.topic import QUEUE_SIZE, Topic
 from pharos.transcript import Transcript
 
 
@@ -221,7 +221,8 @@ class Node(Life):
     def _open_sending_channel(self, topic, typed_as, connect_timeout, wait):
         """Open a channel for :meth:`send_to`; of several threads that come at once, one does, and the others wait."""
         opening = self._first_sends.setdefault(topic.name, threading.RLock())
-        is_mine = opening.acquire(timeout=max(0.0, wait + connect_timeout))
+        limit = max(0.0, wait + connect_timeout)
+        is_mine = opening.acquire(timeout=min(limit, threading.TIMEOUT_MAX))
         try:
             return self._sending_channel(topic) or topic.output_channel(self, typed_as, connect_timeout=connect_timeout,
                                                                         wait=wait)
@@ -235,7 +236,7 @@ class Node(Life):
         return [channel for channel in self._channels if channel.is_open]
 
     def _topic(self, name):
-        return self.master.topic(self._resolve(name, 'topic'))
+        return Topic(self.master, self._resolve(name, 'topic'))
 
     def _resolve(self, name, what):
         """A name as the node means it, in its namespace and remapped, in full."""
