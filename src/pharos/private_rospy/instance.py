@@ -71,7 +71,8 @@ class PrivateRospy:
             'os': private_os,
             'sys': Substitute(sys, argv=self.settings.argv),
             'logging': logging_module,
-            'atexit': Substitute(atexit, register=lambda function, *args, **kwargs: function),    # nodes.py does that
+            # running.py stops the node at the end of the program
+            'atexit': Substitute(atexit, register=lambda function, *args, **kwargs: function),
             'threading': Substitute(threading, Thread=lifetime.Thread),
             '_thread': Substitute(_thread, start_new_thread=lifetime.start_thread),
             'time': Substitute(time, sleep=lifetime.sleep),
@@ -191,7 +192,7 @@ class PrivateRospy:
         core.signal_shutdown('stop')
         with core._shutdown_lock:
             pass    # where the node's own code called that, it returned at once
-        for proxy in core._xmlrpc_cache.values():
+        for proxy in list(core._xmlrpc_cache.values()):    # a thread that is left may add one
             proxy('close')()
         left = self._lifetime.end(given_up)
         logs.close_handlers(self._logging)
