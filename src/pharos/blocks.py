@@ -110,13 +110,15 @@ class Souls:
 
     def fork(self, block, present, name, start_thread):
         """Run a soul in a thread of its own, and return the thread."""
+        known = threading.Event()
+
         def run():
+            known.wait()
             try:
                 self.run(block, present)
             finally:
                 self._threads.discard(threading.current_thread())
-        known = threading.Event()
-        thread = start_thread(lambda: known.wait() and run(), name=name)
+        thread = start_thread(run, name=name)
         self._threads.add(thread)
         known.set()
         return thread

@@ -21,27 +21,37 @@ class Health(NamedTuple):
     refused: int = 0                    # publishers that its channels cannot hear, for they publish another type
 
     def __str__(self):
-        return ', '.join([
-            *([] if self.registered is None else ['registered' if self.registered else 'not registered']),
-            *self._of_master(),
-            *('%d %s' % (count, transport) for transport, count in sorted(self.connections.items())),
-            *(['%d refused' % self.refused] if self.refused else []), '%d dropped' % self.dropped, '%d errors' % self.errors, '%d threads' % self.threads])
+        return ', '.join(self._parts())
 
-    def _of_master(self):
-        """What to say of the master, if anything is known."""
+    def _parts(self):
+        """What is to be said, one thing after the other."""
+        if self.registered is not None:
+            yield 'registered' if self.registered else 'not registered'
         if self.reachable_since:
             yield 'master reachable since ' + time.strftime('%H:%M:%S', time.localtime(self.reachable_since))
         elif self.registered is None:    # else it has just answered
             yield 'master away'
+        for transport, count in sorted(self.connections.items()):
+            yield f'{count} {transport}'
+        if self.refused:
+            yield f'{self.refused} refused'
+        yield f'{self.dropped} dropped'
+        yield f'{self.errors} errors'
+        yield f'{self.threads} threads'
 
 
 def health_of(node, ask):
     """The :class:`Health` of a node; ``ask``: the master too, which may take its time, else ``registered`` is None."""
-    connections = collections.Counter(transport for channel in node.channels for _, transport in channel.connections)
-    reachable_since = watcher_of(node.master).reachable_since if node.is_running else None
-    return Health(_is_registered(node) if ask else None, reachable_since,
-                  dict(connections), sum(getattr(channel, 'dropped', 0) for channel in node.channels), node._failures.count,
-                  node._rospy.thread_count if node._rospy else 0, node._rospy.refusals.count() if node.is_running else 0)
+    channels, is_running = node.channels, node.is_running
+    transports = (transport for channel in channels for _, transport in channel.connections)
+    return Health(
+        registered=_is_registered(node) if ask else None,
+        reachable_since=watcher_of(node.master).reachable_since if is_running else None,
+        connections=dict(collections.Counter(transports)),
+        dropped=sum(getattr(channel, 'dropped', 0) for channel in channels),
+        errors=node._failures.count,
+        threads=node._rospy.thread_count if node._rospy else 0,
+        refused=node._rospy.refusals.count() if is_running else 0)
 
 
 def _is_registered(node):

@@ -10,7 +10,6 @@ import time
 from pharos import signals, stopping
 from pharos.errors import NodeNameInUseError
 from pharos.private_rospy.lifetime import SIGNAL_LATENCY
-from pharos.signals import is_from_signal  # noqa: F401: for those who know the nodes, and no signals
 
 # A stopped node's rospy is a web of cycles of 0.7 MB, which only the collector frees. It looks at the running nodes,
 # too, so it runs after as many stops as there are nodes left, and at least so many:
