@@ -450,7 +450,7 @@ def test_a_call_that_is_ended_before_it_has_connected_is_not_waited_for():
                 connected.set()
                 super().connect()
         address = url[len('http://'):-1]
-        proxy('transport')._connection = address, Shutting(address, proxy('transport'))
+        proxy('transport')._connection = address, Shutting(address, proxy('transport')._limits)
         with pytest.raises(OSError):
             proxy.getPid('/caller')
         assert connected.is_set()
