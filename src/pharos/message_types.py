@@ -13,7 +13,8 @@ from pharos.errors import MessageTypeError, UnknownTypeError
 from pharos.message_fields import build, check_fits, describe_fields, explain, fill
 
 __all__ = ['message_class', 'service_class', 'define_message', 'define_service', 'class_from_definition',
-           'known_service_classes', 'is_provisional', 'describe_fields', 'describe_service', 'build', 'fill', 'check_fits', 'explain']
+           'known_service_classes', 'is_provisional', 'describe_fields', 'describe_service', 'build', 'fill',
+           'check_fits', 'explain']
 
 _lock = threading.RLock()
 _given = {}  # (kind, type): class from define_message or define_service
