@@ -26,7 +26,7 @@ class ProcessNodes:
         self._ports = set()
 
     def look(self, pids):
-        """See on which ports the processes listen now; later, it is not to be seen any more."""
+        """See on which ports the processes listen, which cannot be seen of one that has ended."""
         for pid in pids:
             with contextlib.suppress(OSError):    # it has ended, or is another user's
                 self._ports |= _listening_ports(pid)

@@ -70,7 +70,8 @@ def hooks(lifetime, warn, debug):
         def shutdown(self, reason):
             """rosgraph only closes the socket, on which its thread then spins (ros_comm #2238)."""
             self.is_shutdown = True
-            server, handler, self.server, self.handler = self.server, self.handler, None, None
+            server, handler = self.server, self.handler
+            self.server = self.handler = None    # first, for others take that for stopped
             if handler:
                 handler._shutdown(reason)
             if server:
