@@ -10,7 +10,7 @@ from rospy.numpy_msg import numpy_msg
 
 from conftest import TIMEOUT, Mailbox, speak_tcpros_only
 from pharos import BlockNode
-from pharos.private_rospy import callbacks
+from pharos.private_rospy import callbacks, intraprocess
 from programs import until
 
 INT, STRING, ARRAY = std_msgs.msg.Int32, std_msgs.msg.String, std_msgs.msg.UInt8MultiArray
@@ -394,6 +394,22 @@ def test_a_link_has_a_thread_for_callbacks_only_while_there_are_some(master, mai
     publisher.publish('text')
     assert mailbox.get().data == 'text'
     assert channel.dropped == 0
+
+
+def test_no_thread_is_left_when_a_channel_opens_while_the_last_callback_goes(master, mailbox, monkeypatch):
+    both, sender = create(master, '/both'), create(master, '/sender')
+    channel = sender.output_channel('/threads/last', INT)
+    subscriber, _ = listen(both, '/threads/last', INT)
+    assert channel.wait_for_subscribers(1, TIMEOUT)
+    removed = intraprocess.Link.callback_removed
+
+    def open_first(link):
+        both.interested_in('/threads/last', INT, delegate=mailbox)
+        removed(link)
+    monkeypatch.setattr(intraprocess.Link, 'callback_removed', open_first)
+    both.interested_in('/threads/last', INT, delegate=mailbox)
+    subscriber.unregister()
+    until(lambda: len(link_threads(both)) == 1)    # the node's own
 
 
 def test_what_was_published_before_the_publisher_left_still_arrives(pair):

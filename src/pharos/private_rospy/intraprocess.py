@@ -64,6 +64,9 @@ class Link:
             inboxes[Statistics] = (before.get(Statistics)
                                    or Statistics(subscriber, self.publisher_name, self.thaw, start_thread))
         self.inboxes = inboxes
+        plain = before.get(CallbackInbox)
+        if plain is not None and inboxes.get(CallbackInbox) is not plain:
+            plain.close()    # or its thread would stay: who removes the last callback may come later
         return [inbox for receiver, inbox in inboxes.items() if before.get(receiver) is not inbox]
 
     def all_inboxes(self):
