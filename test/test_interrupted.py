@@ -71,8 +71,9 @@ def test_what_is_opened_while_the_master_is_away_raises_and_leaves_nothing_behin
     before = registrations(away, '/node')
     away.end()
     for _ in range(2):
-        with pytest.raises(pharos.MasterUnreachableError, match=away.url):
+        with pytest.raises(pharos.MasterUnreachableError, match=away.url) as raised:
             OPENERS[opener](node)
+        assert isinstance(raised.value.__cause__, ConnectionRefusedError)
     assert (node.channels, node._services) == ([], []) and not node.errors
     away.come_back()
     until(lambda: registrations(away, '/node') == before)

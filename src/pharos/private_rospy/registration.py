@@ -117,13 +117,14 @@ def hooks(instance):
             master, me = module.xmlrpcapi(self.master_uri), module.get_caller_id()
             call = {'pub': master.registerPublisher, 'sub': master.registerSubscriber,
                     'srv': master.registerService}[kind]
+            cause = None
             try:
                 code, message, value = call(me, name, type_or_uri, self.uri)
             except COMMUNICATION_ERRORS as error:
-                code, message = 0, error
+                code, message, cause = 0, error, error
             if code != 1:
                 _tell_failure(module, f'cannot register {_KINDS[kind]} {name} of {me} with the master '
-                                      f'{self.master_uri}: {message}')
+                                      f'{self.master_uri}: {message}', cause)
             elif kind == 'sub':
                 self.publisher_update(name, value)
             elif kind == 'pub':
@@ -192,10 +193,11 @@ def registered(make, undo):
         del _attempt.failure
 
 
-def _tell_failure(module, text):
+def _tell_failure(module, text, cause):
     """Tell of a registration that failed: who waits for it in :func:`registered`, or else the log."""
     if hasattr(_attempt, 'failure'):
         _attempt.failure = MasterUnreachableError(text + ': is it running? Nothing was opened: try again when it is')
+        _attempt.failure.__cause__ = cause
     else:
         module.logerr(text + ': this is done as soon as it answers')
 
