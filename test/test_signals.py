@@ -78,6 +78,17 @@ def test_a_wait_of_ours_ends_and_the_program_goes_on(program, with_signal, wait)
     assert 'went on stopped stopped' in running.read_to_the_end()
 
 
+@pytest.mark.parametrize('with_signal', [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
+@pytest.mark.parametrize('first', ['rospy', 'pharos'])
+def test_spin_ends_where_the_program_is_a_rospy_node_itself(program, with_signal, first):
+    """rospy's handlers of signals keep Ctrl-C to themselves."""
+    begin = ['rospy.init_node("program_itself")', 'me = node()']
+    running = program('import rospy\n' + '\n'.join(begin if first == 'rospy' else begin[::-1])
+                      + '\nready_in_wait()\npharos.spin()\nprint("went on", me.lifecycle.value)')
+    assert running.end(with_signal) == 0
+    assert 'went on stopped' in running.read_to_the_end()
+
+
 @SIGNALS
 @pytest.mark.parametrize('busy', ['wait_for(threading.Event())', 'while True: pass'])
 def test_plain_code_is_ended_as_without_nodes(program, with_signal, busy):

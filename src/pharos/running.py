@@ -9,6 +9,7 @@ import time
 
 from pharos import signals, stopping
 from pharos.errors import NodeNameInUseError
+from pharos.private_rospy import host
 from pharos.private_rospy.lifetime import SIGNAL_LATENCY
 
 # A stopped node's rospy is a web of cycles of 0.7 MB, which only the collector frees. It looks at the running nodes,
@@ -126,6 +127,12 @@ def _end():
         _others.clear()
 
 
+def _rospy_ended_by(number):
+    """A signal has ended the rospy node that the program itself is; rospy passes on what we had taken on before."""
+    if not signals.is_taken_on(number):
+        stop_all()
+
+
 def _forget():
     """In a process that was forked: the nodes are its parent's, as are the programs, and it must not end them."""
     global _finalizer
@@ -138,5 +145,6 @@ def _forget():
 
 
 signals.serve(lambda: bool(_nodes or _others or stopping.is_under_way()), stop_all)
+host.on_signal(_rospy_ended_by)
 atexit.register(_end)
 os.register_at_fork(after_in_child=_forget)

@@ -16,6 +16,7 @@ _MARK = '_pharos_signal'
 
 _is_needed = _end = None    # see :func:`serve`
 _waiting = 0      # how deep the main thread is in a wait of ours, which ends with the nodes
+_taken_on = set()    # signals for which the program had no handlers
 _held = []        # of each start and stop that the main thread runs, the _Hold
 
 
@@ -74,6 +75,12 @@ def install(*numbers):
         for number in numbers:
             if signal.getsignal(number) is _DEFAULTS[number]:
                 signal.signal(number, _on_signal)
+                _taken_on.add(number)
+
+
+def is_taken_on(number):
+    """Whether the signal has come to be ours, perhaps by way of a handler that the program has installed since."""
+    return number in _taken_on
 
 
 @contextlib.contextmanager
