@@ -412,6 +412,18 @@ def test_no_thread_is_left_when_a_channel_opens_while_the_last_callback_goes(mas
     until(lambda: len(link_threads(both)) == 1)    # the node's own
 
 
+def test_a_link_that_is_closed_opens_no_thread_for_callbacks(master):
+    node = create(master, '/subscriber')
+    publisher = create(master, '/publisher').ros.Publisher('/plain/closed', STRING, queue_size=1)
+    listen(node, '/plain/closed', STRING)
+    connected(publisher)
+    link = publisher.impl.connections[0].link
+    publisher.unregister()
+    until(lambda: not link_threads(node))
+    link.match_receivers()    # as a thread may that changes the subscription just then
+    until(lambda: not link_threads(node))
+
+
 def test_what_was_published_before_the_publisher_left_still_arrives(pair):
     publishing, subscribing = pair
     publisher = publishing.ros.Publisher('/plain/leaving', INT, queue_size=1000)

@@ -152,3 +152,17 @@ def test_what_waits_for_a_subscriber_elsewhere_is_bounded_too(sizes):
         waiting = [len(data) for data in way._queue]
         assert len(waiting) <= 5 and (sum(waiting) <= 100 or len(waiting) == 1)
         assert waiting[-1] == size
+
+
+def test_a_latched_message_that_waits_counts_with_its_bytes(master):
+    gate = Gate()
+    receiver = create(master, '/receiver', Small)
+    receiver.interested_in('/busy_with', BYTES, delegate=gate)
+    sender = create(master, '/sender')
+    sender.output_channel('/latched_large', BYTES, latch=True).send(data=bytes(3 * MEGABYTE))
+    sender.send_to('/busy_with', typed_as=BYTES, data=b'')
+    assert gate.entered.wait(TIMEOUT)
+    latched = receiver.interested_in('/latched_large', BYTES, delegate=gate)
+    sender.send_to('/latched_large', data=bytes(3 * MEGABYTE))
+    assert latched.dropped == 1
+    gate.opened.set()

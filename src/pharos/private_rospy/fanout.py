@@ -158,8 +158,10 @@ class Fanout:
                     self._put_latched(frozen, inboxes)
 
     def _put_latched(self, frozen, inboxes):
+        message = self._thaw(frozen)
+        size = self._size_of(message, frozen) if self._size else 0
         for inbox in inboxes:
-            inbox.put(self._mark.put_on(self._thaw(frozen)) if inbox.shared else frozen)
+            inbox.put(self._mark.put_on(self._thaw(frozen)) if inbox.shared else frozen, size)
         for dispatcher in _dispatchers(inboxes):
             if dispatcher.idle:
                 dispatcher.wake()

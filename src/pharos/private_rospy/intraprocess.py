@@ -67,6 +67,8 @@ class Link:
         plain = before.get(CallbackInbox)
         if plain is not None and inboxes.get(CallbackInbox) is not plain:
             plain.close()    # or its thread would stay: who removes the last callback may come later
+        if self.sending.done or self.receiving.done:
+            self._close_inboxes()    # the link was closed meanwhile, and does not see those opened since
         return [inbox for receiver, inbox in inboxes.items() if before.get(receiver) is not inbox]
 
     def all_inboxes(self):
@@ -82,6 +84,10 @@ class Link:
         self._instance.start_thread(refuse, (self._subscriber, self._other.uri, channel.message_class, self.header),
                                     'refusal')
         return False
+
+    def _close_inboxes(self):
+        for inbox in self.all_inboxes():
+            inbox.close()
 
     def _channel_inbox(self, channel):
         thaw = copier.thawer(self._publisher.data_class, channel.message_class)
@@ -117,8 +123,7 @@ class Link:
 
         In a thread of its own, for rospy closes ends under the lock of their topic, and the other's topic has its own.
         """
-        for inbox in self.all_inboxes():
-            inbox.close()
+        self._close_inboxes()
         other, instance = ((self.receiving, self._instance) if end is self.sending else (self.sending, self._other))
         if not other.done:
             instance.start_thread(other.close, name='closing')
