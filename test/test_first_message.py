@@ -9,6 +9,7 @@ import rosgraph
 
 from conftest import TIMEOUT, Mailbox
 from pharos import BlockNode
+from pharos.private_rospy import intraprocess
 from programs import until
 from sockets import subscribe
 
@@ -142,3 +143,26 @@ def test_a_first_message_may_wait_without_limit_for_its_type(master):
     node = master.create(BlockNode, named='/sender', domain='127.0.0.1')
     node.send_to('/first/unlimited', typed_as='std_msgs/String', wait=float('inf'), data='sent')
     assert [channel.sent for channel in node.channels] == [1]
+
+
+def test_who_waits_for_a_subscriber_waits_until_messages_go_to_it(master, mailbox, monkeypatch):
+    """A connection that counts, and gets nothing yet, would lose the first message."""
+    sent = create(master, '/sender').output_channel('/first/counts', STRING)
+    receiver = create(master, '/receiver', delegate=mailbox)
+    reached, allowed = threading.Event(), threading.Event()
+    match = intraprocess.Link.match_receivers
+
+    def match_late(link):
+        reached.set()
+        allowed.wait(TIMEOUT)
+        return match(link)
+    monkeypatch.setattr(intraprocess.Link, 'match_receivers', match_late)
+    opening = in_thread(receiver.interested_in, '/first/counts', STRING)
+    assert reached.wait(TIMEOUT)
+    assert sent.connections == []
+    assert not sent.wait_for_subscribers(1, 0)
+    allowed.set()
+    assert sent.wait_for_subscribers(1, TIMEOUT)
+    sent.send(data='first')
+    assert mailbox.get().data == 'first'
+    opening.join(TIMEOUT)

@@ -19,7 +19,7 @@ class Fanout:
 
     # a message that comes alone meets cold caches: all that it needs lies together
     __slots__ = ('_lock', '_closed', '_seq', '_has_header', '_freeze', '_ways', '_last', '_size', '_mark',
-                 '_publisher', '_module', '_thaw', '_buffer', '_latches', '_early')
+                 '_publisher', '_module', '_thaw', '_buffer', '_latches', '_early', 'connections')
 
     def __init__(self, publisher, module):
         self._publisher, self._module = publisher, module
@@ -42,6 +42,7 @@ class Fanout:
         self._mark = mark
         # all at once: somebody may be publishing
         self._ways = inboxes, remote, _dispatchers(inboxes), inline, mark
+        self.connections = tuple(connections)    # those through which a message goes that is published from now on
 
     def publish(self, message, by=None, to=None, connection=None):
         """Send a message to all; returns whether there is anybody.

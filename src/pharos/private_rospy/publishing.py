@@ -50,11 +50,9 @@ def mend_publisher(module, start_thread):
         if link is None and self.queue_size is not None:
             connection = Sender(connection, self.queue_size, start_thread, self.queue_bytes)
         with _latched_first(self) as is_open:
-            if not is_open or not base.add_connection(self, connection):
+            if not (is_open and self._add(connection, link)):
                 connection.close()
                 return False
-            # receivers may have come since the link was made, and have not seen it yet
-            _refresh(self, link)
             if link:
                 self.fanout.send_latched(link.all_inboxes(), connection.endpoint_id)
             else:
@@ -66,6 +64,19 @@ def mend_publisher(module, start_thread):
         self.fanout.run()
         return True
     publisher.add_connection = add_connection
+
+    def _add(self, connection, link):
+        """Who counts the connections counts this one only when messages go through it."""
+        lock = self.c_lock
+        if lock is None:    # closed meanwhile
+            return False
+        with lock:
+            if not base.add_connection(self, connection):
+                return False
+            # receivers may have come since the link was made, and have not seen it yet
+            _refresh(self, link)
+            return True
+    publisher._add = _add
 
     def channels_changed(self, link):
         """The subscription at the other end of a link has other channels now."""

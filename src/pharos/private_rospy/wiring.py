@@ -120,9 +120,15 @@ class Wiring:
 
         rospy looks twice a second for subscribers that have left; until then they count as connected (ros_comm #927).
         """
-        ended = _has_left if endpoint.reg_type == 'pub' else _is_done    # a subscriber's thread sees the end by itself
+        topic = endpoint.impl
+        if topic is None:
+            return []
+        if endpoint.reg_type == 'pub':
+            connections, ended = topic.fanout.connections, _has_left
+        else:
+            connections, ended = topic.connections, _is_done    # a subscriber's thread sees the end by itself
         return [(_peer(connection), connection.transport_type)
-                for connection in (endpoint.impl.connections if endpoint.impl else ()) if not ended(connection)]
+                for connection in connections if not ended(connection)]
 
     @staticmethod
     def reaches(endpoint, name):
@@ -143,7 +149,7 @@ class Wiring:
     def sends_to(self, name, topic):
         """Whether the node, if it publishes on the topic at all, is connected to the subscriber of that name."""
         publisher = self._instance.publisher(topic)
-        return publisher is None or any(connection.endpoint_id == name for connection in publisher.connections)
+        return publisher is None or any(connection.endpoint_id == name for connection in publisher.fanout.connections)
 
     def hears(self, topic):
         """Whether the node is connected to a publisher that suits it."""
