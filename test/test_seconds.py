@@ -10,7 +10,7 @@ from conftest import TIMEOUT
 from pharos import BlockNode
 from pharos.seconds import LONGEST, check_seconds
 
-NO_SECONDS = [math.nan, 'x', '1', b'1', [], {}, object()]
+NO_SECONDS = [math.nan, 'x', '1', b'1', [], {}, print]
 WAITS = {
     'wait': lambda node, seconds: node.master.wait(seconds),
     'wait_for_node': lambda node, seconds: node.master.wait_for_node('/nobody', seconds),
