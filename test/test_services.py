@@ -45,7 +45,9 @@ both_ways = pytest.mark.parametrize('call', [call_here, call_through_tcp], ids=[
 @pytest.mark.parametrize('block', [
     lambda request: pharos.service_class(SET_BOOL)._response_class(success=request.data, message='done'),
     lambda request: {'success': request.data, 'message': 'done'},
-], ids=['a response', 'a dict'])
+    lambda request: (request.data, 'done'),
+    lambda request: [request.data, 'done'],
+], ids=['a response', 'a dict', 'a tuple', 'a list'])
 def test_a_block_returns_a_response_or_its_fields(master, call, block):
     create(master).serve('/set', SET_BOOL, block)
     response = call(master, '/set', data=True)
@@ -56,7 +58,8 @@ def test_a_block_returns_a_response_or_its_fields(master, call, block):
 @pytest.mark.parametrize('block', [
     lambda request: request.name + '!',
     lambda request: {'name': request.name + '!'},
-], ids=['the field', 'a dict'])
+    lambda request: (request.name + '!',),
+], ids=['the field', 'a dict', 'a tuple'])
 def test_a_block_returns_the_only_field(master, call, block):
     create(master).serve('/spawn', SPAWN, block)
     assert call(master, '/spawn', name='bob').name == 'bob!'
@@ -92,8 +95,10 @@ def test_the_block_gets_the_request(master, call):
 
 @both_ways
 @pytest.mark.parametrize('value, said', [
-    (None, r'must return a response, a dict of its fields \(success: bool, message: string\); it returned None'),
-    (True, r'must return a response, a dict of its fields .* it returned True'),
+    (None, r'must return .* its fields \(success: bool, message: string\); it returned None'),
+    (True, r'must return a response, a dict, tuple or list of its fields .* it returned True'),
+    ((True,), r'must return a response, .* it returned \(True,\)'),
+    ((7, 7), r'SetBoolResponse.message = 7 does not fit string'),
     ({'ok': True}, r'SetBoolResponse has no field .ok.'),
     ({'message': 7}, r'SetBoolResponse.message = 7 does not fit string'),
     (std_srvs.srv.EmptyResponse(), 'must return a response'),

@@ -275,8 +275,8 @@ class Node(Life):
     def serve(self, name, typed_as, block):
         """Offer a service; returns a handle with ``close()``.
 
-        ``block(request)`` runs in a thread of the caller's connection and returns a response, a dict of its fields, or
-        its only field. An exception in it goes to the caller, and is reported as a delegate's.
+        ``block(request)`` runs in a thread of the caller's connection and returns a response, a dict, tuple or list of
+        its fields, or its only field. An exception in it goes to the caller, and is reported as a delegate's.
 
         :param typed_as: service type name, such as 'std_srvs/Empty', or class
         :raises MasterUnreachableError: if the master does not answer; nothing is left behind then

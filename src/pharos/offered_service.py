@@ -61,7 +61,7 @@ class OfferedService:
             self._answer(request)
 
     def _as_response(self, value):
-        """The response that the block meant: itself, its fields, or its only field."""
+        """The response that the block meant: itself, its fields by name or in their order, or its only field."""
         response = self.service_class._response_class
         if isinstance(value, genpy.Message) and value._type == response._type:
             if value._md5sum != response._md5sum:    # the caller would read its bytes as other fields
@@ -76,11 +76,16 @@ class OfferedService:
             return value
         if isinstance(value, dict):
             return message_types.fill(response(), value)
-        if not response.__slots__:
+        names = response.__slots__
+        if not names:
             return response()
-        if len(response.__slots__) == 1 and value is not None:
-            return message_types.fill(response(), {response.__slots__[0]: value})
-        raise TypeError('the block of %s must return a response, a dict of its fields (%s)%s; it returned %r'
+        has_values = isinstance(value, (list, tuple)) and len(value) == len(names)
+        if has_values and (len(names) > 1 or not response._slot_types[0].endswith(']')):
+            return message_types.fill(response(), dict(zip(names, value)))
+        if len(names) == 1 and value is not None:
+            return message_types.fill(response(), {names[0]: value})
+        raise TypeError('the block of %s must return a response, a dict, tuple or list of its fields (%s)%s; it '
+                        'returned %r'
                         % (self.name, message_types.describe_fields(response),
                            ' or its only field' if len(response.__slots__) == 1 else '', value))
 
