@@ -22,6 +22,7 @@ import rosmaster.master  # noqa: E402
 
 import pharos  # noqa: E402
 from pharos import running  # noqa: E402
+from pharos.private_rospy.intraprocess import PROTOCOL  # noqa: E402
 
 TIMEOUT = 20.0    # seconds; a bound on waits for events, never reached in a test that passes
 #: of a test that serializes a numpy_msg
@@ -56,7 +57,7 @@ class Mailbox:
 def speak_tcpros_only(node):
     """Have the node connect by sockets alone, as those of other processes do; returns it."""
     handlers = node._rospy._lifetime.xmlrpc.handler.protocol_handlers
-    handlers[:] = [handler for handler in handlers if handler.get_supported()[0][0] == 'TCPROS']
+    handlers[:] = [handler for handler in handlers if not handler.supports(PROTOCOL)]
     return node
 
 

@@ -157,7 +157,7 @@ def protocol_handler(instance):
             return protocol == PROTOCOL
 
         def get_supported(self):
-            return [[PROTOCOL]]
+            return [[PROTOCOL]] if instance.wiring.connects_in_process() else []
 
         def init_publisher(self, topic, protocol):
             return 1, 'ready', [PROTOCOL]

@@ -19,6 +19,8 @@ def running_here():
 class Wiring:
     """The channels of one :class:`~.instance.PrivateRospy`."""
 
+    takes_plain_callbacks = False    # whether subscriptions without any channel connect in process, too
+
     def __init__(self, instance):
         self._instance = instance
         self._channels = {}                    # topic -> the channels that receive from it
@@ -145,6 +147,14 @@ class Wiring:
     def channels_on(self, topic):
         """The channels of the node that receive from the topic."""
         return self._channels.get(topic, ())
+
+    def connects_in_process(self):
+        """Whether the connection that this thread negotiates may be INTRAPROCESS.
+
+        Not where nobody but plain rospy callbacks listens: actionlib, for one, does not stand answers that come so
+        quickly, and waits for ever.
+        """
+        return self.takes_plain_callbacks or bool(self.channels_on(self.connecting.topic))
 
     def sends_to(self, name, topic):
         """Whether the node, if it publishes on the topic at all, is connected to the subscriber of that name."""
