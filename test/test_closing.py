@@ -6,7 +6,7 @@ import pytest
 import pharos
 from conftest import TIMEOUT, Mailbox
 from pharos import BlockNode
-from pharos.message_types import define_service
+from pharos.messages.message_types import define_service
 
 STRING = 'std_msgs/String'
 

@@ -29,7 +29,7 @@ from std_msgs.msg import Bool, Duration, Float32MultiArray, Time, UInt8MultiArra
 from tf2_msgs.msg import TFMessage
 
 from conftest import serializes_numpy
-from pharos.private_rospy.copier import copier_for, serialized, thawer
+from pharos.intraprocess.copier import copier_for, serialized, thawer
 
 # Among the wrong values are some that numpy, or genpy on its way, warns of.
 pytestmark = pytest.mark.filterwarnings('ignore')

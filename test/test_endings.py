@@ -6,9 +6,10 @@ import time
 import pytest
 
 from conftest import TIMEOUT
-from pharos import BlockNode, ExternalNode, Lifecycle, Master, Node, NodeNameInUseError, NodeStoppedError, running
+from pharos import (BlockNode, ExternalNode, Lifecycle, Master, Node, NodeNameInUseError, NodeStoppedError, running)
 from pharos import message_class, stopping
-from pharos.private_rospy import door, lifetime, proxies, services, xmlrpc_server
+from pharos.private_rospy import door, lifetime, proxies, xmlrpc_server
+from pharos.intraprocess import services
 from programs import until
 from sockets import refused_url, silent_peer
 
@@ -356,7 +357,7 @@ def waiting(master, monkeypatch):
     peer.serve('/sleep_elsewhere', 'std_srvs/Empty', sleep)
     monkeypatch.setattr('pharos.private_rospy.wiring.Wiring.sends_to', lambda self, name, topic: False)
     monkeypatch.setattr('pharos.channel.OutputChannel.connections', [])
-    monkeypatch.setattr('pharos.private_rospy.services.find', lambda name, uri, cls, find=services.find: (
+    monkeypatch.setattr('pharos.intraprocess.services.find', lambda name, uri, cls, find=services.find: (
         find(name, uri, cls) if name == '/sleep' else None))
     yield waiting
     over.set()

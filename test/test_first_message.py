@@ -9,7 +9,7 @@ import rosgraph
 
 from conftest import TIMEOUT, Mailbox
 from pharos import BlockNode
-from pharos.private_rospy import intraprocess
+from pharos.intraprocess import link as intraprocess
 from programs import until
 from sockets import subscribe
 

@@ -24,9 +24,8 @@ from genpy.generate_initpy import write_modules
 from genpy.generator import MsgGenerator
 
 from conftest import TIMEOUT, Mailbox
-from pharos import (BlockNode, Master, MessageTypeError, NodeStoppedError, PharosError, UnknownTopicError,
-                    UnknownTypeError, define_message, graph_types, message_class)
-from pharos.message_types import class_from_definition
+from pharos import (BlockNode, Master, MessageTypeError, NodeStoppedError, PharosError, UnknownTopicError, UnknownTypeError, define_message, graph_types, message_class)
+from pharos.messages.message_types import class_from_definition
 from pharos.tcpros_connection import publisher_header
 from programs import Program, run, until
 from sockets import refused_url

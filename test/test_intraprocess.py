@@ -11,7 +11,8 @@ import pytest
 
 import pharos
 from conftest import TIMEOUT, InProcessMaster, Mailbox, speak_tcpros_only
-from pharos import BlockNode, Master, dispatcher
+from pharos import BlockNode, Master
+from pharos.intraprocess import dispatcher
 from pharos.life import Lifecycle
 
 TWIST, IMAGE, STRING = 'geometry_msgs/Twist', 'sensor_msgs/Image', 'std_msgs/String'

@@ -14,7 +14,7 @@ from sensor_msgs.msg import Image
 
 from conftest import TIMEOUT, Mailbox
 from load import CAMERA, IMAGE_SIZE, TOPICS, Busy, Viewer, camera, create, image, subscribe
-from pharos import dispatcher
+from pharos.intraprocess import dispatcher
 from programs import ROOT, Program, environment
 
 COUNT = 40        # images, 37 MB: several times what fits into the buffers of a connection

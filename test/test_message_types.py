@@ -18,10 +18,9 @@ import std_msgs.msg
 import std_srvs.srv
 from hypothesis import given, settings, strategies as st
 
-from pharos import known_types, message_definition, message_types
+from pharos.messages import known_types, message_definition, message_types
 from pharos.errors import MessageTypeError, UnknownTypeError
-from pharos.message_types import (check_fits, class_from_definition, define_message, define_service, describe_fields,
-                                  explain, fill, message_class, service_class)
+from pharos.messages.message_types import (check_fits, class_from_definition, define_message, define_service, describe_fields, explain, fill, message_class, service_class)
 
 SEPARATOR = '=' * 80
 PRIMITIVES = ['bool', 'int8', 'uint8', 'int16', 'uint16', 'int32', 'uint32', 'int64', 'uint64', 'float32', 'float64',
@@ -385,7 +384,7 @@ import os, sys
 sys.modules['std_srvs'] = None  # as if not installed
 import rosmaster.master
 import rospy
-from pharos.message_types import define_service, fill
+from pharos.messages.message_types import define_service, fill
 master = rosmaster.master.Master(port=0)
 master.start()
 os.environ['ROS_MASTER_URI'] = master.uri

@@ -14,9 +14,9 @@ from rospy.numpy_msg import numpy_msg
 
 from conftest import TIMEOUT, serializes_numpy
 from pharos import BlockNode, MessageTypeError
-from pharos.message_types import build, check_fits, class_from_definition, explain
-from pharos.nested_types import nested_class
-from pharos.private_rospy.copier import copier_for
+from pharos.messages.message_types import build, check_fits, class_from_definition, explain
+from pharos.messages.nested_types import nested_class
+from pharos.intraprocess.copier import copier_for
 from test_copier import told, wire
 from test_message_types import PRIMITIVES, VALUES
 

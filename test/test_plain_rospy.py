@@ -10,7 +10,7 @@ from rospy.numpy_msg import numpy_msg
 
 from conftest import TIMEOUT, Mailbox, speak_tcpros_only
 from pharos import BlockNode
-from pharos.private_rospy import callbacks, intraprocess
+from pharos.intraprocess import callbacks, link as intraprocess
 from programs import until
 
 INT, STRING, ARRAY = std_msgs.msg.Int32, std_msgs.msg.String, std_msgs.msg.UInt8MultiArray

@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from conftest import TIMEOUT, Mailbox
-from pharos import BlockNode, Node, define_message, dispatcher
+from pharos import BlockNode, Node, define_message
+from pharos.intraprocess import dispatcher
 from pharos.private_rospy import sender
 
 BYTES, NUMBERS = 'std_msgs/UInt8MultiArray', 'std_msgs/Float64MultiArray'

@@ -10,9 +10,10 @@ import std_msgs.msg
 
 import pharos
 from conftest import TIMEOUT, Mailbox
-from pharos import BlockNode, MessageTypeError, message_types
+from pharos import BlockNode, MessageTypeError
+from pharos.messages import message_types
 from pharos.private_rospy import refusals
-from pharos.private_rospy.intraprocess import Link
+from pharos.intraprocess.link import Link
 from programs import Program, until
 from test_graph_types import Publisher
 from test_survival import mortal_master    # noqa: F401 (a fixture)
@@ -23,7 +24,7 @@ FIELD = {STRING: 'data: string', INT32: 'data: int32'}
 
 PEER = r'''
 import sys, rospy
-from pharos import message_types
+from pharos.messages import message_types
 kind, name, topic, type_, text = sys.argv[1:]
 cls = message_types.class_from_definition(type_, text)
 rospy.init_node(name)

@@ -17,7 +17,8 @@ import rosnode
 
 import pharos
 from conftest import TIMEOUT, InProcessMaster
-from pharos import BlockNode, message_types
+from pharos import BlockNode
+from pharos.messages import message_types
 from programs import Program, environment, forget_parameters, run, script, until
 from sockets import wait_for_end
 
@@ -200,7 +201,7 @@ def threads():
 TURTLES = r'''
 import importlib.util, sys
 import pharos
-from pharos import message_types, turtlesim_types
+from pharos.messages import message_types, turtlesim_types
 
 assert importlib.util.find_spec('turtlesim') is None
 master, called = pharos.Master(), {}

@@ -5,7 +5,8 @@ import sys
 import pytest
 
 import pharos
-from pharos import BlockNode, ServiceTypeError, message_types
+from pharos import BlockNode, ServiceTypeError
+from pharos.messages import message_types
 from programs import Program, script
 
 TYPE = 'layout_srvs/Spawn'

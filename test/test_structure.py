@@ -14,6 +14,7 @@ SCRIPTS = sorted(path for path in (ROOT.parent.parent / 'scripts').iterdir() if 
 
 ROSPYS_INSIDE = re.compile(r'rospy\.impl|rospy\.(core|topics|names)\._|_topic_manager|protocol_handlers')
 LINE_LIMIT = 400
+ROOMS_BELOW = 'pharos.private_rospy', 'pharos.intraprocess'
 
 EXPORTS = """
     Master Node BlockNode Lifecycle ExternalNode Topic InputChannel OutputChannel Service Parameter Transcript RosProcess
@@ -56,7 +57,7 @@ def test_the_table_of_contents_is_imports_and_all():
 
 @in_module
 def test_only_private_rospy_touches_rospys_inside(path):
-    if path.parent.name != 'private_rospy':
+    if path.parent.name not in ('private_rospy', 'intraprocess'):
         assert ROSPYS_INSIDE.findall(path.read_text()) == []
 
 
@@ -91,9 +92,8 @@ def test_imports_point_one_way():
 
 def test_private_rospy_knows_nothing_of_nodes():
     """Of the facade above it, it may know what itself imports nothing of the facade."""
-    graph = {dotted(path): {name for name in imports_of(path) if not name.startswith('pharos.private_rospy')}
-             for path in MODULES}
-    imported = set().union(*(names for name, names in graph.items() if name.startswith('pharos.private_rospy')))
+    graph = {dotted(path): {name for name in imports_of(path) if not name.startswith(ROOMS_BELOW)} for path in MODULES}
+    imported = set().union(*(names for name, names in graph.items() if name.startswith(ROOMS_BELOW)))
     assert {name for name in imported if graph[name]} == set()
 
 

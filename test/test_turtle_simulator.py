@@ -14,7 +14,7 @@ from hypothesis import given, strategies
 from programs import Program, forget_parameters, run, script
 
 from pharos import BlockNode, ServiceCallError
-from pharos.turtle_field import BACKGROUND, FIELD_SIZE, PEN_COLOUR, SHELL_COLOURS, Field, Turtle
+from pharos_turtle.field import BACKGROUND, FIELD_SIZE, PEN_COLOUR, SHELL_COLOURS, Field, Turtle
 
 STEP = 0.016
 

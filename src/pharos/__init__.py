@@ -1,13 +1,11 @@
 """PhaROS for Python: many ROS nodes in one process, written with blocks."""
 from pharos.channel import InputChannel, OutputChannel
-from pharos.errors import (MasterUnreachableError, MessageTypeError, NodeNameInUseError, NodeStoppedError, PharosError,
-                           PortInUseError, ServiceCallError, ServiceTypeError, UnknownNodeError, UnknownServiceError,
-                           UnknownTopicError, UnknownTypeError)
+from pharos.errors import (MasterUnreachableError, MessageTypeError, NodeNameInUseError, NodeStoppedError, PharosError, PortInUseError, ServiceCallError, ServiceTypeError, UnknownNodeError, UnknownServiceError, UnknownTopicError, UnknownTypeError)
 from pharos.external_node import ExternalNode
 from pharos.failures import Failure
 from pharos.life import Lifecycle
 from pharos.master import Master
-from pharos.message_types import define_message, define_service, message_class, service_class
+from pharos.messages.message_types import (define_message, define_service, message_class, service_class)
 from pharos.node import BlockNode, Node
 from pharos.parameter import Parameter
 from pharos.ros_process import RosProcess

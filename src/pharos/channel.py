@@ -5,13 +5,13 @@ import time
 
 import genpy
 
-from pharos import message_types
+from pharos.messages import message_types
 from pharos.blocks import check_block, check_delegate, check_runs
-from pharos.dispatcher import Inbox, SocketInbox
+from pharos.intraprocess.dispatcher import Inbox, SocketInbox
 from pharos.errors import MasterUnreachableError, MessageTypeError, NodeStoppedError, PharosError
-from pharos.private_rospy import copier
+from pharos.intraprocess import copier
 from pharos.private_rospy.refusals import suits
-from pharos.private_rospy.fanout import Latch
+from pharos.intraprocess.fanout import Latch
 from pharos.private_rospy.proxies import time_limit
 from pharos.seconds import check_limit
 from pharos.private_rospy.registration import REGISTER_TIMEOUT

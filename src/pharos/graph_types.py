@@ -1,7 +1,7 @@
 """Message types as the publishers of a topic define them, for a subscriber that has no package of them."""
 import rosgraph
 
-from pharos import message_types
+from pharos.messages import message_types
 from pharos.errors import PharosError
 from pharos.private_rospy.proxies import ServerProxy, deadline_in
 from pharos.private_rospy.registration import COMMUNICATION_ERRORS

@@ -5,7 +5,7 @@ import threading
 
 from pharos import running, signals, stopping
 from pharos.blocks import Souls, attempt, check_runs, name_of
-from pharos.dispatcher import Dispatcher
+from pharos.intraprocess.dispatcher import Dispatcher
 from pharos.errors import NodeStoppedError, PharosError
 from pharos.private_rospy.host import rospy
 from pharos.private_rospy.instance import PrivateRospy

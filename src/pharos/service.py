@@ -6,10 +6,10 @@ import time
 import genpy
 import rosgraph
 
-from pharos import message_types
+from pharos.messages import message_types
 from pharos.blocks import check_block
 from pharos.errors import NodeStoppedError, ServiceCallError, ServiceTypeError, UnknownServiceError
-from pharos.private_rospy import services
+from pharos.intraprocess import services
 from pharos.private_rospy.host import rospy
 from pharos.private_rospy.proxies import time_limit
 from pharos.private_rospy.lifetime import Interruption

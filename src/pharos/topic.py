@@ -3,7 +3,8 @@ import time
 
 import rosgraph
 
-from pharos import graph_types, message_types
+from pharos import graph_types
+from pharos.messages import message_types
 from pharos.channel import InputChannel, OutputChannel
 from pharos.errors import MessageTypeError, NodeStoppedError, UnknownTopicError, UnknownTypeError
 from pharos.life import Life

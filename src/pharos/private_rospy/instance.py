@@ -17,12 +17,12 @@ import _thread
 import rosgraph
 
 from pharos.errors import MasterUnreachableError, NodeStoppedError, PortInUseError
-from pharos.private_rospy import host, logs, names, publishing, pubsub, refusals, registration, servers
+from pharos.private_rospy import (host, logs, names, publishing, pubsub, refusals, registration, servers)
 from pharos.private_rospy.lifetime import Lifetime
 from pharos.private_rospy.loader import PrivateImports, Substitute
 from pharos.private_rospy.parameters import WatchedParameters
 from pharos.private_rospy.proxies import ServerProxy, is_time_up, master_api, time_limit
-from pharos.private_rospy.services import Workers
+from pharos.intraprocess.services import Workers
 from pharos.private_rospy.wiring import Wiring
 
 POLL = 0.001    # seconds between rospy's own looks at whether it is registered; it takes 0.1 s

@@ -5,7 +5,7 @@ import math
 import os
 import threading
 
-from pharos.private_rospy.fanout import Fanout, links_of
+from pharos.intraprocess.fanout import Fanout, links_of
 from pharos.private_rospy.lifetime import Interruption
 from pharos.private_rospy.sender import Sender
 

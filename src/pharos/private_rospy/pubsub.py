@@ -3,9 +3,9 @@ import time
 import traceback
 
 from pharos.private_rospy import refusals, registration
-from pharos.private_rospy.callbacks import is_of_channel
-from pharos.private_rospy.fanout import links_of
-from pharos.private_rospy.intraprocess import protocol_handler
+from pharos.intraprocess.callbacks import is_of_channel
+from pharos.intraprocess.fanout import links_of
+from pharos.intraprocess.link import protocol_handler
 from pharos.private_rospy.lifetime import keep_alive
 from pharos.private_rospy.publishing import mend_publisher, notify
 from pharos.signals import is_from_signal

@@ -10,7 +10,7 @@ from pharos.private_rospy.door import BACKLOG, Door, brief
 from pharos.private_rospy.host import rospy
 from pharos.private_rospy.lifetime import shut
 from pharos.private_rospy.names import NAME_LIMIT
-from pharos.private_rospy.sharing import numbered
+from pharos.intraprocess.sharing import numbered
 
 HANDSHAKE_TIMEOUT = 5.0       # seconds for the whole handshake, however slowly it comes
 HANDSHAKE_LIMIT = 1 << 20     # bytes of a connection header; real ones hold a message definition

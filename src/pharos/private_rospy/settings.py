@@ -8,7 +8,7 @@ import os
 import rosgraph.names
 from rosgraph.rosenv import ROS_HOSTNAME, ROS_IP, ROS_MASTER_URI, ROS_NAMESPACE
 
-from pharos.private_rospy.addresses import check_domain, check_environment, check_port, default_domain
+from pharos.private_rospy.addresses import (check_domain, check_environment, check_port, default_domain)
 from pharos.private_rospy.arguments import mappings_for, takes_name
 from pharos.private_rospy.host import rospy
 from pharos.private_rospy.names import NODE_LIMIT, check_name

@@ -5,12 +5,12 @@ import sys
 import threading
 import time
 
-from pharos.private_rospy import copier
+from pharos.intraprocess import copier
 from pharos.private_rospy.host import rospy
 from pharos.private_rospy.lifetime import Interruption
 from pharos.private_rospy.names import Resolved
 from pharos.private_rospy.registration import registered
-from pharos.private_rospy.sharing import numbered
+from pharos.intraprocess.sharing import numbered
 from pharos.private_rospy.wiring import running_here
 from pharos.signals import is_from_signal
 

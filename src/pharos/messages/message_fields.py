@@ -10,8 +10,8 @@ from genmsg.msgs import bare_msg_type, is_builtin, parse_type
 from genpy.base import SIMPLE_TYPES_DICT
 
 from pharos.errors import MessageTypeError
-from pharos.known_types import near
-from pharos.nested_types import nested_class
+from pharos.messages.known_types import near
+from pharos.messages.nested_types import nested_class
 
 
 # Raises where the value of a field of this type would not serialize, and is quick.

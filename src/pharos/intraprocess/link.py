@@ -10,10 +10,10 @@ import uuid
 
 import rospy.impl.transport
 
-from pharos.private_rospy import copier
-from pharos.private_rospy.callbacks import CallbackInbox, is_of_channel
+from pharos.intraprocess import copier
+from pharos.intraprocess.callbacks import CallbackInbox, is_of_channel
 from pharos.private_rospy.refusals import suits
-from pharos.private_rospy.statistics import Statistics
+from pharos.intraprocess.statistics import Statistics
 
 PROTOCOL = None    # its name, of this process alone
 

@@ -16,7 +16,7 @@ def nested_class(cls, type_name):
         type_name = 'std_msgs/Header'
     package, _, name = type_name.rpartition('/')
     package = package or cls._type.partition('/')[0]
-    made_together = getattr(cls, '_classes', {}).get(f'{package}/{name}')    # of pharos.message_definition
+    made_together = getattr(cls, '_classes', {}).get(f'{package}/{name}')    # of pharos.messages.message_definition
     # a numpy_msg has its serialize from rospy, and these from the class that it derives from
     names = getattr(getattr(cls, 'serialize_numpy', None), '__globals__', {})
     made_together = made_together or names.get(f'_{package}__{name}')    # of genpy.dynamic, all in one module

@@ -3,8 +3,8 @@ import io
 import struct
 import time
 
-from pharos.dispatcher import BURST
-from pharos.private_rospy import copier, sharing
+from pharos.intraprocess.dispatcher import BURST
+from pharos.intraprocess import copier, sharing
 
 EARLY = 2.0    # seconds after the start in which log lines are kept for listeners that connect later
 _clock = time.perf_counter

@@ -8,9 +8,9 @@ import threading
 
 import genpy
 
-from pharos import known_types, message_definition
+from pharos.messages import known_types, message_definition
 from pharos.errors import MessageTypeError, UnknownTypeError
-from pharos.message_fields import build, check_fits, describe_fields, explain, fill
+from pharos.messages.message_fields import build, check_fits, describe_fields, explain, fill
 
 __all__ = ['message_class', 'service_class', 'define_message', 'define_service', 'class_from_definition',
            'known_service_classes', 'is_provisional', 'describe_fields', 'describe_service', 'build', 'fill',

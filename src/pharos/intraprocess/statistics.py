@@ -1,7 +1,7 @@
 """What rospy tells on /statistics, where the parameter /enable_statistics is true: of INTRAPROCESS connections, too."""
 import queue
 
-from pharos.private_rospy import copier
+from pharos.intraprocess import copier
 
 WAITING = 1000    # messages; what comes beyond is not counted
 

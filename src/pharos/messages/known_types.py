@@ -10,7 +10,7 @@ import genpy
 import rospkg
 
 from pharos.errors import UnknownTypeError
-from pharos.turtlesim_types import DEFINITIONS
+from pharos.messages.turtlesim_types import DEFINITIONS
 
 MAX_TEXT = 1 << 20  # characters of a definition with those nested in it
 NAME = re.compile('[A-Za-z][A-Za-z0-9_]{0,127}')

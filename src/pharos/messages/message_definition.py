@@ -11,10 +11,10 @@ import types
 import genmsg
 from genmsg.msgs import bare_msg_type, is_builtin
 
-from pharos import known_types
+from pharos.messages import known_types
 from pharos.errors import UnknownTypeError
-from pharos.known_types import MAX_TEXT, NAME
-from pharos.message_fields import nested_classes
+from pharos.messages.known_types import MAX_TEXT, NAME
+from pharos.messages.message_fields import nested_classes
 
 MAX_DEPTH = 64  # types nested in one another
 MAX_FIELDS = 10000  # of a type and those it nests, counted wherever they occur: genpy writes code for each, 4 s for all

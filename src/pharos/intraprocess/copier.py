@@ -42,7 +42,7 @@ import genpy
 from genmsg.msgs import parse_type
 from genpy.base import SIMPLE_TYPES_DICT as STRUCT_CODES    # primitive type -> its code on the wire
 
-from pharos.nested_types import nested_class
+from pharos.messages.nested_types import nested_class
 
 ARRIVAL_CODES = {**STRUCT_CODES, 'bool': '?'}   # genpy sends a bool as a number: 7 goes out, True arrives
 SMALL = 64     # bytes that a message is taken to have beside its texts and arrays

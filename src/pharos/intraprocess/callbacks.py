@@ -3,7 +3,7 @@ import collections
 import contextlib
 import threading
 
-from pharos.dispatcher import Dispatcher
+from pharos.intraprocess.dispatcher import Dispatcher
 
 UNDER_WAY = 4 << 20    # bytes that wait beside a publisher's queue, as they do in the sockets of TCPROS
 SMALL = 64             # bytes that a message is taken to have whose size is not told

@@ -1,0 +1,1 @@
+"""Message and service types by their names: looked up, defined, filled, checked."""

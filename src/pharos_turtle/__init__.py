@@ -1,0 +1,1 @@
+"""The turtle simulator, an example with dependencies of its own: Pillow and tkinter."""
