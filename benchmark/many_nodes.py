@@ -1,4 +1,5 @@
-"""What nodes cost the process they live in, measured in a fresh one; prints its findings as JSON. See benchmark/nodes.
+"""What nodes cost the process they live in, measured in a fresh one; prints its findings as JSON.
+See benchmark/nodes.
 
 usage: many_nodes.py COUNT, at the master of ROS_MASTER_URI
 """
@@ -28,7 +29,7 @@ def create(master, name):
 
 def main():
     master, names = pharos.Master(), ['/many/n%d' % number for number in range(int(sys.argv[1]))]
-    create(master, '/first').stop()    # what is loaded once per process
+    create(master, '/first').stop()  # what is loaded once per process
     before = resident(), count('task'), count('fd')
     begin, each = time.perf_counter(), []
     nodes = []
@@ -37,7 +38,9 @@ def main():
         each.append(time.perf_counter())
     started = time.perf_counter()
     after = resident(), count('task'), count('fd')
-    registered = {name for kind in master.system_state() for nodes in kind.values() for name in nodes}
+    registered = {
+        name for kind in master.system_state() for nodes in kind.values() for name in nodes
+    }
     assert registered >= set(names), 'not all nodes are registered'
     stopping = time.perf_counter()
     for node in nodes:
@@ -45,8 +48,19 @@ def main():
     stopped = time.perf_counter()
     times = [later - earlier for earlier, later in zip([begin, *each], each)]
     memory, threads, descriptors = [(now - then) / len(names) for now, then in zip(after, before)]
-    print(json.dumps({'start': started - begin, 'stop': stopped - stopping, 'time': sorted(times)[len(times) // 2],
-                      'slowest': max(times), 'memory': memory, 'threads': threads, 'descriptors': descriptors}))
+    print(
+        json.dumps(
+            {
+                'start': started - begin,
+                'stop': stopped - stopping,
+                'time': sorted(times)[len(times) // 2],
+                'slowest': max(times),
+                'memory': memory,
+                'threads': threads,
+                'descriptors': descriptors,
+            }
+        )
+    )
 
 
 if __name__ == '__main__':

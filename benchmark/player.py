@@ -1,14 +1,17 @@
 #!/usr/bin/python3
-"""Plays one row of the table: a process that sends and receives as it is told. benchmark/channels starts it.
+"""Plays one row of the table: a process that sends and receives as it is told. benchmark/channels
+starts it.
 
 It reads commands from standard input, one a line, and answers each with a line of JSON:
 
     open MESSAGE RECEIVERS QUEUE        be ready for these slices; a player may have several open
     begin MESSAGE RECEIVERS QUEUE       forget what was received, and count CPU time from here
-    send RATE SECONDS BUSY              send on what was begun, RATE a second (0: flat out), in between computing (BUSY 1)
-    result EXPECTED                     wait until so many have arrived, or no more come, and tell
+    send RATE SECONDS BUSY              send on what was begun, RATE a second (0: flat out), in
+    between computing (BUSY 1) result EXPECTED                     wait until so many have arrived,
+    or no more come, and tell
 
-Stamps are kept beside the messages, which carry an index into them: reading a clock is not part of what is serialized.
+Stamps are kept beside the messages, which carry an index into them: reading a clock is not part of
+what is serialized.
 """
 import argparse
 import array
@@ -24,11 +27,11 @@ from geometry_msgs.msg import Twist
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
-clock = time.perf_counter    # CLOCK_MONOTONIC, the same in all processes
-STAMPS = 1 << 21             # messages of a slice at the most
-SAMPLES = 4000               # latencies told of a slice at the most
-SILENCE = 0.4                # seconds without a message after which the rest is lost
-PATIENCE = 10.0              # seconds that connecting may take
+clock = time.perf_counter  # CLOCK_MONOTONIC, the same in all processes
+STAMPS = 1 << 21  # messages of a slice at the most
+SAMPLES = 4000  # latencies told of a slice at the most
+SILENCE = 0.4  # seconds without a message after which the rest is lost
+PATIENCE = 10.0  # seconds that connecting may take
 IMAGES = {'image0.9': (640, 480), 'image6.2': (1920, 1080)}
 
 
@@ -49,6 +52,7 @@ class Kind:
 
     def mark(self):
         """A function ``mark(message, index)``."""
+
         def twist(message, index):
             message.linear.x = float(index)
 
@@ -56,7 +60,8 @@ class Kind:
             message.data = str(index)
 
         def image(message, index):
-            message.step = index    # rospy overwrites header.seq
+            message.step = index  # rospy overwrites header.seq
+
         return {Twist: twist, String: string, Image: image}[self.ros_class]
 
     def noter(self, sent, took):
@@ -71,6 +76,7 @@ class Kind:
 
         def image(message, channel=None):
             append(now() - sent[message.step])
+
         return {Twist: twist, String: string, Image: image}[self.ros_class]
 
 
@@ -93,7 +99,8 @@ class Player:
         """Return ``publish(message)``, None where the player only receives."""
         raise NotImplementedError
 
-    # -- commands -----------------------------------------------------------------------------------------------------
+    # -- commands
+    # -----------------------------------------------------------------------------------------------------
 
     def open(self, *what):
         name, receivers, queue_size = what
@@ -113,8 +120,11 @@ class Player:
         rate, seconds = float(rate), float(seconds)
         message, mark = kind.make(), kind.mark()
         begun = clock()
-        count = (self._flat_out(publish, message, mark, begun + seconds) if not rate else
-                 self._paced(publish, message, mark, int(rate * seconds), 1 / rate, busy == '1'))
+        count = (
+            self._flat_out(publish, message, mark, begun + seconds)
+            if not rate
+            else self._paced(publish, message, mark, int(rate * seconds), 1 / rate, busy == '1')
+        )
         self._begun = begun
         return {'sent': count, 'begun': begun, 'took': clock() - begun}
 
@@ -149,13 +159,18 @@ class Player:
             if len(self.took) > arrived:
                 arrived, last, cpu = len(self.took), clock(), time.process_time()
             time.sleep(0.002)
-        took = self.took[::len(self.took) // SAMPLES + 1]
+        took = self.took[:: len(self.took) // SAMPLES + 1]
         return {'received': max(arrived, 0), 'last': last, 'cpu': cpu - self._cpu, 'took': took}
 
     def serve(self, commands, answers):
         for line in commands:
             name, *arguments = line.split()
-            answer = {'open': self.open, 'begin': self.begin, 'send': self.send, 'result': self.result}[name](*arguments)
+            answer = {
+                'open': self.open,
+                'begin': self.begin,
+                'send': self.send,
+                'result': self.result,
+            }[name](*arguments)
             print(json.dumps(answer), file=answers, flush=True)
 
 
@@ -170,21 +185,28 @@ class Direct(Player):
         def call_all(message):
             for _ in range(receivers):
                 note(message)
+
         return call_all
 
 
 class Queue(Player):
-    """A bare hand-over to a thread through a SimpleQueue: of the index alone, the least there is to hand over."""
+    """A bare hand-over to a thread through a SimpleQueue: of the index alone, the least there is to
+    hand over."""
 
     def opened(self, kind, topic, receivers, queue_size):
         append, sent, number = self.took.append, self.sent, kind.mark()
         queues = [queue.SimpleQueue() for _ in range(receivers)]
-        of = {'twist': lambda m: int(m.linear.x), 'string': lambda m: int(m.data), 'image': lambda m: m.step}[number.__name__]
+        of = {
+            'twist': lambda m: int(m.linear.x),
+            'string': lambda m: int(m.data),
+            'image': lambda m: m.step,
+        }[number.__name__]
 
         def receive(get):
             while True:
                 index = get()
                 append(clock() - sent[index])
+
         for each in queues:
             threading.Thread(target=receive, args=(each.get,), daemon=True).start()
         if receivers == 1:
@@ -195,6 +217,7 @@ class Queue(Player):
             index = of(message)
             for each in queues:
                 each.put(index)
+
         return put_all
 
 
@@ -203,6 +226,7 @@ class Pharos(Player):
 
     def __init__(self, options):
         import pharos
+
         super().__init__(options)
         self._master = pharos.Master()
         self._options = {'inline': options.inline, 'shared': options.shared}
@@ -211,66 +235,95 @@ class Pharos(Player):
         self._publisher = self._node('publisher') if self.sends else None
 
     def _node(self, name):
-        return self._master.create(self._pharos.BlockNode, named='%s/%s' % (self.options.name, name), domain='127.0.0.1')
+        return self._master.create(
+            self._pharos.BlockNode, named=f'{self.options.name}/{name}', domain='127.0.0.1'
+        )
 
     def opened(self, kind, topic, receivers, queue_size):
         if self.receives:
             while len(self._nodes) < receivers:
-                self._nodes.append(self._node('receiver%d' % len(self._nodes)))
+                self._nodes.append(self._node(f'receiver{len(self._nodes)}'))
             for node in self._nodes[:receivers]:
-                node.interested_in(topic, typed_as=kind.ros_class, delegate=kind.noter(self.sent, self.took),
-                                   queue_size=queue_size, **self._options)
+                node.interested_in(
+                    topic,
+                    typed_as=kind.ros_class,
+                    delegate=kind.noter(self.sent, self.took),
+                    queue_size=queue_size,
+                    **self._options,
+                )
         if self.sends:
-            channel = self._publisher.output_channel(topic, typed_as=kind.ros_class, queue_size=queue_size)
+            channel = self._publisher.output_channel(
+                topic, typed_as=kind.ros_class, queue_size=queue_size
+            )
             if not channel.wait_for_subscribers(receivers, PATIENCE):
-                raise SystemExit('not connected: %r' % channel)
+                raise SystemExit(f'not connected: {channel!r}')
             return channel.publish
 
 
 class Rospy(Player):
-    """rospy; a process has one node, and one connection to a publisher whatever the number of callbacks."""
+    """rospy; a process has one node, and one connection to a publisher whatever the number of
+    callbacks."""
 
     def __init__(self, options):
         import rospy
+
         super().__init__(options)
         self._rospy = rospy
-        rospy.init_node('%s_%s' % (options.name, options.role), disable_signals=True)
+        rospy.init_node(f'{options.name}_{options.role}', disable_signals=True)
 
     def opened(self, kind, topic, receivers, queue_size):
         rospy = self._rospy
         tuned = {'tcp_nodelay': True} if self.options.tuned else {}
         if self.receives:
             if tuned:
-                tuned_input = {'buff_size': 1 << 24 if self.options.role == 'both' else 1 << 20, **tuned}
+                tuned_input = {
+                    'buff_size': 1 << 24 if self.options.role == 'both' else 1 << 20,
+                    **tuned,
+                }
             for _ in range(receivers):
-                rospy.Subscriber(topic, kind.ros_class, kind.noter(self.sent, self.took), queue_size=queue_size,
-                                 **(tuned_input if tuned else {}))
+                rospy.Subscriber(
+                    topic,
+                    kind.ros_class,
+                    kind.noter(self.sent, self.took),
+                    queue_size=queue_size,
+                    **(tuned_input if tuned else {}),
+                )
         if self.sends:
             publisher = rospy.Publisher(topic, kind.ros_class, queue_size=queue_size, **tuned)
             deadline = clock() + PATIENCE
             while not publisher.get_num_connections():
                 if clock() > deadline:
-                    raise SystemExit('not connected: %s' % topic)
+                    raise SystemExit(f'not connected: {topic}')
                 time.sleep(0.01)
             return publisher.publish
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     ways = {'direct': Direct, 'queue': Queue, 'pharos': Pharos, 'rospy': Rospy}
     parser.add_argument('way', choices=ways)
     parser.add_argument('name', help='of the row: for topics and nodes')
     parser.add_argument('--role', choices=('both', 'send', 'receive'), default='both')
-    parser.add_argument('--stamps', help='file of %d doubles, shared by a sender and a receiver' % STAMPS)
-    parser.add_argument('--inline', action='store_true', help="pharos: the delegate runs in the publisher's thread")
-    parser.add_argument('--shared', action='store_true', help='pharos: the receiver gets the published instance')
-    parser.add_argument('--tuned', action='store_true', help='rospy: tcp_nodelay, and a large buff_size')
+    parser.add_argument(
+        '--stamps', help='file of %d doubles, shared by a sender and a receiver' % STAMPS
+    )
+    parser.add_argument(
+        '--inline', action='store_true', help="pharos: the delegate runs in the publisher's thread"
+    )
+    parser.add_argument(
+        '--shared', action='store_true', help='pharos: the receiver gets the published instance'
+    )
+    parser.add_argument(
+        '--tuned', action='store_true', help='rospy: tcp_nodelay, and a large buff_size'
+    )
     options = parser.parse_args()
     answers = os.fdopen(os.dup(1), 'w')
-    os.dup2(2, 1)    # what ROS prints is no answer
+    os.dup2(2, 1)  # what ROS prints is no answer
     ways[options.way](options).serve(sys.stdin, answers)
     answers.flush()
-    os._exit(0)      # no nodes to be stopped tidily: all that is measured is over
+    os._exit(0)  # no nodes to be stopped tidily: all that is measured is over
 
 
 if __name__ == '__main__':

@@ -1,4 +1,5 @@
-"""The rows of the table: each is a player, a process of its own, or two where messages go from one to another."""
+"""The rows of the table: each is a player, a process of its own, or two where messages go from one
+to another."""
 import ctypes
 import json
 import os
@@ -16,9 +17,14 @@ HERE = pathlib.Path(__file__).resolve().parent
 SOURCE = HERE.parent / 'src'
 BUILD = HERE.parent / 'build' / 'benchmark'
 # Debian package -> what of it is in /usr/include
-CPP_PACKAGES = {'libroscpp-dev': 'ros/ros.h', 'libnodeletlib-dev': 'nodelet/loader.h', 'pluginlib-dev': 'pluginlib',
-                'libgeometry-msgs-dev': 'geometry_msgs/Twist.h', 'libsensor-msgs-dev': 'sensor_msgs/Image.h',
-                'libstd-msgs-dev': 'std_msgs/String.h'}
+CPP_PACKAGES = {
+    'libroscpp-dev': 'ros/ros.h',
+    'libnodeletlib-dev': 'nodelet/loader.h',
+    'pluginlib-dev': 'pluginlib',
+    'libgeometry-msgs-dev': 'geometry_msgs/Twist.h',
+    'libsensor-msgs-dev': 'sensor_msgs/Image.h',
+    'libstd-msgs-dev': 'std_msgs/String.h',
+}
 CPP_TOOLS = {'catkin': '/usr/share/catkin/cmake', 'cmake': '/usr/bin/cmake', 'g++': '/usr/bin/g++'}
 
 # What stands in the table -> the words for player.py; a row of two processes has '--two'
@@ -40,19 +46,21 @@ CPP_ROWS = {'C++ nodelets': 'nodelets', 'roscpp, 1 process': 'roscpp'}
 class Slice(NamedTuple):
     """What was measured in a short while; times in seconds."""
 
-    took: List[float]    # latencies, a sample of them
-    sent: int            # messages to be received, over all receivers
+    took: List[float]  # latencies, a sample of them
+    sent: int  # messages to be received, over all receivers
     received: int
-    duration: float      # from the first message sent to the last received
-    cpu: float           # of the processes
+    duration: float  # from the first message sent to the last received
+    cpu: float  # of the processes
 
 
 class Row:
-    """One way of messages; it runs only within :meth:`measure`, and is stopped by a signal meanwhile."""
+    """One way of messages; it runs only within :meth:`measure`, and is stopped by a signal
+    meanwhile."""
 
     def __init__(self, name, commands, environment, errors):
         self.name = name
-        self._players = [_Player(command, environment, errors) for command in commands]    # the sender last
+        # the sender last
+        self._players = [_Player(command, environment, errors) for command in commands]
         self._open = set()
         self._pause()
 
@@ -65,7 +73,8 @@ class Row:
             self._open.add(what)
             for player in self._players:
                 player.ask('open', *what)
-        self._slice(what, 100, 0.05, busy)    # what the players put off while they were stopped, and cold caches
+        # what the players put off while they were stopped, and cold caches
+        self._slice(what, 100, 0.05, busy)
         measured = self._slice(what, rate, seconds, busy)
         self._pause()
         return measured
@@ -92,8 +101,15 @@ class Row:
 class _Player:
     def __init__(self, command, environment, errors):
         self._command, self._errors = command, errors
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True,
-                                         env=environment, preexec_fn=_end_with_parent)
+        self._process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
+            env=environment,
+            preexec_fn=_end_with_parent,
+        )
 
     def ask(self, *words):
         try:
@@ -103,7 +119,9 @@ class _Player:
             answer = ''
         if not answer:
             self._errors.seek(0)
-            raise RuntimeError('%s ended at %s:\n%s' % (' '.join(self._command), words, self._errors.read()[-2000:]))
+            raise RuntimeError(
+                f"{' '.join(self._command)} ended at {words}:\n{self._errors.read()[-2000:]}"
+            )
         return json.loads(answer)
 
     def signal(self, number):
@@ -115,32 +133,48 @@ class _Player:
 
 
 def _end_with_parent():
-    ctypes.CDLL(None).prctl(1, signal.SIGKILL)    # PR_SET_PDEATHSIG: a stopped player would stay for ever
+    # PR_SET_PDEATHSIG: a stopped player would stay for ever
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)
 
 
 def make(names, environment, folder, beside=()):
     """The rows of these names.
 
     :param folder: where they may keep files
-    :param beside: other ``src`` folders of pharos: their rows are there too, marked with ', '' and so on
+    :param beside: other ``src`` folders of pharos: their rows are there too, marked with ', '' and
+        so on
     """
     errors = open(folder / 'errors', 'w+')
     rows = []
     for name in names:
-        label = 'row%d' % len(rows)
+        label = f'row{len(rows)}'
         if name in CPP_ROWS:
-            rows.append(Row(name, [[str(BUILD / 'player'), CPP_ROWS[name], label]], environment, errors))
+            rows.append(
+                Row(name, [[str(BUILD / 'player'), CPP_ROWS[name], label]], environment, errors)
+            )
             continue
         words = PYTHON_ROWS[name]
         for number, source in enumerate((SOURCE, *beside) if 'pharos' in name else (SOURCE,)):
-            label = 'row%d' % len(rows)
-            rows.append(Row(name + "'" * number, _commands(words, label, folder), {**environment, 'PYTHONPATH': str(source)}, errors))
+            label = f'row{len(rows)}'
+            rows.append(
+                Row(
+                    name + "'" * number,
+                    _commands(words, label, folder),
+                    {**environment, 'PYTHONPATH': str(source)},
+                    errors,
+                )
+            )
     return rows
 
 
 def _commands(words, label, folder):
-    command = ['/usr/bin/python3', str(HERE / 'player.py'), words[0], label,
-               *(word for word in words[1:] if word != '--two')]
+    command = [
+        '/usr/bin/python3',
+        str(HERE / 'player.py'),
+        words[0],
+        label,
+        *(word for word in words[1:] if word != '--two'),
+    ]
     if '--two' not in words:
         return [command]
     stamps = folder / (label + '.stamps')
@@ -150,15 +184,25 @@ def _commands(words, label, folder):
 
 
 def build_cpp():
-    """Build the C++ player, where its packages are installed; returns the names of those that are missing."""
-    missing = [package for package, file in CPP_PACKAGES.items() if not os.path.exists('/usr/include/' + file)]
+    """Build the C++ player, where its packages are installed; returns the names of those that are
+    missing."""
+    missing = [
+        package
+        for package, file in CPP_PACKAGES.items()
+        if not os.path.exists('/usr/include/' + file)
+    ]
     missing += [package for package, file in CPP_TOOLS.items() if not os.path.exists(file)]
     if missing:
         return sorted(missing)
     BUILD.mkdir(parents=True, exist_ok=True)
-    python = ['-D%s_EXECUTABLE=/usr/bin/python3' % name for name in ('PYTHON', 'Python3')]
-    for command in (['cmake', str(HERE / 'nodelet'), '-DCATKIN_ENABLE_TESTING=OFF', *python], ['cmake', '--build', '.']):
-        done = subprocess.run(command, cwd=BUILD, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    python = [f'-D{name}_EXECUTABLE=/usr/bin/python3' for name in ('PYTHON', 'Python3')]
+    for command in (
+        ['cmake', str(HERE / 'nodelet'), '-DCATKIN_ENABLE_TESTING=OFF', *python],
+        ['cmake', '--build', '.'],
+    ):
+        done = subprocess.run(
+            command, cwd=BUILD, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
         if done.returncode:
-            sys.exit('%s failed in %s:\n%s' % (' '.join(command), BUILD, done.stdout))
+            sys.exit(f"{' '.join(command)} failed in {BUILD}:\n{done.stdout}")
     return []

@@ -1,4 +1,5 @@
-"""Prints what benchmark/channels measured: ``slices`` is ``{(key, row name): [Slice of each round]}``."""
+"""Prints what benchmark/channels measured: ``slices`` is ``{(key, row name): [Slice of each
+round]}``."""
 import statistics
 
 
@@ -28,9 +29,19 @@ def _time(value):
 
 def print_ways(names, messages, receivers, slices):
     """The table."""
-    print('%-24s | %-31s | %-33s | %-27s' % ('', 'latency at 100 Hz, us', 'latency flat out, us', 'flat out'))
-    heads = ('p50', 'ratio', 'p99', 'CPU'), ('p50', 'ratio', 'p99'), ('received/s', 'ratio', 'lost', 'CPU us')
-    print('%-24s | %8s %6s %8s %6s | %10s %9s %12s | %10s %6s %6s %8s' % ('', *heads[0], *heads[1], *heads[2]))
+    print(
+        '%-24s | %-31s | %-33s | %-27s'
+        % ('', 'latency at 100 Hz, us', 'latency flat out, us', 'flat out')
+    )
+    heads = (
+        ('p50', 'ratio', 'p99', 'CPU'),
+        ('p50', 'ratio', 'p99'),
+        ('received/s', 'ratio', 'lost', 'CPU us'),
+    )
+    print(
+        '%-24s | %8s %6s %8s %6s | %10s %9s %12s | %10s %6s %6s %8s'
+        % ('', *heads[0], *heads[1], *heads[2])
+    )
     for message in messages:
         for count in receivers:
             print('-' * 130)
@@ -42,18 +53,36 @@ def print_ways(names, messages, receivers, slices):
                     continue
                 paced, flat = map(Figures, found)
                 first = first or (paced, flat)
-                print('  %-22s | %8s %6s %8s %6s | %10s %9s %12s | %10s %6s %5.1f%% %8s' % (
-                    name, _time(paced.p50), _ratio(paced.p50, first[0].p50), _time(paced.p99), _time(paced.cpu),
-                    _time(flat.p50), _ratio(flat.p50, first[1].p50), _time(flat.p99),
-                    '%d' % flat.rate, _ratio(flat.rate, first[1].rate), flat.lost, _time(flat.cpu))
-                      + ('' if paced.lost == 0 else '   (100 Hz: %.0f%% lost)' % paced.lost))
+                print(
+                    '  %-22s | %8s %6s %8s %6s | %10s %9s %12s | %10s %6s %5.1f%% %8s'
+                    % (
+                        name,
+                        _time(paced.p50),
+                        _ratio(paced.p50, first[0].p50),
+                        _time(paced.p99),
+                        _time(paced.cpu),
+                        _time(flat.p50),
+                        _ratio(flat.p50, first[1].p50),
+                        _time(flat.p99),
+                        '%d' % flat.rate,
+                        _ratio(flat.rate, first[1].rate),
+                        flat.lost,
+                        _time(flat.cpu),
+                    )
+                    + ('' if paced.lost == 0 else f'   (100 Hz: {paced.lost:.0f}% lost)')
+                )
 
 
 def print_special(names, slices):
     """The small tables."""
-    _print_small('twist at 100 Hz, the publisher busy with Python code in between', names, slices, ('twist', 'busy'))
+    _print_small(
+        'twist at 100 Hz, the publisher busy with Python code in between',
+        names,
+        slices,
+        ('twist', 'busy'),
+    )
     for message in ('twist', 'image0.9'):
-        _print_small('%s flat out, queue_size=10' % message, names, slices, (message, 'short'))
+        _print_small(f'{message} flat out, queue_size=10', names, slices, (message, 'short'))
 
 
 def _print_small(title, names, slices, key):
@@ -61,8 +90,10 @@ def _print_small(title, names, slices, key):
     if figures:
         print('\n%-58s %8s %8s %8s %10s %6s' % (title, 'p50', 'p95', 'p99', 'received/s', 'lost'))
         for name, each in figures.items():
-            print('  %-56s %8s %8s %8s %10d %5.1f%%' % (name, _time(each.p50), _time(each.p95), _time(each.p99), each.rate,
-                                                       each.lost))
+            print(
+                '  %-56s %8s %8s %8s %10d %5.1f%%'
+                % (name, _time(each.p50), _time(each.p95), _time(each.p99), each.rate, each.lost)
+            )
 
 
 def print_aims(slices):
@@ -71,25 +102,31 @@ def print_aims(slices):
 
     def of(row, *key):
         return figures.get((key, row))
+
     aims = []
 
     def aim(text, left, right, unit='%.1f'):
         """left is to be below right"""
         aims.append((text, left <= right, unit % left, unit % right))
+
     for message in ('twist', 'image6.2'):
         paced, flat = (message, 1, 'paced'), (message, 1, 'flat')
-        direct, queue, nodelets = (of(row, *paced) for row in ('direct call', 'SimpleQueue, 2 threads', 'C++ nodelets'))
-        inline, shared, default = (of(row, *paced) for row in ('pharos inline', 'pharos inline, shared', 'pharos default'))
+        direct, queue, nodelets = (
+            of(row, *paced) for row in ('direct call', 'SimpleQueue, 2 threads', 'C++ nodelets')
+        )
+        inline, shared, default = (
+            of(row, *paced) for row in ('pharos inline', 'pharos inline, shared', 'pharos default')
+        )
         if of('pharos inline', *flat):
-            aim('%s, inline, flat out: 3 us' % message, of('pharos inline', *flat).p50, 3.0)
+            aim(f'{message}, inline, flat out: 3 us', of('pharos inline', *flat).p50, 3.0)
         if direct and inline:
-            aim('%s, inline, 100 Hz: 4 direct calls' % message, inline.p50, 4 * direct.p50)
+            aim(f'{message}, inline, 100 Hz: 4 direct calls', inline.p50, 4 * direct.p50)
         if direct and shared:
-            aim('%s, inline and shared, 100 Hz: 3 direct calls' % message, shared.p50, 3 * direct.p50)
+            aim(f'{message}, inline and shared, 100 Hz: 3 direct calls', shared.p50, 3 * direct.p50)
         if default and nodelets:
-            aim('%s, default, 100 Hz: below nodelets' % message, default.p50, nodelets.p50)
+            aim(f'{message}, default, 100 Hz: below nodelets', default.p50, nodelets.p50)
         if default and queue:
-            aim('%s, default, 100 Hz: 2 bare hand-overs' % message, default.p50, 2 * queue.p50)
+            aim(f'{message}, default, 100 Hz: 2 bare hand-overs', default.p50, 2 * queue.p50)
     busy = of('pharos default', 'twist', 'busy')
     if busy:
         aim('busy publisher, default: p95 200 us', busy.p95, 200.0)
@@ -98,19 +135,37 @@ def print_aims(slices):
         aim('twist, default, flat out: none lost', flat.lost, 0.0)
         aim('twist, default, flat out: at least so many a second', -flat.rate, -200000.0, '%.0f')
         if of('C++ nodelets', 'twist', 1, 'flat'):
-            aim('... and more than nodelets', -flat.rate, -of('C++ nodelets', 'twist', 1, 'flat').rate, '%.0f')
+            aim(
+                '... and more than nodelets',
+                -flat.rate,
+                -of('C++ nodelets', 'twist', 1, 'flat').rate,
+                '%.0f',
+            )
     for message in ('twist', 'image0.9'):
         if of('pharos default', message, 'short'):
-            aim('%s, queue_size=10, flat out: 25 %% lost' % message, of('pharos default', message, 'short').lost, 25.0)
+            aim(
+                f'{message}, queue_size=10, flat out: 25 % lost',
+                of('pharos default', message, 'short').lost,
+                25.0,
+            )
     for message in ('twist', 'image0.9', 'image6.2'):
         ours = of('pharos, 2 processes', message, 1, 'paced')
         if ours and of('rospy, 2 proc., tuned', message, 1, 'paced'):
-            aim('%s over TCPROS, 100 Hz: rospy, same options, +5 %%' % message, ours.p50,
-                1.05 * of('rospy, 2 proc., tuned', message, 1, 'paced').p50)
+            aim(
+                f'{message} over TCPROS, 100 Hz: rospy, same options, +5 %',
+                ours.p50,
+                1.05 * of('rospy, 2 proc., tuned', message, 1, 'paced').p50,
+            )
         if ours and of('rospy, 2 processes', message, 1, 'paced'):
-            aim("%s over TCPROS, 100 Hz: rospy's defaults" % message, ours.p50,
-                of('rospy, 2 processes', message, 1, 'paced').p50)
+            aim(
+                f"{message} over TCPROS, 100 Hz: rospy's defaults",
+                ours.p50,
+                of('rospy, 2 processes', message, 1, 'paced').p50,
+            )
     if aims:
         print('\n%-58s %10s %10s' % ('aims', 'here', 'limit'))
         for text, reached, left, right in aims:
-            print('  %-56s %10s %10s  %s' % (text, left.lstrip('-'), right.lstrip('-'), 'reached' if reached else 'MISSED'))
+            print(
+                '  %-56s %10s %10s  %s'
+                % (text, left.lstrip('-'), right.lstrip('-'), 'reached' if reached else 'MISSED')
+            )

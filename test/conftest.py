@@ -1,4 +1,5 @@
-"""Fixtures: a real ROS master in this process, on a free port and loopback, so that runs go side by side."""
+"""Fixtures: a real ROS master in this process, on a free port and loopback, so that runs go side by
+side."""
 import atexit
 import os
 import pathlib
@@ -24,11 +25,12 @@ import pharos  # noqa: E402
 from pharos import running  # noqa: E402
 from pharos.intraprocess.link import PROTOCOL  # noqa: E402
 
-TIMEOUT = 20.0    # seconds; a bound on waits for events, never reached in a test that passes
+TIMEOUT = 20.0  # seconds; a bound on waits for events, never reached in a test that passes
 #: of a test that serializes a numpy_msg
 serializes_numpy = pytest.mark.skipif(
     not hasattr(numpy.ndarray, 'tostring'),
-    reason="genpy's code writes numpy_msg with ndarray.tostring, which this numpy has no more; bare rospy fails, too")
+    reason="genpy's code writes numpy_msg with ndarray.tostring, which this numpy has no more; bare rospy fails, too",
+)
 
 
 class Mailbox:
@@ -69,13 +71,13 @@ class InProcessMaster:
         self._master.start()
         ready = threading.Event()
         while not self._master.uri:
-            ready.wait(0.001)    # rosmaster has no event for it
+            ready.wait(0.001)  # rosmaster has no event for it
         self.url = 'http://127.0.0.1:%d/' % self._master.master_node.port
 
     def stop(self):
         node = self._master.master_node
         node.is_shutdown = True
-        node.server.shutdown()    # rosgraph itself only closes its socket, and its thread spins (ros_comm #2238)
+        node.server.shutdown()  # rosgraph itself only closes its socket, and its thread spins (ros_comm #2238)
         self._master.stop()
 
 
@@ -89,7 +91,8 @@ def ros_master():
 
 @pytest.fixture
 def master(ros_master, monkeypatch):
-    """A pharos.Master; every node that the test leaves running is stopped, and nothing may stay registered."""
+    """A pharos.Master; every node that the test leaves running is stopped, and nothing may stay
+    registered."""
     monkeypatch.setenv('ROS_MASTER_URI', ros_master.url)
     yield pharos.Master(ros_master.url)
     running.stop_all()

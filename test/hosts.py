@@ -1,4 +1,5 @@
-"""Several hosts on this one: network namespaces, each with an address and a name, on a network of their own."""
+"""Several hosts on this one: network namespaces, each with an address and a name, on a network of
+their own."""
 import contextlib
 import os
 import pathlib
@@ -12,15 +13,16 @@ import pytest
 from programs import Program
 
 NETWORK = '10.77.0.%d'
-MASTER_PORT = 11311    # of a host's own: nobody else is there
-CONFIGURATION = pathlib.Path('/etc/netns')    # `ip netns exec` shows a namespace its files there in place of /etc
+MASTER_PORT = 11311  # of a host's own: nobody else is there
+# `ip netns exec` shows a namespace its files there in place of /etc
+CONFIGURATION = pathlib.Path('/etc/netns')
 
 
 def ip(*arguments):
     """Run the program ip; an error says what it said."""
     ended = subprocess.run(['ip', *arguments], capture_output=True, text=True, check=False)
     if ended.returncode:
-        raise OSError('ip %s: %s' % (' '.join(arguments), ended.stderr.strip()))
+        raise OSError(f"ip {' '.join(arguments)}: {ended.stderr.strip()}")
 
 
 class Host:
@@ -28,26 +30,44 @@ class Host:
 
     def __init__(self, network, name, number):
         self.name, self.address, self.domain = name, NETWORK % number, name + '.pharos.test'
-        self.namespace, self._switch, self._port = '%s-%s' % (network, name), '%s-switch' % network, 'to-' + name
+        self.namespace, self._switch, self._port = (
+            f'{network}-{name}',
+            f'{network}-switch',
+            'to-' + name,
+        )
 
     def plug_in(self, hosts):
         """Join it to the switch; ``hosts`` is the text of its /etc/hosts."""
         folder = CONFIGURATION / self.namespace
         folder.mkdir(parents=True)
         (folder / 'hosts').write_text(hosts)
-        ip('-n', self._switch, 'link', 'add', self._port, 'type', 'veth',
-           'peer', 'name', 'eth0', 'netns', self.namespace)
+        ip(
+            '-n',
+            self._switch,
+            'link',
+            'add',
+            self._port,
+            'type',
+            'veth',
+            'peer',
+            'name',
+            'eth0',
+            'netns',
+            self.namespace,
+        )
         ip('-n', self._switch, 'link', 'set', self._port, 'master', 'bridge', 'up')
         ip('-n', self.namespace, 'address', 'add', self.address + '/24', 'dev', 'eth0')
         for device in 'lo', 'eth0':
             ip('-n', self.namespace, 'link', 'set', device, 'up')
 
     def link(self, state):
-        """Take the link to the switch 'down', or 'up' again: the host itself is told as little as by a bad cable."""
+        """Take the link to the switch 'down', or 'up' again: the host itself is told as little as
+        by a bad cable."""
         ip('-n', self._switch, 'link', 'set', self._port, state)
 
     def forget_neighbours(self):
-        """Have it ask for the others' hardware addresses again, without which it soon knows that they are gone."""
+        """Have it ask for the others' hardware addresses again, without which it soon knows that
+        they are gone."""
         ip('-n', self.namespace, 'neighbour', 'flush', 'dev', 'eth0')
 
     def command(self, *command):
@@ -72,10 +92,10 @@ def network(*names):
     """
     if os.geteuid() != 0 or shutil.which('ip') is None:
         pytest.skip('needs root and the program ip, for network namespaces')
-    network_name = 'pharos-%s' % secrets.token_hex(4)
+    network_name = f'pharos-{secrets.token_hex(4)}'
     hosts = [Host(network_name, name, number) for number, name in enumerate(names, 1)]
-    namespaces = ['%s-switch' % network_name, *(host.namespace for host in hosts)]
-    table = '127.0.0.1 localhost\n' + ''.join('%s %s\n' % (host.address, host.domain) for host in hosts)
+    namespaces = [f'{network_name}-switch', *(host.namespace for host in hosts)]
+    table = '127.0.0.1 localhost\n' + ''.join(f'{host.address} {host.domain}\n' for host in hosts)
     try:
         try:
             for namespace in namespaces:
@@ -83,7 +103,7 @@ def network(*names):
             ip('-n', namespaces[0], 'link', 'add', 'bridge', 'type', 'bridge')
             ip('netns', 'exec', namespaces[0], 'true')
         except OSError as error:
-            pytest.skip('no network namespaces here: %s' % error)
+            pytest.skip(f'no network namespaces here: {error}')
         ip('-n', namespaces[0], 'link', 'set', 'bridge', 'up')
         for host in hosts:
             host.plug_in(table)
@@ -94,4 +114,4 @@ def network(*names):
                 ip('netns', 'delete', namespace)
             shutil.rmtree(CONFIGURATION / namespace, ignore_errors=True)
         with contextlib.suppress(OSError):
-            CONFIGURATION.rmdir()    # if it is empty
+            CONFIGURATION.rmdir()  # if it is empty

@@ -1,6 +1,8 @@
-"""Much at once: nodes, topics, messages, and slow receivers. test_load.py has seconds of it, tools/soak minutes.
+"""Much at once: nodes, topics, messages, and slow receivers. test_load.py has seconds of it,
+tools/soak minutes.
 
-Each function leaves nothing behind, returns counts, and raises AssertionError where something is not as it should be.
+Each function leaves nothing behind, returns counts, and raises AssertionError where something is
+not as it should be.
 """
 import collections
 import contextlib
@@ -25,7 +27,7 @@ from programs import TIMEOUT, until
 
 NODES, TOPICS = 100, 1000
 IMAGE_SIZE = 640 * 480 * 3
-STEP = 0.01    # seconds between two bursts of messages, where they are not sent flat out
+STEP = 0.01  # seconds between two bursts of messages, where they are not sent flat out
 
 
 def create(master, name, **kwargs):
@@ -38,20 +40,29 @@ def image(number):
 
 
 def in_use():
-    """What the process has of what a node may leave behind; threads are the kernel's, not only those Python knows."""
+    """What the process has of what a node may leave behind; threads are the kernel's, not only
+    those Python knows."""
     gc.collect()
     open_files = []
     for descriptor in os.listdir('/proc/self/fd'):
-        with contextlib.suppress(FileNotFoundError):    # that of the listing
+        with contextlib.suppress(FileNotFoundError):  # that of the listing
             open_files.append(os.readlink('/proc/self/fd/' + descriptor).partition(':')[0])
-    return {'threads': len(os.listdir('/proc/self/task')), 'sockets': open_files.count('socket'),
-            'descriptors': len(open_files)}
+    return {
+        'threads': len(os.listdir('/proc/self/task')),
+        'sockets': open_files.count('socket'),
+        'descriptors': len(open_files),
+    }
 
 
 def registered(master, prefix):
     """The nodes that the master knows under names that begin so."""
-    return {name for kind in master.system_state() for names in kind.values() for name in names
-            if name.startswith(prefix)}
+    return {
+        name
+        for kind in master.system_state()
+        for names in kind.values()
+        for name in names
+        if name.startswith(prefix)
+    }
 
 
 def allow_many_descriptors():
@@ -60,15 +71,17 @@ def allow_many_descriptors():
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
-# -- a crowd ----------------------------------------------------------------------------------------------------------
+# -- a crowd
+
 
 class Crowd:
-    """Nodes and topics, many of both; each topic has a publisher and, on another node, a subscriber."""
+    """Nodes and topics, many of both; each topic has a publisher and, on another node, a
+    subscriber."""
 
     def __init__(self, master):
         allow_many_descriptors()
         nodes = [create(master, '/crowd/n%d' % number) for number in range(NODES)]
-        self._received = [0] * TOPICS    # how many of each topic came, each of them once and in order
+        self._received = [0] * TOPICS  # how many of each topic came, each of them once and in order
         self._inputs, self._outputs = [], []
         for number in range(TOPICS):
             topic = '/crowd/t%d' % number
@@ -84,10 +97,12 @@ class Crowd:
         def receive(message, channel):
             if message.data == received[topic]:
                 received[topic] += 1
+
         return receive
 
     def send(self, rounds, rate=None):
-        """Send a message on each topic so many times; ``rate`` messages a second, or as fast as it goes."""
+        """Send a message on each topic so many times; ``rate`` messages a second, or as fast as it
+        goes."""
         begin, pause, burst = time.monotonic(), threading.Event(), rate and int(rate * STEP)
         messages = ((channel, number) for number in range(rounds) for channel in self._outputs)
         for count, (channel, number) in enumerate(messages):
@@ -99,7 +114,12 @@ class Crowd:
         dropped = sum(channel.dropped for channel in self._inputs)
         until(lambda: sum(self._received) + dropped == sent, 'all %d messages' % sent)
         assert not any(node.errors for node in running.nodes())
-        return {'sent': sent, 'delivered': sum(self._received), 'dropped': dropped, 'per second': int(sent / took)}
+        return {
+            'sent': sent,
+            'delivered': sum(self._received),
+            'dropped': dropped,
+            'per second': int(sent / took),
+        }
 
 
 def crowd(master, rounds, rate=None):
@@ -113,22 +133,30 @@ def crowd(master, rounds, rate=None):
     return counts
 
 
-# -- nodes that come and go -------------------------------------------------------------------------------------------
+# -- nodes that come and go
+
 
 class Traffic:
-    """Nodes that start, stop, send, listen and call each other at random, from a seed, in several threads at once."""
+    """Nodes that start, stop, send, listen and call each other at random, from a seed, in several
+    threads at once."""
 
-    THREADS, NODES, TOPICS = 4, 4, 6    # NODES are a thread's own
+    THREADS, NODES, TOPICS = 4, 4, 6  # NODES are a thread's own
 
     def __init__(self, master, seed):
         self._master, self._seed = master, seed
         self._counting, self._counts = threading.Lock(), collections.Counter()
         self._problems = []
-        self._names = ['/traffic/n%d_%d' % place for place in itertools.product(range(self.THREADS), range(self.NODES))]
+        self._names = [
+            '/traffic/n%d_%d' % place
+            for place in itertools.product(range(self.THREADS), range(self.NODES))
+        ]
 
     def run(self, turns):
         """Let it go on for so many turns in each thread; returns the counts of what was done."""
-        threads = [threading.Thread(target=self._work, args=(number, turns)) for number in range(self.THREADS)]
+        threads = [
+            threading.Thread(target=self._work, args=(number, turns))
+            for number in range(self.THREADS)
+        ]
         for thread in threads:
             thread.start()
         for thread in threads:
@@ -138,31 +166,39 @@ class Traffic:
         return dict(self._counts)
 
     def _work(self, number, turns):
-        some, nodes = random.Random('%s %s' % (self._seed, number)), {}
-        names = self._names[number * self.NODES:][:self.NODES]
-        actions = [self._start_or_stop] * 2 + [self._restart, self._close] + [self._send] * 8 + [self._call] * 4
+        some, nodes = random.Random(f'{self._seed} {number}'), {}
+        names = self._names[number * self.NODES :][: self.NODES]
+        actions = (
+            [self._start_or_stop] * 2
+            + [self._restart, self._close]
+            + [self._send] * 8
+            + [self._call] * 4
+        )
         try:
             for _ in range(turns):
                 name = some.choice(names)
                 node, action = nodes.get(name), some.choice(actions)
                 if node is None or not node.is_running:
                     node = nodes[name] = self._start(name, some)
-                with self._judged('%s of %s' % (action.__name__, name)):
+                with self._judged(f'{action.__name__} of {name}'):
                     action(node, some)
         except Exception as error:
-            self._problems.append('%s: %r' % (name, error))
+            self._problems.append(f'{name}: {error!r}')
         for node in nodes.values():
             node.stop()
             self._problems += map(repr, node.errors)
 
     @contextlib.contextmanager
     def _judged(self, what):
-        """Services may be gone when they are called, and stop while they answer; that is all that may go wrong."""
+        """Services may be gone when they are called, and stop while they answer; that is all that
+        may go wrong."""
         try:
             yield
         except Exception as error:
-            if not isinstance(error, (UnknownServiceError, ServiceCallError)) or 'in time' in str(error):
-                self._problems.append('%s: %s' % (what, traceback.format_exc()))
+            if not isinstance(error, (UnknownServiceError, ServiceCallError)) or 'in time' in str(
+                error
+            ):
+                self._problems.append(f'{what}: {traceback.format_exc()}')
             self._count('calls refused')
 
     def _count(self, what):
@@ -178,16 +214,19 @@ class Traffic:
 
         def receive(message, channel):
             self._count('delivered')
-            if message.data % 10 == 0:    # a delegate that calls, perhaps the node that sent it
+            if message.data % 10 == 0:  # a delegate that calls, perhaps the node that sent it
                 with self._judged('a delegate of ' + name):
-                    self._master.lookup_service(self._names[message.data % len(self._names)] + '/set').call(data=True)
+                    self._master.lookup_service(
+                        self._names[message.data % len(self._names)] + '/set'
+                    ).call(data=True)
+
         for topic in {self._topic(some), self._topic(some)}:
             node.interested_in(topic, Int32, receive)
         self._count('starts')
         return node
 
     def _start_or_stop(self, node, some):
-        node.stop()    # the next turn of its name starts another
+        node.stop()  # the next turn of its name starts another
 
     def _restart(self, node, some):
         node.stop()
@@ -211,7 +250,7 @@ class Traffic:
 
 def come_and_go(master, seed, turns):
     """Traffic, after which the process uses no more than before, and nothing is registered."""
-    create(master, '/traffic/first').stop()    # what is loaded once per process
+    create(master, '/traffic/first').stop()  # what is loaded once per process
     until(lambda: not any('watcher' in thread.name for thread in threading.enumerate()))
     before = in_use()
     try:
@@ -219,13 +258,14 @@ def come_and_go(master, seed, turns):
         with contextlib.suppress(AssertionError):
             until(lambda: in_use() == before)
         left = in_use()
-        assert left == before, '%s before, %s left' % (before, left)
+        assert left == before, f'{before} before, {left} left'
     except Exception as error:
         raise AssertionError('%s\nPHAROS_LOAD_SEED=%d repeats it' % (error, seed)) from error
     return counts
 
 
-# -- slow receivers ---------------------------------------------------------------------------------------------------
+# -- slow receivers
+
 
 def camera(master, queue_size):
     """A node that publishes as many images on /load/images as it is told to on /load/more."""
@@ -236,6 +276,7 @@ def camera(master, queue_size):
         images.wait_for_subscribers(1, TIMEOUT)
         for number in range(message.data):
             images.publish(image(number))
+
     node.interested_in('/load/more', Int32, publish)
     return node
 
@@ -265,7 +306,10 @@ class Viewer:
 
     def wait_for_all(self):
         """Wait until all has arrived; what the queue has room for is still in it."""
-        until(lambda: self.channel.received + self.channel.dropped == self._asked - self.channel.queue_size)
+        until(
+            lambda: self.channel.received + self.channel.dropped
+            == self._asked - self.channel.queue_size
+        )
 
 
 def subscribe(node, topic, message_class):
@@ -274,8 +318,16 @@ def subscribe(node, topic, message_class):
     client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 16)
     client.settimeout(TIMEOUT)
     client.connect(('127.0.0.1', node.tcp_port))
-    client.sendall(encode_ros_handshake_header(
-        {'callerid': '/silent', 'topic': topic, 'type': message_class._type, 'md5sum': message_class._md5sum}))
+    client.sendall(
+        encode_ros_handshake_header(
+            {
+                'callerid': '/silent',
+                'topic': topic,
+                'type': message_class._type,
+                'md5sum': message_class._md5sum,
+            }
+        )
+    )
     with client:
         file = client.makefile('rb')
     file.read(*struct.unpack('<I', file.read(4)))

@@ -10,7 +10,7 @@ import time
 import rosgraph
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
-TIMEOUT = 60.0    # seconds; a bound on waits, never reached in a test that passes
+TIMEOUT = 60.0  # seconds; a bound on waits, never reached in a test that passes
 
 
 def script(name):
@@ -20,28 +20,48 @@ def script(name):
 
 def environment(master_url, **variables):
     """The environment in which programs find this package and the master, but no display."""
-    kept = {name: value for name, value in os.environ.items() if name not in ('DISPLAY', 'ROS_NAMESPACE', 'ROS_IP')}
-    return {**kept, 'ROS_MASTER_URI': master_url, 'ROS_HOSTNAME': '127.0.0.1', 'PYTHONPATH': str(ROOT / 'src'),
-            'PYTHONUNBUFFERED': '1', **variables}
+    kept = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in ('DISPLAY', 'ROS_NAMESPACE', 'ROS_IP')
+    }
+    return {
+        **kept,
+        'ROS_MASTER_URI': master_url,
+        'ROS_HOSTNAME': '127.0.0.1',
+        'PYTHONPATH': str(ROOT / 'src'),
+        'PYTHONUNBUFFERED': '1',
+        **variables,
+    }
 
 
 def run(master_url, *command, cwd=None):
-    """Run a program to its end; returns what it printed and its status (subprocess.CompletedProcess)."""
+    """Run a program to its end; returns what it printed and its status
+    (subprocess.CompletedProcess)."""
     return subprocess.run(
-        command, cwd=cwd, env=environment(master_url), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        timeout=TIMEOUT, check=False)
+        command,
+        cwd=cwd,
+        env=environment(master_url),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        timeout=TIMEOUT,
+        check=False,
+    )
 
 
 def until(condition, what='it'):
-    """Wait for what nobody tells: what another process does, or a thread of a node, or what only a master knows."""
+    """Wait for what nobody tells: what another process does, or a thread of a node, or what only a
+    master knows."""
     pause, deadline = threading.Event(), time.monotonic() + TIMEOUT
     while not condition():
-        assert time.monotonic() < deadline, '%s did not come to be: %s' % (what, condition)
+        assert time.monotonic() < deadline, f'{what} did not come to be: {condition}'
         pause.wait(0.01)
 
 
 def forget_parameters(master_url):
-    """Delete all parameters: a node's outlive it on the master, and would be those of the next one of its name."""
+    """Delete all parameters: a node's outlive it on the master, and would be those of the next one
+    of its name."""
     server = rosgraph.Master('/test', master_uri=master_url)
     for name in server.getParamNames():
         server.deleteParam(name)
@@ -54,8 +74,13 @@ class Program:
         self.printed = []
         self._lines = queue.SimpleQueue()
         self.process = subprocess.Popen(
-            command, cwd=cwd, env=environment(master_url, **variables), stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT, text=True)
+            command,
+            cwd=cwd,
+            env=environment(master_url, **variables),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 

@@ -1,9 +1,10 @@
 #!/usr/bin/python3
 """Do to nodes for minutes what the tests do to them for seconds, and print what they have survived.
 
-Bad clients, a master that is killed over and over, peers that are, nodes that come and go, a hundred nodes and a
-thousand topics, receivers too slow for images, and, as root, a link that is cut for a minute. Status 1 if anything is
-lost, left behind or gone; --seed repeats what was done, though not when.
+Bad clients, a master that is killed over and over, peers that are, nodes that come and go, a
+hundred nodes and a thousand topics, receivers too slow for images, and, as root, a link that is cut
+for a minute. Status 1 if anything is lost, left behind or gone; --seed repeats what was done,
+though not when.
 """
 import argparse
 import collections
@@ -32,15 +33,16 @@ from pharos import Master, ServiceCallError, running
 from programs import Program, environment, until
 
 HERE = pathlib.Path(__file__).resolve().parent
-PATHS = '%s:%s' % (HERE.parent / 'src', HERE)
-RATE = 10000           # messages a second among the thousand topics
-CUT = 60               # seconds that a link is down, once that has been noticed
-IMAGES = 40            # of 0.9 MB, published at a time
-MEMORY_LIMIT = 100e6   # bytes that the process may grow by while images pile up
+PATHS = f"{HERE.parent / 'src'}:{HERE}"
+RATE = 10000  # messages a second among the thousand topics
+CUT = 60  # seconds that a link is down, once that has been noticed
+IMAGES = 40  # of 0.9 MB, published at a time
+MEMORY_LIMIT = 100e6  # bytes that the process may grow by while images pile up
 
 
 class Soak:
-    """What the stages share: a master, a source of chance, the counts, and the time that each has."""
+    """What the stages share: a master, a source of chance, the counts, and the time that each
+    has."""
 
     def __init__(self, master, seed):
         self.master, self.random = master, random.Random(seed)
@@ -70,7 +72,8 @@ def resident():
         return int(file.read().split()[1]) * os.sysconf('SC_PAGESIZE')
 
 
-# -- the stages -------------------------------------------------------------------------------------------------------
+# -- the stages
+
 
 def clients(soak):
     """Mutated handshakes and calls, and clients that say nothing or not all."""
@@ -82,14 +85,22 @@ def clients(soak):
     while soak.left > 0:
         with contextlib.ExitStack() as silent:
             for number in range(200):
-                port, beginning = [(node.tcp_port, b'\0\1'), (node.xmlrpc_port, b'POST / HT')][number % 2]
+                port, beginning = [(node.tcp_port, b'\0\1'), (node.xmlrpc_port, b'POST / HT')][
+                    number % 2
+                ]
                 client = silent.enter_context(socket.create_connection(('127.0.0.1', port)))
-                client.sendall(beginning[:number % 4])
-            Fuzz(soak.random.randrange(1 << 32), *victim).attack(node.tcp_port, node.xmlrpc_port, 300)
+                client.sendall(beginning[: number % 4])
+            Fuzz(soak.random.randrange(1 << 32), *victim).attack(
+                node.tcp_port, node.xmlrpc_port, 300
+            )
             with xmlrpc.client.ServerProxy(node.uri) as proxy:
                 assert proxy.getPid('/soak')[0] == 1
             load.subscribe(node, topic, String).close()
-            assert soak.master.lookup_service('/soak/set').call(data=True, timeout=load.TIMEOUT).success
+            assert (
+                soak.master.lookup_service('/soak/set')
+                .call(data=True, timeout=load.TIMEOUT)
+                .success
+            )
         chat.send(data='still there')
         soak.count(bad_clients_tried=300, silent_clients=200)
     until(lambda: heard.received == chat.sent)
@@ -98,17 +109,28 @@ def clients(soak):
 
 
 def master_dies(soak):
-    """A master that is killed and comes back with an empty registry, while two nodes talk and a third comes."""
+    """A master that is killed and comes back with an empty registry, while two nodes talk and a
+    third comes."""
     embedded = Master.embedded()
     port, slowest = int(embedded.url.rsplit(':', 1)[1].strip('/')), 0.0
     master = Master(embedded.url)
-    ours = [create(master, '/soak/%s' % name) for name in ('sender', 'receiver')]
-    chat, heard = ours[0].output_channel('/soak/chat', String), ours[1].interested_in('/soak/chat', String)
+    ours = [create(master, f'/soak/{name}') for name in ('sender', 'receiver')]
+    chat, heard = ours[0].output_channel('/soak/chat', String), ours[1].interested_in(
+        '/soak/chat', String
+    )
     ours[1].serve('/soak/set', 'std_srvs/SetBool', lambda request: {'success': request.data})
 
     def registrations():
-        return [sorted((name, node.name) for name, users in kind.items() for node in ours if node.name in users)
-                for kind in master.system_state()]
+        return [
+            sorted(
+                (name, node.name)
+                for name, users in kind.items()
+                for node in ours
+                if node.name in users
+            )
+            for kind in master.system_state()
+        ]
+
     before = registrations()
     try:
         while soak.left > 0:
@@ -125,7 +147,7 @@ def master_dies(soak):
                 assert master.lookup_service('/soak/set').call(data=True).success
                 chat.send(data='with a new peer')
             soak.count(master_restarts=1)
-        assert slowest < 5.0, 'it took %.1f s until all was registered again' % slowest
+        assert slowest < 5.0, f'it took {slowest:.1f} s until all was registered again'
         until(lambda: heard.received == chat.sent)
         soak.sees_messages(chat.sent, heard.received)
     finally:
@@ -134,25 +156,28 @@ def master_dies(soak):
         embedded.stop()
 
 
-PEERS = ['''
+PEERS = [
+    '''
 import rospy
 from std_msgs.msg import String
 from std_srvs.srv import Empty
 rospy.init_node('peer')
 rospy.Subscriber('/soak/to_peer', String, lambda message: None)
-rospy.Service('/soak/stuck', Empty, lambda request: print('called', flush=True) or rospy.sleep(3600))
-publisher = rospy.Publisher('/soak/from_peer', String, latch=True, queue_size=1)
+rospy.Service('/soak/stuck', Empty, lambda request: print('called', flush=True) or
+rospy.sleep(3600)) publisher = rospy.Publisher('/soak/from_peer', String, latch=True, queue_size=1)
 publisher.publish('hello')
 rospy.spin()
-''', '''
+''',
+    '''
 import threading
 from pharos import BlockNode, Master, spin
 node = Master().create(BlockNode, named='/peer')
 node.interested_in('/soak/to_peer', 'std_msgs/String')
-node.serve('/soak/stuck', 'std_srvs/Empty', lambda request: print('called', flush=True) or node.sleep(3600))
-node.output_channel('/soak/from_peer', 'std_msgs/String', latch=True).send(data='hello')
-spin()
-''']
+node.serve('/soak/stuck', 'std_srvs/Empty', lambda request: print('called', flush=True) or
+node.sleep(3600)) node.output_channel('/soak/from_peer', 'std_msgs/String',
+latch=True).send(data='hello') spin()
+''',
+]
 
 
 def peers_die(soak):
@@ -165,9 +190,12 @@ def peers_die(soak):
         with contextlib.suppress(ServiceCallError):
             soak.master.lookup_service('/soak/stuck').call()
             failures.append('a call to a peer that was killed was answered')
+
     failures = []
     while soak.left > 0:
-        with Program(soak.master.url, sys.executable, '-c', soak.random.choice(PEERS), PYTHONPATH=PATHS) as peer:
+        with Program(
+            soak.master.url, sys.executable, '-c', soak.random.choice(PEERS), PYTHONPATH=PATHS
+        ) as peer:
             assert came.acquire(timeout=load.TIMEOUT) and told.wait_for_subscribers(1, load.TIMEOUT)
             calling = threading.Thread(target=call)
             calling.start()
@@ -184,8 +212,11 @@ def come_and_go(soak):
     """Nodes that start and stop at random, and talk to each other."""
     while soak.left > 0:
         done = load.come_and_go(soak.master, soak.random.randrange(1 << 32), turns=50)
-        soak.count(node_starts=done['starts'], calls_among_nodes_that_come_and_go=done['calls'],
-                   messages_among_nodes_that_come_and_go=done['delivered'])
+        soak.count(
+            node_starts=done['starts'],
+            calls_among_nodes_that_come_and_go=done['calls'],
+            messages_among_nodes_that_come_and_go=done['delivered'],
+        )
 
 
 def crowd(soak):
@@ -197,7 +228,9 @@ def crowd(soak):
 
 
 def images(soak):
-    """Images from here and from another process to a receiver that does not keep up: it is to get the newest next."""
+    """Images from here and from another process to a receiver that does not keep up: it is to get
+    the newest next."""
+
     def watch(seconds):
         busy = load.Busy()
         viewer, before, end = load.Viewer(soak.master, busy), resident(), soak.left - seconds
@@ -210,8 +243,11 @@ def images(soak):
             assert busy.wait() == IMAGES - 1
             busy.go_on()
             soak.count(images_sent=IMAGES + 1, images_dropped_for_newer_ones=IMAGES - 1)
-            assert resident() - before < MEMORY_LIMIT, 'images pile up: %d MB' % ((resident() - before) / 1e6)
+            assert resident() - before < MEMORY_LIMIT, 'images pile up: %d MB' % (
+                (resident() - before) / 1e6
+            )
         running.stop_all()
+
     seconds = soak.left / 2
     load.camera(soak.master, IMAGES)
     watch(seconds)
@@ -224,21 +260,39 @@ STAGES = {clients: 60, master_dies: 60, peers_die: 45, come_and_go: 60, crowd: 6
 
 
 class LinkCut:
-    """A test of test_hosts.py with the package's own time limits and a longer cut; it runs beside the stages."""
+    """A test of test_hosts.py with the package's own time limits and a longer cut; it runs beside
+    the stages."""
 
     def __init__(self):
         self._test = subprocess.Popen(
-            [sys.executable, '-m', 'pytest', '-q', '-rs', '-p', 'no:cacheprovider', str(HERE / 'test_hosts.py'), '-k',
-             'silent_loss'], env=environment('', PHAROS_TEST_CUT=str(CUT)), cwd=HERE.parent,
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+            [
+                sys.executable,
+                '-m',
+                'pytest',
+                '-q',
+                '-rs',
+                '-p',
+                'no:cacheprovider',
+                str(HERE / 'test_hosts.py'),
+                '-k',
+                'silent_loss',
+            ],
+            env=environment('', PHAROS_TEST_CUT=str(CUT)),
+            cwd=HERE.parent,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
 
     def outcome(self):
-        """Wait for its end; returns whether there could be a cut, and what went wrong, if anything did."""
+        """Wait for its end; returns whether there could be a cut, and what went wrong, if anything
+        did."""
         said, _ = self._test.communicate()
         return ' passed' in said, said if self._test.returncode else None
 
 
-# -- the whole --------------------------------------------------------------------------------------------------------
+# -- the whole
+
 
 def run_stage(soak, stage, seconds):
     """Run it; returns what went wrong, if anything did, and what it left behind."""
@@ -253,12 +307,15 @@ def run_stage(soak, stage, seconds):
         until(lambda: load.in_use() == before)
     after = load.in_use()
     if failure is None and after != before:
-        failure = '%s before, %s after' % (before, after)
+        failure = f'{before} before, {after} after'
     return failure, (stage.__name__, time.monotonic() - begin, resident() / 1e6, after)
 
 
 def print_summary(soak, rows, before):
-    print('\n%-14s %8s %10s %8s %8s %12s' % ('after', 'seconds', 'memory MB', 'threads', 'sockets', 'descriptors'))
+    print(
+        '\n%-14s %8s %10s %8s %8s %12s'
+        % ('after', 'seconds', 'memory MB', 'threads', 'sockets', 'descriptors')
+    )
     for name, seconds, memory, used in [('the beginning', 0, *before), *rows]:
         print('%-14s %8.0f %10.1f %8d %8d %12d' % (name, seconds, memory, *used.values()))
     print()
@@ -267,12 +324,19 @@ def print_summary(soak, rows, before):
 
 
 def parse_arguments():
-    parser = argparse.ArgumentParser(prog='tools/soak', description=__doc__,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        prog='tools/soak', description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     names = [stage.__name__ for stage in STAGES] + ['link']
-    parser.add_argument('--minutes', type=float, default=5, help='how long, about (default: %(default)s)')
-    parser.add_argument('--seed', type=int, default=random.randrange(1, 1 << 32), help='of a run to be repeated')
-    parser.add_argument('--only', default=','.join(names), metavar='WORD,...', help='of: %(default)s')
+    parser.add_argument(
+        '--minutes', type=float, default=5, help='how long, about (default: %(default)s)'
+    )
+    parser.add_argument(
+        '--seed', type=int, default=random.randrange(1, 1 << 32), help='of a run to be repeated'
+    )
+    parser.add_argument(
+        '--only', default=','.join(names), metavar='WORD,...', help='of: %(default)s'
+    )
     options = parser.parse_args()
     options.only = re.split(r'[ ,]+', options.only)
     if not set(options.only) <= set(names) or options.minutes <= 0:
@@ -281,12 +345,13 @@ def parse_arguments():
 
 
 def soak_all(options, say):
-    """Run the stages; returns the Soak, the rows of its table, what was there at the beginning, and the failures."""
+    """Run the stages; returns the Soak, the rows of its table, what was there at the beginning, and
+    the failures."""
     stages = {stage: share for stage, share in STAGES.items() if stage.__name__ in options.only}
     link, rows, failures = LinkCut() if 'link' in options.only else None, [], {}
     with Master.embedded() as master:
         soak = Soak(master, options.seed)
-        create(master, '/soak/first').stop()    # what is loaded once per process
+        create(master, '/soak/first').stop()  # what is loaded once per process
         running.stop_all()
         until(lambda: not any('watcher' in thread.name for thread in threading.enumerate()))
         before = resident() / 1e6, load.in_use()
@@ -297,7 +362,7 @@ def soak_all(options, say):
             rows.append(row)
             if failure:
                 failures[stage.__name__] = failure
-                say('%s FAILED' % stage.__name__)
+                say(f'{stage.__name__} FAILED')
         if link:
             say('link: waiting for the end of a cut of %d s' % CUT)
             cut, failure = link.outcome()
@@ -309,21 +374,26 @@ def soak_all(options, say):
 
 def main():
     options, screen = parse_arguments(), sys.stdout
-    signal.signal(signal.SIGINT, signal.default_int_handler)    # started with &, all it starts would ignore Ctrl-C
+    # started with &, all it starts would ignore Ctrl-C
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     load.allow_many_descriptors()
-    faulthandler.dump_traceback_later(120 * options.minutes + 240, exit=True, file=sys.stderr)    # if it hangs
+    # if it hangs
+    faulthandler.dump_traceback_later(120 * options.minutes + 240, exit=True, file=sys.stderr)
     print('seed %d' % options.seed, flush=True)
     with tempfile.TemporaryDirectory() as folder, open(os.devnull, 'w') as nowhere:
         os.environ.update(ROS_LOG_DIR=folder, ROS_HOSTNAME='127.0.0.1')
         # nodes that bad clients come to have much to say
         with contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere):
             soak, rows, before, failures = soak_all(
-                options, lambda text: screen.isatty() and print('==', text, file=screen, flush=True))
+                options, lambda text: screen.isatty() and print('==', text, file=screen, flush=True)
+            )
     print_summary(soak, rows, before)
     for name, failure in failures.items():
-        print('\n%s FAILED\n%s' % (name, failure), flush=True)
+        print(f'\n{name} FAILED\n{failure}', flush=True)
     if failures:
-        sys.exit('tools/soak: failed: %s; --seed %d repeats it' % (', '.join(failures), options.seed))
+        sys.exit(
+            'tools/soak: failed: %s; --seed %d repeats it' % (', '.join(failures), options.seed)
+        )
 
 
 if __name__ == '__main__':

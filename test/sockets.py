@@ -7,7 +7,7 @@ import struct
 
 from rosgraph.network import encode_ros_handshake_header
 
-LISTEN = '0A'    # the state, in /proc/net/tcp
+LISTEN = '0A'  # the state, in /proc/net/tcp
 
 
 def listening(pid='self'):
@@ -17,7 +17,7 @@ def listening(pid='self'):
         with contextlib.suppress(OSError):
             link = os.readlink(f'/proc/{pid}/fd/{descriptor}')
             if link.startswith('socket:'):
-                inodes.add(link[len('socket:['):-1])
+                inodes.add(link[len('socket:[') : -1])
     found = set()
     for table, family in ('tcp', socket.AF_INET), ('tcp6', socket.AF_INET6):
         with open(f'/proc/{pid}/net/{table}') as file:
@@ -60,11 +60,16 @@ def wait_for_end(pid, timeout):
 
 
 def subscribe(port, topic, name='/raw'):
-    """A subscriber of no client library: its socket, on which a connection header and messages will come."""
+    """A subscriber of no client library: its socket, on which a connection header and messages will
+    come."""
     sock = socket.socket()
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 16)    # little more goes to who does not read
+    # little more goes to who does not read
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 16)
     sock.settimeout(20)
     sock.connect(('127.0.0.1', port))
-    sock.sendall(encode_ros_handshake_header(
-        {'callerid': name, 'topic': topic, 'type': '*', 'md5sum': '*', 'tcp_nodelay': '0'}))
+    sock.sendall(
+        encode_ros_handshake_header(
+            {'callerid': name, 'topic': topic, 'type': '*', 'md5sum': '*', 'tcp_nodelay': '0'}
+        )
+    )
     return sock

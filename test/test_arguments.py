@@ -41,33 +41,52 @@ def names(master, argv, *named, **kwargs):
     return [create(master, name, argv=argv, **kwargs).name for name in named]
 
 
-# -- several nodes -----------------------------------------------------------------------------------------------------
+# -- several nodes
 
-@pytest.mark.parametrize('arguments, named, expected', [
-    (['__name:=eye'], ['/a', '/b', '/c'], ['/eye', '/b', '/c']),
-    (['__name:=eye'], ['/r/a', '/r/b'], ['/r/eye', '/r/b']),
-    (['__name:=eye', '__ns:=/robot'], ['/a', '/b', 'c'], ['/robot/eye', '/robot/b', '/robot/c']),
-    (['__ns:=robot'], ['/a', 'b'], ['/robot/a', '/robot/b']),
-    (['__ns:=/robot'], ['/left/eye', '/right/eye', 'arm/eye'],
-     ['/robot/left/eye', '/robot/right/eye', '/robot/arm/eye']),
-    (['__name:=eye', '__ns:=/robot'], ['/left/a', '/left/b'], ['/robot/eye', '/robot/left/b']),
-    (['__ns:=/'], ['/a'], ['/a']),
-    (['__name:='], ['/a'], ['/a']),
-])
-def test_the_first_takes_the_name_and_the_others_keep_theirs(master, argv, arguments, named, expected):
+
+@pytest.mark.parametrize(
+    'arguments, named, expected',
+    [
+        (['__name:=eye'], ['/a', '/b', '/c'], ['/eye', '/b', '/c']),
+        (['__name:=eye'], ['/r/a', '/r/b'], ['/r/eye', '/r/b']),
+        (
+            ['__name:=eye', '__ns:=/robot'],
+            ['/a', '/b', 'c'],
+            ['/robot/eye', '/robot/b', '/robot/c'],
+        ),
+        (['__ns:=robot'], ['/a', 'b'], ['/robot/a', '/robot/b']),
+        (
+            ['__ns:=/robot'],
+            ['/left/eye', '/right/eye', 'arm/eye'],
+            ['/robot/left/eye', '/robot/right/eye', '/robot/arm/eye'],
+        ),
+        (['__name:=eye', '__ns:=/robot'], ['/left/a', '/left/b'], ['/robot/eye', '/robot/left/b']),
+        (['__ns:=/'], ['/a'], ['/a']),
+        (['__name:='], ['/a'], ['/a']),
+    ],
+)
+def test_the_first_takes_the_name_and_the_others_keep_theirs(
+    master, argv, arguments, named, expected
+):
     assert names(master, argv(*arguments), *named) == expected
 
 
 def test_a_list_of_the_same_arguments_is_the_same(master, argv):
     arguments = argv('__name:=eye')
-    assert names(master, list(arguments), '/a') + names(master, tuple(arguments), '/b') == ['/eye', '/b']
+    assert names(master, list(arguments), '/a') + names(master, tuple(arguments), '/b') == [
+        '/eye',
+        '/b',
+    ]
 
 
 def test_each_master_has_a_first(master, argv):
     arguments = argv('__name:=bridge')
     with pharos.Master.embedded() as other:
         assert names(master, arguments, '/one') + names(other, arguments, '/one', '/two') == [
-            '/bridge', '/bridge', '/two']
+            '/bridge',
+            '/bridge',
+            '/two',
+        ]
     again = pharos.Master(master.url.replace('127.0.0.1', 'localhost'))
     assert names(again, arguments, '/three') == ['/three']
 
@@ -92,17 +111,32 @@ def test_remappings_and_parameters_hold_for_all(master, argv):
     assert master.parameters['/eye/rate'] == master.parameters['/b/rate'] == 5
 
 
-# -- for one node alone ------------------------------------------------------------------------------------------------
+# -- for one node alone
+
 
 def test_what_is_for_one_node_is_for_that_alone(master, argv):
-    arguments = argv('image:=/image', 'detector:image:=/camera/image', 'detector:__name:=spotter',
-                     'detector:_threshold:=0.5', '_threshold:=0.1', 'detector:_url:=http://host:80/')
-    detector, other = (create(master, name, argv=arguments) for name in ('/robot/detector', '/robot/other'))
+    arguments = argv(
+        'image:=/image',
+        'detector:image:=/camera/image',
+        'detector:__name:=spotter',
+        'detector:_threshold:=0.5',
+        '_threshold:=0.1',
+        'detector:_url:=http://host:80/',
+    )
+    detector, other = (
+        create(master, name, argv=arguments) for name in ('/robot/detector', '/robot/other')
+    )
     assert (detector.name, other.name) == ('/robot/spotter', '/robot/other')
     assert detector.output_channel('image', STRING).topic == '/camera/image'
     assert other.output_channel('image', STRING).topic == '/image'
-    assert (detector.parameter('~threshold').value, other.parameter('~threshold').value) == (0.5, 0.1)
-    assert (detector.parameter('~url').value, other.parameter('~url').value) == ('http://host:80/', None)
+    assert (detector.parameter('~threshold').value, other.parameter('~threshold').value) == (
+        0.5,
+        0.1,
+    )
+    assert (detector.parameter('~url').value, other.parameter('~url').value) == (
+        'http://host:80/',
+        None,
+    )
 
 
 def test_who_has_a_name_of_its_own_leaves_the_other_one(master, argv):
@@ -118,7 +152,9 @@ def test_a_namespace_of_its_own(master, argv):
 def test_the_part_before_the_colon_is_the_last_of_the_name_given(master, argv):
     arguments = argv('eye:image:=/seen', 'left:image:=/wrong', '__name:=first')
     for named in '/left/eye', '/right/eye':
-        assert create(master, named, argv=arguments).output_channel('image', STRING).topic == '/seen'
+        assert (
+            create(master, named, argv=arguments).output_channel('image', STRING).topic == '/seen'
+        )
 
 
 @pytest.mark.parametrize('variable', [None, 'ROS_NAMESPACE'])
@@ -129,25 +165,42 @@ def test_the_root_is_a_namespace_however_it_is_written(master, monkeypatch, vari
     assert create(master, 'eye', argv=[] if variable else [f'__ns:={root}']).name == '/eye'
 
 
-# -- what is none ------------------------------------------------------------------------------------------------------
+# -- what is none
 
-@pytest.mark.parametrize('arguments', ['__name:=eye', 'a:=b', b'__name:=eye', ['__name:=eye', 5], [None], 5, False,
-                                       {'a': 'b'}, iter(['__name:=eye']), (each for each in ['eye:a:=b'])])
+
+@pytest.mark.parametrize(
+    'arguments',
+    [
+        '__name:=eye',
+        'a:=b',
+        b'__name:=eye',
+        ['__name:=eye', 5],
+        [None],
+        5,
+        False,
+        {'a': 'b'},
+        iter(['__name:=eye']),
+        (each for each in ['eye:a:=b']),
+    ],
+)
 def test_what_is_no_list_of_strings_is_refused(master, arguments):
     with pytest.raises(TypeError, match=r'argv is a list of strings, such as sys\.argv'):
         create(master, '/refused', argv=arguments)
     create(master, '/refused').stop()
 
 
-@pytest.mark.parametrize('arguments, says', [
-    (['a:=b:=c'], "'a:=b:=c' in argv maps to several"),
-    (['_p:=b:=c'], "'_p:=b:=c' in argv maps to several"),
-    (['__name:=a b'], "'a b' cannot be a node name"),
-    (['__name:=/ns/eye'], "'/ns/eye' cannot be a node name"),
-    (['__ns:=a b'], "'a b' cannot be a namespace name"),
-    (['__ns:=~a'], "'~a' cannot be a namespace name"),
-    (['refused:__name:=1'], "'1' cannot be a node name"),
-])
+@pytest.mark.parametrize(
+    'arguments, says',
+    [
+        (['a:=b:=c'], "'a:=b:=c' in argv maps to several"),
+        (['_p:=b:=c'], "'_p:=b:=c' in argv maps to several"),
+        (['__name:=a b'], "'a b' cannot be a node name"),
+        (['__name:=/ns/eye'], "'/ns/eye' cannot be a node name"),
+        (['__ns:=a b'], "'a b' cannot be a namespace name"),
+        (['__ns:=~a'], "'~a' cannot be a namespace name"),
+        (['refused:__name:=1'], "'1' cannot be a node name"),
+    ],
+)
 def test_a_mapping_that_cannot_be_one_is_refused(master, argv, arguments, says):
     before = master.system_state()
     with pytest.raises(ValueError, match=says):
@@ -156,17 +209,21 @@ def test_a_mapping_that_cannot_be_one_is_refused(master, argv, arguments, says):
 
 
 def test_what_is_no_mapping_is_ignored_as_by_ros(master, argv):
-    arguments = argv('x', '-v', '--to=a:=b', ':=b', 'a:=', '_p:=', 'a b:=c', 'é:=b', 'other:_p:=1', '1:a:=b', '')
+    arguments = argv(
+        'x', '-v', '--to=a:=b', ':=b', 'a:=', '_p:=', 'a b:=c', 'é:=b', 'other:_p:=1', '1:a:=b', ''
+    )
     node = create(master, '/patient', argv=arguments)
     assert node.output_channel('a', STRING).topic == '/a'
     assert node.parameter('~p').value is None
 
 
-# -- roslaunch ---------------------------------------------------------------------------------------------------------
+# -- roslaunch
+
 
 @pytest.fixture
 def launch(master, tmp_path, monkeypatch):
-    """Runs a launch file with a program of four nodes; returns what these have seen, {name: [topic, parameters...]}."""
+    """Runs a launch file with a program of four nodes; returns what these have seen, {name: [topic,
+    parameters...]}."""
     folder = tmp_path / 'src' / 'two_in_one'
     write(folder / 'package.xml', MANIFEST % 'two_in_one')
     write(folder / 'scripts' / 'program', SCRIPT % str(ROOT / 'src'), 0o755)
@@ -176,7 +233,9 @@ def launch(master, tmp_path, monkeypatch):
     def run(text):
         write(folder / 'launch' / 'test.launch', text)
         seen, lines = {}, Mailbox()
-        with master.launch('two_in_one', 'test.launch', on_line=lambda line: lines(line, None)) as process:
+        with master.launch(
+            'two_in_one', 'test.launch', on_line=lambda line: lines(line, None)
+        ) as process:
             while True:
                 words = lines.get().split()
                 if words[:1] == ['SEEN']:
@@ -184,33 +243,43 @@ def launch(master, tmp_path, monkeypatch):
                         registered = {node.name for node in master.nodes()}
                         return seen, registered
                     seen[words[1]] = words[2:]
+
     return run
 
 
 def test_under_roslaunch_the_first_has_the_name_that_roslaunch_knows(launch):
-    seen, registered = launch("""<launch><group ns="robot">
-      <node pkg="two_in_one" type="program" name="vision" output="screen" args="_threshold:=3 eye:_threshold:=4">
+    seen, registered = launch(
+        """<launch><group ns="robot">
+      <node pkg="two_in_one" type="program" name="vision" output="screen" args="_threshold:=3
+      eye:_threshold:=4">
         <remap from="image" to="/camera/image"/>
         <param name="given" value="7"/>
       </node>
-      <param name="listener/mine" value="8"/></group></launch>""")
+      <param name="listener/mine" value="8"/></group></launch>"""
+    )
     assert seen == {
         '/robot/vision': ['/camera/image', '7', 'None', '3', '/robot/'],
         '/robot/listener': ['/camera/image', 'None', '8', '3', '/robot/'],
         '/robot/left/eye': ['/camera/image', 'None', 'None', '4', '/robot/left/'],
-        '/robot/right/eye': ['/camera/image', 'None', 'None', '4', '/robot/right/']}
+        '/robot/right/eye': ['/camera/image', 'None', 'None', '4', '/robot/right/'],
+    }
     assert set(seen) <= registered
 
 
 def test_under_roslaunch_without_a_namespace(launch, tmp_path):
-    seen, registered = launch("""<launch>
+    seen, registered = launch(
+        """<launch>
       <node pkg="two_in_one" type="program" name="vision" output="screen">
         <remap from="image" to="picture"/>
         <param name="given" value="7"/>
-      </node></launch>""")
+      </node></launch>"""
+    )
     assert {name: values[:2] for name, values in seen.items()} == {
-        '/vision': ['/picture', '7'], '/listener': ['/picture', 'None'],
-        '/left/eye': ['/left/picture', 'None'], '/right/eye': ['/right/picture', 'None']}
+        '/vision': ['/picture', '7'],
+        '/listener': ['/picture', 'None'],
+        '/left/eye': ['/left/picture', 'None'],
+        '/right/eye': ['/right/picture', 'None'],
+    }
     assert set(seen) <= registered
     logs = {path.name for path in (tmp_path / 'log').rglob('*.log')}
-    assert {'vision-1.log', 'listener.log', 'left_eye.log', 'right_eye.log'} <= logs    # each its own
+    assert {'vision-1.log', 'listener.log', 'left_eye.log', 'right_eye.log'} <= logs  # each its own

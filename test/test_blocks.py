@@ -12,7 +12,8 @@ def create(master, name='/node', **kwargs):
     return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
 
 
-# -- what would never run ----------------------------------------------------------------------------------------------
+# -- what would never run
+
 
 async def coroutine(*args):
     pass
@@ -41,12 +42,21 @@ class Methods:
         pass
 
 
-ASYNC = [coroutine, async_generator, AsyncCallable(), functools.partial(coroutine), mock.AsyncMock(),
-         functools.partial(functools.partial(AsyncCallable(), 1), 2), Methods().method]
+ASYNC = [
+    coroutine,
+    async_generator,
+    AsyncCallable(),
+    functools.partial(coroutine),
+    mock.AsyncMock(),
+    functools.partial(functools.partial(AsyncCallable(), 1), 2),
+    Methods().method,
+]
 GENERATORS = [generator, GeneratorCallable(), functools.partial(generator)]
 GIVEN = {
     'a delegate': lambda node, block: setattr(node, 'delegate', block),
-    'a delegate of a channel': lambda node, block: node.interested_in('/never', 'std_msgs/Empty', delegate=block),
+    'a delegate of a channel': lambda node, block: node.interested_in(
+        '/never', 'std_msgs/Empty', delegate=block
+    ),
     'a soul': lambda node, block: setattr(node, 'soul', block),
     'a soul to fork': lambda node, block: node.fork(block),
     'a service block': lambda node, block: node.serve('/never', 'std_srvs/Empty', block),
@@ -55,8 +65,12 @@ GIVEN = {
     'a block for changes': lambda node, block: node.master.on_change(block),
     'on_line': lambda node, block: node.master.run('topic_tools', 'relay', on_line=block),
     'a receiver': lambda node, block: Transcript.on_show(block),
-    'a block that fills': lambda node, block: node.send_to('/never', block, typed_as='std_msgs/Empty'),
-    'a block that fills in a channel': lambda node, block: node.output_channel('/never', 'std_msgs/Empty').send(block),
+    'a block that fills': lambda node, block: node.send_to(
+        '/never', block, typed_as='std_msgs/Empty'
+    ),
+    'a block that fills in a channel': lambda node, block: node.output_channel(
+        '/never', 'std_msgs/Empty'
+    ).send(block),
     'a block that fills a request': lambda node, block: fill_request(node, block),
 }
 
@@ -81,7 +95,9 @@ def fill_request(node, block):
 def test_a_block_that_is_async_is_refused_when_it_is_given(master, give):
     node = create(master)
     for block in ASYNC:
-        with pytest.raises(TypeError, match=r'async, would never run.*plain function.*run_coroutine_threadsafe'):
+        with pytest.raises(
+            TypeError, match=r'async, would never run.*plain function.*run_coroutine_threadsafe'
+        ):
             give(node, block)
 
 
@@ -89,7 +105,9 @@ def test_a_block_that_is_async_is_refused_when_it_is_given(master, give):
 def test_a_generator_function_is_refused_when_it_is_given(master, give):
     node = create(master)
     for block in GENERATORS:
-        with pytest.raises(TypeError, match=r'a yield, would never run.*plain function.*node.every\(seconds\)'):
+        with pytest.raises(
+            TypeError, match=r'a yield, would never run.*plain function.*node.every\(seconds\)'
+        ):
             give(node, block)
 
 
@@ -97,7 +115,8 @@ def test_a_generator_function_is_refused_when_it_is_given(master, give):
 def test_a_node_whose_start_or_stop_is_async_is_refused(master, method):
     async def never(self):
         pass
-    with pytest.raises(TypeError, match='Async.%s .*would never run' % method):
+
+    with pytest.raises(TypeError, match=f'Async.{method} .*would never run'):
         master.create(type('Async', (Node,), {method: wrong_name(never, method)}), named='/async')
     assert '/async' not in [node.name for node in master.nodes()]
 
@@ -111,13 +130,15 @@ def test_a_plain_function_around_an_async_one_is_a_block(master, mailbox):
     @functools.wraps(coroutine)
     def plain(message, channel):
         mailbox(message, channel)
+
     node = create(master, delegate=plain)
     node.interested_in('/wrapped', 'std_msgs/String')
     node.send_to('/wrapped', data='ran')
     assert mailbox.get().data == 'ran'
 
 
-# -- what is falsy, and runs all the same ------------------------------------------------------------------------------
+# -- what is falsy, and runs all the same
+
 
 class Falsy(list):
     """A list that can be called, as one that collects what it gets may be; empty, it is false."""
@@ -160,7 +181,8 @@ def test_falsy_blocks_of_other_kinds_run(master, transcript):
     watched.set(5)
     assert parameter.mailbox.get() == 5
     end = master.on_change(changes)
-    with master.run('topic_tools', 'relay', on_line=line) as process:    # which says how it is used, and ends
+    # which says how it is used, and ends
+    with master.run('topic_tools', 'relay', on_line=line) as process:
         assert line.mailbox.get() == process.output.split('\n')[0]
     create(master, '/another')
     assert changes.mailbox.get() in ('node', 'topic', 'service')
@@ -182,6 +204,7 @@ def test_a_falsy_node_is_known_as_a_node_of_this_process(master):
     class Empty(Node):
         def __len__(self):
             return 0
+
     node = master.create(Empty, named='/falsy_node', domain='127.0.0.1')
     assert master.node('/falsy_node') is master.wait_for_node('/falsy_node', 20) is node
     node.interested_in('/falsy_topic', 'std_msgs/Empty')

@@ -1,7 +1,8 @@
-"""Clients that misbehave: none keeps others out, costs much, or ends anything; each is logged once, with its address.
+"""Clients that misbehave: none keeps others out, costs much, or ends anything; each is logged once,
+with its address.
 
-With rospy, one silent client blocks all new connections (ros_comm PR #1918), 4 GiB announced are waited for, and what
-is refused becomes a traceback in the log that does not say who it was.
+With rospy, one silent client blocks all new connections (ros_comm PR #1918), 4 GiB announced are
+waited for, and what is refused becomes a traceback in the log that does not say who it was.
 """
 import contextlib
 import io
@@ -25,7 +26,7 @@ from pharos import BlockNode
 from pharos.private_rospy import door, registration, servers, xmlrpc_server
 from programs import Program, until
 
-FUZZ_COUNT = int(os.environ.get('PHAROS_FUZZ_COUNT', 2500))    # bad clients; tools/soak makes it more
+FUZZ_COUNT = int(os.environ.get('PHAROS_FUZZ_COUNT', 2500))  # bad clients; tools/soak makes it more
 STRING = std_msgs.msg.String
 
 
@@ -38,7 +39,7 @@ def connect(port):
 
 
 def threads(node, kind):
-    return [thread.name for thread in threading.enumerate() if thread.name == '%s %s' % (node.name, kind)]
+    return [thread.name for thread in threading.enumerate() if thread.name == f'{node.name} {kind}']
 
 
 def address_of(client):
@@ -54,11 +55,20 @@ def is_closed(client):
 
 
 def answers(node):
-    """Whether the node answers an XML-RPC call, and a fresh subscriber receives what it publishes."""
+    """Whether the node answers an XML-RPC call, and a fresh subscriber receives what it
+    publishes."""
     with xmlrpc.client.ServerProxy(node.uri) as proxy, connect(node.tcp_port) as subscriber:
         assert proxy.getPid('/test')[0] == 1
-        subscriber.sendall(encode_ros_handshake_header(
-            {'callerid': '/test', 'topic': '/clients/out', 'type': STRING._type, 'md5sum': STRING._md5sum}))
+        subscriber.sendall(
+            encode_ros_handshake_header(
+                {
+                    'callerid': '/test',
+                    'topic': '/clients/out',
+                    'type': STRING._type,
+                    'md5sum': STRING._md5sum,
+                }
+            )
+        )
         file = subscriber.makefile('rb')
         file.read(*struct.unpack('<I', file.read(4)))
         return file.read(*struct.unpack('<I', file.read(4))) == struct.pack('<I', 5) + b'hello'
@@ -82,10 +92,14 @@ def screen(monkeypatch):
 @pytest.fixture
 def node(master, warnings, screen):
     """A node that publishes and serves; no traceback gets to its log or to the screen."""
+
     def keep(line, channel):
         if line.name == '/node' and line.level > line.INFO:
             warnings(line.msg, channel)
-    log_lines = create(master, '/auditor', delegate=keep).interested_in('/rosout', 'rosgraph_msgs/Log')
+
+    log_lines = create(master, '/auditor', delegate=keep).interested_in(
+        '/rosout', 'rosgraph_msgs/Log'
+    )
     log = pathlib.Path(os.environ['ROS_LOG_DIR']) / 'node.log'
     logged_before = log.stat().st_size if log.exists() else 0
     node = create(master, '/node')
@@ -100,7 +114,7 @@ def node(master, warnings, screen):
     assert 'Traceback' not in screen.getvalue()
 
 
-# -- silent and slow clients, and many of them ------------------------------------------------------------------------
+# -- silent and slow clients, and many of them
 
 HANG = """
 import signal, socket, struct, sys
@@ -118,19 +132,26 @@ signal.pause()
 def test_hundreds_of_silent_clients_keep_nobody_out(master, mailbox, node, warnings, monkeypatch):
     """400 at each port say nothing, or begin and do not go on."""
     monkeypatch.setattr(servers, 'HANDSHAKE_TIMEOUT', TIMEOUT)
-    with Program(master.url, sys.executable, '-c', HANG, str(node.tcp_port), str(node.xmlrpc_port)) as crowd:
+    with Program(
+        master.url, sys.executable, '-c', HANG, str(node.tcp_port), str(node.xmlrpc_port)
+    ) as crowd:
         crowd.wait_for('there')
         receiver = create(master, '/receiver')
-        speak_tcpros_only(receiver).ros.Subscriber('/clients/out', STRING, lambda message: mailbox(message, None))    # through TCPROS
+        # through TCPROS
+        speak_tcpros_only(receiver).ros.Subscriber(
+            '/clients/out', STRING, lambda message: mailbox(message, None)
+        )
         assert mailbox.get().data == 'hello'
         assert answers(node) and rosnode.rosnode_ping('/node', max_count=1)
         assert master.lookup_service('/clients/set').call(data=True, timeout=TIMEOUT).success
         for kind in 'TCPROS', 'XML-RPC':
             until(lambda: len(threads(node, kind)) <= door.CLIENTS)
-            assert len(threads(node, kind)) > 1    # some do hang there
+            assert len(threads(node, kind)) > 1  # some do hang there
         assert {warnings.get(), warnings.get()} == {
             '%d %s clients say nothing: those that said nothing for longest are closed, to let others in'
-            % (door.CLIENTS, kind) for kind in ('TCPROS', 'XML-RPC')}
+            % (door.CLIENTS, kind)
+            for kind in ('TCPROS', 'XML-RPC')
+        }
         assert warnings.empty()
 
 
@@ -147,7 +168,9 @@ print('all were served')
 """
 
 
-def test_of_hundreds_of_good_clients_none_is_taken_for_a_silent_one(master, node, warnings, monkeypatch):
+def test_of_hundreds_of_good_clients_none_is_taken_for_a_silent_one(
+    master, node, warnings, monkeypatch
+):
     """Those that come in a rush wait for their turn; it is 0.25 s otherwise until one is silent."""
     monkeypatch.setattr(door, 'GRACE', TIMEOUT)
     request = post(call('getPid', '/test'), more='Connection: close\r\n')
@@ -163,7 +186,10 @@ def test_a_slow_handshake_ends_after_its_limit(node, warnings, monkeypatch):
     with connect(node.tcp_port) as client:
         dribble(client, struct.pack('<I', 100000))
         assert is_closed(client)
-        assert warnings.get() == 'TCPROS client %s refused: no handshake within 0.3 s' % address_of(client)
+        assert (
+            warnings.get()
+            == f'TCPROS client {address_of(client)} refused: no handshake within 0.3 s'
+        )
     assert answers(node) and warnings.empty()
 
 
@@ -173,7 +199,7 @@ def test_a_slow_request_ends_after_its_limit(node, warnings, monkeypatch):
         dribble(client, b'POST / HTTP/1.1\r\nContent-Length: 10000\r\n\r\n')
         assert is_closed(client)
         line = warnings.get()
-        assert line.startswith('XML-RPC client %s refused: Request timed out' % address_of(client))
+        assert line.startswith(f'XML-RPC client {address_of(client)} refused: Request timed out')
     assert answers(node) and warnings.empty()
 
 
@@ -208,9 +234,15 @@ resource.setrlimit(resource.RLIMIT_NOFILE, (limit, limit))
 print('ports', node.tcp_port, node.xmlrpc_port, flush=True)
 pharos.spin()
 '''
-    with Program(master.url, sys.executable, '-c', program) as poor, contextlib.ExitStack() as clients:
+    with Program(
+        master.url, sys.executable, '-c', program
+    ) as poor, contextlib.ExitStack() as clients:
         tcp_port, xmlrpc_port = map(int, poor.wait_for('ports').split()[1:])
-        crowd = [clients.enter_context(connect(port)) for port in (tcp_port, xmlrpc_port) for _ in range(40)]
+        crowd = [
+            clients.enter_context(connect(port))
+            for port in (tcp_port, xmlrpc_port)
+            for _ in range(40)
+        ]
         poor.wait_for('Too many open files')
         for client in crowd:
             client.close()
@@ -223,6 +255,7 @@ pharos.spin()
 def test_a_client_for_whom_there_is_no_thread_is_closed(node, warnings, monkeypatch):
     def start(thread):
         raise RuntimeError("can't start new thread")
+
     with monkeypatch.context() as patch:
         patch.setattr(node._rospy._lifetime.Thread, 'start', start)
         for port in node.tcp_port, node.xmlrpc_port:
@@ -236,56 +269,74 @@ def named(value):
     return '' if isinstance(value, bytes) else ascii(value)[1:30]
 
 
-# -- handshakes -------------------------------------------------------------------------------------------------------
+# -- handshakes
+
 
 def shake(**fields):
     """The bytes of a subscriber's handshake, with these fields; None: without that one."""
-    header = {'callerid': '/bad', 'topic': '/clients/out', 'type': STRING._type, 'md5sum': STRING._md5sum, **fields}
-    return encode_ros_handshake_header({name: value for name, value in header.items() if value is not None})
+    header = {
+        'callerid': '/bad',
+        'topic': '/clients/out',
+        'type': STRING._type,
+        'md5sum': STRING._md5sum,
+        **fields,
+    }
+    return encode_ros_handshake_header(
+        {name: value for name, value in header.items() if value is not None}
+    )
 
 
 def assert_refused_and_logged_once(node, port, kind, warnings, said, logged):
     with connect(port) as client:
-        with contextlib.suppress(ConnectionError):    # it closes before all of a long one is said
+        with contextlib.suppress(ConnectionError):  # it closes before all of a long one is said
             client.sendall(said)
             client.shutdown(socket.SHUT_WR)
         assert is_closed(client)
         line = warnings.get()
-        assert logged in line and line.startswith('%s client %s refused: ' % (kind, address_of(client)))
+        assert logged in line and line.startswith(f'{kind} client {address_of(client)} refused: ')
     assert '\n' not in line and len(line) < 500
     assert answers(node) and warnings.empty()
 
 
-@pytest.mark.parametrize('said, logged', [
-    (struct.pack('<I', 0xffffffff), '4294967299 bytes; the limit is'),
-    (b'GET / HTTP/1.0\r\n\r\n', 'the limit is'),
-    (struct.pack('<I', 4) + struct.pack('<I', 0), '0-length'),
-    (struct.pack('<I', 7) + struct.pack('<I', 3) + b'abc', 'Invalid line'),
-    (struct.pack('<I', 0), 'no topic or service name detected'),
-    (struct.pack('<I', 2) + b'ab', 'unpack requires'),
-    (struct.pack('<I', 7) + struct.pack('<I', 3) + b'\xff=a', "can't decode byte"),
-    (b'', 'closed within the handshake'),
-    (b'\x01\x02', 'closed within the handshake'),
-    (shake()[:-3], 'closed within the handshake'),
-    (shake(topic=None), 'no topic or service name detected (/bad)'),
-    (shake(callerid=None), "Missing required 'callerid' field"),
-    (shake(topic='/clients/other'), '[/node] is not a publisher of [/clients/other]'),
-    (shake(md5sum='0' * 32), 'to have datatype/md5sum'),
-    (shake(topic=None, service='/clients/none'), 'is not a provider of  [/clients/none]'),
-    (shake(callerid='/a\nINFO: all is well'), r'/a\nINFO: all is well can be no callerid'),
-    (shake(callerid='\x1b[2J'), r'\x1b[2J can be no callerid'),
-    (shake(callerid='/' + 'a' * 1000000), 'aaa... can be no callerid'),
-    (shake(topic='/\x00'), r'/\x00 can be no topic'),
-    (shake(topic='/%s%n%(x)s{0.__class__}'), '[/node] is not a publisher of [/%s%n%(x)s{0.__class__}]'),
-], ids=named)
+@pytest.mark.parametrize(
+    'said, logged',
+    [
+        (struct.pack('<I', 0xFFFFFFFF), '4294967299 bytes; the limit is'),
+        (b'GET / HTTP/1.0\r\n\r\n', 'the limit is'),
+        (struct.pack('<I', 4) + struct.pack('<I', 0), '0-length'),
+        (struct.pack('<I', 7) + struct.pack('<I', 3) + b'abc', 'Invalid line'),
+        (struct.pack('<I', 0), 'no topic or service name detected'),
+        (struct.pack('<I', 2) + b'ab', 'unpack requires'),
+        (struct.pack('<I', 7) + struct.pack('<I', 3) + b'\xff=a', "can't decode byte"),
+        (b'', 'closed within the handshake'),
+        (b'\x01\x02', 'closed within the handshake'),
+        (shake()[:-3], 'closed within the handshake'),
+        (shake(topic=None), 'no topic or service name detected (/bad)'),
+        (shake(callerid=None), "Missing required 'callerid' field"),
+        (shake(topic='/clients/other'), '[/node] is not a publisher of [/clients/other]'),
+        (shake(md5sum='0' * 32), 'to have datatype/md5sum'),
+        (shake(topic=None, service='/clients/none'), 'is not a provider of  [/clients/none]'),
+        (shake(callerid='/a\nINFO: all is well'), r'/a\nINFO: all is well can be no callerid'),
+        (shake(callerid='\x1b[2J'), r'\x1b[2J can be no callerid'),
+        (shake(callerid='/' + 'a' * 1000000), 'aaa... can be no callerid'),
+        (shake(topic='/\x00'), r'/\x00 can be no topic'),
+        (
+            shake(topic='/%s%n%(x)s{0.__class__}'),
+            '[/node] is not a publisher of [/%s%n%(x)s{0.__class__}]',
+        ),
+    ],
+    ids=named,
+)
 def test_a_bad_handshake_is_refused_and_logged_once(node, warnings, said, logged):
     assert_refused_and_logged_once(node, node.tcp_port, 'TCPROS', warnings, said, logged)
 
 
 def test_a_caller_id_is_shown_as_it_is(node, warnings, screen):
-    """It comes to the log and the screen, and to those who ask for the node's connections, whatever it is made of.
+    """It comes to the log and the screen, and to those who ask for the node's connections, whatever
+    it is made of.
 
-    rosgraph takes '${time:' in a message for a part of its own format, and raises where it is logged.
+    rosgraph takes '${time:' in a message for a part of its own format, and raises where it is
+    logged.
     """
     name = '/%s%n%(x)s{0.__class__}<&>${time:${message}'
     with connect(node.tcp_port) as client, xmlrpc.client.ServerProxy(node.uri) as proxy:
@@ -296,12 +347,17 @@ def test_a_caller_id_is_shown_as_it_is(node, warnings, screen):
             other.sendall(shake(callerid=name, md5sum='0' * 32))
             is_closed(other)
         line = warnings.get()
-        assert 'Client [%s] wants topic' % name in line and line in screen.getvalue()
+        assert f'Client [{name}] wants topic' in line and line in screen.getvalue()
 
 
 def test_a_node_whose_screen_is_closed_refuses_as_before(node, warnings):
-    """With rospy, it is an error of whoever logs; here that would be the thread that is to close the connection."""
-    screen, = [handler for handler in node._rospy._logging.getLogger('rosout').handlers if hasattr(handler, '_stderr')]
+    """With rospy, it is an error of whoever logs; here that would be the thread that is to close
+    the connection."""
+    (screen,) = [
+        handler
+        for handler in node._rospy._logging.getLogger('rosout').handlers
+        if hasattr(handler, '_stderr')
+    ]
     screen._stderr = io.StringIO()
     screen._stderr.close()
     with connect(node.tcp_port) as client:
@@ -310,7 +366,8 @@ def test_a_node_whose_screen_is_closed_refuses_as_before(node, warnings):
     assert 'no topic or service' in warnings.get() and answers(node)
 
 
-# -- service clients --------------------------------------------------------------------------------------------------
+# -- service clients
+
 
 def call_service(node, **fields):
     """A connection to the node's service, that has shaken hands."""
@@ -323,24 +380,33 @@ def call_service(node, **fields):
 
 
 @pytest.mark.parametrize('persistent', ['0', '1'])
-@pytest.mark.parametrize('said, logged', [
-    (struct.pack('<I', 0xffffffff), 'a message of 4294967295 bytes; the limit is'),
-    (struct.pack('<I', 0), 'cannot deserialize'),
-], ids=named)
-def test_a_bad_request_of_a_service_ends_its_connection(master, node, warnings, said, logged, persistent):
+@pytest.mark.parametrize(
+    'said, logged',
+    [
+        (struct.pack('<I', 0xFFFFFFFF), 'a message of 4294967295 bytes; the limit is'),
+        (struct.pack('<I', 0), 'cannot deserialize'),
+    ],
+    ids=named,
+)
+def test_a_bad_request_of_a_service_ends_its_connection(
+    master, node, warnings, said, logged, persistent
+):
     """With rospy, it raises in a thread of its own and the connection stays open."""
     with call_service(node, persistent=persistent) as client:
         client.sendall(said)
         assert is_closed(client)
         line = warnings.get()
-        assert logged in line and line.startswith('service client %s refused: ' % address_of(client))
+        assert logged in line and line.startswith(f'service client {address_of(client)} refused: ')
     assert master.lookup_service('/clients/set').call(data=True).success and warnings.empty()
 
 
 def test_a_service_client_that_leaves_without_a_request_is_logged_once(node, warnings):
     with call_service(node) as client:
         address = address_of(client)
-    assert warnings.get().startswith('service client %s refused: unable to receive' % address) and warnings.empty()
+    assert (
+        warnings.get().startswith(f'service client {address} refused: unable to receive')
+        and warnings.empty()
+    )
 
 
 def test_a_client_that_does_not_wait_for_its_answer_is_no_error(master, node, warnings):
@@ -351,9 +417,11 @@ def test_a_client_that_does_not_wait_for_its_answer_is_no_error(master, node, wa
         assert left.wait(TIMEOUT)
         served.set()
         return {'message': 'x' * 10000000}
+
     node.serve('/clients/slow', 'std_srvs/Trigger', answer)
     with call_service(node, service='/clients/slow') as client:
-        client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack('ii', 1, 0))    # close() breaks off
+        # close() breaks off
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack('ii', 1, 0))
         client.sendall(struct.pack('<I', 0))
         assert asked.wait(TIMEOUT)
     left.set()
@@ -367,6 +435,7 @@ def test_service_clients_that_ask_nothing_keep_nobody_out(master, node, warnings
             client.sendall(struct.pack('<I', 1) + b'\1')
             assert client.recv(1) == b'\1'
             return not warnings.empty()
+
     with contextlib.ExitStack() as clients:
         longest, *_ = [clients.enter_context(call_service(node)) for _ in range(door.CLIENTS + 20)]
         until(ask)
@@ -375,23 +444,33 @@ def test_service_clients_that_ask_nothing_keep_nobody_out(master, node, warnings
 
 
 def test_a_publisher_that_announces_4_gib_is_left_and_found_again(master, mailbox, node, warnings):
-    """With rospy, what was received stays in the buffer, and no later message of that connection is understood."""
+    """With rospy, what was received stays in the buffer, and no later message of that connection is
+    understood."""
     other = create(master, '/other')
     sent = other.output_channel('/clients/in', STRING)
     speak_tcpros_only(node)
     node.ros.Subscriber('/clients/in', STRING, lambda message: mailbox(message, None))
-    for said, logged in (struct.pack('<I', 0xffffffff), '4294967295'), (struct.pack('<I', 0), 'cannot deserialize'):
+    for said, logged in (struct.pack('<I', 0xFFFFFFFF), '4294967295'), (
+        struct.pack('<I', 0),
+        'cannot deserialize',
+    ):
         assert sent.wait_for_subscribers(1, TIMEOUT)
-        connection, = other._rospy.publisher('/clients/in').connections
+        (connection,) = other._rospy.publisher('/clients/in').connections
         connection.write_data(said)
         line = warnings.get()
-        assert logged in line and line.startswith('connection with %s for /clients/in closed: ' % other.uri)
-        until(lambda: connection not in other._rospy.publisher('/clients/in').connections and sent.connections)
+        assert logged in line and line.startswith(
+            f'connection with {other.uri} for /clients/in closed: '
+        )
+        until(
+            lambda: connection not in other._rospy.publisher('/clients/in').connections
+            and sent.connections
+        )
     sent.send(data='understood')
     assert mailbox.get().data == 'understood'
 
 
-# -- XML-RPC ----------------------------------------------------------------------------------------------------------
+# -- XML-RPC
+
 
 def call(method, *parameters):
     return xmlrpc.client.dumps(parameters, method).encode()
@@ -399,86 +478,130 @@ def call(method, *parameters):
 
 def post(body, head='POST / HTTP/1.1', length=None, more=''):
     length = len(body) if length is None else length
-    return ('%s\r\nContent-Length: %s\r\n%s\r\n' % (head, length, more)).encode() + body
+    return (f'{head}\r\nContent-Length: {length}\r\n{more}\r\n').encode() + body
 
 
 PID = call('getPid', '/test')
-LAUGHS = b'<!DOCTYPE a [<!ENTITY b "ha"><!ENTITY c "&b;&b;">]>' + call('getPid', 'x').replace(b'>x<', b'>&c;<')
+LAUGHS = b'<!DOCTYPE a [<!ENTITY b "ha"><!ENTITY c "&b;&b;">]>' + call('getPid', 'x').replace(
+    b'>x<', b'>&c;<'
+)
 
 
-@pytest.mark.parametrize('said, logged', [
-    (random.Random(1).randbytes(5000) + b'\r\n', 'code 4'),
-    (b'\0' * 100000, 'code 414'),
-    (shake(), 'code 400'),
-    (b'POST / HTTP/1.1\r\nContent-Le', 'code 411'),
-    (post(PID)[:-10], 'closed after %d of %d bytes' % (len(PID) - 10, len(PID))),
-    (b'POST / HTTP/1.1\r\n\r\n' + PID, 'code 411'),
-    (post(b'5\r\nabcde\r\n0\r\n\r\n', more='Transfer-Encoding: chunked\r\n'), 'code 411'),
-    (post(PID, length=-1), 'code 411'),
-    (post(PID, length='1e3'), 'code 411'),
-    (post(PID, length=8 << 30), 'a request of 8589934592 bytes; the limit is'),
-    (post(PID, length='9' * 5000), 'the limit is'),
-    (post(PID, more='Content-Encoding: gzip\r\n'), 'code 415'),
-    (post(PID, more='X: %s\r\n' % ('y' * 70000)), 'code 431'),
-    (post(PID, more='X: y\r\n' * 200), 'code 431'),
-    (post(PID, head='GET / HTTP/1.1'), 'code 501'),
-    (post(PID, head='POST /etc/passwd HTTP/1.1'), 'code 404'),
-    (post(PID, head='POST / HTTP/7.1'), 'code 505'),
-    (post(b''), 'no XML-RPC call: no element found'),
-    (post(b'\xff\xfe garbage'), 'no XML-RPC call: '),
-    (post(b'<a/>'), 'no XML-RPC call: '),
-    (post(PID[:-5]), 'no XML-RPC call: '),
-    (post(LAUGHS), 'no XML-RPC call: it has a document type'),
-    (post(LAUGHS.decode().encode('utf-16')), 'no XML-RPC call: it has a document type'),
-    (post(call('getPid', '/test').replace(b'/test', b'\x01')), 'no XML-RPC call: '),
-    (post(call('nothing', '/test')), 'call of nothing: method "nothing" is not supported'),
-    (post(call('_shutdown', '/test')), 'method "_shutdown" is not supported'),
-    (post(call('reg_man.cleanup', '/test')), 'method "reg_man.cleanup" is not supported'),
-    (post(call('reg_man', '/test')), 'not callable'),
-    (post(call('no\nbody')), r'call of no\nbody: '),
-    (post(call('n' * 100000)), 'nnn...'),
-    (post(call('publisherUpdate', '/test', '/clients/in', ['http://a/'] * 2000)), '2000 publishers; the limit is'),
-    (post(call('system.multicall', [{'methodName': 'nothing', 'params': []}])), 'call of nothing: '),
-], ids=named)
+@pytest.mark.parametrize(
+    'said, logged',
+    [
+        (random.Random(1).randbytes(5000) + b'\r\n', 'code 4'),
+        (b'\0' * 100000, 'code 414'),
+        (shake(), 'code 400'),
+        (b'POST / HTTP/1.1\r\nContent-Le', 'code 411'),
+        (post(PID)[:-10], 'closed after %d of %d bytes' % (len(PID) - 10, len(PID))),
+        (b'POST / HTTP/1.1\r\n\r\n' + PID, 'code 411'),
+        (post(b'5\r\nabcde\r\n0\r\n\r\n', more='Transfer-Encoding: chunked\r\n'), 'code 411'),
+        (post(PID, length=-1), 'code 411'),
+        (post(PID, length='1e3'), 'code 411'),
+        (post(PID, length=8 << 30), 'a request of 8589934592 bytes; the limit is'),
+        (post(PID, length='9' * 5000), 'the limit is'),
+        (post(PID, more='Content-Encoding: gzip\r\n'), 'code 415'),
+        (post(PID, more=f"X: {'y' * 70000}\r\n"), 'code 431'),
+        (post(PID, more='X: y\r\n' * 200), 'code 431'),
+        (post(PID, head='GET / HTTP/1.1'), 'code 501'),
+        (post(PID, head='POST /etc/passwd HTTP/1.1'), 'code 404'),
+        (post(PID, head='POST / HTTP/7.1'), 'code 505'),
+        (post(b''), 'no XML-RPC call: no element found'),
+        (post(b'\xff\xfe garbage'), 'no XML-RPC call: '),
+        (post(b'<a/>'), 'no XML-RPC call: '),
+        (post(PID[:-5]), 'no XML-RPC call: '),
+        (post(LAUGHS), 'no XML-RPC call: it has a document type'),
+        (post(LAUGHS.decode().encode('utf-16')), 'no XML-RPC call: it has a document type'),
+        (post(call('getPid', '/test').replace(b'/test', b'\x01')), 'no XML-RPC call: '),
+        (post(call('nothing', '/test')), 'call of nothing: method "nothing" is not supported'),
+        (post(call('_shutdown', '/test')), 'method "_shutdown" is not supported'),
+        (post(call('reg_man.cleanup', '/test')), 'method "reg_man.cleanup" is not supported'),
+        (post(call('reg_man', '/test')), 'not callable'),
+        (post(call('no\nbody')), r'call of no\nbody: '),
+        (post(call('n' * 100000)), 'nnn...'),
+        (
+            post(call('publisherUpdate', '/test', '/clients/in', ['http://a/'] * 2000)),
+            '2000 publishers; the limit is',
+        ),
+        (
+            post(call('system.multicall', [{'methodName': 'nothing', 'params': []}])),
+            'call of nothing: ',
+        ),
+    ],
+    ids=named,
+)
 def test_a_bad_call_is_refused_and_logged_once(node, warnings, said, logged):
     assert_refused_and_logged_once(node, node.xmlrpc_port, 'XML-RPC', warnings, said, logged)
 
 
-# what ROS's slave API says to a call that does not suit it: as bare rospy, and no warning (rospy itself writes none)
+# what ROS's slave API says to a call that does not suit it: as bare rospy, and no warning (rospy
+# itself writes none)
 SLAVE_API = {
-    'getPid': (), 'getBusStats': (), 'getBusInfo': (), 'getMasterUri': (), 'getUri': (), 'getName': (),
-    'getSubscriptions': (), 'getPublications': (), 'shutdown': ('a reason',),
-    'paramUpdate': ('/clients/parameter', 1), 'publisherUpdate': ('/clients/none', []),
+    'getPid': (),
+    'getBusStats': (),
+    'getBusInfo': (),
+    'getMasterUri': (),
+    'getUri': (),
+    'getName': (),
+    'getSubscriptions': (),
+    'getPublications': (),
+    'shutdown': ('a reason',),
+    'paramUpdate': ('/clients/parameter', 1),
+    'publisherUpdate': ('/clients/none', []),
     'requestTopic': ('/clients/out', [['TCPROS']]),
 }
-WRONG_NUMBERS = [(method, arguments) for method, parameters in SLAVE_API.items()
-                 for right in [('/test', *parameters)] for arguments in [*(right[:n] for n in range(len(right))),
-                                                                         (*right, 'one more')]]
+WRONG_NUMBERS = [
+    (method, arguments)
+    for method, parameters in SLAVE_API.items()
+    for right in [('/test', *parameters)]
+    for arguments in [*(right[:n] for n in range(len(right))), (*right, 'one more')]
+]
 
 
-@pytest.mark.parametrize('method, arguments, code, said', [
-    *((method, arguments, -1, 'caller_id' if not arguments else 'bad call arity')
-      for method, arguments in WRONG_NUMBERS),
-    *((method, (5, *parameters), -1, 'caller_id must be a string') for method, parameters in SLAVE_API.items()),
-    ('paramUpdate', ('/test', 7, 7), -1, 'parameter_key'),
-    ('paramUpdate', ('/test', '', 7), -1, 'parameter_key'),
-    ('paramUpdate', ('/test', 'no/namespace', 7), -1, 'parameter_key'),
-    ('paramUpdate', ('/test', '/%s/{0}/../../etc/passwd\n', 1), -1, 'not subscribed'),
-    ('paramUpdate', ('/test', '/' + 'a' * 1000000, {'': [1, {'b': {}}]}), -1, 'not subscribed'),
-    ('requestTopic', ('/test', '/clients/none', [['TCPROS']]), -1, 'Not a publisher of'),
-    ('requestTopic', ('/test', '/clients/out', []), -1, 'non-empty'),
-    ('requestTopic', ('/test', '/clients/out', 5), -1, 'invalid arguments'),
-    ('requestTopic', ('/test', '/clients/out', [[]]), 0, 'Internal failure: '),
-    ('requestTopic', ('/test', '/clients/out', [['CARRIER-PIGEON']]), 0, 'no supported protocol'),
-    ('requestTopic', ('/test', {}, [['TCPROS']]), -1, 'ERROR'),
-    ('publisherUpdate', ('/test', '/../../tmp/%s', ['http://127.0.0.1:1/']), 1, ''),
-    ('publisherUpdate', ('/test', '/clients/in', 'http://127.0.0.1:1/'), -1, 'must be a list'),
-    ('publisherUpdate', ('/test', '/clients/in', [5]), -1, 'must be a list of strings'),
-    ('publisherUpdate', ('/test', '/clients/in', ['gopher']), -1, 'does not contain valid URLs [gopher]'),
-    ('publisherUpdate', ('/test', '/clients/in', ['http://[']), 0, 'Invalid IPv6 URL'),
-], ids=named)
-def test_a_call_that_does_not_suit_the_slave_api_is_answered_and_no_warning(node, warnings, method, arguments, code,
-                                                                            said):
+@pytest.mark.parametrize(
+    'method, arguments, code, said',
+    [
+        *(
+            (method, arguments, -1, 'caller_id' if not arguments else 'bad call arity')
+            for method, arguments in WRONG_NUMBERS
+        ),
+        *(
+            (method, (5, *parameters), -1, 'caller_id must be a string')
+            for method, parameters in SLAVE_API.items()
+        ),
+        ('paramUpdate', ('/test', 7, 7), -1, 'parameter_key'),
+        ('paramUpdate', ('/test', '', 7), -1, 'parameter_key'),
+        ('paramUpdate', ('/test', 'no/namespace', 7), -1, 'parameter_key'),
+        ('paramUpdate', ('/test', '/%s/{0}/../../etc/passwd\n', 1), -1, 'not subscribed'),
+        ('paramUpdate', ('/test', '/' + 'a' * 1000000, {'': [1, {'b': {}}]}), -1, 'not subscribed'),
+        ('requestTopic', ('/test', '/clients/none', [['TCPROS']]), -1, 'Not a publisher of'),
+        ('requestTopic', ('/test', '/clients/out', []), -1, 'non-empty'),
+        ('requestTopic', ('/test', '/clients/out', 5), -1, 'invalid arguments'),
+        ('requestTopic', ('/test', '/clients/out', [[]]), 0, 'Internal failure: '),
+        (
+            'requestTopic',
+            ('/test', '/clients/out', [['CARRIER-PIGEON']]),
+            0,
+            'no supported protocol',
+        ),
+        ('requestTopic', ('/test', {}, [['TCPROS']]), -1, 'ERROR'),
+        ('publisherUpdate', ('/test', '/../../tmp/%s', ['http://127.0.0.1:1/']), 1, ''),
+        ('publisherUpdate', ('/test', '/clients/in', 'http://127.0.0.1:1/'), -1, 'must be a list'),
+        ('publisherUpdate', ('/test', '/clients/in', [5]), -1, 'must be a list of strings'),
+        (
+            'publisherUpdate',
+            ('/test', '/clients/in', ['gopher']),
+            -1,
+            'does not contain valid URLs [gopher]',
+        ),
+        ('publisherUpdate', ('/test', '/clients/in', ['http://[']), 0, 'Invalid IPv6 URL'),
+    ],
+    ids=named,
+)
+def test_a_call_that_does_not_suit_the_slave_api_is_answered_and_no_warning(
+    node, warnings, method, arguments, code, said
+):
     with xmlrpc.client.ServerProxy(node.uri) as proxy:
         answer = getattr(proxy, method)(*arguments)
     assert answer[0] == code and said in answer[1] and len(answer) == 3
@@ -498,12 +621,17 @@ def test_a_parameter_update_for_no_parameter_is_told_to_nobody(node):
 def test_a_flood_of_bad_clients_does_not_fill_the_log(node, warnings, monkeypatch):
     monkeypatch.setattr(door, 'COMPLAINT_PERIOD', 3600)
     with xmlrpc.client.ServerProxy(node.uri) as proxy:
+
         def refused():
             with contextlib.suppress(xmlrpc.client.Fault):
                 proxy.nothing()
+
         for _ in range(door.COMPLAINTS + 5):
             refused()
-        assert all('call of nothing' in line for line in warnings.take(door.COMPLAINTS)) and warnings.empty()
+        assert (
+            all('call of nothing' in line for line in warnings.take(door.COMPLAINTS))
+            and warnings.empty()
+        )
         monkeypatch.setattr(door, 'COMPLAINT_PERIOD', 0)
         refused()
     assert 'and 5 more' in warnings.get()
@@ -513,12 +641,14 @@ def test_only_a_few_large_requests_are_held_at_a_time(node, warnings):
     """Hundreds of clients that each send all but the last byte of 8 MB do not fill the memory."""
     size = xmlrpc_server.REQUEST_LIMIT
     with contextlib.ExitStack() as clients:
+
         def answer():
             client = clients.enter_context(connect(node.xmlrpc_port))
             client.sendall(post(b'', length=size, more='Expect: 100-continue\r\n'))
             return client.recv(100)
+
         for _ in range(xmlrpc_server.LARGE_REQUESTS):
-            assert answer().startswith(b'HTTP/1.1 100')    # it waits for the body
+            assert answer().startswith(b'HTTP/1.1 100')  # it waits for the body
         assert answer().startswith(b'HTTP/1.1 503')
         assert 'too many large requests at once' in warnings.get()
         assert answers(node)
@@ -526,19 +656,25 @@ def test_only_a_few_large_requests_are_held_at_a_time(node, warnings):
 
 def test_a_large_call_is_answered(node, warnings):
     with xmlrpc.client.ServerProxy(node.uri) as proxy:
-        assert proxy.paramUpdate('/test', '/robot_description', 'x' * 2000000)[0] == -1    # not subscribed
+        # not subscribed
+        assert proxy.paramUpdate('/test', '/robot_description', 'x' * 2000000)[0] == -1
         assert proxy.getPid('/test')[0] == 1
     assert warnings.empty()
 
 
-# -- all at once ------------------------------------------------------------------------------------------------------
+# -- all at once
+
 
 def test_thousands_of_mutated_handshakes_and_calls_change_nothing(master, mailbox, node):
     seed = int(os.environ.get('PHAROS_FUZZ_SEED', 0)) or random.randrange(1, 1 << 32)
     node.delegate = mailbox
     node.interested_in('/clients/in', STRING)
     resting = len(threading.enumerate())
-    clients = Fuzz(seed, topics=[('/clients/out', STRING._type, STRING._md5sum)], services=[('/clients/set', '*')])
+    clients = Fuzz(
+        seed,
+        topics=[('/clients/out', STRING._type, STRING._md5sum)],
+        services=[('/clients/set', '*')],
+    )
     try:
         clients.attack(node.tcp_port, node.xmlrpc_port, FUZZ_COUNT)
         assert answers(node) and rosnode.rosnode_ping('/node', max_count=1)
@@ -551,9 +687,9 @@ def test_thousands_of_mutated_handshakes_and_calls_change_nothing(master, mailbo
         raise AssertionError('after Fuzz(%d): PHAROS_FUZZ_SEED repeats it' % seed) from error
 
 
-# -- who may stop a node ----------------------------------------------------------------------------------------------
+# -- who may stop a node
 
-FAR = '192.0.2.7'    # of a range that no host has (RFC 5737)
+FAR = '192.0.2.7'  # of a range that no host has (RFC 5737)
 
 
 @pytest.fixture
@@ -572,9 +708,11 @@ def test_another_host_may_not_stop_a_node(node, warnings, far_client):
 
 
 def test_nor_through_a_multicall_or_in_the_name_of_the_master(node, far_client):
-    taken = '[/node] Reason: new node registered with same name'    # what a master says; this one knows better
+    taken = '[/node] Reason: new node registered with same name'  # what a master says; this one knows better
     with xmlrpc.client.ServerProxy(node.uri) as proxy:
-        (answer,), = proxy.system.multicall([{'methodName': 'shutdown', 'params': ['/intruder', 'go away']}])
+        ((answer,),) = proxy.system.multicall(
+            [{'methodName': 'shutdown', 'params': ['/intruder', 'go away']}]
+        )
         assert answer[0] == -1
         proxy.shutdown('/master', taken)
     assert answers(node)
@@ -583,6 +721,7 @@ def test_nor_through_a_multicall_or_in_the_name_of_the_master(node, far_client):
 def test_a_node_may_allow_it(master, far_client):
     class Trusting(BlockNode):
         allow_remote_shutdown = True
+
     node = master.create(Trusting, named='/trusting', domain='127.0.0.1')
     with xmlrpc.client.ServerProxy(node.uri) as proxy:
         assert proxy.shutdown('/friend', 'please')[0] == 1
@@ -597,22 +736,28 @@ def test_the_same_host_may_stop_a_node(master):
 
 
 def test_the_master_may_stop_a_node_whose_name_it_gave_away(master, far_client):
-    """From wherever it calls: a host may have many addresses, but the master itself says whose the name is."""
+    """From wherever it calls: a host may have many addresses, but the master itself says whose the
+    name is."""
     node = create(master, '/taken_over')
-    master._api('/taken_over').registerPublisher('/clients/taken', 'std_msgs/String', 'http://127.0.0.1:1/')
+    master._api('/taken_over').registerPublisher(
+        '/clients/taken', 'std_msgs/String', 'http://127.0.0.1:1/'
+    )
     until(lambda: node.lifecycle.value == 'stopped')
     master._api('/taken_over').unregisterPublisher('/clients/taken', 'http://127.0.0.1:1/')
 
 
-@pytest.mark.parametrize('ends, master_url, nearby', [
-    ((FAR, '192.0.2.1'), 'http://127.0.0.1:11311/', False),
-    ((FAR, '192.0.2.1'), 'http://%s:11311/' % FAR, True),
-    ((FAR, FAR), 'http://127.0.0.1:11311/', True),
-    (('127.0.0.2', '127.0.0.1'), 'http://192.0.2.9:11311/', True),
-    (('::1', '::1'), 'http://192.0.2.9:11311/', True),
-    (('fe80::1', 'fe80::2'), 'http://localhost:11311/', False),
-    ((FAR, '192.0.2.1'), 'http://no.such.host.invalid:11311/', False),
-])
+@pytest.mark.parametrize(
+    'ends, master_url, nearby',
+    [
+        ((FAR, '192.0.2.1'), 'http://127.0.0.1:11311/', False),
+        ((FAR, '192.0.2.1'), f'http://{FAR}:11311/', True),
+        ((FAR, FAR), 'http://127.0.0.1:11311/', True),
+        (('127.0.0.2', '127.0.0.1'), 'http://192.0.2.9:11311/', True),
+        (('::1', '::1'), 'http://192.0.2.9:11311/', True),
+        (('fe80::1', 'fe80::2'), 'http://localhost:11311/', False),
+        ((FAR, '192.0.2.1'), 'http://no.such.host.invalid:11311/', False),
+    ],
+)
 def test_who_calls_from_nearby(monkeypatch, ends, master_url, nearby):
     monkeypatch.setattr(xmlrpc_server, 'ends_of_call', lambda: ends)
     assert xmlrpc_server.is_call_from_nearby(master_url) is nearby

@@ -1,4 +1,5 @@
-"""Closing a channel: nothing runs for it afterwards, and nobody is held up for long by what others publish inline."""
+"""Closing a channel: nothing runs for it afterwards, and nobody is held up for long by what others
+publish inline."""
 import threading
 
 import pytest
@@ -34,13 +35,15 @@ def test_no_delegate_runs_once_close_has_returned(master, inline):
         runs.release()
         proceed.wait(TIMEOUT)
         calls.append(message.data)
+
     receiver = create(master, '/receiver')
     closing = receiver.interested_in('/closing', STRING, delegate=slow, inline=inline)
     mailbox = Mailbox()
     receiver.interested_in('/not_closing', STRING, delegate=mailbox)
     sender = create(master, '/sender')
     first = in_thread(lambda: sender.send_to('/closing', typed_as=STRING, data='0'))
-    assert runs.acquire(timeout=TIMEOUT)    # the delegate is busy, and all the rest waits in the queue
+    # the delegate is busy, and all the rest waits in the queue
+    assert runs.acquire(timeout=TIMEOUT)
     for number in range(1, 10):
         sender.send_to('/closing', data=str(number))
 
@@ -49,13 +52,14 @@ def test_no_delegate_runs_once_close_has_returned(master, inline):
     def close():
         closing.close()
         called_at_return.extend(calls)
+
     thread = in_thread(close)
     while not closing.closed:
         pass
     proceed.set()
     assert ended(thread) and ended(first)
     sender.send_to('/not_closing', typed_as=STRING, data='done')
-    assert mailbox.get().data == 'done'    # whatever was queued before has been looked at
+    assert mailbox.get().data == 'done'  # whatever was queued before has been looked at
     assert calls == called_at_return == ['0']
     assert closing.received == 1
 
@@ -68,6 +72,7 @@ def test_a_delegate_may_close_its_channel_while_the_channel_opens(master):
     def close(message, channel):
         channel.close()
         closed.set()
+
     for inline in (False, True):
         channel = receiver.interested_in('/latched', STRING, delegate=close, inline=inline)
         assert closed.wait(TIMEOUT)
@@ -99,6 +104,7 @@ def test_a_channel_may_be_closed_while_its_node_stops(master):
                     channel.close()
             except Exception as error:
                 errors.append(error)
+
         thread = in_thread(close)
         begun.wait(TIMEOUT)
         node.stop()
@@ -115,6 +121,7 @@ def test_threads_that_open_channels_side_by_side_lose_none(master):
         begun.wait(TIMEOUT)
         for index in range(5):
             node.interested_in('/side_by_side', STRING)
+
     threads = [in_thread(open_some, number) for number in range(8)]
     assert all(map(ended, threads))
     assert len(node.channels) == len(master.topic('/side_by_side').channels) == 40
@@ -129,20 +136,24 @@ def test_an_inline_publisher_is_not_held_by_what_others_publish(master):
             entered.set()
             flooding.wait(TIMEOUT)
         else:
-            over.wait(0.001)    # slower than the others bring messages
+            over.wait(0.001)  # slower than the others bring messages
+
     receiver = create(master, '/receiver')
     receiver.interested_in('/busy', STRING, delegate=delegate, inline=True)
-    sent, flood = (create(master, name).output_channel('/busy', STRING) for name in ('/one', '/many'))
+    sent, flood = (
+        create(master, name).output_channel('/busy', STRING) for name in ('/one', '/many')
+    )
 
     def publish_without_end():
         while not over.is_set():
             flood.send(data='more')
             if flood.sent == 100:
                 flooding.set()
+
     published = in_thread(lambda: sent.send(data='first'))
     assert entered.wait(TIMEOUT)
     other = in_thread(publish_without_end)
-    returned = ended(published)    # while the other goes on
+    returned = ended(published)  # while the other goes on
     over.set()
     assert returned
     assert ended(other)
@@ -156,11 +167,12 @@ def test_inline_nodes_that_send_to_each_other_without_end_let_the_publisher_go(m
     def pass_on(message, channel):
         turns.release()
         channels[nodes.index(channel.node)].publish(message)
+
     for index, node in enumerate(nodes):
         node.interested_in(f'/to{1 - index}', STRING, delegate=pass_on, inline=True)
     assert ended(in_thread(lambda: channels[0].send(data='ball')))
     for _ in range(1000):
-        assert turns.acquire(timeout=TIMEOUT)    # they go on in the nodes' own threads
+        assert turns.acquire(timeout=TIMEOUT)  # they go on in the nodes' own threads
 
 
 def test_a_service_block_that_outlives_its_caller_ends_quietly(master, capfd):
@@ -170,7 +182,8 @@ def test_a_service_block_that_outlives_its_caller_ends_quietly(master, capfd):
     def slow(request):
         entered.set()
         proceed.wait(TIMEOUT)
-        return 'x' * (1 << 24)    # more than the socket of a client that has gone takes
+        return 'x' * (1 << 24)  # more than the socket of a client that has gone takes
+
     define_service('closing/Large', '---\nstring text\n')
     node.serve('/slow', 'closing/Large', slow)
     service_class = pharos.service_class('closing/Large')
@@ -183,6 +196,7 @@ def test_a_service_block_that_outlives_its_caller_ends_quietly(master, capfd):
             proxy()
         except Exception as error:
             errors.append(error)
+
     thread = in_thread(call)
     assert entered.wait(TIMEOUT)
     answering = [thread for thread in threading.enumerate() if thread.name.startswith('/provider ')]

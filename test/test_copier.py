@@ -1,7 +1,7 @@
 """A copy made in process cannot be told from one that went over the wire.
 
-The wire is genpy's serialize() followed by deserialize(): the tests compare with that, never with values of their own,
-but for a few sentences at the end that spell out what the wire does.
+The wire is genpy's serialize() followed by deserialize(): the tests compare with that, never with
+values of their own, but for a few sentences at the end that spell out what the wire does.
 """
 import array
 import collections
@@ -34,33 +34,42 @@ from pharos.intraprocess.copier import copier_for, serialized, thawer
 # Among the wrong values are some that numpy, or genpy on its way, warns of.
 pytestmark = pytest.mark.filterwarnings('ignore')
 
-# A type of each kind of field, made at run time, in which even the nested classes are not the installed ones.
+# A type of each kind of field, made at run time, in which even the nested classes are not the
+# installed ones.
 PRIMITIVES = 'bool int8 uint8 int16 uint16 int32 uint32 int64 uint64 float32 float64 char byte string time duration'
 SEPARATOR = '\n' + '=' * 80 + '\n'
-DEFINITION = SEPARATOR.join([
-    'Header header\nInner inner\nInner[] inners\nInner[2] two_inners\nEmpty empty\nEmpty[] empties\n' + '\n'.join(
-        '{0} a_{0}\n{0}[] some_{0}\n{0}[3] three_{0}'.format(primitive) for primitive in PRIMITIVES.split()),
-    'MSG: std_msgs/Header\n' + Header._full_text,
-    'MSG: made_up/Inner\nstd_msgs/Header header\ntime stamp\nmade_up/Leaf[] leaves\nbool yes\nfloat64 from',
-    'MSG: made_up/Leaf\nduration age\nstring[] names\nfloat32[2] pair\nbool[2] flags',
-    'MSG: made_up/Empty\n'])
+DEFINITION = SEPARATOR.join(
+    [
+        'Header header\nInner inner\nInner[] inners\nInner[2] two_inners\nEmpty empty\nEmpty[] empties\n'
+        + '\n'.join(
+            '{0} a_{0}\n{0}[] some_{0}\n{0}[3] three_{0}'.format(primitive)
+            for primitive in PRIMITIVES.split()
+        ),
+        'MSG: std_msgs/Header\n' + Header._full_text,
+        'MSG: made_up/Inner\nstd_msgs/Header header\ntime stamp\nmade_up/Leaf[] leaves\nbool yes\nfloat64 from',
+        'MSG: made_up/Leaf\nduration age\nstring[] names\nfloat32[2] pair\nbool[2] flags',
+        'MSG: made_up/Empty\n',
+    ]
+)
 EVERYTHING = genpy.dynamic.generate_dynamic('made_up/Everything', DEFINITION)['made_up/Everything']
 
 TYPES = """
-    std_msgs/Empty std_msgs/String std_msgs/Bool std_msgs/Byte std_msgs/Char std_msgs/Int64 std_msgs/Float32
-    std_msgs/Time std_msgs/Duration std_msgs/Header std_msgs/ColorRGBA std_msgs/Float64MultiArray
-    std_msgs/UInt8MultiArray
+    std_msgs/Empty std_msgs/String std_msgs/Bool std_msgs/Byte std_msgs/Char std_msgs/Int64
+    std_msgs/Float32 std_msgs/Time std_msgs/Duration std_msgs/Header std_msgs/ColorRGBA
+    std_msgs/Float64MultiArray std_msgs/UInt8MultiArray
     geometry_msgs/Twist geometry_msgs/PoseStamped geometry_msgs/PoseWithCovarianceStamped
     geometry_msgs/PolygonStamped
-    sensor_msgs/Image sensor_msgs/PointCloud2 sensor_msgs/LaserScan sensor_msgs/JointState sensor_msgs/CameraInfo
-    sensor_msgs/BatteryState sensor_msgs/MultiDOFJointState nav_msgs/Odometry nav_msgs/OccupancyGrid nav_msgs/Path
-    nav_msgs/MapMetaData diagnostic_msgs/DiagnosticArray tf2_msgs/TFMessage rosgraph_msgs/Log rosgraph_msgs/Clock
-    rosgraph_msgs/TopicStatistics actionlib_msgs/GoalStatusArray actionlib_msgs/GoalID
+    sensor_msgs/Image sensor_msgs/PointCloud2 sensor_msgs/LaserScan sensor_msgs/JointState
+    sensor_msgs/CameraInfo sensor_msgs/BatteryState sensor_msgs/MultiDOFJointState nav_msgs/Odometry
+    nav_msgs/OccupancyGrid nav_msgs/Path nav_msgs/MapMetaData diagnostic_msgs/DiagnosticArray
+    tf2_msgs/TFMessage rosgraph_msgs/Log rosgraph_msgs/Clock rosgraph_msgs/TopicStatistics
+    actionlib_msgs/GoalStatusArray actionlib_msgs/GoalID
 """.split()
 CLASSES = [genpy.message.get_message_class(name) for name in TYPES] + [EVERYTHING]
 
 
 # Random messages
+
 
 class Level(enum.IntEnum):
     LOW = 1
@@ -76,7 +85,11 @@ class RospyTime(genpy.Time):
 
 def integers(base):
     bits, signed = int(base.strip('uint') or 8), not base.startswith('u')
-    return st.integers(-2 ** (bits - 1), 2 ** (bits - 1) - 1) if signed else st.integers(0, 2 ** bits - 1)
+    return (
+        st.integers(-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
+        if signed
+        else st.integers(0, 2**bits - 1)
+    )
 
 
 def numbers(base):
@@ -94,23 +107,66 @@ def arrays(base, length):
     size = {} if length is None else dict(min_size=length, max_size=length)
     plain = st.lists(numbers(base), **{'max_size': 4, **size})
     if base in ('uint8', 'char'):
-        return plain | plain.map(tuple) | plain.map(bytes) | plain.map(bytearray) | st.binary(max_size=5)
+        return (
+            plain
+            | plain.map(tuple)
+            | plain.map(bytes)
+            | plain.map(bytearray)
+            | st.binary(max_size=5)
+        )
     small = st.lists(st.integers(0, 100), **{'max_size': 4, **size})
-    dtypes = ['i1', 'u1', '>i2', 'i4', 'i8', 'u8'] + (['f2', 'f4', '>f4', 'f8', 'g'] if 'float' in base else [])
+    dtypes = ['i1', 'u1', '>i2', 'i4', 'i8', 'u8'] + (
+        ['f2', 'f4', '>f4', 'f8', 'g'] if 'float' in base else []
+    )
     from_numpy = st.builds(numpy.array, small, st.sampled_from(dtypes))
     if base in ('float32', 'float64'):
-        from_numpy |= st.builds(numpy.array, st.lists(st.floats(width=32), **size), st.sampled_from(['f4', 'f8']))
+        from_numpy |= st.builds(
+            numpy.array, st.lists(st.floats(width=32), **size), st.sampled_from(['f4', 'f8'])
+        )
     others = small.map(collections.deque) | small.map(lambda items: array.array('h', items))
     return plain | plain.map(tuple) | from_numpy | others
 
 
 WRONG = [
-    None, 1.5, -1, 2 ** 70, 10 ** 400, 1e39, '', 'text', '\ud800', Text('text'), b'', b'ab', memoryview(b'abc'),
-    (), {}, {1: 2}, {0.5}, [None], [-1], [1e39], [2 ** 70], ['\ud800'], Empty(), Vector3(), genpy.Time(),
-    types.SimpleNamespace(secs=1, nsecs=2), types.SimpleNamespace(x=1, y=2, z=3),
-    numpy.bool_(True), numpy.float32(0.1), numpy.array(3), numpy.array([True]), numpy.array([300, -1]),
-    numpy.array([1 + 0j]), numpy.array([1, None]), numpy.array(['2020-01-01'], 'M8[ns]'),
-    numpy.array([[1.0, 2.0]]), numpy.array([[1], [2], [3]]), numpy.ma.array([1, 2], mask=[0, 1])]
+    None,
+    1.5,
+    -1,
+    2**70,
+    10**400,
+    1e39,
+    '',
+    'text',
+    '\ud800',
+    Text('text'),
+    b'',
+    b'ab',
+    memoryview(b'abc'),
+    (),
+    {},
+    {1: 2},
+    {0.5},
+    [None],
+    [-1],
+    [1e39],
+    [2**70],
+    ['\ud800'],
+    Empty(),
+    Vector3(),
+    genpy.Time(),
+    types.SimpleNamespace(secs=1, nsecs=2),
+    types.SimpleNamespace(x=1, y=2, z=3),
+    numpy.bool_(True),
+    numpy.float32(0.1),
+    numpy.array(3),
+    numpy.array([True]),
+    numpy.array([300, -1]),
+    numpy.array([1 + 0j]),
+    numpy.array([1, None]),
+    numpy.array(['2020-01-01'], 'M8[ns]'),
+    numpy.array([[1.0, 2.0]]),
+    numpy.array([[1], [2], [3]]),
+    numpy.ma.array([1, 2], mask=[0, 1]),
+]
 
 
 def times(base):
@@ -119,9 +175,12 @@ def times(base):
 
     def make(cls, secs, nsecs):
         value = cls()
-        value.secs, value.nsecs = secs, nsecs   # not canonical, as the constructor would make it
+        value.secs, value.nsecs = secs, nsecs  # not canonical, as the constructor would make it
         return value
-    return st.builds(make, st.sampled_from([unset, RospyTime]), number, number | st.integers(0, 999999999))
+
+    return st.builds(
+        make, st.sampled_from([unset, RospyTime]), number, number | st.integers(0, 999999999)
+    )
 
 
 @st.composite
@@ -147,7 +206,9 @@ def values(cls, type_name, wrong):
     else:
         package, name = base.split('/')
         module = cls.deserialize.__globals__
-        element = messages(module.get('_%s__%s' % (package, name)) or getattr(module[package].msg, name), wrong)
+        element = messages(
+            module.get(f'_{package}__{name}') or getattr(module[package].msg, name), wrong
+        )
     if not is_array:
         return element
     elements = st.lists(element, min_size=length or 0, max_size=2 if length is None else length)
@@ -156,12 +217,14 @@ def values(cls, type_name, wrong):
 
 # Comparing
 
+
 def wire(message):
     return type(message)().deserialize(serialized(message))
 
 
 def told(value):
-    """A value as tuples, equal only if the value and type of everything in it are: 1 is not 1.0, nan is nan."""
+    """A value as tuples, equal only if the value and type of everything in it are: 1 is not 1.0,
+    nan is nan."""
     kind = type(value)
     if isinstance(value, (genpy.Message, genpy.rostime.TVal)):
         assert not hasattr(value, '_connection_header') and not hasattr(value, '__dict__')
@@ -218,7 +281,9 @@ def copy(message):
 
 # Any message at all
 
-quickly = settings(deadline=None, max_examples=20, database=None, suppress_health_check=list(HealthCheck))
+quickly = settings(
+    deadline=None, max_examples=20, database=None, suppress_health_check=list(HealthCheck)
+)
 each_class = pytest.mark.parametrize('cls', CLASSES, ids=lambda cls: cls._type)
 
 
@@ -228,6 +293,7 @@ def test_random_values_arrive_as_on_the_wire(cls):
     @given(messages(cls))
     def test(message):
         assert_as_on_the_wire(message)
+
     test()
 
 
@@ -237,6 +303,7 @@ def test_wrong_values_arrive_or_are_refused_as_on_the_wire(cls):
     @given(messages(cls, wrong=True))
     def test(message):
         assert_as_on_the_wire(message)
+
     test()
 
 
@@ -253,12 +320,24 @@ def test_each_wrong_value_in_each_kind_of_field(name):
         assert_as_on_the_wire(message)
 
 
-@pytest.mark.parametrize('package', ['actionlib', 'actionlib_msgs', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs',
-                                     'rosgraph_msgs', 'sensor_msgs', 'std_msgs', 'tf2_msgs'])
+@pytest.mark.parametrize(
+    'package',
+    [
+        'actionlib',
+        'actionlib_msgs',
+        'diagnostic_msgs',
+        'geometry_msgs',
+        'nav_msgs',
+        'rosgraph_msgs',
+        'sensor_msgs',
+        'std_msgs',
+        'tf2_msgs',
+    ],
+)
 def test_every_installed_class_has_generated_functions(package):
     for kind in ('msg', 'srv'):
         try:
-            module = importlib.import_module('%s.%s' % (package, kind))
+            module = importlib.import_module(f'{package}.{kind}')
         except ImportError:
             continue
         for cls in vars(module).values():
@@ -268,6 +347,7 @@ def test_every_installed_class_has_generated_functions(package):
 
 
 # What the wire does that surprises, without the wire
+
 
 def test_a_float32_is_rounded():
     assert copy(Float32(0.1)).data == struct.unpack('<f', struct.pack('<f', 0.1))[0] != 0.1
@@ -288,12 +368,16 @@ def test_a_bool_given_as_7_arrives_as_true():
 @pytest.mark.parametrize('number', [-0.0, float('inf'), float('-inf'), float('nan'), 5e-324])
 def test_special_floats_keep_every_bit(number):
     assert told(copy(Float64(number)).data) == told(number)
-    assert told(copy(LaserScan(ranges=[number])).ranges) == told(wire(LaserScan(ranges=[number])).ranges)
+    assert told(copy(LaserScan(ranges=[number])).ranges) == told(
+        wire(LaserScan(ranges=[number])).ranges
+    )
 
 
 def test_number_arrays_arrive_as_tuples():
     received = copy(JointState(position=[1, 2.5], velocity=numpy.array([1.0, 2.0]), effort=(1.0,)))
-    assert told((received.position, received.velocity, received.effort)) == told(((1.0, 2.5), (1.0, 2.0), (1.0,)))
+    assert told((received.position, received.velocity, received.effort)) == told(
+        ((1.0, 2.5), (1.0, 2.0), (1.0,))
+    )
 
 
 @pytest.mark.parametrize('dtype', ['f2', 'f4', 'f8', '>f8', 'i4', 'u1'])
@@ -304,20 +388,28 @@ def test_an_array_of_numpy_needs_no_wire(dtype):
 
 def test_a_bool_array_arrives_as_a_list_of_bools():
     received = copy(EVERYTHING(some_bool=(1, 0, 7), three_bool=[True, False, 2]))
-    assert told((received.some_bool, received.three_bool)) == told(([True, False, True], [True, False, True]))
+    assert told((received.some_bool, received.three_bool)) == told(
+        ([True, False, True], [True, False, True])
+    )
 
 
 @pytest.mark.parametrize('kind', [bytes, bytearray, list, tuple])
 def test_uint8_and_char_arrays_arrive_as_bytes(kind):
-    received = copy(EVERYTHING(some_uint8=kind(b'ab'), some_char=kind(b'cd'), three_uint8=kind(b'efg')))
-    assert told((received.some_uint8, received.some_char, received.three_uint8)) == told((b'ab', b'cd', b'efg'))
+    received = copy(
+        EVERYTHING(some_uint8=kind(b'ab'), some_char=kind(b'cd'), three_uint8=kind(b'efg'))
+    )
+    assert told((received.some_uint8, received.some_char, received.three_uint8)) == told(
+        (b'ab', b'cd', b'efg')
+    )
 
 
 def test_a_byte_array_is_one_of_signed_numbers():
     assert copy(ByteMultiArray(data=[-1, 1])).data == (-1, 1)
 
 
-@pytest.mark.parametrize('sent, arriving', [(b'abcd', b'abc'), (bytearray(b'abcd'), b'abc'), (b'a', b'a\0\0')])
+@pytest.mark.parametrize(
+    'sent, arriving', [(b'abcd', b'abc'), (bytearray(b'abcd'), b'abc'), (b'a', b'a\0\0')]
+)
 def test_bytes_are_cut_or_padded_to_a_fixed_length(sent, arriving):
     message = EVERYTHING(three_uint8=sent)
     copier = copier_for(EVERYTHING)
@@ -330,14 +422,24 @@ def test_other_buffers_are_refused_in_a_uint8_array(data):
         copier_for(UInt8MultiArray).freeze(UInt8MultiArray(data=data))
 
 
-@pytest.mark.parametrize('message, error', [
-    (String(b'bytes'), AttributeError), (String('\ud800'), UnicodeEncodeError), (Float32(1e39), OverflowError),
-    (Bool(256), genpy.SerializationError), (Float64('0.1'), genpy.SerializationError),
-    (CameraInfo(K=[0.0] * 8), genpy.SerializationError), (PoseArray(poses=[None]), AttributeError)])
+@pytest.mark.parametrize(
+    'message, error',
+    [
+        (String(b'bytes'), AttributeError),
+        (String('\ud800'), UnicodeEncodeError),
+        (Float32(1e39), OverflowError),
+        (Bool(256), genpy.SerializationError),
+        (Float64('0.1'), genpy.SerializationError),
+        (CameraInfo(K=[0.0] * 8), genpy.SerializationError),
+        (PoseArray(poses=[None]), AttributeError),
+    ],
+)
 def test_a_refusal_is_the_wires_own(message, error):
     with pytest.raises(error) as caught:
         copier_for(type(message)).freeze(message)
-    assert caught.value.__context__ is None or not type(caught.value.__context__).__module__.startswith('pharos')
+    assert caught.value.__context__ is None or not type(
+        caught.value.__context__
+    ).__module__.startswith('pharos')
 
 
 @pytest.mark.parametrize('cls, unset', [(Time, genpy.Time), (Duration, genpy.Duration)])
@@ -354,7 +456,7 @@ def test_a_time_is_not_canonized_in_a_header_or_an_array():
 
 
 def test_a_time_after_2038_needs_no_wire():
-    assert copy(Time(genpy.Time(2 ** 32 - 1))).data.secs == 2 ** 32 - 1
+    assert copy(Time(genpy.Time(2**32 - 1))).data.secs == 2**32 - 1
 
 
 def test_a_subclass_of_time_arrives_as_a_plain_time():
@@ -362,7 +464,9 @@ def test_a_subclass_of_time_arrives_as_a_plain_time():
 
 
 def test_a_nested_message_of_another_class_with_the_same_fields_is_taken():
-    assert told(copy(Twist(linear=types.SimpleNamespace(x=1, y=2, z=3.0))).linear) == told(Vector3(1.0, 2.0, 3.0))
+    assert told(copy(Twist(linear=types.SimpleNamespace(x=1, y=2, z=3.0))).linear) == told(
+        Vector3(1.0, 2.0, 3.0)
+    )
 
 
 def test_text_beyond_ascii_needs_no_wire():
@@ -370,6 +474,7 @@ def test_text_beyond_ascii_needs_no_wire():
 
 
 # Independence
+
 
 def test_what_the_publisher_does_afterwards_does_not_show():
     message = Image(data=bytearray(b'old'), header=Header(frame_id='old'))
@@ -395,18 +500,27 @@ def test_large_data_is_shared():
 
 
 def test_frozen_values_cost_the_garbage_collector_nothing():
-    frozen = [frozen_fast(message) for message in
-              (PoseStamped(), TFMessage([TransformStamped()]), LaserScan(ranges=[1.0]))]
-    for _ in range(4):  # the collector drops a tuple when it finds that nothing in it is tracked, here four levels deep
+    frozen = [
+        frozen_fast(message)
+        for message in (PoseStamped(), TFMessage([TransformStamped()]), LaserScan(ranges=[1.0]))
+    ]
+    # the collector drops a tuple when it finds that nothing in it is tracked, here four levels deep
+    for _ in range(4):
         gc.collect()
     assert not any(map(gc.is_tracked, frozen))
 
 
 # Classes
 
+
 def test_a_class_made_at_run_time_nests_its_own_classes():
     message = copy(EVERYTHING(inners=[EVERYTHING().inner], two_inners=[EVERYTHING().inner] * 2))
-    assert type(message.inners[0]) is type(message.two_inners[1]) is type(EVERYTHING().inner) is not Pose
+    assert (
+        type(message.inners[0])
+        is type(message.two_inners[1])
+        is type(EVERYTHING().inner)
+        is not Pose
+    )
     assert type(message.header) is type(message.inners[0].header) is not Header
 
 
@@ -424,6 +538,7 @@ def test_a_message_of_another_class_than_the_publishers_takes_the_wire():
     class Shouted(String):
         def serialize(self, buffer):
             String(self.data.upper()).serialize(buffer)
+
     received = copier_for(String).thaw(copier_for(String).freeze(Shouted('text')))
     assert type(received) is String and received.data == 'TEXT'
 
@@ -433,6 +548,7 @@ def test_a_class_with_a_constructor_of_its_own_is_made_by_it():
         def __init__(self):
             super().__init__()
             self.mine = 'set'
+
     copier = copier_for(MyString)
     assert copier.thaw(copier.freeze(MyString())).mine == 'set'
 
@@ -449,23 +565,39 @@ def test_a_class_written_by_hand_serializes_as_it_says():
         def deserialize(self, data):
             self.data = data.decode()
             return self
+
     message = Backwards('abc')
     assert copier_for(Backwards).thaw(copier_for(Backwards).freeze(message)).data == 'cba'
 
 
-@pytest.mark.parametrize('name', ['data.real', 'data=1; raise SystemExit; message.data', 'class', ''])
+@pytest.mark.parametrize(
+    'name', ['data.real', 'data=1; raise SystemExit; message.data', 'class', '']
+)
 def test_a_field_name_is_never_run_as_code(name):
-    evil = type('Evil', (genpy.Message,), {name: vars(Float64)[name] for name in ('serialize', 'serialize_numpy')})
+    evil = type(
+        'Evil',
+        (genpy.Message,),
+        {name: vars(Float64)[name] for name in ('serialize', 'serialize_numpy')},
+    )
     evil.__slots__, evil._slot_types = [name], ['float64']
     assert copier_for(evil).freeze_fields is None
 
 
-@pytest.mark.parametrize('message', [
-    Twist(linear=Vector3(1, 2, 3)), String('text'), Time(genpy.Time(1, 2)), UInt8MultiArray(data=b'ab'),
-    LaserScan(ranges=[0.1], header=Header(frame_id='laser'))])
+@pytest.mark.parametrize(
+    'message',
+    [
+        Twist(linear=Vector3(1, 2, 3)),
+        String('text'),
+        Time(genpy.Time(1, 2)),
+        UInt8MultiArray(data=b'ab'),
+        LaserScan(ranges=[0.1], header=Header(frame_id='laser')),
+    ],
+)
 def test_a_receiver_of_another_class_gets_what_the_wire_gives_it(message):
     publisher = type(message)
-    same_type = genpy.dynamic.generate_dynamic(publisher._type, publisher._full_text)[publisher._type]
+    same_type = genpy.dynamic.generate_dynamic(publisher._type, publisher._full_text)[
+        publisher._type
+    ]
     for receiver in (publisher, same_type, numpy_msg(publisher), rospy.msg.AnyMsg):
         received = thawer(publisher, receiver)(copier_for(publisher).freeze(message))
         assert type(received) is receiver
@@ -480,7 +612,7 @@ def test_any_msg_gets_times_as_they_were_sent():
 
 
 def test_any_msg_forwards_what_it_got():
-    private = types.ModuleType('private')   # another node's AnyMsg is another class
+    private = types.ModuleType('private')  # another node's AnyMsg is another class
     exec(inspect.getsource(rospy.msg), vars(private))
     message = private.AnyMsg()
     message._buff = serialized(Float64(0.1))

@@ -21,7 +21,7 @@ def embedded():
 
 
 def is_refused(url):
-    host, port = url[len('http://'):].rstrip('/').split(':')
+    host, port = url[len('http://') :].rstrip('/').split(':')
     with socket.socket() as client:
         return client.connect_ex((host, int(port))) != 0
 
@@ -35,14 +35,18 @@ def test_it_is_a_master_of_its_own(embedded):
 
 def test_nodes_of_this_process_and_others_meet_there(embedded):
     mailbox = Mailbox()
-    embedded.create(BlockNode, named='/receiver', delegate=mailbox).interested_in('/t', 'std_msgs/String')
+    embedded.create(BlockNode, named='/receiver', delegate=mailbox).interested_in(
+        '/t', 'std_msgs/String'
+    )
     with Program(embedded.url, 'rostopic', 'pub', '/t', 'std_msgs/String', 'data: from outside'):
         assert mailbox.get().data == 'from outside'
 
 
 def test_rosout_agg_gets_each_line_once(embedded):
     mailbox = Mailbox()
-    embedded.create(BlockNode, named='/listener', delegate=mailbox).interested_in('/rosout_agg', 'rosgraph_msgs/Log')
+    embedded.create(BlockNode, named='/listener', delegate=mailbox).interested_in(
+        '/rosout_agg', 'rosgraph_msgs/Log'
+    )
     speaker = embedded.create(BlockNode, named='/speaker')
     while not any(name == '/rosout' for name, _ in speaker_connections(speaker)):
         speaker._rospy.ended.wait(0.01)
@@ -59,7 +63,10 @@ def test_rosout_agg_gets_each_line_once(embedded):
 
 def speaker_connections(node):
     """The node's connections on /rosout, where rospy itself publishes."""
-    return [(connection.endpoint_id, None) for connection in node._rospy.publisher('/rosout').connections]
+    return [
+        (connection.endpoint_id, None)
+        for connection in node._rospy.publisher('/rosout').connections
+    ]
 
 
 def test_it_listens_on_loopback_alone(embedded):
@@ -73,7 +80,7 @@ def test_stop_ends_it_and_this_processs_nodes_there():
     pid, node = master.pid, master.create(BlockNode, named='/n')
     master.stop()
     assert not node.is_running and wait_for_end(pid, 0) and is_refused(master.url)
-    master.stop()    # harmless
+    master.stop()  # harmless
     assert not master.is_reachable()
 
 
@@ -86,7 +93,9 @@ def test_the_end_of_a_with_block_ends_it():
 def test_it_comes_back_on_the_same_port_and_a_taken_one_is_said():
     with Master.embedded() as master:
         port = int(master.url.rstrip('/').rpartition(':')[2])
-        with pytest.raises(PortInUseError, match='port %d for a master .*another port, or 0' % port):
+        with pytest.raises(
+            PortInUseError, match='port %d for a master .*another port, or 0' % port
+        ):
             Master.embedded(port)
     with Master.embedded(port) as again:
         assert again.url == master.url and again.is_reachable()
@@ -105,7 +114,7 @@ def test_it_outlives_its_own_murder(embedded):
     embedded._child.wait(TIMEOUT)
     with pytest.raises(MasterUnreachableError):
         embedded.nodes()
-    node.stop()    # says nothing but a warning in the log
+    node.stop()  # says nothing but a warning in the log
     embedded.stop()
 
 
@@ -120,10 +129,18 @@ print('URL', master.url, master.pid, flush=True)
 """
 
 
-@pytest.mark.parametrize(('code', 'status'), [
-    ('', 0), ('sys.exit(3)', 3), ('raise RuntimeError', 1), ('os._exit(4)', 4), ('os.abort()', -signal.SIGABRT),
-    ('os.kill(os.getpid(), signal.SIGTERM)', 128 + signal.SIGTERM)],
-    ids=['end', 'exit', 'exception', '_exit', 'abort', 'SIGTERM'])
+@pytest.mark.parametrize(
+    ('code', 'status'),
+    [
+        ('', 0),
+        ('sys.exit(3)', 3),
+        ('raise RuntimeError', 1),
+        ('os._exit(4)', 4),
+        ('os.abort()', -signal.SIGABRT),
+        ('os.kill(os.getpid(), signal.SIGTERM)', 128 + signal.SIGTERM),
+    ],
+    ids=['end', 'exit', 'exception', '_exit', 'abort', 'SIGTERM'],
+)
 def test_it_ends_with_the_program(code, status):
     with Program(refused_url(), sys.executable, '-c', PROGRAM % code) as program:
         url, pid = program.wait_for('URL').split()[1:]
@@ -135,25 +152,38 @@ def test_it_is_gone_when_a_program_has_ended_properly():
     with Program(refused_url(), sys.executable, '-c', PROGRAM % '') as program:
         url = program.wait_for('URL').split()[1]
         program.process.wait(TIMEOUT)
-        assert is_refused(url)    # so that the next program can have the port
+        assert is_refused(url)  # so that the next program can have the port
 
 
 def test_it_says_nothing_of_nodes_that_stop():
-    with Program(refused_url(), sys.executable, '-c', PROGRAM % """
+    with Program(
+        refused_url(),
+        sys.executable,
+        '-c',
+        PROGRAM
+        % """
 nodes = [master.create(BlockNode, named='/n%d' % number) for number in range(10)]
 for node in nodes:
     node.interested_in('/t', 'std_msgs/String')
     node.output_channel('/t', 'std_msgs/String')
-""") as program:
+""",
+    ) as program:
         program.process.wait(TIMEOUT)
-        assert len(program.read_to_the_end().splitlines()) == 1    # the URL
+        assert len(program.read_to_the_end().splitlines()) == 1  # the URL
 
 
-@pytest.mark.parametrize('code', ['signal.pause()', """
+@pytest.mark.parametrize(
+    'code',
+    [
+        'signal.pause()',
+        """
 if os.fork() == 0:
     print('FORK', os.getpid(), flush=True)
 signal.pause()
-"""], ids=['alone', 'with a fork that lives on'])
+""",
+    ],
+    ids=['alone', 'with a fork that lives on'],
+)
 def test_it_ends_with_a_program_that_is_killed(code):
     with Program(refused_url(), sys.executable, '-c', PROGRAM % code) as program:
         url, pid = program.wait_for('URL').split()[1:]
@@ -167,15 +197,21 @@ def test_it_ends_with_a_program_that_is_killed(code):
 
 
 def test_ctrl_c_is_the_programs_own():
-    with Program(refused_url(), sys.executable, '-c', PROGRAM % """
+    with Program(
+        refused_url(),
+        sys.executable,
+        '-c',
+        PROGRAM
+        % """
 try:
     print('PAUSES', flush=True)
     signal.pause()
 except KeyboardInterrupt:
     print('STILL THERE' if master.is_reachable() else 'GONE', flush=True)
-""") as program:
+""",
+    ) as program:
         program.wait_for('PAUSES')
-        os.killpg(program.process.pid, signal.SIGINT)    # as a terminal sends it to all of a program
+        os.killpg(program.process.pid, signal.SIGINT)  # as a terminal sends it to all of a program
         assert program.wait_for('THERE')
 
 
@@ -189,7 +225,9 @@ def test_only_an_embedded_one_is_stopped(master):
 
 def test_without_a_master_the_error_names_it(monkeypatch):
     monkeypatch.setenv('ROS_MASTER_URI', refused_url())
-    with pytest.raises(MasterUnreachableError, match=r'start one with roscore or Master.embedded\(\)'):
+    with pytest.raises(
+        MasterUnreachableError, match=r'start one with roscore or Master.embedded\(\)'
+    ):
         Master().create(BlockNode, named='/n')
     assert pharos.running.nodes() == []
     ended = run(refused_url(), sys.executable, '-c', 'from pharos import Master; Master().nodes()')

@@ -1,4 +1,5 @@
-"""One life at a time: a node is known here first, its stop() runs once, and what waits for it ends with it."""
+"""One life at a time: a node is known here first, its stop() runs once, and what waits for it ends
+with it."""
 import socket
 import threading
 import time
@@ -6,7 +7,16 @@ import time
 import pytest
 
 from conftest import TIMEOUT
-from pharos import (BlockNode, ExternalNode, Lifecycle, Master, Node, NodeNameInUseError, NodeStoppedError, running)
+from pharos import (
+    BlockNode,
+    ExternalNode,
+    Lifecycle,
+    Master,
+    Node,
+    NodeNameInUseError,
+    NodeStoppedError,
+    running,
+)
 from pharos import message_class, stopping
 from pharos.private_rospy import door, lifetime, proxies, xmlrpc_server
 from pharos.intraprocess import services
@@ -19,7 +29,8 @@ def create(master, name, node_class=BlockNode, **settings):
 
 
 def in_thread(function, *arguments):
-    """Run it in a thread; returns the thread, and a list of what came of it: a value, or an exception."""
+    """Run it in a thread; returns the thread, and a list of what came of it: a value, or an
+    exception."""
     outcome = []
 
     def run():
@@ -27,6 +38,7 @@ def in_thread(function, *arguments):
             outcome.append(function(*arguments))
         except Exception as error:
             outcome.append(error)
+
     thread = threading.Thread(target=run, daemon=True)
     thread.start()
     return thread, outcome
@@ -37,7 +49,8 @@ def ended(thread):
     return not thread.is_alive()
 
 
-# -- known here before the master knows it ------------------------------------------------------------------------------
+# -- known here before the master knows it
+
 
 def test_a_node_that_starts_or_stops_is_never_one_of_another_process(master):
     seen, over = [], threading.Event()
@@ -45,6 +58,7 @@ def test_a_node_that_starts_or_stops_is_never_one_of_another_process(master):
     def look():
         while not over.is_set():
             seen.extend(node for node in master.nodes() if node.name == '/flickering')
+
     thread, _ = in_thread(look)
     for _ in range(20):
         with create(master, '/flickering'):
@@ -67,12 +81,15 @@ def test_of_threads_that_create_a_node_of_one_name_one_wins(master):
     def start():
         go.wait(TIMEOUT)
         return create(master, '/contested')
+
     threads, outcomes = zip(*(in_thread(start) for _ in range(4)))
     assert all(map(ended, threads))
     nodes = [outcome for outcome, in outcomes if isinstance(outcome, BlockNode)]
     errors = [outcome for outcome, in outcomes if isinstance(outcome, NodeNameInUseError)]
     assert (len(nodes), len(errors)) == (1, 3)
-    assert all('/contested' in str(error) and 'node of this process' in str(error) for error in errors)
+    assert all(
+        '/contested' in str(error) and 'node of this process' in str(error) for error in errors
+    )
     assert nodes[0].is_running and master.node('/contested') is nodes[0]
 
 
@@ -83,7 +100,8 @@ def test_a_name_is_free_again_when_the_start_has_failed(master):
     assert create(master, '/unlucky').is_running
 
 
-# -- stop() runs once, to its end ----------------------------------------------------------------------------------------
+# -- stop() runs once, to its end
+
 
 class Careful(Node):
     """Its stop() goes on after super().stop(), until it may end."""
@@ -103,7 +121,10 @@ def test_an_overridden_stop_runs_once_and_others_wait_for_its_end(master):
     node = create(master, '/careful', Careful)
     first, _ = in_thread(node.stop)
     assert node.begun.wait(TIMEOUT)
-    others = [in_thread(ask)[0] for ask in (node.stop, running.stop_all, running.spin, lambda: node.__exit__())]
+    others = [
+        in_thread(ask)[0]
+        for ask in (node.stop, running.stop_all, running.spin, lambda: node.__exit__())
+    ]
     until(lambda: len(stopping._waiting) == 2)
     assert all(thread.is_alive() for thread in (first, *others))
     node.may_end.set()
@@ -126,7 +147,9 @@ def test_an_overridden_stop_runs_once_for_each_start(master):
 def test_a_stop_that_comes_from_the_node_itself_is_waited_for(master, how):
     node = create(master, '/careful', Careful)
     if how == 'delegate':
-        node.interested_in('/careful_end', 'std_msgs/Empty', delegate=lambda message, channel: node.stop())
+        node.interested_in(
+            '/careful_end', 'std_msgs/Empty', delegate=lambda message, channel: node.stop()
+        )
         node.send_to('/careful_end')
     elif how == 'soul':
         node.fork(lambda me: me.stop())
@@ -152,6 +175,7 @@ def test_a_mixins_stop_runs_once_too(master):
 
     class Mixed(Mixin, BlockNode):
         pass
+
     node = create(master, '/mixed', Mixed)
     node.stop()
     node.stop()
@@ -171,6 +195,7 @@ def test_each_of_several_overriding_stops_runs_once_in_order(master):
         def stop(self):
             super().stop()
             calls.append('last')
+
     create(master, '/layered', Last).stop()
     assert calls == ['middle', Lifecycle.STOPPED, 'last']
 
@@ -181,6 +206,7 @@ def test_a_node_is_stopped_when_its_stop_has_ended_however(master, fails):
         def stop(self):
             if fails:
                 raise ZeroDivisionError
+
     node = create(master, '/clumsy', Clumsy)
     if fails:
         with pytest.raises(ZeroDivisionError):
@@ -199,6 +225,7 @@ def test_nodes_that_stop_each_other_do_not_wait_for_ever(master):
             both.wait(TIMEOUT)
             self.other.stop()
             super().stop()
+
     first, second = create(master, '/partner', Partner), create(master, '/partner_too', Partner)
     first.other, second.other = second, first
     begin = time.monotonic()
@@ -226,6 +253,7 @@ def test_a_node_may_start_again_at_the_end_of_its_stop(master):
             if not hasattr(self, 'rose'):
                 self.rose = True
                 self.start()
+
     node = create(master, '/phoenix', Phoenix)
     node.stop()
     assert node.is_running and master.node('/phoenix') is node
@@ -233,20 +261,23 @@ def test_a_node_may_start_again_at_the_end_of_its_stop(master):
     assert not node.is_running
 
 
-# -- stop() during the start -------------------------------------------------------------------------------------------
+# -- stop() during the start
+
 
 def test_a_stop_during_the_start_ends_it(master, monkeypatch):
     from pharos.private_rospy import registration
+
     claim, claiming, go_on = registration.claim_name, threading.Event(), threading.Event()
 
     def claim_name(*arguments):
         claim(*arguments)
         claiming.set()
         assert go_on.wait(TIMEOUT)
+
     monkeypatch.setattr(registration, 'claim_name', claim_name)
     starting, outcome = in_thread(create, master, '/premature')
     assert claiming.wait(TIMEOUT)
-    node, = running.nodes()
+    (node,) = running.nodes()
     assert node.lifecycle is Lifecycle.STARTING
     stop, _ = in_thread(node.stop)
     until(lambda: stopping._waiting)
@@ -283,6 +314,7 @@ def test_a_node_stopped_before_it_accepts_anybody_ends_its_threads(master, monke
     def accept_late(self, listener, serve):
         late.wait(TIMEOUT)
         accept(self, listener, serve)
+
     monkeypatch.setattr(door.Door, 'accept', accept_late)
     node = master.create(BlockNode, named='/late', domain='127.0.0.1')
     accepting = [thread for thread in threading.enumerate() if thread.name.startswith('/late')]
@@ -290,6 +322,7 @@ def test_a_node_stopped_before_it_accepts_anybody_ends_its_threads(master, monke
     def shut_and_tell(sock):
         shut(sock)
         late.set()
+
     shut = xmlrpc_server.shut
     monkeypatch.setattr(xmlrpc_server, 'shut', shut_and_tell)
     stopping = threading.Thread(target=node.stop, daemon=True)
@@ -308,7 +341,8 @@ def test_a_stop_ends_a_start_at_a_master_that_says_nothing():
         assert isinstance(outcome[0], NodeStoppedError) and running.nodes() == []
 
 
-# -- what waits ends with the node -------------------------------------------------------------------------------------
+# -- what waits ends with the node
+
 
 def loop(me):
     channel = me.output_channel('/nobody', 'std_msgs/Empty')
@@ -325,7 +359,9 @@ def silent():
 
 LISTENERS = []
 WAITS = {
-    'wait_for_subscribers': lambda me: me.output_channel('/nobody', 'std_msgs/Empty').wait_for_subscribers(),
+    'wait_for_subscribers': lambda me: me.output_channel(
+        '/nobody', 'std_msgs/Empty'
+    ).wait_for_subscribers(),
     'wait_for_subscribers in a loop': loop,
     'wait_for_node': lambda me: me.master.wait_for_node('/nobody'),
     'Master.wait': lambda me: Master(refused_url()).wait(),
@@ -341,7 +377,8 @@ WAITS = {
 
 @pytest.fixture
 def waiting(master, monkeypatch):
-    """Peers that do not connect, and services that do not answer; returns an event set when one is waited for."""
+    """Peers that do not connect, and services that do not answer; returns an event set when one is
+    waited for."""
     peer, waiting, over = create(master, '/slow_peer'), threading.Event(), threading.Event()
     peer.output_channel('/slow', 'std_msgs/Empty')
     peer.interested_in('/fast', 'std_msgs/Empty')
@@ -353,12 +390,19 @@ def waiting(master, monkeypatch):
     def sleep(request):
         waiting.set()
         over.wait(TIMEOUT)
+
     peer.serve('/sleep', 'std_srvs/Empty', sleep)
     peer.serve('/sleep_elsewhere', 'std_srvs/Empty', sleep)
-    monkeypatch.setattr('pharos.private_rospy.wiring.Wiring.sends_to', lambda self, name, topic: False)
+    monkeypatch.setattr(
+        'pharos.private_rospy.wiring.Wiring.sends_to', lambda self, name, topic: False
+    )
     monkeypatch.setattr('pharos.channel.OutputChannel.connections', [])
-    monkeypatch.setattr('pharos.intraprocess.services.find', lambda name, uri, cls, find=services.find: (
-        find(name, uri, cls) if name == '/sleep' else None))
+    monkeypatch.setattr(
+        'pharos.intraprocess.services.find',
+        lambda name, uri, cls, find=services.find: (
+            find(name, uri, cls) if name == '/sleep' else None
+        ),
+    )
     yield waiting
     over.set()
     master._api('/mute_one').unregisterSubscriber('/mute', mute)
@@ -366,15 +410,22 @@ def waiting(master, monkeypatch):
         LISTENERS.pop().close()
 
 
-@pytest.mark.parametrize('where, name', [
-    (where, name) for where in ('soul', 'executed soul', 'delegate') for name in WAITS
-    if (where, name) != ('delegate', 'wait_for_subscribers in a loop')])    # a delegate is told, and must end itself
+# a delegate is told, and must end itself
+@pytest.mark.parametrize(
+    'where, name',
+    [
+        (where, name)
+        for where in ('soul', 'executed soul', 'delegate')
+        for name in WAITS
+        if (where, name) != ('delegate', 'wait_for_subscribers in a loop')
+    ],
+)
 def test_what_waits_ends_with_the_node(master, waiting, monkeypatch, where, name):
     node = create(master, '/waiter')
     node.connect_timeout = node.stop_timeout = TIMEOUT
 
     def run(me):
-        if 'service' not in name:    # there, it is the peer who knows
+        if 'service' not in name:  # there, it is the peer who knows
             monkeypatch.setattr(lifetime.Interruption, '__enter__', enter)
             monkeypatch.setattr('pharos.topic.POLL', TIMEOUT)
             if 'type' in name:
@@ -385,6 +436,7 @@ def test_what_waits_ends_with_the_node(master, waiting, monkeypatch, where, name
     def enter(self, really=lifetime.Interruption.__enter__):
         waiting.set()
         return really(self)
+
     if where == 'delegate':
         sender = create(master, '/sender').output_channel('/go', 'std_msgs/Empty', latch=True)
         sender.publish(message_class('std_msgs/Empty')())
@@ -450,7 +502,8 @@ def test_a_call_that_is_ended_before_it_has_connected_is_not_waited_for():
                 proxy('transport').shut()
                 connected.set()
                 super().connect()
-        address = url[len('http://'):-1]
+
+        address = url[len('http://') : -1]
         proxy('transport')._connection = address, Shutting(address, proxy('transport')._limits)
         with pytest.raises(OSError):
             proxy.getPid('/caller')

@@ -1,4 +1,5 @@
-"""Bad input: each its own error, which names the thing and the remedy, and leaves nothing behind."""
+"""Bad input: each its own error, which names the thing and the remedy, and leaves nothing
+behind."""
 import socket
 import threading
 
@@ -26,20 +27,27 @@ def nothing_left(master):
     """After the test, no thread and no registration more than before."""
     before = set(threading.enumerate()), master.system_state()
     yield
-    left = [thread.name for thread in set(threading.enumerate()) - before[0] if '/node' in thread.name]
+    left = [
+        thread.name for thread in set(threading.enumerate()) - before[0] if '/node' in thread.name
+    ]
     assert (left, master.system_state()) == ([], before[1])
 
 
 @pytest.mark.parametrize('which', ['tcp_port', 'xmlrpc_port'])
 def test_a_busy_port(master, busy_port, nothing_left, which):
-    """rospy says 'init_node interrupted', or prints the error and registers a node that is deaf (ros_comm #127)."""
-    with pytest.raises(pharos.PortInUseError, match='%s %d cannot be bound .*: choose another' % (which, busy_port)):
+    """rospy says 'init_node interrupted', or prints the error and registers a node that is deaf
+    (ros_comm #127)."""
+    with pytest.raises(
+        pharos.PortInUseError, match='%s %d cannot be bound .*: choose another' % (which, busy_port)
+    ):
         create(master, **{which: busy_port})
 
 
 def test_a_taken_name(master):
     owner = create(master, '/taken')
-    with pytest.raises(pharos.NodeNameInUseError, match='/taken is taken by a running node of this process: .*stop'):
+    with pytest.raises(
+        pharos.NodeNameInUseError, match='/taken is taken by a running node of this process: .*stop'
+    ):
         create(master, '/taken')
     assert owner.is_running and master.answers('/taken')
 
@@ -73,14 +81,28 @@ def test_a_master_that_never_answers_is_given_up(monkeypatch):
             create(Master('http://127.0.0.1:%d' % silent.getsockname()[1]))
 
 
-@pytest.mark.parametrize('url', ['', 'localhost:11311', 'http://', 'http://host', 'http://host:port', 'ftp://host:1',
-                                 'http://host:1/path', 7, b'http://host:1'])
+@pytest.mark.parametrize(
+    'url',
+    [
+        '',
+        'localhost:11311',
+        'http://',
+        'http://host',
+        'http://host:port',
+        'ftp://host:1',
+        'http://host:1/path',
+        7,
+        b'http://host:1',
+    ],
+)
 def test_a_malformed_url(url):
     with pytest.raises(ValueError, match='looks like http://127.0.0.1:11311/'):
         Master(url)
 
 
-@pytest.mark.parametrize('name', ['', '/', '//', '/a b', '/1st', '~private', '/ends/', 'é', None, '/a-b'])
+@pytest.mark.parametrize(
+    'name', ['', '/', '//', '/a b', '/1st', '~private', '/ends/', 'é', None, '/a-b']
+)
 def test_a_name_that_cannot_be_a_nodes(master, nothing_left, name):
     with pytest.raises(ValueError, match='node'):
         create(master, name)
@@ -111,13 +133,18 @@ def test_a_delegate_that_cannot_be_called_as_one(master, block):
 
 
 def test_an_unknown_type(master):
-    with pytest.raises(pharos.UnknownTypeError, match="unknown message type 'turtlesim/Speed'.*define_message"):
+    with pytest.raises(
+        pharos.UnknownTypeError, match="unknown message type 'turtlesim/Speed'.*define_message"
+    ):
         create(master).send_to('/t', typed_as='turtlesim/Speed')
 
 
 def test_an_unknown_topic(master):
     node = create(master)
-    with pytest.raises(pharos.UnknownTopicError, match='no node of .* publishes or subscribes to /untyped_yet.*typed_as='):
+    with pytest.raises(
+        pharos.UnknownTopicError,
+        match='no node of .* publishes or subscribes to /untyped_yet.*typed_as=',
+    ):
         node.send_to('/untyped_yet', data=1)
     node.output_channel('/posing_turtle/pose', 'turtlesim/Pose')
     with pytest.raises(pharos.UnknownTopicError, match='did you mean /posing_turtle/pose'):
@@ -127,7 +154,9 @@ def test_an_unknown_topic(master):
 def test_another_type_for_a_topic_in_use(master):
     node = create(master)
     node.interested_in('/t', 'std_msgs/String')
-    with pytest.raises(pharos.MessageTypeError, match=r'std_msgs/String \[.*\] already .* std_msgs/Bool \['):
+    with pytest.raises(
+        pharos.MessageTypeError, match=r'std_msgs/String \[.*\] already .* std_msgs/Bool \['
+    ):
         node.send_to('/t', data=True, typed_as='std_msgs/Bool')
 
 
@@ -139,20 +168,33 @@ def fills_with_text(message):
     message.linear = 'fast'
 
 
-@pytest.mark.parametrize('block, fields, said', [
-    (None, {'liner': 1.0}, 'turtlesim/Velocity has no field .liner. .*did you mean .linear.*linear: float32, angular'),
-    (fills_by_setattr, {}, 'turtlesim/Velocity has no field .liner.'),
-    (None, {'linear': 'fast'}, 'turtlesim/Velocity.linear = .fast. does not fit float32: give a number'),
-    (fills_with_text, {}, 'turtlesim/Velocity.linear = .fast. does not fit float32'),
-])
+@pytest.mark.parametrize(
+    'block, fields, said',
+    [
+        (
+            None,
+            {'liner': 1.0},
+            'turtlesim/Velocity has no field .liner. .*did you mean .linear.*linear: float32, angular',
+        ),
+        (fills_by_setattr, {}, 'turtlesim/Velocity has no field .liner.'),
+        (
+            None,
+            {'linear': 'fast'},
+            'turtlesim/Velocity.linear = .fast. does not fit float32: give a number',
+        ),
+        (fills_with_text, {}, 'turtlesim/Velocity.linear = .fast. does not fit float32'),
+    ],
+)
 @pytest.mark.parametrize('interested', [False, True])
-def test_a_field_that_does_not_exist_or_does_not_fit(master, mailbox, block, fields, said, interested):
+def test_a_field_that_does_not_exist_or_does_not_fit(
+    master, mailbox, block, fields, said, interested
+):
     node = create(master)
     if interested:
         create(master, '/other', delegate=mailbox).interested_in('/t', 'turtlesim/Velocity')
     with pytest.raises(pharos.MessageTypeError, match=said):
         node.send_to('/t', block, typed_as='turtlesim/Velocity', **fields)
-    node.send_to('/t', linear=2)    # and the next one goes through
+    node.send_to('/t', linear=2)  # and the next one goes through
     assert not interested or mailbox.get().linear == 2.0
 
 
@@ -160,14 +202,18 @@ def test_a_value_in_a_blocks_place_is_told_how_a_block_is_called(master):
     node = create(master)
     channel = node.output_channel('/t', 'std_msgs/String')
     for send in channel.send, lambda block: node.send_to('/t', block):
-        with pytest.raises(TypeError, match=r"a block is called as block\(message\); 'hello' cannot be called"):
+        with pytest.raises(
+            TypeError, match=r"a block is called as block\(message\); 'hello' cannot be called"
+        ):
             send('hello')
 
 
 def test_a_block_that_returns_a_message_of_its_own_is_told_that_it_would_not_be_sent(master):
     """An empty message went out in silence."""
     node, cls = create(master), pharos.message_class('std_msgs/String')
-    with pytest.raises(pharos.MessageTypeError, match='returned another std_msgs/String than it was given'):
+    with pytest.raises(
+        pharos.MessageTypeError, match='returned another std_msgs/String than it was given'
+    ):
         node.send_to('/t', lambda message: cls('lost'), typed_as=cls)
     assert node.send_to('/t', lambda message: message).data == ''
     assert node.send_to('/t', lambda message: setattr(message, 'data', 'x')).data == 'x'
@@ -176,7 +222,9 @@ def test_a_block_that_returns_a_message_of_its_own_is_told_that_it_would_not_be_
 def test_a_message_of_another_type(master):
     channel = create(master).output_channel('/t', 'turtlesim/Velocity')
     for wrong in pharos.message_class('std_msgs/String')(), {'linear': 1.0}, None:
-        with pytest.raises(pharos.MessageTypeError, match='/t carries turtlesim/Velocity .linear: float32'):
+        with pytest.raises(
+            pharos.MessageTypeError, match='/t carries turtlesim/Velocity .linear: float32'
+        ):
             channel.publish(wrong)
 
 
@@ -193,21 +241,28 @@ def test_an_exception_in_start_stops_the_node(master, nothing_left):
         def start(self):
             super().start()
             raise RuntimeError('broken')
+
     with pytest.raises(RuntimeError, match='broken'):
         master.create(Broken, named='/node')
 
 
 def test_a_name_is_given_to_create_and_not_set(master, nothing_left):
     """The node went on as one of that name, and the master listed it as one of another process."""
+
     class Arm(pharos.Node):
         def __init__(self):
             self.name = 'left arm'
-    with pytest.raises(AttributeError, match="/node is the name .*create.., as named='left arm'.*Arm is called"):
+
+    with pytest.raises(
+        AttributeError, match="/node is the name .*create.., as named='left arm'.*Arm is called"
+    ):
         create(master, node_class=Arm)
 
 
 def test_a_node_that_no_master_made_is_refused():
-    with pytest.raises(TypeError, match=r'made by a master: .*create\(BlockNode, named=...\), not BlockNode\(\)'):
+    with pytest.raises(
+        TypeError, match=r'made by a master: .*create\(BlockNode, named=...\), not BlockNode\(\)'
+    ):
         BlockNode()
 
 
@@ -224,10 +279,15 @@ def test_a_start_that_does_not_call_super_is_told_so(master, nothing_left):
     class Earlier(pharos.Node):
         def __init__(self):
             self.interested_in('/never', 'std_msgs/Empty')
-    with pytest.raises(pharos.PharosError, match=r'/node did not start: Silent.start.* call super\(\).start\(\)'):
+
+    with pytest.raises(
+        pharos.PharosError, match=r'/node did not start: Silent.start.* call super\(\).start\(\)'
+    ):
         create(master, '/node', node_class=Silent)
     for node_class in Early, Earlier:
-        with pytest.raises(pharos.NodeStoppedError, match=r'/node is new: .* call super\(\).start\(\) before'):
+        with pytest.raises(
+            pharos.NodeStoppedError, match=r'/node is new: .* call super\(\).start\(\) before'
+        ):
             create(master, '/node', node_class=node_class)
 
 
@@ -242,8 +302,11 @@ def test_a_method_for_a_soul_that_already_has_its_self_is_told_what_to_give(mast
     class Driver(pharos.Node):
         def loop(self):
             pass
+
     node = create(master, node_class=Driver)
-    with pytest.raises(TypeError, match=r'called as soul\(node\).*Give .*Driver.loop, whose self is the node'):
+    with pytest.raises(
+        TypeError, match=r'called as soul\(node\).*Give .*Driver.loop, whose self is the node'
+    ):
         node.fork(node.loop)
     node.fork(Driver.loop).join()
 

@@ -22,7 +22,14 @@ class OfMyOwn(BaseException):
     """Derived from no Exception, as nothing should be but often is."""
 
 
-OUTCASTS = [SystemExit, KeyboardInterrupt, GeneratorExit, asyncio.CancelledError, pytest.fail.Exception, OfMyOwn]
+OUTCASTS = [
+    SystemExit,
+    KeyboardInterrupt,
+    GeneratorExit,
+    asyncio.CancelledError,
+    pytest.fail.Exception,
+    OfMyOwn,
+]
 
 
 def create(master, name='/node', **kwargs):
@@ -30,7 +37,8 @@ def create(master, name='/node', **kwargs):
 
 
 class Raising:
-    """A block that raises one error after the other, and when there are none left takes what it gets."""
+    """A block that raises one error after the other, and when there are none left takes what it
+    gets."""
 
     def __init__(self, *errors):
         self._errors = list(errors)
@@ -54,7 +62,8 @@ def dead_threads(monkeypatch):
     return dead
 
 
-# -- whatever it raises, no thread and no caller ends ------------------------------------------------------------------
+# -- whatever it raises, no thread and no caller ends
+
 
 @pytest.mark.parametrize('inline', [False, True])
 def test_a_delegate_may_raise_anything(master, transcript, inline):
@@ -65,14 +74,18 @@ def test_a_delegate_may_raise_anything(master, transcript, inline):
         create(master, '/sender%d' % number).send_to('/failing', data=number)
     assert block.taken.get().data == len(OUTCASTS)
     assert classes_of(node.errors) == OUTCASTS
-    assert [line.split(' raised ')[1] for line in transcript] == [outcast.__name__ + ': out' for outcast in OUTCASTS]
+    assert [line.split(' raised ')[1] for line in transcript] == [
+        outcast.__name__ + ': out' for outcast in OUTCASTS
+    ]
 
 
 def test_a_delegate_of_an_external_publisher_may_raise_anything(master, transcript):
     block = Raising(*[outcast('out') for outcast in OUTCASTS])
     node = create(master, delegate=block)
     node.interested_in('/failing_outside', 'std_msgs/Int32')
-    with Program(master.url, 'rostopic', 'pub', '-r', '50', '/failing_outside', 'std_msgs/Int32', '5'):
+    with Program(
+        master.url, 'rostopic', 'pub', '-r', '50', '/failing_outside', 'std_msgs/Int32', '5'
+    ):
         block.taken.take(20)
     assert classes_of(node.errors) == OUTCASTS
 
@@ -81,11 +94,17 @@ def test_a_delegate_of_an_external_publisher_may_raise_anything(master, transcri
 def test_a_soul_may_raise_anything(master, transcript, dead_threads, outcast):
     def soul(me):
         raise outcast('out')
+
     node = create(master, soul=soul)
     assert node.execute() is None
     node.fork().join(TIMEOUT)
-    failure, = node.failures
-    assert type(failure.error) is outcast and failure.count == 2 and failure.block is soul and not dead_threads
+    (failure,) = node.failures
+    assert (
+        type(failure.error) is outcast
+        and failure.count == 2
+        and failure.block is soul
+        and not dead_threads
+    )
 
 
 @pytest.mark.parametrize('outcast', OUTCASTS)
@@ -96,9 +115,9 @@ def test_a_service_block_may_raise_anything(master, transcript, dead_threads, ou
     node.serve('/fails', 'std_srvs/Empty', block)
     service = master.lookup_service('/fails')
     begin = time.monotonic()
-    with pytest.raises(pharos.ServiceCallError, match='/fails failed: .*%s: out' % outcast.__name__):
+    with pytest.raises(pharos.ServiceCallError, match=f'/fails failed: .*{outcast.__name__}: out'):
         service.call(timeout=timeout)
-    assert time.monotonic() - begin < TIMEOUT    # it is not waited for in vain
+    assert time.monotonic() - begin < TIMEOUT  # it is not waited for in vain
     service.call(timeout=timeout)
     assert classes_of(node.errors) == [outcast] and not dead_threads
 
@@ -118,8 +137,8 @@ def test_a_parameter_block_may_raise_anything(master, transcript):
     block = Raising(*[outcast('out') for outcast in OUTCASTS * 2])
     parameter.on_change(block)
     for number in range(len(OUTCASTS)):
-        parameter.set(number)                            # runs it here
-        master.parameters['/node/failing'] = number      # runs it in a thread of the XML-RPC server
+        parameter.set(number)  # runs it here
+        master.parameters['/node/failing'] = number  # runs it in a thread of the XML-RPC server
         until(lambda: node.health().errors == 2 * number + 2)
     parameter.set(99)
     assert block.taken.get() == 99
@@ -133,6 +152,7 @@ def test_a_block_for_changes_may_raise_anything(master, transcript):
         if name in events:
             events.pop(name)
             raise SystemExit('out')
+
     end = master.on_change(block)
     also = master.on_change(lambda kind, name, is_there: watched((kind, name), None))
     for name in '/first', '/second':
@@ -163,14 +183,20 @@ def test_on_line_may_raise_anything(master, transcript):
     def on_line(text):
         lines(text, None)
         raise SystemExit(text)
+
     with master.run('topic_tools', 'relay', on_line=on_line) as process:
         process.wait(TIMEOUT)
     printed = process.output.split('\n')
     assert len(printed) > 1 and lines.take(len(printed)) == printed
-    assert 'block' in transcript[0] and 'for the output of' in transcript[0] and 'raised SystemExit' in transcript[0]
+    assert (
+        'block' in transcript[0]
+        and 'for the output of' in transcript[0]
+        and 'raised SystemExit' in transcript[0]
+    )
 
 
-# -- plain rospy, and what else a thread of ours runs ------------------------------------------------------------------
+# -- plain rospy, and what else a thread of ours runs
+
 
 @pytest.mark.parametrize('timeout', [None, TIMEOUT])
 @pytest.mark.parametrize('outcast', OUTCASTS)
@@ -180,11 +206,18 @@ def test_a_service_of_plain_rospy_may_raise_anything(master, dead_threads, outca
     def tell(error, *information):
         told.append(type(error))
         raise SystemExit('cannot tell')
+
     block = Raising(outcast('out'))
-    node.ros.Service('/plain', pharos.service_class('std_srvs/Empty'),
-                     lambda request: block(request) or {}, error_handler=tell)
+    node.ros.Service(
+        '/plain',
+        pharos.service_class('std_srvs/Empty'),
+        lambda request: block(request) or {},
+        error_handler=tell,
+    )
     service = master.lookup_service('/plain')
-    with pytest.raises(pharos.ServiceCallError, match='/plain failed: error processing request: out'):
+    with pytest.raises(
+        pharos.ServiceCallError, match='/plain failed: error processing request: out'
+    ):
         service.call(timeout=timeout)
     service.call(timeout=timeout)
     assert told == [outcast] and not dead_threads
@@ -192,13 +225,22 @@ def test_a_service_of_plain_rospy_may_raise_anything(master, dead_threads, outca
 
 def test_a_service_of_plain_rospy_called_from_outside_may_raise_anything(master, dead_threads):
     node, block = create(master), Raising(SystemExit('out'))
-    node.ros.Service('/plain_outside', pharos.service_class('std_srvs/Empty'), lambda request: block(request) or {})
-    assert 'error processing request: out' in run(master.url, 'rosservice', 'call', '/plain_outside').stderr
+    node.ros.Service(
+        '/plain_outside',
+        pharos.service_class('std_srvs/Empty'),
+        lambda request: block(request) or {},
+    )
+    assert (
+        'error processing request: out'
+        in run(master.url, 'rosservice', 'call', '/plain_outside').stderr
+    )
     assert run(master.url, 'rosservice', 'call', '/plain_outside').returncode == 0
     assert not dead_threads
 
 
-def test_a_callback_of_plain_rospy_takes_nothing_from_a_channel_whatever_it_raises(master, mailbox, dead_threads):
+def test_a_callback_of_plain_rospy_takes_nothing_from_a_channel_whatever_it_raises(
+    master, mailbox, dead_threads
+):
     node, plain = create(master), Raising(*[outcast('out') for outcast in OUTCASTS])
     type_ = pharos.message_class('std_msgs/Int32')
     node.ros.Subscriber('/plain_topic', type_, plain)
@@ -206,7 +248,9 @@ def test_a_callback_of_plain_rospy_takes_nothing_from_a_channel_whatever_it_rais
     sender = create(master, '/sender')
     for number in range(len(OUTCASTS) + 1):
         sender.send_to('/plain_topic', data=number)
-    assert [message.data for message in mailbox.take(len(OUTCASTS) + 1)] == list(range(len(OUTCASTS) + 1))
+    assert [message.data for message in mailbox.take(len(OUTCASTS) + 1)] == list(
+        range(len(OUTCASTS) + 1)
+    )
     assert plain.taken.get().data == len(OUTCASTS) and not dead_threads
 
 
@@ -217,8 +261,10 @@ def test_a_hook_of_on_shutdown_may_raise_anything(master, transcript, monkeypatc
     node, hook = create(master), Raising(outcast('out'))
     node.ros.on_shutdown(lambda: hook('out'))
     node.ros.on_shutdown(lambda: hook('the other'))
-    with monkeypatch.context() as patched, io.TextIOWrapper(io.FileIO(write, 'w'), write_through=True) as closed:
-        patched.setattr(sys, 'stderr', closed)    # where rospy would print it
+    with monkeypatch.context() as patched, io.TextIOWrapper(
+        io.FileIO(write, 'w'), write_through=True
+    ) as closed:
+        patched.setattr(sys, 'stderr', closed)  # where rospy would print it
         node.stop()
     assert hook.taken.get() == 'the other' and classes_of(node.errors) == [outcast]
     assert '/node' not in [other.name for other in master.nodes()]
@@ -236,14 +282,19 @@ class Failing(pharos.Node):
 
 @pytest.mark.parametrize('how', ['asked by ROS', 'all are stopped'])
 def test_a_stop_that_fails_in_a_thread_of_ours_is_a_failure_and_the_node_stops(
-        master, transcript, dead_threads, how):
+    master, transcript, dead_threads, how
+):
     node = master.create(Failing, named='/failing_stop', domain='127.0.0.1')
     if how == 'asked by ROS':
         node.ros.signal_shutdown('enough')
     else:
         running.stop_all()
     until(lambda: node.failures)
-    assert node.lifecycle.value == 'stopped' and classes_of(node.errors) == [SystemExit] and not dead_threads
+    assert (
+        node.lifecycle.value == 'stopped'
+        and classes_of(node.errors) == [SystemExit]
+        and not dead_threads
+    )
     assert transcript[-1] == 'Failing.stop of /failing_stop raised SystemExit: stop'
     assert '/failing_stop' not in [other.name for other in master.nodes()]
 
@@ -263,7 +314,8 @@ def test_a_stop_that_fails_hides_no_failure_of_the_start(master, transcript):
     assert '/failing_stop' not in [other.name for other in master.nodes()]
 
 
-# -- nor by what the report of it raises -------------------------------------------------------------------------------
+# -- nor by what the report of it raises
+
 
 class Unspeakable(Exception):
     def __str__(self):
@@ -291,6 +343,7 @@ def fails_on_bad(mailbox, error):
         if message.data == 'bad':
             raise error
         mailbox(message, channel)
+
     return delegate
 
 
@@ -300,14 +353,16 @@ def send_bad_and_good(node, inline=False):
     node.send_to('/reported', data='good')
 
 
-@pytest.mark.parametrize('make', [Unspeakable, lambda: SystemExit(Unspeakable())], ids=['itself', 'what it holds'])
+@pytest.mark.parametrize(
+    'make', [Unspeakable, lambda: SystemExit(Unspeakable())], ids=['itself', 'what it holds']
+)
 def test_an_error_that_cannot_be_shown_is_kept_all_the_same(master, transcript, mailbox, make):
     error = make()
     error.__cause__ = Unspeakable()
     node = create(master, delegate=fails_on_bad(mailbox, error))
     send_bad_and_good(node)
     assert mailbox.get().data == 'good' and node.errors[0] is error
-    assert 'raised %s' % type(error).__name__ in transcript[0]
+    assert f'raised {type(error).__name__}' in transcript[0]
     assert repr(node.failures)
 
 
@@ -327,16 +382,19 @@ def test_a_log_and_a_transcript_that_fail_change_nothing(master, mailbox, capsys
 
     def receiver(text):
         raise outcast('no line')
+
     before = Transcript.on_show(receiver)
     try:
-        node = master.create(Mute, named='/mute', delegate=fails_on_bad(mailbox, ValueError('bad one')))
+        node = master.create(
+            Mute, named='/mute', delegate=fails_on_bad(mailbox, ValueError('bad one'))
+        )
         send_bad_and_good(node, inline)
         assert mailbox.get().data == 'good' and classes_of(node.errors) == [ValueError]
         Transcript.show('another', Unspeakable())
     finally:
         Transcript.on_show(before)
     about, line, another = capsys.readouterr().out.splitlines()
-    assert 'receiver' in about and 'raised %s: no line' % outcast.__name__ in about
+    assert 'receiver' in about and f'raised {outcast.__name__}: no line' in about
     assert line.endswith('raised ValueError: bad one')
     assert another == 'another <Unspeakable that cannot be shown>'
 
@@ -387,12 +445,16 @@ def test_a_receiver_that_works_again_gets_the_lines_again(capsys):
     assert capsys.readouterr().out.splitlines()[1:] == ['first']
 
 
-# -- kept, told, counted -----------------------------------------------------------------------------------------------
+# -- kept, told, counted
+
 
 def failing(node, error_of, count, topic='/counted'):
-    """Have a delegate of the node raise ``error_of(message.data)`` on each of so many messages; returns the channel."""
+    """Have a delegate of the node raise ``error_of(message.data)`` on each of so many messages;
+    returns the channel."""
+
     def delegate(message, channel):
         raise error_of(message.data)
+
     before = node.health().errors
     channel = node.interested_in(topic, 'std_msgs/Int32', delegate=delegate, inline=True)
     for number in range(count):
@@ -404,11 +466,17 @@ def failing(node, error_of, count, topic='/counted'):
 def test_identical_failures_are_one_told_once_and_then_counted(master, transcript):
     node = create(master)
     channel = failing(node, lambda number: ValueError('the same'), 250)
-    error, = node.errors
-    failure, = node.failures
+    (error,) = node.errors
+    (failure,) = node.failures
     assert isinstance(failure, pharos.Failure) and failure.error is error and failure.count == 250
-    assert failure.channel is channel and failure.message.data == 249 and abs(failure.time - time.time()) < 100
-    assert 'ValueError: the same, 250 times' in repr(failure) and 'raise error_of' in failure.traceback
+    assert (
+        failure.channel is channel
+        and failure.message.data == 249
+        and abs(failure.time - time.time()) < 100
+    )
+    assert (
+        'ValueError: the same, 250 times' in repr(failure) and 'raise error_of' in failure.traceback
+    )
     first, tenth, hundredth = transcript
     assert first.endswith('on /counted raised ValueError: the same')
     assert tenth == first + ', 10 times by now' and hundredth == first + ', 100 times by now'
@@ -418,19 +486,24 @@ def test_identical_failures_are_one_told_once_and_then_counted(master, transcrip
 def test_the_log_has_the_traceback_of_a_failure_once(master, transcript):
     lines = []
     create(master, '/auditor', delegate=lambda line, channel: lines.append(line.msg)).interested_in(
-        '/rosout', 'rosgraph_msgs/Log', inline=True)
+        '/rosout', 'rosgraph_msgs/Log', inline=True
+    )
     failing(create(master), lambda number: ValueError('the same'), 50)
 
     def told():
         return ['Traceback' in text for text in lines if 'ValueError: the same' in text]
-    until(lambda: len(told()) == 2)    # the listener may connect later than the first line
+
+    until(lambda: len(told()) == 2)  # the listener may connect later than the first line
     assert told() == [True, False]
 
 
-def test_a_listener_to_the_log_that_fails_does_not_hear_of_itself_for_ever(master, transcript, mailbox):
+def test_a_listener_to_the_log_that_fails_does_not_hear_of_itself_for_ever(
+    master, transcript, mailbox
+):
     def delegate(line, channel):
         mailbox(line, channel)
         raise ValueError(f'cannot read {line.msg}')
+
     node = create(master, delegate=delegate)
     node.interested_in('/rosout', 'rosgraph_msgs/Log')
     speaker = create(master, '/speaker')
@@ -439,13 +512,18 @@ def test_a_listener_to_the_log_that_fails_does_not_hear_of_itself_for_ever(maste
         pass
     speaker.log('one more')
     until(lambda: any('one more' in failure.text for failure in node.failures))
-    assert len(transcript) <= failures.TEXTS + 2    # and for the 10th and 100th, should it come to that
+    # and for the 10th and 100th, should it come to that
+    assert len(transcript) <= failures.TEXTS + 2
 
 
 def test_failures_differ_in_block_channel_class_place_and_text(master, transcript):
     node = create(master)
-    for topic, error_of in [('/one', lambda number: ValueError('a')), ('/two', lambda number: ValueError('a')),
-                            ('/two', lambda number: ValueError('b')), ('/two', lambda number: KeyError('a'))]:
+    for topic, error_of in [
+        ('/one', lambda number: ValueError('a')),
+        ('/two', lambda number: ValueError('a')),
+        ('/two', lambda number: ValueError('b')),
+        ('/two', lambda number: KeyError('a')),
+    ]:
         failing(node, error_of, 2, topic).close()
     assert [failure.count for failure in node.failures] == [2] * 4 and len(transcript) == 4
 
@@ -454,10 +532,17 @@ def test_failures_of_ever_changing_text_are_told_a_few_times(master, transcript)
     node = create(master)
     failing(node, lambda number: ValueError(f'no transform at {number}'), 1000)
     assert [line.split('no transform at ')[1] for line in transcript] == [
-        '0', '1', '2', '9, 10 times by now, with different texts', '99, 100 times by now, with different texts',
-        '999, 1000 times by now, with different texts']
+        '0',
+        '1',
+        '2',
+        '9, 10 times by now, with different texts',
+        '99, 100 times by now, with different texts',
+        '999, 1000 times by now, with different texts',
+    ]
     assert len(node.errors) == len(node.failures) == failures.KEPT
-    assert str(node.errors[0]) == 'no transform at 0' and str(node.errors[-1]) == 'no transform at 999'
+    assert (
+        str(node.errors[0]) == 'no transform at 0' and str(node.errors[-1]) == 'no transform at 999'
+    )
 
 
 def test_a_block_that_replaces_another_and_fails_as_that_did_is_told(master, transcript):
@@ -490,17 +575,24 @@ def test_a_flood_of_failures_displaces_no_other(master, transcript):
     failing(node, lambda number: ValueError(f'first, at {number}'), 300, '/flood')
     failing(node, lambda number: KeyError('the cause, perhaps'), 1, '/rare')
     failing(node, lambda number: ValueError(f'then, at {number}'), 300, '/flood_too')
-    assert [str(error) for error in node.errors if isinstance(error, KeyError)] == ["'the cause, perhaps'"]
+    assert [str(error) for error in node.errors if isinstance(error, KeyError)] == [
+        "'the cause, perhaps'"
+    ]
     assert any('/rare' in line for line in transcript) and len(node.errors) == failures.KEPT
 
 
 def test_the_newest_failure_is_the_last(master, transcript):
     node = create(master)
     failing(node, lambda number: ValueError(number % 2), 4)
-    assert [(str(failure.error), failure.count) for failure in node.failures] == [('0', 2), ('1', 2)]
+    assert [(str(failure.error), failure.count) for failure in node.failures] == [
+        ('0', 2),
+        ('1', 2),
+    ]
     failing(node, lambda number: ValueError('more'), 1, '/more')
     assert [str(error) for error in node.errors] == ['0', '1', 'more']
-    assert [str(error) for error in node.errors[1:]] == ['1', 'more'] and repr(node.errors).startswith('[ValueError(0)')
+    assert [str(error) for error in node.errors[1:]] == ['1', 'more'] and repr(
+        node.errors
+    ).startswith('[ValueError(0)')
 
 
 def test_errors_that_have_been_seen_to_may_be_taken_out(master, transcript):
@@ -514,7 +606,7 @@ def test_errors_that_have_been_seen_to_may_be_taken_out(master, transcript):
     assert len(node.errors) == 1 and 'new' in transcript[-1]
 
 
-# -- what is large is kept for the newest alone ------------------------------------------------------------------------
+# -- what is large is kept for the newest alone
 
 SIZE = 200000
 
@@ -522,6 +614,7 @@ SIZE = 200000
 @dataclasses.dataclass(frozen=True)
 class Frozen(Exception):
     """Its attributes cannot be set, not even __traceback__ by its name."""
+
     what: object
 
 
@@ -547,13 +640,15 @@ def in_a_group(message):
     try:
         in_a_chain(message)
     except ValueError as error:
-        raise ExceptionGroup('bad images', [error])    # noqa: F821: of Python 3.11
+        raise ExceptionGroup('bad images', [error])  # noqa: F821: of Python 3.11
 
 
 WAYS = {
     'the same': lambda message: int('x'),
     'another text': lambda message: int(f'x{message.height}'),
-    'the message in the error': lambda message: throw(ValueError('bad image', message, message.height)),
+    'the message in the error': lambda message: throw(
+        ValueError('bad image', message, message.height)
+    ),
     'its data in the error': lambda message: throw(ValueError(message.height, message.data)),
     'the message an attribute': lambda message: throw(with_attribute(message)),
     'in a frozen error': lambda message: throw(Frozen(message)),
@@ -574,9 +669,12 @@ def held(datas):
 @pytest.mark.parametrize('inline', [False, True])
 @pytest.mark.parametrize('way', WAYS.values(), ids=WAYS)
 def test_a_delegate_that_fails_on_images_holds_on_to_few(master, transcript, way, inline):
-    node, sender = create(master, delegate=lambda message, channel: way(message)), create(master, '/sender')
+    node, sender = create(master, delegate=lambda message, channel: way(message)), create(
+        master, '/sender'
+    )
     node.interested_in('/failing_images', 'sensor_msgs/Image', inline=inline)
-    datas = [b'x' * (number + 1) + b'\xff' * SIZE for number in range(30)]    # each decodes up to another place
+    # each decodes up to another place
+    datas = [b'x' * (number + 1) + b'\xff' * SIZE for number in range(30)]
     assert held(datas) == 0
     for number in range(len(datas)):
         sender.send_to('/failing_images', data=datas[number], height=number)
@@ -600,17 +698,21 @@ def test_long_texts_are_cut(master, transcript):
     assert len(transcript[0]) < 5000 and len(node.failures[0].traceback) < 50000
 
 
-# -- again -------------------------------------------------------------------------------------------------------------
+# -- again
+
 
 def test_a_delegate_is_run_again_as_it_is_now_on_the_same_message(master, transcript, mailbox):
     node = create(master, delegate=lambda message, channel: 1 / 0)
     channel = node.interested_in('/again', 'std_msgs/String', inline=True)
     node.send_to('/again', data='bad')
-    failure, = node.failures
-    assert failure.retry() is False and failure.count == 2 and len(transcript) == 2    # told, for somebody waits for it
+    (failure,) = node.failures
+    # told, for somebody waits for it
+    assert failure.retry() is False and failure.count == 2 and len(transcript) == 2
     node.delegate = mailbox
     assert failure.retry() is True
-    assert mailbox.get_with_channel() == (failure.message, channel) and failure.message.data == 'bad'
+    assert (
+        mailbox.get_with_channel() == (failure.message, channel) and failure.message.data == 'bad'
+    )
     assert (failure.count, channel.received) == (2, 1)
     channel.delegate = Raising(SystemExit('out'))
     assert failure.retry() is False and classes_of(node.errors) == [ZeroDivisionError, SystemExit]
@@ -627,6 +729,7 @@ def test_a_delegate_is_run_again_when_no_other_runs(master, transcript, mailbox)
         busy.set()
         go_on.wait(TIMEOUT)
         ran.append('slow')
+
     node.interested_in('/slow', 'std_msgs/Empty', delegate=slow)
     node.send_to('/slow')
     assert busy.wait(TIMEOUT)
@@ -642,26 +745,37 @@ def test_a_delegate_is_run_again_when_no_other_runs(master, transcript, mailbox)
 def test_a_delegate_may_have_another_one_run_again(master, transcript, mailbox, inline):
     node, failing_once = create(master), Raising(ValueError('bad'))
     node.interested_in('/again', 'std_msgs/String', delegate=failing_once, inline=inline)
-    node.interested_in('/retry', 'std_msgs/Empty', inline=inline,
-                       delegate=lambda message, channel: mailbox(node.failures[-1].retry(), channel))
+    node.interested_in(
+        '/retry',
+        'std_msgs/Empty',
+        inline=inline,
+        delegate=lambda message, channel: mailbox(node.failures[-1].retry(), channel),
+    )
     node.send_to('/again', data='bad')
     until(lambda: node.failures)
     node.send_to('/retry')
     assert mailbox.get() is True and failing_once.taken.get().data == 'bad'
 
 
-def test_what_came_inline_while_a_delegate_was_run_again_is_not_left_lying(master, transcript, mailbox):
+def test_what_came_inline_while_a_delegate_was_run_again_is_not_left_lying(
+    master, transcript, mailbox
+):
     node, sender = create(master), create(master, '/sender')
-    channel = node.interested_in('/again', 'std_msgs/String', delegate=Raising(ValueError('bad')), inline=True)
+    channel = node.interested_in(
+        '/again', 'std_msgs/String', delegate=Raising(ValueError('bad')), inline=True
+    )
     sender.send_to('/again', data='bad')
-    failure, = node.failures
+    (failure,) = node.failures
 
     def again(message, channel):
         mailbox(message, channel)
         if message.data == 'bad':
-            meanwhile = threading.Thread(target=sender.send_to, args=('/again',), kwargs={'data': 'meanwhile'})
+            meanwhile = threading.Thread(
+                target=sender.send_to, args=('/again',), kwargs={'data': 'meanwhile'}
+            )
             meanwhile.start()
             meanwhile.join(TIMEOUT)
+
     channel.delegate = again
     assert failure.retry() is True
     assert [message.data for message in mailbox.take(2)] == ['bad', 'meanwhile']
@@ -673,7 +787,11 @@ def test_a_soul_is_run_again_as_it_is_now(master, transcript, mailbox):
     node.fork(forked).join(TIMEOUT)
     node.soul = lambda me: mailbox('again', None)
     of_soul, of_fork = node.failures
-    assert of_soul.retry() is True and mailbox.get() == 'again' and of_soul.message is of_soul.channel is None
+    assert (
+        of_soul.retry() is True
+        and mailbox.get() == 'again'
+        and of_soul.message is of_soul.channel is None
+    )
     assert of_fork.retry() is True and forked.taken.get() is node and mailbox.empty()
 
 
@@ -682,7 +800,7 @@ def test_a_service_block_is_run_again_on_the_same_request(master, transcript, ma
     offered = node.serve('/fails_again', 'std_srvs/SetBool', lambda request: 1 / 0)
     with pytest.raises(pharos.ServiceCallError):
         master.lookup_service('/fails_again').call(data=True)
-    failure, = node.failures
+    (failure,) = node.failures
     assert failure.message.data is True and failure.retry() is False and failure.count == 2
     offered.block = lambda request: mailbox(request, None) or {'success': True}
     assert failure.retry() is True and mailbox.get() is failure.message
@@ -693,7 +811,7 @@ def test_a_parameter_block_is_run_again_on_the_same_value(master, transcript):
     parameter = node.parameter('~again')
     parameter.on_change(block)
     parameter.set(5)
-    failure, = node.failures
+    (failure,) = node.failures
     assert failure.message == 5 and failure.block is block
     assert failure.retry() is True and block.taken.get() == 5
     failing(node, ValueError, failures.WHOLE)
@@ -721,7 +839,7 @@ def test_the_newest_failures_alone_are_run_again_and_looked_at(master, transcrip
 def test_a_delegate_of_a_stopped_node_is_not_run_again(master, transcript):
     node = create(master)
     failing(node, lambda number: ValueError('bad'), 1)
-    failure, = node.failures
+    (failure,) = node.failures
     node.stop()
     with pytest.raises(pharos.NodeStoppedError):
         failure.retry()

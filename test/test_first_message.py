@@ -1,4 +1,5 @@
-"""The first message on a topic waits for the subscribers that the master knows, whichever thread sends it."""
+"""The first message on a topic waits for the subscribers that the master knows, whichever thread
+sends it."""
 import contextlib
 import struct
 import threading
@@ -46,7 +47,8 @@ class LateSubscriber:
 
         def sized():
             return file.read(*struct.unpack('<I', file.read(4)))
-        sized()    # the connection header
+
+        sized()  # the connection header
         return lambda count: [sized()[4:].decode() for _ in range(count)]
 
     def close(self):
@@ -68,13 +70,15 @@ def test_nothing_is_lost_of_what_several_threads_send_first(master, opens):
     node = create(master, '/sender')
     node.connect_timeout = TIMEOUT
     with contextlib.closing(LateSubscriber(master, '/first/threads')) as late:
+
         def send(number):
             if opens == 'output_channel' and number == 0:
                 node.output_channel('/first/threads', STRING).send(data='0')
             else:
                 node.send_to('/first/threads', typed_as=STRING, data=str(number))
+
         threads = [in_thread(send, 0)]
-        assert late.told.wait(TIMEOUT)    # the first has registered, and waits
+        assert late.told.wait(TIMEOUT)  # the first has registered, and waits
         threads += [in_thread(send, number) for number in range(1, 10)]
         until(lambda: len(node.channels) == 1)
         receive = late.connect(node)
@@ -93,6 +97,7 @@ def test_threads_that_send_first_at_the_same_time_share_a_channel(master, mailbo
         def send():
             begun.wait(TIMEOUT)
             sender.send_to(topic, typed_as=STRING, data='text')
+
         threads = [in_thread(send) for _ in range(8)]
         for thread in threads:
             thread.join(TIMEOUT)
@@ -130,6 +135,7 @@ def test_a_send_that_waits_for_another_threads_channel_ends_with_the_node(master
                 node.send_to('/first/ending', typed_as=STRING, data='text')
             except Exception as error:
                 errors(error, None)
+
         threads = [in_thread(send)]
         assert late.told.wait(TIMEOUT)
         threads += [in_thread(send) for _ in range(3)]
@@ -156,6 +162,7 @@ def test_who_waits_for_a_subscriber_waits_until_messages_go_to_it(master, mailbo
         reached.set()
         allowed.wait(TIMEOUT)
         return match(link)
+
     monkeypatch.setattr(intraprocess.Link, 'match_receivers', match_late)
     opening = in_thread(receiver.interested_in, '/first/counts', STRING)
     assert reached.wait(TIMEOUT)

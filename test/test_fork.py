@@ -1,4 +1,5 @@
-"""A process forked off one with nodes has none of them, however it ends: they, and what they hold, are its parent's."""
+"""A process forked off one with nodes has none of them, however it ends: they, and what they hold,
+are its parent's."""
 import sys
 
 import pytest
@@ -11,7 +12,8 @@ import multiprocessing, os, signal, sys, threading, warnings
 import pharos
 from pharos import BlockNode, Master
 
-# Python 3.12 and later say in the middle of what is printed that they do not like what is tried here.
+# Python 3.12 and later say in the middle of what is printed that they do not like what is tried
+# here.
 warnings.filterwarnings('ignore', '.* is multi-threaded, use of fork', DeprecationWarning)
 heard, embedded = threading.Event(), Master.embedded()
 
@@ -34,8 +36,8 @@ def child():
 
 heard.wait()
 {fork}
-print('still', me.lifecycle.value, other.health().registered, started.poll(), embedded.is_reachable(), flush=True)
-back.send(data='back')
+print('still', me.lifecycle.value, other.health().registered, started.poll(),
+embedded.is_reachable(), flush=True) back.send(data='back')
 
 def tell_of_the_wait():
     while not pharos.signals._waiting:
@@ -71,8 +73,8 @@ CHILDREN = {
     'nodes of its own': '''
     mine = Master().create(BlockNode, named='/program_child', domain='127.0.0.1')
     got = threading.Event()
-    mine.interested_in('/forks_said', 'std_msgs/String', delegate=lambda message, channel: got.set())
-    mine.send_to('/forks_back', data='from the child')
+    mine.interested_in('/forks_said', 'std_msgs/String', delegate=lambda message, channel:
+    got.set()) mine.send_to('/forks_back', data='from the child')
     assert got.wait(60)
     assert mine.master.nodes() and mine.health().registered
     def live(me):
@@ -85,8 +87,11 @@ CHILDREN = {
 }
 
 
-@pytest.mark.parametrize('fork', [FORK, 'c = multiprocessing.get_context("fork").Process(target=child)\nc.start()\nc.join()'],
-                         ids=['os.fork', 'multiprocessing'])
+@pytest.mark.parametrize(
+    'fork',
+    [FORK, 'c = multiprocessing.get_context("fork").Process(target=child)\nc.start()\nc.join()'],
+    ids=['os.fork', 'multiprocessing'],
+)
 @pytest.mark.parametrize('child', CHILDREN.values(), ids=CHILDREN)
 def test_the_end_of_a_child_leaves_its_parents_nodes_alone(master, mailbox, child, fork):
     node = master.create(BlockNode, named='/tester', domain='127.0.0.1', delegate=mailbox)
@@ -102,20 +107,29 @@ def test_the_end_of_a_child_leaves_its_parents_nodes_alone(master, mailbox, chil
             assert mailbox.get().data == 'good-bye'
             assert '/program_child' not in [node.name for node in master.nodes()]
         assert mailbox.get().data == 'back'
-        program.wait_for('waiting')    # before that, Ctrl-C ends it with another status
+        program.wait_for('waiting')  # before that, Ctrl-C ends it with another status
         out.send(data='second')
         program.wait_for('heard second')
         assert program.end() == 0
 
 
-@pytest.mark.parametrize('use', ['me.send_to("/forks_back", data="x")', 'back.send(data="x")', 'me.sleep(1)', 'me.ros',
-                                 'me.execute()', 'me.interested_in("/c", "std_msgs/String")'])
+@pytest.mark.parametrize(
+    'use',
+    [
+        'me.send_to("/forks_back", data="x")',
+        'back.send(data="x")',
+        'me.sleep(1)',
+        'me.ros',
+        'me.execute()',
+        'me.interested_in("/c", "std_msgs/String")',
+    ],
+)
 def test_a_node_of_the_parent_is_stopped_in_the_child(master, use):
-    child = """
+    child = f"""
     try:
-        %s
+        {use}
     except pharos.NodeStoppedError as error:
-        print('refused', error, repr(me), flush=True)""" % use
+        print('refused', error, repr(me), flush=True)"""
     with Program(master.url, sys.executable, '-c', CODE.format(child=child, fork=FORK)) as program:
         node = master.create(BlockNode, named='/tester', domain='127.0.0.1')
         node.output_channel('/forks', 'std_msgs/String', latch=True).send(data='go')

@@ -37,7 +37,8 @@ def create(master, name, **kwargs):
 
 
 def peer(master, name):
-    """A rospy node of its own process: hears /to_peers, sends its name on /from_peers when ~clear is called."""
+    """A rospy node of its own process: hears /to_peers, sends its name on /from_peers when ~clear
+    is called."""
     program = Program(master.url, sys.executable, '-c', PEER, name)
     program.wait_for('is ready')
     return program
@@ -58,7 +59,8 @@ def bare():
     ros_master.stop()
 
 
-# -- the master -------------------------------------------------------------------------------------------------------
+# -- the master
+
 
 def test_a_bare_master_has_nothing(bare):
     assert bare.is_reachable() and bare.wait(0) is bare
@@ -68,7 +70,7 @@ def test_a_bare_master_has_nothing(bare):
 
 
 def test_what_does_not_exist_is_said_to_be_unknown(bare):
-    with pytest.raises(UnknownNodeError, match='no node /nobody at %s: see rosnode list' % bare.url):
+    with pytest.raises(UnknownNodeError, match=f'no node /nobody at {bare.url}: see rosnode list'):
         bare.node('nobody')
     with pytest.raises(UnknownNodeError, match='/nobody'):
         ExternalNode(bare, '/nobody').pid
@@ -81,7 +83,12 @@ def test_what_does_not_exist_is_said_to_be_unknown(bare):
     nothing = bare.topic('/nothing')
     assert (nothing.publishers, nothing.subscribers, nothing.channels) == ([], [], [])
     nobody = ExternalNode(bare, '/nobody')
-    assert (nobody.is_alive(), nobody.publications, nobody.subscriptions, nobody.services) == (False, {}, {}, [])
+    assert (nobody.is_alive(), nobody.publications, nobody.subscriptions, nobody.services) == (
+        False,
+        {},
+        {},
+        [],
+    )
 
 
 def test_near_names_are_offered(master):
@@ -89,11 +96,13 @@ def test_near_names_are_offered(master):
     node.output_channel('/velocity', STRING)
     node.serve('/clear', 'std_srvs/Empty', lambda request: None)
     master.parameters['/background_r'] = 1
-    for name, ask in (('/turtle_driver', lambda: master.node('/turtle_drivr')),
-                      ('/velocity', lambda: master.topic('/velocty').type),
-                      ('/clear', lambda: master.lookup_service('/claer')),
-                      ('/background_r', lambda: master.parameters['/backgruond_r'])):
-        with pytest.raises((pharos.PharosError, KeyError), match='did you mean %s' % name):
+    for name, ask in (
+        ('/turtle_driver', lambda: master.node('/turtle_drivr')),
+        ('/velocity', lambda: master.topic('/velocty').type),
+        ('/clear', lambda: master.lookup_service('/claer')),
+        ('/background_r', lambda: master.parameters['/backgruond_r']),
+    ):
+        with pytest.raises((pharos.PharosError, KeyError), match=f'did you mean {name}'):
             ask()
 
 
@@ -105,14 +114,18 @@ def test_nodes_topics_and_services_are_those_that_rostopic_and_rosnode_list(mast
     assert [node.name for node in master.nodes()] == ['/here']
     topics = {topic.name: topic for topic in master.topics()}
     assert {'/out', '/in', '/rosout'} <= set(topics)
-    assert (topics['/out'].type, topics['/out'].publishers, topics['/out'].subscribers) == (STRING, ['/here'], [])
+    assert (topics['/out'].type, topics['/out'].publishers, topics['/out'].subscribers) == (
+        STRING,
+        ['/here'],
+        [],
+    )
     assert master.topic('in') == topics['/in'] and topics['/in'].subscribers == ['/here']
     assert '/serve' in master.services()
     assert master.system_state()[2]['/serve'] == ['/here']
 
 
 def test_the_masters_pid_is_that_of_its_process(master):
-    assert master.pid == os.getpid()    # rosmaster runs in this process, in these tests
+    assert master.pid == os.getpid()  # rosmaster runs in this process, in these tests
 
 
 @pytest.mark.parametrize('open_', [pharos.Topic.input_channel, pharos.Topic.output_channel])
@@ -127,7 +140,9 @@ def test_a_topic_gives_channels_to_running_nodes_of_its_master_alone(master, ope
     node.stop()
     with pytest.raises(pharos.NodeStoppedError, match='/taker is stopped'):
         open_(topic, node, STRING)
-    assert not topic.channels and '/given' not in (name for kind in master.system_state() for name in kind)
+    assert not topic.channels and '/given' not in (
+        name for kind in master.system_state() for name in kind
+    )
 
 
 def test_parameters_that_others_have_named_oddly_are_in_the_mapping_too(bare):
@@ -137,7 +152,9 @@ def test_parameters_that_others_have_named_oddly_are_in_the_mapping_too(bare):
         with pytest.raises(ValueError, match='cannot be a parameter name'):
             bare.parameters[name] = 6
         assert name in bare.parameters
-    assert {name: value for name, value in bare.parameters.items() if name in names} == dict.fromkeys(names, 5)
+    assert {
+        name: value for name, value in bare.parameters.items() if name in names
+    } == dict.fromkeys(names, 5)
     for name in names:
         del bare.parameters[name]
         with pytest.raises(ValueError, match='cannot be a parameter name'):
@@ -158,28 +175,56 @@ def test_parameters_are_a_mapping(bare):
         del bare.parameters['/robot/wheels']
 
 
-@pytest.mark.parametrize('question', [
-    lambda master: master.nodes(), lambda master: master.node('/n'), lambda master: master.topics(),
-    lambda master: master.topic('/t').type, lambda master: master.topic('/t').publishers,
-    lambda master: master.services(), lambda master: master.system_state(), lambda master: master.pid,
-    lambda master: master.wait(0), lambda master: master.lookup_service('/s'),
-    lambda master: master.parameters['/p'], lambda master: list(master.parameters),
-    lambda master: ExternalNode(master, '/n').uri, lambda master: ExternalNode(master, '/n').publications,
-    lambda master: master.wait_for_node('/n', 0)])
+@pytest.mark.parametrize(
+    'question',
+    [
+        lambda master: master.nodes(),
+        lambda master: master.node('/n'),
+        lambda master: master.topics(),
+        lambda master: master.topic('/t').type,
+        lambda master: master.topic('/t').publishers,
+        lambda master: master.services(),
+        lambda master: master.system_state(),
+        lambda master: master.pid,
+        lambda master: master.wait(0),
+        lambda master: master.lookup_service('/s'),
+        lambda master: master.parameters['/p'],
+        lambda master: list(master.parameters),
+        lambda master: ExternalNode(master, '/n').uri,
+        lambda master: ExternalNode(master, '/n').publications,
+        lambda master: master.wait_for_node('/n', 0),
+    ],
+)
 def test_without_a_master_a_question_says_so(question):
-    with pytest.raises(MasterUnreachableError, match=r'no ROS master answers at .* start one with .* Master.embedded'):
+    with pytest.raises(
+        MasterUnreachableError,
+        match=r'no ROS master answers at .* start one with .* Master.embedded',
+    ):
         question(Master(refused_url()))
 
 
 def test_every_question_to_a_silent_master_has_a_time_limit():
     with silent_peer() as url, concurrent.futures.ThreadPoolExecutor(16) as side_by_side:
         master = Master(url)
-        questions = [side_by_side.submit(question) for question in (
-            master.nodes, master.topics, master.services, lambda: master.node('/n'), lambda: master.pid,
-            lambda: master.topic('/t').type, lambda: master.lookup_service('/s'), lambda: master.parameters['/p'],
-            lambda: '/p' in master.parameters, lambda: master.parameters.update({'/p': 1}),
-            lambda: ExternalNode(master, '/n').pid, lambda: master.wait(1), lambda: master.wait_for_node('/n', 0.1),
-            lambda: create(master, '/n'))]
+        questions = [
+            side_by_side.submit(question)
+            for question in (
+                master.nodes,
+                master.topics,
+                master.services,
+                lambda: master.node('/n'),
+                lambda: master.pid,
+                lambda: master.topic('/t').type,
+                lambda: master.lookup_service('/s'),
+                lambda: master.parameters['/p'],
+                lambda: '/p' in master.parameters,
+                lambda: master.parameters.update({'/p': 1}),
+                lambda: ExternalNode(master, '/n').pid,
+                lambda: master.wait(1),
+                lambda: master.wait_for_node('/n', 0.1),
+                lambda: create(master, '/n'),
+            )
+        ]
         reachable = side_by_side.submit(master.is_reachable)
         for question in questions:
             assert isinstance(question.exception(TIMEOUT), MasterUnreachableError)
@@ -195,6 +240,7 @@ def test_what_answers_but_is_no_master_is_not_reachable():
 
         def log_message(self, *args):
             pass
+
     with http.server.ThreadingHTTPServer(('127.0.0.1', 0), Page) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         assert not Master('http://127.0.0.1:%d' % server.server_port).is_reachable()
@@ -212,7 +258,8 @@ def test_wait_returns_once_the_master_answers():
         ros_master.stop()
 
 
-# -- nodes outside ----------------------------------------------------------------------------------------------------
+# -- nodes outside
+
 
 def test_a_rospy_node_from_outside(master):
     with peer(master, 'outside') as program:
@@ -220,7 +267,10 @@ def test_a_rospy_node_from_outside(master):
         assert isinstance(node, ExternalNode) and node.is_alive()
         assert (node.name, node.pid, node.host) == ('/outside', program.process.pid, '127.0.0.1')
         assert node.uri.startswith('http://127.0.0.1:')
-        assert (node.publications['/from_peers'], node.subscriptions) == (STRING, {'/to_peers': STRING})
+        assert (node.publications['/from_peers'], node.subscriptions) == (
+            STRING,
+            {'/to_peers': STRING},
+        )
         assert '/outside/clear' in node.services
         node.shutdown()
         assert program.process.wait(TIMEOUT) == 0
@@ -235,7 +285,7 @@ def test_a_roscpp_node_from_outside(master, mailbox):
         assert isinstance(node, ExternalNode) and node.is_alive()
         assert (node.pid, node.host) == (process.pid, '127.0.0.1')
         sender = create(master, '/sender')
-        while mailbox.empty():    # relay advertises only with its first message, which so is lost
+        while mailbox.empty():  # relay advertises only with its first message, which so is lost
             sender.send_to('/direct', typed_as=STRING, data='hello')
             threading.Event().wait(0.01)
         assert (node.publications['/relayed'], node.subscriptions['/direct']) == (STRING, STRING)
@@ -257,12 +307,21 @@ def test_a_node_that_was_killed_is_registered_and_not_alive(master):
         program.end(signal.SIGKILL)
         node = master.node('/killed')
         assert node in master.nodes() and not node.is_alive()
-        assert (node.publications['/from_peers'], node.subscriptions) == (STRING, {'/to_peers': STRING})
+        assert (node.publications['/from_peers'], node.subscriptions) == (
+            STRING,
+            {'/to_peers': STRING},
+        )
         assert '/killed/clear' in node.services and node.host == '127.0.0.1'
         for ask in (lambda: node.pid), node.shutdown:
-            with pytest.raises(UnknownNodeError, match='/killed is registered at .* but does not answer .*cleanup'):
+            with pytest.raises(
+                UnknownNodeError, match='/killed is registered at .* but does not answer .*cleanup'
+            ):
                 ask()
-        assert create(master, '/other').send_to('/to_peers', typed_as=STRING, data='does not hang').data
+        assert (
+            create(master, '/other')
+            .send_to('/to_peers', typed_as=STRING, data='does not hang')
+            .data
+        )
         clean_up(master, '/killed', '/to_peers', '/from_peers')
 
 
@@ -309,7 +368,8 @@ def test_to_an_external_node_alone(master):
         assert 'for two' in two.wait_for('heard') and 'for all' in one.wait_for('heard')
 
 
-# -- what comes and goes -----------------------------------------------------------------------------------------------
+# -- what comes and goes
+
 
 class Changes:
     """A block for on_change that keeps what it is told."""
@@ -343,7 +403,7 @@ def test_on_change_tells_what_comes_and_goes(master):
     node.stop()
     assert ('service', '/service', False) in changes.wait_for('topic', '/topic', False)
     end()
-    end()    # harmless
+    end()  # harmless
 
 
 def test_a_listener_misses_nothing_that_comes_right_after(bare):
@@ -359,6 +419,7 @@ def test_a_listener_misses_nothing_that_comes_right_after(bare):
 def test_a_listener_that_raises_stops_nothing(bare, transcript):
     def stumble(kind, name, is_there):
         raise RuntimeError('stumbled')
+
     bare.on_change(stumble)
     changes = Changes()
     ending = bare.on_change(changes)
@@ -396,7 +457,9 @@ def test_wait_for_node_tells_one_that_is_gone_from_one_that_is_there(master):
     node = create(master, '/goes')
     changes.wait_for('node', '/goes', True)
     node.stop()
-    with pytest.raises(UnknownNodeError, match="no node /goes came to .* within 0.2 s: is it started"):
+    with pytest.raises(
+        UnknownNodeError, match="no node /goes came to .* within 0.2 s: is it started"
+    ):
         master.wait_for_node('/goes', 0.2)
     end()
 
@@ -404,14 +467,16 @@ def test_wait_for_node_tells_one_that_is_gone_from_one_that_is_there(master):
 def test_no_thread_is_left_that_nobody_needs(bare):
     end = bare.on_change(Changes())
     with create(bare, '/n'):
-        watching = [thread for thread in threading.enumerate() if thread.name == 'watcher of %s' % bare.url]
+        watching = [
+            thread for thread in threading.enumerate() if thread.name == f'watcher of {bare.url}'
+        ]
         assert len(watching) == 1
         assert bare.wait_for_node('/n').name == '/n'
         end()
-        assert watching[0].is_alive()    # for the node
+        assert watching[0].is_alive()  # for the node
     with pytest.raises(UnknownNodeError):
         bare.wait_for_node('/other', 0.01)
     for thread in threading.enumerate():
-        if thread.name == 'watcher of %s' % bare.url:
+        if thread.name == f'watcher of {bare.url}':
             thread.join(TIMEOUT)
             assert not thread.is_alive()

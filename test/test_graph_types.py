@@ -24,7 +24,18 @@ from genpy.generate_initpy import write_modules
 from genpy.generator import MsgGenerator
 
 from conftest import TIMEOUT, Mailbox
-from pharos import (BlockNode, Master, MessageTypeError, NodeStoppedError, PharosError, UnknownTopicError, UnknownTypeError, define_message, graph_types, message_class)
+from pharos import (
+    BlockNode,
+    Master,
+    MessageTypeError,
+    NodeStoppedError,
+    PharosError,
+    UnknownTopicError,
+    UnknownTypeError,
+    define_message,
+    graph_types,
+    message_class,
+)
 from pharos.messages.message_types import class_from_definition
 from pharos.tcpros_connection import publisher_header
 from programs import Program, run, until
@@ -61,26 +72,51 @@ Place[] none''',
     'Mark': 'string name\nPlace[] places\nduration[2] waits',
     'Place': 'int8 UNKNOWN=-1\nfloat64 x\ntime seen',
 }
-TEXT = SEPARATOR.join([
-    FILES['Scan'], 'MSG: scanner_msgs/Mark\n' + FILES['Mark'], 'MSG: scanner_msgs/Place\n' + FILES['Place'],
-    'MSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id',
-    'MSG: geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z'])
+TEXT = SEPARATOR.join(
+    [
+        FILES['Scan'],
+        'MSG: scanner_msgs/Mark\n' + FILES['Mark'],
+        'MSG: scanner_msgs/Place\n' + FILES['Place'],
+        'MSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id',
+        'MSG: geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z',
+    ]
+)
 PLACE = {'x': 1.5, 'seen': [1, 999999999]}
 EMPTY_MARK = {'name': '', 'places': [], 'waits': [[0, 0], [0, 0]]}
 # the publisher numbers the header itself
 VALUES = {
     'header': {'stamp': [9, 8], 'frame_id': 'laser'},
-    'marks': [{'name': 'door', 'places': [PLACE, {'x': -2.0, 'seen': [0, 0]}], 'waits': [[-1, 5], [2, 0]]}, EMPTY_MARK],
+    'marks': [
+        {
+            'name': 'door',
+            'places': [PLACE, {'x': -2.0, 'seen': [0, 0]}],
+            'waits': [[-1, 5], [2, 0]],
+        },
+        EMPTY_MARK,
+    ],
     'pair': [EMPTY_MARK, {'name': 'right', 'places': [PLACE], 'waits': [[0, 0], [0, 1]]}],
-    'place': PLACE, 'stamps': [[3, 4], [2 ** 32 - 1, 6]], 'lasted': [-2, 7], 'three': [1, -2, 3],
-    'raw': list(range(256)), 'four': [1, 0, 3, 255], 'flags': [True, False], 'letter': 65, 'small': -128,
-    'ranges': [0.5, -1.25], 'names': ['', 'Tür', '日本'], 'text': 'two\n"lines" \\', 'big': -2 ** 63,
-    'huge': 2 ** 64 - 1, 'points': [{'x': 1.0, 'y': 2.0, 'z': -3.0}], 'none': []}
-
+    'place': PLACE,
+    'stamps': [[3, 4], [2**32 - 1, 6]],
+    'lasted': [-2, 7],
+    'three': [1, -2, 3],
+    'raw': list(range(256)),
+    'four': [1, 0, 3, 255],
+    'flags': [True, False],
+    'letter': 65,
+    'small': -128,
+    'ranges': [0.5, -1.25],
+    'names': ['', 'Tür', '日本'],
+    'text': 'two\n"lines" \\',
+    'big': -(2**63),
+    'huge': 2**64 - 1,
+    'points': [{'x': 1.0, 'y': 2.0, 'z': -3.0}],
+    'none': [],
+}
 
 
 def make(find, type_, value):
-    """A message of such values, by the classes that ``find(type)`` gives; the programs below do this, too."""
+    """A message of such values, by the classes that ``find(type)`` gives; the programs below do
+    this, too."""
     base, _, array = type_.partition('[')
     if array:
         return bytes(value) if base == 'uint8' else [make(find, base, one) for one in value]
@@ -97,7 +133,9 @@ def make(find, type_, value):
 
 MAKE = 'import genpy, json, sys\n' + inspect.getsource(make)
 # a rospy node whose class genpy.dynamic has generated from a text
-ROSPY_PEER = MAKE + '''
+ROSPY_PEER = (
+    MAKE
+    + '''
 import genpy.dynamic, rospy
 name, topic, type_, text, values = sys.argv[1:]
 classes = genpy.dynamic.generate_dynamic(type_, text)
@@ -107,8 +145,12 @@ publisher.publish(make(classes.get, type_, json.loads(values)))
 print('published', flush=True)
 rospy.spin()
 '''
-# a node of this package, which finds the type in the .msg files of a package on its ROS_PACKAGE_PATH
-FILES_PEER = MAKE + '''
+)
+# a node of this package, which finds the type in the .msg files of a package on its
+# ROS_PACKAGE_PATH
+FILES_PEER = (
+    MAKE
+    + '''
 import pharos
 topic, type_, values = sys.argv[1:]
 node = pharos.Master().create(pharos.BlockNode, named='/files_peer')
@@ -117,14 +159,15 @@ channel.publish(make(pharos.message_class, type_, json.loads(values)))
 print('published', flush=True)
 pharos.spin()
 '''
+)
 # a node of this package that knows nothing: it prints what it hears
 HEARING_PEER = '''
 import sys, pharos
 def hear(message, channel):
     print(message, flush=True)
     print('heard', channel.type, message.OK, flush=True)
-pharos.Master().create(pharos.BlockNode, named='/hearing_peer', delegate=hear).interested_in(sys.argv[1], wait=60)
-pharos.spin()
+pharos.Master().create(pharos.BlockNode, named='/hearing_peer',
+delegate=hear).interested_in(sys.argv[1], wait=60) pharos.spin()
 '''
 
 
@@ -149,8 +192,17 @@ def assert_unknown_here(type_=SCAN):
 @pytest.fixture(scope='module')
 def rospy_peer(ros_master):
     """A rospy node that publishes VALUES on /types/from_rospy, latched."""
-    with Program(ros_master.url, sys.executable, '-c', ROSPY_PEER, 'rospy_peer', '/types/from_rospy', SCAN, TEXT,
-                 json.dumps(VALUES)) as program:
+    with Program(
+        ros_master.url,
+        sys.executable,
+        '-c',
+        ROSPY_PEER,
+        'rospy_peer',
+        '/types/from_rospy',
+        SCAN,
+        TEXT,
+        json.dumps(VALUES),
+    ) as program:
         program.wait_for('published')
         yield program
 
@@ -169,9 +221,10 @@ def record(url, topic, path):
 
 
 def read(bag):
-    """The type and the message in a bag, which rosbag decodes by the definition that it has recorded."""
+    """The type and the message in a bag, which rosbag decodes by the definition that it has
+    recorded."""
     with rosbag.Bag(str(bag)) as opened:
-        (topic, message, _), = opened.read_messages()
+        ((topic, message, _),) = opened.read_messages()
         return opened.get_type_and_topic_info().topics[topic].msg_type, message
 
 
@@ -184,11 +237,21 @@ def publishing_rospy_peer(master, request, tmp_path):
 @contextlib.contextmanager
 def publishing_files_peer(master, request, tmp_path):
     (tmp_path / 'scanner_msgs/msg').mkdir(parents=True)
-    (tmp_path / 'scanner_msgs/package.xml').write_text('<package><name>scanner_msgs</name></package>')
+    (tmp_path / 'scanner_msgs/package.xml').write_text(
+        '<package><name>scanner_msgs</name></package>'
+    )
     for name, text in FILES.items():
         (tmp_path / 'scanner_msgs/msg' / (name + '.msg')).write_text(text)
-    with Program(master.url, sys.executable, '-c', FILES_PEER, '/types/from_files', SCAN, json.dumps(VALUES),
-                 ROS_PACKAGE_PATH=os.pathsep.join([str(tmp_path), '/usr/share'])) as program:
+    with Program(
+        master.url,
+        sys.executable,
+        '-c',
+        FILES_PEER,
+        '/types/from_files',
+        SCAN,
+        json.dumps(VALUES),
+        ROS_PACKAGE_PATH=os.pathsep.join([str(tmp_path), '/usr/share']),
+    ) as program:
         program.wait_for('published')
         yield '/types/from_files'
 
@@ -196,7 +259,9 @@ def publishing_files_peer(master, request, tmp_path):
 @contextlib.contextmanager
 def publishing_rosbag_play(master, request, tmp_path):
     bag = request.getfixturevalue('bag')
-    with Program(master.url, 'rosbag', 'play', '--keep-alive', str(bag), '/types/from_rospy:=/types/from_bag'):
+    with Program(
+        master.url, 'rosbag', 'play', '--keep-alive', str(bag), '/types/from_rospy:=/types/from_bag'
+    ):
         yield '/types/from_bag'
 
 
@@ -208,12 +273,18 @@ def publishing_roscpp(master, request, tmp_path):
         yield '/types/from_roscpp'
 
 
-# -- receiving --------------------------------------------------------------------------------------------------------
+# -- receiving
 
-@pytest.mark.parametrize('publishing', [publishing_rospy_peer, publishing_files_peer, publishing_rosbag_play,
-                                        publishing_roscpp])
-def test_a_type_that_is_nowhere_here_is_received_with_all_fields_right(master, request, tmp_path, mailbox, publishing):
-    """rospy subscribes with a class alone, which must be there; only its tools take the type from the publisher."""
+
+@pytest.mark.parametrize(
+    'publishing',
+    [publishing_rospy_peer, publishing_files_peer, publishing_rosbag_play, publishing_roscpp],
+)
+def test_a_type_that_is_nowhere_here_is_received_with_all_fields_right(
+    master, request, tmp_path, mailbox, publishing
+):
+    """rospy subscribes with a class alone, which must be there; only its tools take the type from
+    the publisher."""
     with publishing(master, request, tmp_path) as topic:
         channel = create(master, '/receiver', delegate=mailbox).interested_in(topic, wait=TIMEOUT)
         message = mailbox.get()
@@ -221,8 +292,12 @@ def test_a_type_that_is_nowhere_here_is_received_with_all_fields_right(master, r
     assert plain(message) == VALUES
     assert (message.OK, message.BROKEN, message.FRAME) == (0, 7, 'base "link" # not a comment')
     assert (message.STEP, message.TURNS, message.marks[0].places[1].UNKNOWN) == (0.25, True, -1)
-    assert isinstance(message.stamps[0], genpy.Time) and isinstance(message.marks[0].waits[0], genpy.Duration)
-    assert message.four == b'\1\0\3\xff' and message.points[0] == message_class('geometry_msgs/Point')(1, 2, -3)
+    assert isinstance(message.stamps[0], genpy.Time) and isinstance(
+        message.marks[0].waits[0], genpy.Duration
+    )
+    assert message.four == b'\1\0\3\xff' and message.points[0] == message_class(
+        'geometry_msgs/Point'
+    )(1, 2, -3)
     assert_unknown_here()
 
 
@@ -241,8 +316,17 @@ def test_nodes_that_learn_a_type_each_send_and_receive_it(master, rospy_peer, ma
 
 def test_a_type_learnt_serves_its_node_after_the_publisher_has_gone(master, mailbox):
     node = create(master, '/node', delegate=mailbox)
-    with Program(master.url, sys.executable, '-c', ROSPY_PEER, 'brief_peer', '/types/brief', 'brief_msgs/Word',
-                 'string word', '{"word": "hello"}') as program:
+    with Program(
+        master.url,
+        sys.executable,
+        '-c',
+        ROSPY_PEER,
+        'brief_peer',
+        '/types/brief',
+        'brief_msgs/Word',
+        'string word',
+        '{"word": "hello"}',
+    ) as program:
         program.wait_for('published')
         node.interested_in('/types/brief')
         assert mailbox.get().word == 'hello'
@@ -256,15 +340,20 @@ def test_a_type_learnt_serves_its_node_after_the_publisher_has_gone(master, mail
 
 
 def test_without_a_type_the_masters_is_taken(master, mailbox):
-    talker = Program(master.url, 'rostopic', 'pub', '--latch', '/types/installed', 'std_msgs/Int32', '7')
+    talker = Program(
+        master.url, 'rostopic', 'pub', '--latch', '/types/installed', 'std_msgs/Int32', '7'
+    )
     with talker, Program(master.url, 'rostopic', 'echo', '/types/echoed', 'std_msgs/msg/String'):
         node = create(master, '/node', delegate=mailbox)
         assert node.interested_in('/types/installed', wait=TIMEOUT).type == 'std_msgs/Int32'
         assert mailbox.get().data == 7
-        assert node.send_to('/types/installed', data=8)._type == 'std_msgs/Int32' and mailbox.get().data == 8
+        assert (
+            node.send_to('/types/installed', data=8)._type == 'std_msgs/Int32'
+            and mailbox.get().data == 8
+        )
 
 
-# -- sending ----------------------------------------------------------------------------------------------------------
+# -- sending
 
 DEFINED = 'defined_msgs/Scan'
 
@@ -280,16 +369,20 @@ def defined(master):
 
 def printed_message(text):
     """A message as a program printed it, in YAML."""
+
     def as_values(value):
         if isinstance(value, dict):
             if set(value) == {'secs', 'nsecs'}:
                 return [value['secs'], value['nsecs']]
             return {name: as_values(one) for name, one in value.items() if name != 'seq'}
         return [as_values(one) for one in value] if isinstance(value, list) else value
+
     return as_values(yaml.safe_load(text))
 
 
-def test_rosbag_records_a_type_given_by_definition_with_all_that_reading_it_takes(master, defined, tmp_path):
+def test_rosbag_records_a_type_given_by_definition_with_all_that_reading_it_takes(
+    master, defined, tmp_path
+):
     bag = record(master.url, '/types/defined', tmp_path / 'defined.bag')
     type_, message = read(bag)
     assert (type_, message._md5sum) == (DEFINED, defined.message_class._md5sum)
@@ -298,7 +391,9 @@ def test_rosbag_records_a_type_given_by_definition_with_all_that_reading_it_take
     assert printed_message(printed.partition('---')[0]) == VALUES
 
 
-def test_rosbag_records_a_type_learnt_from_the_graph_and_sent_on(master, rospy_peer, mailbox, tmp_path):
+def test_rosbag_records_a_type_learnt_from_the_graph_and_sent_on(
+    master, rospy_peer, mailbox, tmp_path
+):
     node = create(master, '/node', delegate=mailbox)
     heard = node.interested_in('/types/from_rospy')
     node.output_channel('/types/sent_on', heard.message_class, latch=True).publish(mailbox.get())
@@ -320,8 +415,11 @@ def test_rostopic_tells_the_type_given_by_definition_and_whether_it_comes(master
         bandwidth.wait_for('average:')
 
 
-def test_rostopic_echo_prints_it_where_generated_code_is_installed(master, defined, rospy_peer, tmp_path):
-    """And only there: rostopic echo and hz do not use the definition that a publisher sends, be it rospy's or ours."""
+def test_rostopic_echo_prints_it_where_generated_code_is_installed(
+    master, defined, rospy_peer, tmp_path
+):
+    """And only there: rostopic echo and hz do not use the definition that a publisher sends, be it
+    rospy's or ours."""
     for topic in '/types/defined', '/types/from_rospy':
         echo = run(master.url, 'rostopic', 'echo', '-n1', topic)
         assert echo.returncode == 1 and 'Cannot load message class' in echo.stderr
@@ -331,19 +429,29 @@ def test_rostopic_echo_prints_it_where_generated_code_is_installed(master, defin
     (package.parent / '__init__.py').touch()
     for name, text in FILES.items():
         (definitions / (name + '.msg')).write_text(text)
-    found = {name: [rospkg.RosPack().get_path(name) + '/msg'] for name in ('std_msgs', 'geometry_msgs')}
-    MsgGenerator().generate_messages('defined_msgs', [str(path) for path in definitions.iterdir()], str(package),
-                                     {'defined_msgs': [str(definitions)], **found})
+    found = {
+        name: [rospkg.RosPack().get_path(name) + '/msg'] for name in ('std_msgs', 'geometry_msgs')
+    }
+    MsgGenerator().generate_messages(
+        'defined_msgs',
+        [str(path) for path in definitions.iterdir()],
+        str(package),
+        {'defined_msgs': [str(definitions)], **found},
+    )
     write_modules(str(package))
-    with Program(master.url, 'rostopic', 'echo', '-n1', '/types/defined', PYTHONPATH=str(tmp_path / 'python')) as echo:
+    with Program(
+        master.url, 'rostopic', 'echo', '-n1', '/types/defined', PYTHONPATH=str(tmp_path / 'python')
+    ) as echo:
         assert printed_message(echo.read_to_the_end().partition('---')[0]) == VALUES
 
 
-# -- no type yet ------------------------------------------------------------------------------------------------------
+# -- no type yet
 
-WAYS = {'interested_in': lambda node, topic, **wait: node.interested_in(topic, **wait).type,
-        'output_channel': lambda node, topic, **wait: node.output_channel(topic, **wait).type,
-        'send_to': lambda node, topic, **wait: node.send_to(topic, **wait)._type}
+WAYS = {
+    'interested_in': lambda node, topic, **wait: node.interested_in(topic, **wait).type,
+    'output_channel': lambda node, topic, **wait: node.output_channel(topic, **wait).type,
+    'send_to': lambda node, topic, **wait: node.send_to(topic, **wait)._type,
+}
 each_way = pytest.mark.parametrize('way', WAYS.values(), ids=WAYS)
 
 
@@ -356,6 +464,7 @@ def asked(monkeypatch):
         types = topic_types(self)
         event.set()
         return types
+
     monkeypatch.setattr(Master, 'topic_types', answer)
     return event
 
@@ -364,13 +473,17 @@ def asked(monkeypatch):
 def test_a_topic_that_only_subscribers_of_any_type_have_is_an_error_that_says_so(master, way):
     with master.run('topic_tools', 'relay', '/types/any', '/types/any_relayed'):
         until(lambda: master.topic('/types/any').subscribers)
-        with pytest.raises(UnknownTopicError, match='/types/any is not known yet.*nodes of any type.*typed_as='):
+        with pytest.raises(
+            UnknownTopicError, match='/types/any is not known yet.*nodes of any type.*typed_as='
+        ):
             way(create(master, '/node'), '/types/any')
 
 
 @each_way
 def test_a_topic_that_nobody_uses_is_an_error_after_the_wait(master, way):
-    with pytest.raises(UnknownTopicError, match='no node of .* publishes or subscribes to /types/unused'):
+    with pytest.raises(
+        UnknownTopicError, match='no node of .* publishes or subscribes to /types/unused'
+    ):
         way(create(master, '/node'), '/types/unused', wait=0.01)
 
 
@@ -388,7 +501,9 @@ def test_a_definition_that_is_not_there_yet_is_waited_for(master, asked):
     topic, type_ = '/types/late_definition', 'late_msgs/Word'
     node = create(master, '/node')
     with subscriber(master, topic, type_):
-        with pytest.raises(UnknownTypeError, match=r"unknown message type 'late_msgs/Word'.*define_message\("):
+        with pytest.raises(
+            UnknownTypeError, match=r"unknown message type 'late_msgs/Word'.*define_message\("
+        ):
             node.interested_in(topic)
         asked.clear()
         with concurrent.futures.ThreadPoolExecutor() as pool:
@@ -409,6 +524,7 @@ def test_the_stop_of_a_node_ends_its_wait_for_a_type(master, asked, transcript):
         except BaseException as error:
             raised(error, None)
             raise
+
     node.fork(soul)
     assert asked.wait(TIMEOUT)
     node.stop()
@@ -417,7 +533,8 @@ def test_the_stop_of_a_node_ends_its_wait_for_a_type(master, asked, transcript):
     assert not node.errors and not transcript
 
 
-# -- publishers that lie ----------------------------------------------------------------------------------------------
+# -- publishers that lie
+
 
 @contextlib.contextmanager
 def subscriber(master, topic, type_):
@@ -436,20 +553,51 @@ class Publisher:
     :param heard: called with the connection header of each who comes
     """
 
-    def __init__(self, master, topic, type_, definition=None, md5sum='*', name='/liar', answer=None, said=None,
-                 heard=lambda header: None, **header):
+    def __init__(
+        self,
+        master,
+        topic,
+        type_,
+        definition=None,
+        md5sum='*',
+        name='/liar',
+        answer=None,
+        said=None,
+        heard=lambda header: None,
+        **header,
+    ):
         self._heard = heard
-        self._master, self._topic, self._name = rosgraph.Master(name, master_uri=master.url), topic, name
-        header = {'type': type_, 'md5sum': md5sum, 'message_definition': definition, 'callerid': name, **header}
-        self._said = said if said is not None else rosgraph.network.encode_ros_handshake_header(
-            {key: value for key, value in header.items() if value is not None})
+        self._master, self._topic, self._name = (
+            rosgraph.Master(name, master_uri=master.url),
+            topic,
+            name,
+        )
+        header = {
+            'type': type_,
+            'md5sum': md5sum,
+            'message_definition': definition,
+            'callerid': name,
+            **header,
+        }
+        self._said = (
+            said
+            if said is not None
+            else rosgraph.network.encode_ros_handshake_header(
+                {key: value for key, value in header.items() if value is not None}
+            )
+        )
         self._listener = socket.create_server(('127.0.0.1', 0))
         self._rpc = xmlrpc.server.SimpleXMLRPCServer(('127.0.0.1', 0), logRequests=False)
-        self._rpc.register_function(lambda *args: answer or [1, '', ['TCPROS', *self._listener.getsockname()]],
-                                    'requestTopic')
+        self._rpc.register_function(
+            lambda *args: answer or [1, '', ['TCPROS', *self._listener.getsockname()]],
+            'requestTopic',
+        )
         self._rpc.register_function(lambda *args: [1, '', os.getpid()], 'getPid')
-        self._threads = [threading.Thread(target=target) for target in (
-            self._serve, functools.partial(self._rpc.serve_forever, 0.01))]    # looks for its end every 10 ms
+        # looks for its end every 10 ms
+        self._threads = [
+            threading.Thread(target=target)
+            for target in (self._serve, functools.partial(self._rpc.serve_forever, 0.01))
+        ]
         for thread in self._threads:
             thread.start()
         self._uri = 'http://127.0.0.1:%d/' % self._rpc.server_address[1]
@@ -460,9 +608,9 @@ class Publisher:
             try:
                 client, _ = self._listener.accept()
             except OSError:
-                return    # the end
-            with client, contextlib.suppress(OSError, struct.error):    # it may go at once
-                size, = struct.unpack('<I', client.recv(4, socket.MSG_WAITALL))
+                return  # the end
+            with client, contextlib.suppress(OSError, struct.error):  # it may go at once
+                (size,) = struct.unpack('<I', client.recv(4, socket.MSG_WAITALL))
                 asked = struct.pack('<I', size) + client.recv(size, socket.MSG_WAITALL)
                 self._heard(rosgraph.network.decode_ros_handshake_header(asked))
                 client.sendall(self._said)
@@ -484,12 +632,13 @@ class Publisher:
 
 
 CODE = '__import__("os").system("touch executed")'
-topic_numbers = itertools.count()    # the master never forgets the type of a topic
+topic_numbers = itertools.count()  # the master never forgets the type of a topic
 
 
 @pytest.fixture
 def lie(master, tmp_path, monkeypatch):
-    """``lie(type, definition, …)``: the error by which a node refuses a topic with such a publisher."""
+    """``lie(type, definition, …)``: the error by which a node refuses a topic with such a
+    publisher."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(graph_types, 'TIMEOUT', 0.5)
 
@@ -499,35 +648,50 @@ def lie(master, tmp_path, monkeypatch):
         with Publisher(master, topic, type_, *args, **kwargs):
             with pytest.raises(PharosError) as error:
                 node.interested_in(topic)
-        assert node.is_running and not node.channels and '/victim' not in master.topic(topic).subscribers
+        assert (
+            node.is_running
+            and not node.channels
+            and '/victim' not in master.topic(topic).subscribers
+        )
         assert list(tmp_path.iterdir()) == [] and len(str(error.value)) < 2000
         return error.value
+
     return refusal
 
 
-@pytest.mark.parametrize('definition, reason', [
-    ('complete nonsense!', "line 1, 'complete nonsense!'"),
-    ('complete nonsense', "unknown message type 'lie_msgs/complete'"),
-    ('\0\1\2\n\x7f', 'line 1'),
-    (f'int8 X={CODE}', 'line 1'),
-    (f'bool X={CODE}', 'line 1'),
-    (f'float64 X={CODE}', 'line 1'),
-    (f'int8 x; {CODE}', 'line 1'),
-    (f'int8 a\nint8[{CODE}] x', 'line 2'),
-    (f'{CODE} x', 'line 1'),
-    (f'int8 a{SEPARATOR}MSG: evil/../../x\nint8 b', 'malformed'),
-    (f'int8 a{SEPARATOR}MSG: a/b"; import os\nint8 b', 'malformed'),
-    ('../../../etc/passwd x', 'line 1'),
-    ('sys/modules x', "unknown message type 'sys/modules'"),
-    ('%s%n{0.__class__} x', 'line 1'),
-    ('Lie x', 'nests itself'),
-    (f'Other[] x{SEPARATOR}MSG: lie_msgs/Other\nLie[] y', 'nests itself'),
-    (''.join(f'T{n} x{SEPARATOR}MSG: lie_msgs/T{n}\n' for n in range(3000)) + 'int8 x', 'nests itself or more than 64'),
-    (''.join(f'T{n} x\nT{n} y{SEPARATOR}MSG: lie_msgs/T{n}\n' for n in range(40)) + 'int8 x', 'fields'),
-    ('uint8[999999999] x', 'elements'),
-    ('int8 x\n' * 100000, 'Duplicate'),
-    ('#' * (2 << 20), 'at most 1048576 characters'),
-], ids=lambda text: text.partition('\n')[0][:30])
+@pytest.mark.parametrize(
+    'definition, reason',
+    [
+        ('complete nonsense!', "line 1, 'complete nonsense!'"),
+        ('complete nonsense', "unknown message type 'lie_msgs/complete'"),
+        ('\0\1\2\n\x7f', 'line 1'),
+        (f'int8 X={CODE}', 'line 1'),
+        (f'bool X={CODE}', 'line 1'),
+        (f'float64 X={CODE}', 'line 1'),
+        (f'int8 x; {CODE}', 'line 1'),
+        (f'int8 a\nint8[{CODE}] x', 'line 2'),
+        (f'{CODE} x', 'line 1'),
+        (f'int8 a{SEPARATOR}MSG: evil/../../x\nint8 b', 'malformed'),
+        (f'int8 a{SEPARATOR}MSG: a/b"; import os\nint8 b', 'malformed'),
+        ('../../../etc/passwd x', 'line 1'),
+        ('sys/modules x', "unknown message type 'sys/modules'"),
+        ('%s%n{0.__class__} x', 'line 1'),
+        ('Lie x', 'nests itself'),
+        (f'Other[] x{SEPARATOR}MSG: lie_msgs/Other\nLie[] y', 'nests itself'),
+        (
+            ''.join(f'T{n} x{SEPARATOR}MSG: lie_msgs/T{n}\n' for n in range(3000)) + 'int8 x',
+            'nests itself or more than 64',
+        ),
+        (
+            ''.join(f'T{n} x\nT{n} y{SEPARATOR}MSG: lie_msgs/T{n}\n' for n in range(40)) + 'int8 x',
+            'fields',
+        ),
+        ('uint8[999999999] x', 'elements'),
+        ('int8 x\n' * 100000, 'Duplicate'),
+        ('#' * (2 << 20), 'at most 1048576 characters'),
+    ],
+    ids=lambda text: text.partition('\n')[0][:30],
+)
 def test_a_definition_that_cannot_be_read_is_refused_and_runs_nothing(lie, definition, reason):
     error = lie('lie_msgs/Lie', definition)
     assert isinstance(error, UnknownTypeError)
@@ -541,33 +705,53 @@ def test_a_definition_that_has_not_the_md5sum_given_is_refused(lie):
     assert 'md5sum 0123456789abcdef0123456789abcdef' in str(error) and 'a: int8' in str(error)
 
 
-@pytest.mark.parametrize('type_', ['a/b"; import os', '../x', 'x/..', 'a/b\n', 'evil/%s', 'é/B', '/b',
-                                   'a/' + 'b' * 1000])
+@pytest.mark.parametrize(
+    'type_', ['a/b"; import os', '../x', 'x/..', 'a/b\n', 'evil/%s', 'é/B', '/b', 'a/' + 'b' * 1000]
+)
 def test_a_type_that_can_be_no_name_is_refused(lie, type_):
     assert 'malformed' in str(lie(type_, 'int8 a'))
 
 
-@pytest.mark.parametrize('instead', [
-    {'definition': None}, {'type': 'std_msgs/String'}, {'type': '*'}, {'said': b''}, {'said': b'\xff\xff\xff\xff'},
-    {'said': b'\4\0\0\0\xff\xff\xff\xff'}, {'said': b'HTTP/1.1 400 Bad Request\r\n\r\n'},
-    {'said': struct.pack('<II', 9, 5) + b'\xff=\xff=\xff'},
-    {'answer': 1}, {'answer': 'TCPROS'}, {'answer': [1]}, {'answer': [1, '', []]}, {'answer': [1, '', 0]},
-    {'answer': [0, 'no', 0]}, {'answer': [1, '', ['TCPROS', '127.0.0.1', 1 << 20]]},
-    {'answer': [1, '', ['TCPROS', 7, 'x']]}, {'answer': [1, '', ['TCPROS', 'a' * 100 + '.', 7]]},
-], ids=lambda instead: ' '.join(map(str, *instead.items()))[:40])
+@pytest.mark.parametrize(
+    'instead',
+    [
+        {'definition': None},
+        {'type': 'std_msgs/String'},
+        {'type': '*'},
+        {'said': b''},
+        {'said': b'\xff\xff\xff\xff'},
+        {'said': b'\4\0\0\0\xff\xff\xff\xff'},
+        {'said': b'HTTP/1.1 400 Bad Request\r\n\r\n'},
+        {'said': struct.pack('<II', 9, 5) + b'\xff=\xff=\xff'},
+        {'answer': 1},
+        {'answer': 'TCPROS'},
+        {'answer': [1]},
+        {'answer': [1, '', []]},
+        {'answer': [1, '', 0]},
+        {'answer': [0, 'no', 0]},
+        {'answer': [1, '', ['TCPROS', '127.0.0.1', 1 << 20]]},
+        {'answer': [1, '', ['TCPROS', 7, 'x']]},
+        {'answer': [1, '', ['TCPROS', 'a' * 100 + '.', 7]]},
+    ],
+    ids=lambda instead: ' '.join(map(str, *instead.items()))[:40],
+)
 def test_a_publisher_that_does_not_tell_the_definition_is_passed_over(lie, master, instead):
     what = {'definition': 'int8 a', **instead}
     assert "unknown message type 'lie_msgs/Lie'" in str(lie('lie_msgs/Lie', **what))
     topic = '/types/lie_%d' % next(topic_numbers)
-    with Publisher(master, topic, 'lie_msgs/Lie', **what), \
-            Publisher(master, topic, 'lie_msgs/Lie', 'string word', name='/honest'):
+    with Publisher(master, topic, 'lie_msgs/Lie', **what), Publisher(
+        master, topic, 'lie_msgs/Lie', 'string word', name='/honest'
+    ):
         assert master.topic(topic).message_class(create(master, '/other')).__slots__ == ['word']
 
 
 def test_one_who_lies_keeps_nobody_from_the_definition_of_another(master):
-    with Publisher(master, '/types/disputed', 'disputed_msgs/Word', 'nonsense'), \
-            Publisher(master, '/types/disputed', 'disputed_msgs/Word', 'string word', name='/honest'):
-        assert master.topic('/types/disputed').message_class(create(master, '/node')).__slots__ == ['word']
+    with Publisher(master, '/types/disputed', 'disputed_msgs/Word', 'nonsense'), Publisher(
+        master, '/types/disputed', 'disputed_msgs/Word', 'string word', name='/honest'
+    ):
+        assert master.topic('/types/disputed').message_class(create(master, '/node')).__slots__ == [
+            'word'
+        ]
 
 
 def test_code_in_a_constant_of_text_is_text(master, tmp_path, monkeypatch):
@@ -577,22 +761,29 @@ def test_code_in_a_constant_of_text_is_text(master, tmp_path, monkeypatch):
     assert cls.X == CODE and cls(CODE).x == CODE and list(tmp_path.iterdir()) == []
 
 
-# -- several definitions of one type -----------------------------------------------------------------------------------
+# -- several definitions of one type
+
 
 @contextlib.contextmanager
 def publishing(master, topic, type_, text, **values):
     """A rospy node in another process that publishes such a message, latched."""
     name = 'defines' + topic.replace('/', '_')
-    with Program(master.url, sys.executable, '-c', ROSPY_PEER, name, topic, type_, text, json.dumps(values)) as peer:
+    with Program(
+        master.url, sys.executable, '-c', ROSPY_PEER, name, topic, type_, text, json.dumps(values)
+    ) as peer:
         peer.wait_for('published')
         yield
 
 
-@pytest.mark.parametrize('type_, define', [('given_msgs/Reading', True), ('turtlesim/Pose', False)],
-                         ids=['given', 'shipped'])
+@pytest.mark.parametrize(
+    'type_, define',
+    [('given_msgs/Reading', True), ('turtlesim/Pose', False)],
+    ids=['given', 'shipped'],
+)
 @pytest.mark.parametrize('typed', [True, False], ids=['by name', 'without a type'])
-def test_a_subscriber_takes_a_live_publishers_definition_before_one_given_or_shipped(master, mailbox, type_, define,
-                                                                                      typed):
+def test_a_subscriber_takes_a_live_publishers_definition_before_one_given_or_shipped(
+    master, mailbox, type_, define, typed
+):
     here = define_message(type_, 'string level\n') if define else message_class(type_)
     topic = '/types/live_%d' % next(topic_numbers)
     node = create(master, '/node', delegate=mailbox)
@@ -600,7 +791,8 @@ def test_a_subscriber_takes_a_live_publishers_definition_before_one_given_or_shi
         channel = node.interested_in(topic, *[type_] * typed)
         message = mailbox.get()
     assert (message.level, message.more) == (7, 8)
-    assert channel.message_class is not here and message_class(type_) is here    # nothing is defined for others
+    # nothing is defined for others
+    assert channel.message_class is not here and message_class(type_) is here
 
 
 def test_who_asks_for_a_class_gets_that_one(master):
@@ -626,9 +818,11 @@ def test_a_type_in_a_msg_file_goes_before_a_publishers(master, tmp_path, monkeyp
     with publishing(master, topic, 'file_msgs/Reading', 'int32 level\n', level=7):
         channel = create(master, '/node').interested_in(topic, 'file_msgs/Reading')
     assert describe(channel) == 'string'
-    define_message('file_msgs/Reading', 'string level')    # the same, which makes it no other
+    define_message('file_msgs/Reading', 'string level')  # the same, which makes it no other
     with publishing(master, topic, 'file_msgs/Reading', 'int32 level\n', level=7):
-        assert describe(create(master, '/other').interested_in(topic, 'file_msgs/Reading')) == 'string'
+        assert (
+            describe(create(master, '/other').interested_in(topic, 'file_msgs/Reading')) == 'string'
+        )
 
 
 def describe(channel):
@@ -651,12 +845,17 @@ def test_who_sends_takes_the_definition_given(master, mailbox):
     here = define_message('given_msgs/Reading', 'string level\n')
     topic = '/types/live_%d' % next(topic_numbers)
     with publishing(master, topic, 'given_msgs/Reading', 'int32 level\n', level=7):
-        assert type(create(master, '/node').send_to(topic, typed_as='given_msgs/Reading', level='low')) is here
+        assert (
+            type(create(master, '/node').send_to(topic, typed_as='given_msgs/Reading', level='low'))
+            is here
+        )
 
 
 def test_a_publisher_of_this_process_is_taken_at_its_word_too(master, mailbox):
     define_message('given_msgs/Reading', 'string level\n')
-    other = genpy.dynamic.generate_dynamic('given_msgs/Reading', 'int32 level\n')['given_msgs/Reading']
+    other = genpy.dynamic.generate_dynamic('given_msgs/Reading', 'int32 level\n')[
+        'given_msgs/Reading'
+    ]
     topic = '/types/live_%d' % next(topic_numbers)
     sender, node = create(master, '/sender'), create(master, '/node', delegate=mailbox)
     sender.output_channel(topic, other, latch=True).send(level=7)
@@ -664,31 +863,53 @@ def test_a_publisher_of_this_process_is_taken_at_its_word_too(master, mailbox):
     assert mailbox.get().level == 7
 
 
-@pytest.mark.parametrize('given, taken', [('int32 level\n', ['int32']), ('int8 level\n', ['int8']),
-                                          ('string level\n', ['int8', 'int32'])])
+@pytest.mark.parametrize(
+    'given, taken',
+    [
+        ('int32 level\n', ['int32']),
+        ('int8 level\n', ['int8']),
+        ('string level\n', ['int8', 'int32']),
+    ],
+)
 def test_of_several_publishers_the_one_that_agrees_with_what_was_given_counts(master, given, taken):
     type_ = 'given_msgs/Reading%d' % next(topic_numbers)
     topic = '/types/live_%d' % next(topic_numbers)
     define_message(type_, given)
     with publishing(master, topic, type_, 'int32 level\n', level=1):
-        with Publisher(master, topic, type_, 'int8 level\n', class_from_definition(type_, 'int8 level\n')._md5sum):
+        with Publisher(
+            master,
+            topic,
+            type_,
+            'int8 level\n',
+            class_from_definition(type_, 'int8 level\n')._md5sum,
+        ):
             assert describe(create(master, '/node').interested_in(topic, type_)) in taken
 
 
-@pytest.mark.parametrize('publisher', [
-    dict(definition='complete nonsense!'), dict(definition='int8 a', md5sum='0' * 32), dict(definition=None),
-    dict(said=b''), dict(answer=[0, 'not today', 0])], ids=str)
+@pytest.mark.parametrize(
+    'publisher',
+    [
+        dict(definition='complete nonsense!'),
+        dict(definition='int8 a', md5sum='0' * 32),
+        dict(definition=None),
+        dict(said=b''),
+        dict(answer=[0, 'not today', 0]),
+    ],
+    ids=str,
+)
 def test_a_publisher_that_does_not_tell_leaves_what_was_given(master, publisher, monkeypatch):
     here = define_message('given_msgs/Reading', 'string level\n')
     topic = '/types/live_%d' % next(topic_numbers)
     with Publisher(master, topic, 'given_msgs/Reading', **publisher):
-        assert create(master, '/node').interested_in(topic, 'given_msgs/Reading').message_class is here
+        assert (
+            create(master, '/node').interested_in(topic, 'given_msgs/Reading').message_class is here
+        )
 
 
 @pytest.mark.parametrize('here', ['int32 level\n', 'string level\n'])
 def test_no_publisher_takes_the_question_for_its_definition_for_a_subscriber(master, mailbox, here):
     """rospy's, which waits for a subscriber and then sends, would send to nobody."""
-    topic, type_ = '/types/live_%d' % next(topic_numbers), 'given_msgs/Level%d' % len(here)
+    topic, type_ = '/types/live_%d' % next(topic_numbers), f'given_msgs/Level{len(here)}'
     define_message(type_, here)
     there = class_from_definition(type_, 'int32 level\n')
     came = []
@@ -716,16 +937,26 @@ def test_the_definition_that_is_taken_is_no_failure_and_those_it_does_not_suit_a
         assert describe(node.interested_in(topic, 'given_msgs/Reading')) == 'int32'
         assert mailbox.get().level == 7
         until(lambda: node.errors)
-    error, = node.errors
+    (error,) = node.errors
     assert '/other publishes std_msgs/Empty' in str(error)
 
 
 def test_a_channel_keeps_the_class_that_it_was_opened_with(master, mailbox):
     here = define_message('given_msgs/Reading', 'string level\n')
-    topic, early, late = '/types/live_%d' % next(topic_numbers), create(master, '/early'), create(master, '/late')
+    topic, early, late = (
+        '/types/live_%d' % next(topic_numbers),
+        create(master, '/early'),
+        create(master, '/late'),
+    )
     opened = early.interested_in(topic, 'given_msgs/Reading')
     with publishing(master, topic, 'given_msgs/Reading', 'int32 level\n', level=7):
-        assert describe(late.interested_in(topic, 'given_msgs/Reading', delegate=mailbox)) == 'int32'
+        assert (
+            describe(late.interested_in(topic, 'given_msgs/Reading', delegate=mailbox)) == 'int32'
+        )
         assert mailbox.get().level == 7
-        assert early.interested_in(topic, 'given_msgs/Reading').message_class is opened.message_class is here
+        assert (
+            early.interested_in(topic, 'given_msgs/Reading').message_class
+            is opened.message_class
+            is here
+        )
     early.send_to(topic, level='low')

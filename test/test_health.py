@@ -21,11 +21,15 @@ def test_a_healthy_node(master, mailbox):
     mailbox.get()
     health = node.health()
     assert health.registered
-    assert before - 100 < health.reachable_since <= time.time()    # the watcher may be that of an earlier test
+    # the watcher may be that of an earlier test
+    assert before - 100 < health.reachable_since <= time.time()
     assert health.connections == {'INTRAPROCESS': 1}
     assert (health.dropped, health.errors) == (0, 0)
     # one that answers the master may be about to end
-    until(lambda: node.health().threads == len([t for t in threading.enumerate() if t.name.startswith('/healthy ')]))
+    until(
+        lambda: node.health().threads
+        == len([t for t in threading.enumerate() if t.name.startswith('/healthy ')])
+    )
 
 
 def test_dropped_messages_and_errors_are_counted(master):
@@ -36,12 +40,13 @@ def test_dropped_messages_and_errors_are_counted(master):
         busy.set()
         go_on.wait(TIMEOUT)
         raise ZeroDivisionError
+
     node.interested_in('/work', 'std_msgs/String', delegate=block, queue_size=1)
     for text in 'abc':
         peer.send_to('/work', data=text, typed_as='std_msgs/String')
-        assert busy.wait(TIMEOUT)    # with the first
+        assert busy.wait(TIMEOUT)  # with the first
     go_on.set()
-    while node.health().errors < 2:    # identical ones, of which node.errors has one
+    while node.health().errors < 2:  # identical ones, of which node.errors has one
         threading.Event().wait(0.01)
     assert (node.health().dropped, node.health().errors) == (1, 2)
     assert '1 INTRAPROCESS, 1 dropped, 2 errors' in repr(node)
@@ -78,11 +83,18 @@ def test_a_master_that_goes_and_comes_back(monkeypatch):
     back.stop()
 
 
-@pytest.mark.parametrize('health, line', [
-    ((None, None, {}, 0, 0, 4), 'master away, 0 dropped, 0 errors, 4 threads'),
-    ((True, None, {}, 0, 0, 4), 'registered, 0 dropped, 0 errors, 4 threads'),
-    ((False, None, {'TCPROS': 2, 'INTRAPROCESS': 1}, 3, 4, 5),
-     'not registered, 1 INTRAPROCESS, 2 TCPROS, 3 dropped, 4 errors, 5 threads')])
+@pytest.mark.parametrize(
+    'health, line',
+    [
+        ((None, None, {}, 0, 0, 4), 'master away, 0 dropped, 0 errors, 4 threads'),
+        ((True, None, {}, 0, 0, 4), 'registered, 0 dropped, 0 errors, 4 threads'),
+        (
+            (False, None, {'TCPROS': 2, 'INTRAPROCESS': 1}, 3, 4, 5),
+            'not registered, 1 INTRAPROCESS, 2 TCPROS, 3 dropped, 4 errors, 5 threads',
+        ),
+    ],
+)
 def test_it_is_told_in_a_line(health, line):
     from pharos.health import Health
+
     assert str(Health(*health)) == line

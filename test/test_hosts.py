@@ -1,4 +1,5 @@
-"""Several hosts: the addresses of nodes, who may come in, and links that fail; as root, with network namespaces."""
+"""Several hosts: the addresses of nodes, who may come in, and links that fail; as root, with
+network namespaces."""
 import contextlib
 import os
 import signal
@@ -20,7 +21,8 @@ from programs import until
 from sockets import listening, refused_url
 
 STRING = 'std_msgs/String'
-#: seconds that a cut goes on once it has been noticed; where it is set, the package's own time limits hold
+#: seconds that a cut goes on once it has been noticed; where it is set, the package's own time
+#: limits hold
 CUT = float(os.environ.get('PHAROS_TEST_CUT', 0))
 
 
@@ -33,11 +35,14 @@ def hosts():
 
 @pytest.fixture
 def programs():
-    """Programs given to this are killed at the end of the test: they leave nothing, for their master goes too."""
+    """Programs given to this are killed at the end of the test: they leave nothing, for their
+    master goes too."""
     with contextlib.ExitStack() as running:
+
         def keep(program):
             running.callback(program.end, signal.SIGKILL)
             return program
+
         yield keep
 
 
@@ -45,7 +50,9 @@ def programs():
 def one(hosts, programs, tmp_path):
     """Host one, where the ROS master is."""
     host = hosts[0]
-    master = programs(host.start(host, 'rosmaster', '--core', '-p', str(MASTER_PORT), ROS_LOG_DIR=str(tmp_path)))
+    master = programs(
+        host.start(host, 'rosmaster', '--core', '-p', str(MASTER_PORT), ROS_LOG_DIR=str(tmp_path))
+    )
     until(lambda: MASTER_PORT in {port for _, port in listening(master.process.pid)})
     return host
 
@@ -60,16 +67,16 @@ def three(hosts):
     return hosts[2]
 
 
-# -- messages and calls -----------------------------------------------------------------------------------------------
+# -- messages and calls
 
 PHAROS = '''
 from pharos import BlockNode, Master, Transcript, spin
 
 node = Master().wait(20).create(BlockNode, named='/pharos')
 answers = node.output_channel('/pharos/answer', 'std_msgs/String')
-node.interested_in('/pharos/question', answers.type, lambda message, channel: answers.publish(message))
-node.serve('/pharos/who', 'std_srvs/Trigger', lambda request: {'success': True, 'message': 'a pharos node'})
-Transcript.show('ready')
+node.interested_in('/pharos/question', answers.type, lambda message, channel:
+answers.publish(message)) node.serve('/pharos/who', 'std_srvs/Trigger', lambda request: {'success':
+True, 'message': 'a pharos node'}) Transcript.show('ready')
 spin()
 '''
 
@@ -94,8 +101,8 @@ from pharos import BlockNode, Master, Transcript
 master, peer = Master().wait(20), sys.argv[1]
 with master.create(BlockNode, named='/asking') as node:
     answers = queue.SimpleQueue()
-    heard = node.interested_in('/%s/answer' % peer, 'std_msgs/String', lambda message, channel: answers.put(message))
-    asked = node.output_channel('/%s/question' % peer, 'std_msgs/String')
+    heard = node.interested_in('/%s/answer' % peer, 'std_msgs/String', lambda message, channel:
+    answers.put(message)) asked = node.output_channel('/%s/question' % peer, 'std_msgs/String')
     while answers.empty():    # relay advertises only with its first message, which so is lost
         asked.wait_for_subscribers(1, 20)
         asked.send(data='hello')
@@ -107,15 +114,18 @@ with master.create(BlockNode, named='/asking') as node:
 
 def relay():
     """The path of a ROS program in C++ that passes messages on."""
-    folder, = find_in_workspaces(['libexec'], project='topic_tools')
+    (folder,) = find_in_workspaces(['libexec'], project='topic_tools')
     return os.path.join(folder, 'relay')
 
 
-@pytest.mark.parametrize('peer, service, said', [
-    ('pharos', '/pharos/who', 'a pharos node'),
-    ('rospy', '/rospy/who', 'a rospy node'),
-    ('roscpp', '/roscpp/get_loggers', 'ros.roscpp'),
-])
+@pytest.mark.parametrize(
+    'peer, service, said',
+    [
+        ('pharos', '/pharos/who', 'a pharos node'),
+        ('rospy', '/rospy/who', 'a rospy node'),
+        ('roscpp', '/roscpp/get_loggers', 'ros.roscpp'),
+    ],
+)
 def test_a_node_talks_with_one_of_another_host(one, two, three, programs, peer, service, said):
     if peer == 'roscpp':
         programs(two.start(one, relay(), '/roscpp/question', '/roscpp/answer', '__name:=roscpp'))
@@ -123,20 +133,30 @@ def test_a_node_talks_with_one_of_another_host(one, two, three, programs, peer, 
         programs(two.python(one, {'pharos': PHAROS, 'rospy': ROSPY}[peer])).wait_for('ready')
     asking = programs(three.python(one, ASKING, peer, service))
     link = [('/' + peer, 'TCPROS')]
-    assert asking.wait_for('hello') == 'hello %s %s\n' % (link, link)
+    assert asking.wait_for('hello') == f'hello {link} {link}\n'
     assert said in asking.read_to_the_end()
 
 
 def test_rospys_tools_talk_with_a_node_of_another_host(one, two, three, programs):
     programs(two.python(one, PHAROS)).wait_for('ready')
-    assert 'a pharos node' in programs(three.start(one, 'rosservice', 'call', '/pharos/who')).read_to_the_end()
-    assert 'xmlrpc reply' in programs(three.start(one, 'rosnode', 'ping', '-c', '1', '/pharos')).read_to_the_end()
+    assert (
+        'a pharos node'
+        in programs(three.start(one, 'rosservice', 'call', '/pharos/who')).read_to_the_end()
+    )
+    assert (
+        'xmlrpc reply'
+        in programs(three.start(one, 'rosnode', 'ping', '-c', '1', '/pharos')).read_to_the_end()
+    )
     echo = programs(three.start(one, 'rostopic', 'echo', '/pharos/answer'))
-    programs(three.start(one, 'rostopic', 'pub', '-r', '20', '/pharos/question', STRING, 'data: there and back'))
+    programs(
+        three.start(
+            one, 'rostopic', 'pub', '-r', '20', '/pharos/question', STRING, 'data: there and back'
+        )
+    )
     assert echo.wait_for('there and back')
 
 
-# -- addresses --------------------------------------------------------------------------------------------------------
+# -- addresses
 
 ADDRESSED = '''
 import sys
@@ -184,41 +204,62 @@ def ports_of(program):
 @pytest.mark.parametrize('is_name', [False, True], ids=['address', 'name'])
 def test_the_domain_is_advertised_as_given(one, two, three, programs, is_name):
     domain = two.domain if is_name else two.address
-    program = programs(two.python(one, ADDRESSED, domain, ROS_HOSTNAME='elsewhere.test', ROS_IP=three.address))
+    program = programs(
+        two.python(one, ADDRESSED, domain, ROS_HOSTNAME='elsewhere.test', ROS_IP=three.address)
+    )
     xmlrpc_port, tcp_port = ports_of(program)
     assert programs(three.python(one, ADVERTISED)).read_to_the_end().splitlines() == [
-        'http://%s:%s/' % (domain, xmlrpc_port),
-        'TCPROS %s %s' % (domain, tcp_port),
-        'rosrpc://%s:%s' % (domain, tcp_port)]
-    assert 'found' in programs(three.start(one, 'rostopic', 'echo', '-n', '1', '/t')).read_to_the_end()
+        f'http://{domain}:{xmlrpc_port}/',
+        f'TCPROS {domain} {tcp_port}',
+        f'rosrpc://{domain}:{tcp_port}',
+    ]
+    assert (
+        'found' in programs(three.start(one, 'rostopic', 'echo', '-n', '1', '/t')).read_to_the_end()
+    )
 
 
 def test_a_loopback_domain_is_reached_from_its_own_host_alone(one, two, three, programs):
-    """rospy listens on all interfaces unless the whole process is told otherwise (ros_comm #315)."""
+    """rospy listens on all interfaces unless the whole process is told otherwise (ros_comm
+    #315)."""
     program = programs(two.python(one, ADDRESSED, '127.0.0.1'))
     ports = ports_of(program)
     assert {('127.0.0.1', int(port)) for port in ports} == listening(program.process.pid)
-    assert programs(two.python(one, CONNECTING, '127.0.0.1', *ports)).read_to_the_end() == 'connected\n' * 2
+    assert (
+        programs(two.python(one, CONNECTING, '127.0.0.1', *ports)).read_to_the_end()
+        == 'connected\n' * 2
+    )
     assert programs(three.python(one, CONNECTING, two.address, *ports)).read_to_the_end() == (
-        'ConnectionRefusedError\n' * 2)
-    assert 'found' in programs(two.start(one, 'rostopic', 'echo', '-n', '1', '/t')).read_to_the_end()
+        'ConnectionRefusedError\n' * 2
+    )
+    assert (
+        'found' in programs(two.start(one, 'rostopic', 'echo', '-n', '1', '/t')).read_to_the_end()
+    )
 
 
 def test_an_address_is_reached_from_other_hosts(one, two, three, programs):
     """So that what refuses a connection above is the domain."""
     ports = ports_of(programs(two.python(one, ADDRESSED, two.address)))
-    assert programs(three.python(one, CONNECTING, two.address, *ports)).read_to_the_end() == 'connected\n' * 2
+    assert (
+        programs(three.python(one, CONNECTING, two.address, *ports)).read_to_the_end()
+        == 'connected\n' * 2
+    )
 
 
-# -- links that fail --------------------------------------------------------------------------------------------------
+# -- links that fail
 
-IMPATIENT = '' if CUT else '''
+IMPATIENT = (
+    ''
+    if CUT
+    else '''
 from pharos.private_rospy import lifetime, registration
 lifetime.KEEPALIVE_IDLE = lifetime.KEEPALIVE_INTERVAL = lifetime.KEEPALIVE_COUNT = 1
 registration.RETRY_DELAY = 0.2
 '''
+)
 
-SPEAKING = IMPATIENT + '''
+SPEAKING = (
+    IMPATIENT
+    + '''
 from pharos import BlockNode, Master, Transcript
 
 node = Master().wait(20).create(BlockNode, named='/pharos')
@@ -233,8 +274,11 @@ for _ in node.every(0.05):
         before = latched.connections
         Transcript.show('told', before)
 '''
+)
 
-LISTENING = IMPATIENT + '''
+LISTENING = (
+    IMPATIENT
+    + '''
 import sys
 from pharos import BlockNode, Master, Transcript
 from pharos.watcher import watcher_of
@@ -253,6 +297,7 @@ for _ in node.every(0.05):
             Transcript.show('found' if now[name] else 'lost', name)
     before = now
 '''
+)
 
 
 def wait_for_each(program, *texts):
@@ -275,7 +320,8 @@ def cut(host):
 
 
 def test_links_come_back_after_a_silent_loss_however_long(one, two, three, programs):
-    """rospy's subscriber notices it after 150 s and lets the link go for good (ros_comm #851), its publisher never."""
+    """rospy's subscriber notices it after 150 s and lets the link go for good (ros_comm #851), its
+    publisher never."""
     topics = '/chat/pharos', '/chat/rospy', '/latched/pharos', '/latched/rospy'
     speaking = programs(two.python(one, SPEAKING))
     programs(two.start(one, 'rostopic', 'pub', '-r', '20', '/chat/rospy', STRING, 'data: x'))
@@ -291,12 +337,13 @@ def test_links_come_back_after_a_silent_loss_however_long(one, two, three, progr
 def test_a_publisher_that_came_during_a_cut_is_found_after_it(one, two, three, programs, tmp_path):
     """The master tells of it once; rospy, which did not hear that, never connects."""
     programs(two.python(one, SPEAKING)).wait_for('ready')
-    # it hears of that one when it registers, so that the master has no connection to it that would wait out the cut
+    # it hears of that one when it registers, so that the master has no connection to it that would
+    # wait out the cut
     listening = programs(three.python(one, LISTENING, '/chat/pharos', '/late'))
     wait_for_each(listening, 'heard /chat/pharos', 'found the master')
     with cut(three):
         programs(two.start(one, 'rostopic', 'pub', '-r', '20', '/late', STRING, 'data: x'))
-        one.forget_neighbours()    # so that it fails at once
+        one.forget_neighbours()  # so that it fails at once
         until(lambda: 'publisherUpdate[/late]' in failures(tmp_path / 'master.log'))
         listening.wait_for('lost the master')
     listening.wait_for('heard /late')
@@ -307,7 +354,9 @@ def failures(log):
     return ''.join(line for line in log.read_text().splitlines() if 'exception=' in line)
 
 
-CALLING = IMPATIENT + '''
+CALLING = (
+    IMPATIENT
+    + '''
 import sys
 from pharos import Master, ServiceCallError, Transcript
 
@@ -316,6 +365,7 @@ try:
 except ServiceCallError as error:
     Transcript.show('the call ended:', error)
 '''
+)
 
 SLOW = '''
 from pharos import BlockNode, Master, Transcript, spin
@@ -333,7 +383,8 @@ spin()
 
 
 def test_a_service_call_ends_when_its_provider_vanishes(one, two, three, programs):
-    """With rospy it lasts for ever, for it has no time limit and nothing asks whether the provider is there."""
+    """With rospy it lasts for ever, for it has no time limit and nothing asks whether the provider
+    is there."""
     slow = programs(two.python(one, SLOW))
     slow.wait_for('ready')
     calling = programs(three.python(one, CALLING))
@@ -342,13 +393,14 @@ def test_a_service_call_ends_when_its_provider_vanishes(one, two, three, program
         assert 'broke' in calling.wait_for('the call ended:')
 
 
-# -- publishers out of reach, of one host -----------------------------------------------------------------------------
+# -- publishers out of reach, of one host
+
 
 class Stranger:
     """What a publisher seems to be to the master and to subscribers, but is not.
 
-    :param ports: that it names to subscribers as its TCPROS port, one at each request, and the last from then on; None:
-        it closes the connection instead
+    :param ports: that it names to subscribers as its TCPROS port, one at each request, and the last
+        from then on; None: it closes the connection instead
     """
 
     def __init__(self, master, topic, *ports):
@@ -367,7 +419,7 @@ class Stranger:
         self.asked.release()
         port = self._ports.pop(0) if len(self._ports) > 1 else self._ports[0]
         if port is None:
-            raise SystemExit    # passes xmlrpc.server by, and its connection is closed
+            raise SystemExit  # passes xmlrpc.server by, and its connection is closed
         return 1, '', ['TCPROS', '127.0.0.1', port]
 
     def unregister(self):
@@ -384,10 +436,12 @@ class Stranger:
 def stranger(master):
     """``stranger(topic, *ports)`` -> a Stranger, gone at the end."""
     with contextlib.ExitStack() as ends:
+
         def make(*arguments):
             found = Stranger(master, *arguments)
             ends.callback(found.end)
             return found
+
         yield make
 
 
@@ -410,8 +464,11 @@ def speaker():
     ros_master.stop()
 
 
-def test_a_publisher_whose_port_cannot_be_reached_yet_is_tried_again(master, mailbox, impatient, stranger, speaker):
-    """As when a link comes back for one connection, and is lost before the next; rospy then gives up."""
+def test_a_publisher_whose_port_cannot_be_reached_yet_is_tried_again(
+    master, mailbox, impatient, stranger, speaker
+):
+    """As when a link comes back for one connection, and is lost before the next; rospy then gives
+    up."""
     speaker.output_channel('/hosts/seldom', STRING, latch=True).send(data='reached')
     closed = int(refused_url().rsplit(':', 1)[1].strip('/'))
     stranger('/hosts/seldom', None, closed, None, closed, closed, speaker.tcp_port)
@@ -448,8 +505,10 @@ def test_a_publisher_that_refuses_is_asked_once(master, impatient, stranger):
         connection, _ = server.accept()
         with connection:
             connection.settimeout(TIMEOUT)
-            rosgraph.network.write_ros_handshake_header(connection, {'error': 'topic types do not match'})
-            while connection.recv(4096):    # its handshake, and then that it closes
+            rosgraph.network.write_ros_handshake_header(
+                connection, {'error': 'topic types do not match'}
+            )
+            while connection.recv(4096):  # its handshake, and then that it closes
                 pass
     until(lambda: not threads('/hosts/refused'))
     assert asked.acquire(blocking=False)

@@ -1,4 +1,5 @@
-"""What cannot be done because the master is away, or the start ends early, leaves nothing behind and loses nothing."""
+"""What cannot be done because the master is away, or the start ends early, leaves nothing behind
+and loses nothing."""
 import signal
 import socket
 import threading
@@ -21,7 +22,10 @@ def create(master, name, **kwargs):
 
 
 def registrations(master, name):
-    return [sorted(topic for topic, nodes in kind.items() if name in nodes) for kind in master.system_state()]
+    return [
+        sorted(topic for topic, nodes in kind.items() if name in nodes)
+        for kind in master.system_state()
+    ]
 
 
 @pytest.fixture
@@ -46,6 +50,7 @@ def away(monkeypatch):
 
         def go_on(self):
             embedded._child.send_signal(signal.SIGCONT)
+
     master = Away(embedded.url)
     yield master
     master.go_on()
@@ -53,7 +58,7 @@ def away(monkeypatch):
     master.end()
 
 
-# -- the master is away -----------------------------------------------------------------------------------------------
+# -- the master is away
 
 OPENERS = {
     'interested_in': lambda node: node.interested_in('/interrupted/opened', STRING),
@@ -78,11 +83,16 @@ def test_what_is_opened_while_the_master_is_away_raises_and_leaves_nothing_behin
     away.come_back()
     until(lambda: registrations(away, '/node') == before)
     assert '/interrupted/opened' not in away.parameters
-    OPENERS[opener](node)    # it can be done as if nothing had been
-    assert sum(map(len, registrations(away, '/node'))) == sum(map(len, before)) + (opener not in ('parameter', 'on_change'))
+    OPENERS[opener](node)  # it can be done as if nothing had been
+    assert sum(map(len, registrations(away, '/node'))) == sum(map(len, before)) + (
+        opener not in ('parameter', 'on_change')
+    )
     node.stop()
     assert registrations(away, '/node') == [[], [], []]
-    assert away._api('/test').subscribeParam('http://127.0.0.1:1/', '/interrupted/opened') in ({}, 5)
+    assert away._api('/test').subscribeParam('http://127.0.0.1:1/', '/interrupted/opened') in (
+        {},
+        5,
+    )
 
 
 def test_a_second_channel_on_a_topic_needs_no_master(away, mailbox):
@@ -99,7 +109,9 @@ def test_a_second_channel_on_a_topic_needs_no_master(away, mailbox):
 def test_what_plain_rospy_opens_while_the_master_is_away_is_registered_later(away):
     node, mailbox = create(away, '/node'), Mailbox()
     away.end()
-    node.ros.Subscriber('/interrupted/plain', std_msgs.msg.String, lambda message: mailbox(message, None))
+    node.ros.Subscriber(
+        '/interrupted/plain', std_msgs.msg.String, lambda message: mailbox(message, None)
+    )
     publisher = node.ros.Publisher('/interrupted/plain', std_msgs.msg.String, queue_size=5)
     node.ros.Service('/interrupted/plain_service', std_srvs.srv.Empty, lambda request: None)
     away.come_back()
@@ -110,11 +122,15 @@ def test_what_plain_rospy_opens_while_the_master_is_away_is_registered_later(awa
 
 
 def test_what_is_closed_while_the_master_hangs_is_unregistered_when_it_goes_on(away, monkeypatch):
-    monkeypatch.setattr(proxies.ServerProxy.__init__, '__defaults__', (0.2,))    # seconds that a call may take
+    # seconds that a call may take
+    monkeypatch.setattr(proxies.ServerProxy.__init__, '__defaults__', (0.2,))
     node = create(away, '/node')
     before = registrations(away, '/node')
-    opened = [node.interested_in('/interrupted/in', STRING), node.output_channel('/interrupted/out', STRING),
-              node.serve('/interrupted/service', 'std_srvs/Empty', lambda request: None)]
+    opened = [
+        node.interested_in('/interrupted/in', STRING),
+        node.output_channel('/interrupted/out', STRING),
+        node.serve('/interrupted/service', 'std_srvs/Empty', lambda request: None),
+    ]
     away.hang()
     for closed in opened:
         closed.close()
@@ -125,7 +141,8 @@ def test_what_is_closed_while_the_master_hangs_is_unregistered_when_it_goes_on(a
     until(lambda: registrations(away, '/node') == before)
 
 
-# -- the start is interrupted -----------------------------------------------------------------------------------------
+# -- the start is interrupted
+
 
 @pytest.fixture
 def stopped(away, mailbox):
@@ -175,11 +192,15 @@ def test_a_start_at_a_busy_port_loses_nothing(away, stopped, mailbox):
 
 
 @pytest.mark.parametrize('what', ['interested_in', 'output_channel', 'serve', 'parameter'])
-@pytest.mark.parametrize('error', [pharos.MasterUnreachableError('gone'), KeyboardInterrupt()], ids=type)
-def test_a_start_that_is_interrupted_while_it_opens_what_it_had_loses_nothing(away, stopped, mailbox, monkeypatch,
-                                                                              what, error):
+@pytest.mark.parametrize(
+    'error', [pharos.MasterUnreachableError('gone'), KeyboardInterrupt()], ids=type
+)
+def test_a_start_that_is_interrupted_while_it_opens_what_it_had_loses_nothing(
+    away, stopped, mailbox, monkeypatch, what, error
+):
     def interrupt(*args, **kwargs):
         raise error
+
     with monkeypatch.context() as patch:
         if what == 'parameter':
             patch.setattr('pharos.private_rospy.parameters.WatchedParameters._subscribe', interrupt)
@@ -203,6 +224,7 @@ def test_a_start_during_which_the_master_goes_loses_nothing(away, stopped, mailb
     def open_when_it_has_gone(self):
         away.end()
         begin(self)
+
     with monkeypatch.context() as patch:
         patch.setattr(pharos.InputChannel, '_open', open_when_it_has_gone)
         with pytest.raises(pharos.MasterUnreachableError):
@@ -212,7 +234,9 @@ def test_a_start_during_which_the_master_goes_loses_nothing(away, stopped, mailb
     assert_all_is_back(away, stopped, mailbox)
 
 
-def test_a_start_that_is_stopped_while_it_opens_what_it_had_loses_nothing(away, stopped, mailbox, monkeypatch):
+def test_a_start_that_is_stopped_while_it_opens_what_it_had_loses_nothing(
+    away, stopped, mailbox, monkeypatch
+):
     begin = pharos.OutputChannel._open
 
     def open_when_it_was_stopped(self, *args):
@@ -220,6 +244,7 @@ def test_a_start_that_is_stopped_while_it_opens_what_it_had_loses_nothing(away, 
         stopper.start()
         stopper.join(TIMEOUT)
         begin(self, *args)
+
     with monkeypatch.context() as patch:
         patch.setattr(pharos.OutputChannel, '_open', open_when_it_was_stopped)
         with pytest.raises(pharos.NodeStoppedError, match='stopped while it started'):

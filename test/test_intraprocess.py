@@ -43,13 +43,15 @@ def connected(channel, count):
     return sorted(channel.connections)
 
 
-# -- the transport ----------------------------------------------------------------------------------------------------
+# -- the transport
+
 
 @pytest.mark.parametrize('is_before', [True, False])
 def test_a_channel_that_opens_while_the_link_of_another_one_does_hears_all_of_it_once(
-        master, monkeypatch, is_before):
+    master, monkeypatch, is_before
+):
     sender, receiver = create(master, '/sender'), create(master, '/receiver')
-    receiver.connect_timeout = 0    # the link is not waited for by who delays it
+    receiver.connect_timeout = 0  # the link is not waited for by who delays it
     first, second = Mailbox(), Mailbox()
     sent = sender.output_channel('/meanwhile', STRING, latch=True)
     sent.send(data='latched')
@@ -64,6 +66,7 @@ def test_a_channel_that_opens_while_the_link_of_another_one_does_hears_all_of_it
         if not is_before:
             receiver.interested_in('/meanwhile', STRING, delegate=second)
         return is_added
+
     monkeypatch.setattr(subscription, 'add_connection', add_meanwhile)
     receiver.interested_in('/meanwhile', STRING, delegate=first)
     assert sent.wait_for_subscribers(1, TIMEOUT)
@@ -79,6 +82,7 @@ def test_no_socket_is_opened_and_nothing_serialized(master, monkeypatch):
 
     def never(*args, **kwargs):
         raise AssertionError('a socket was opened, or a message serialized')
+
     monkeypatch.setattr(socket, 'socket', never)
     monkeypatch.setattr(sent.message_class, 'serialize', never)
     monkeypatch.setattr(sent.message_class, 'deserialize', never)
@@ -90,7 +94,9 @@ def test_no_socket_is_opened_and_nothing_serialized(master, monkeypatch):
 def test_ros_tools_see_the_connection(master):
     pair(master, '/t', TWIST)
     for name, peer in ('/sender', '/receiver'), ('/receiver', '/sender'):
-        info = subprocess.run(['rosnode', 'info', name], stdout=subprocess.PIPE, text=True, timeout=60).stdout
+        info = subprocess.run(
+            ['rosnode', 'info', name], stdout=subprocess.PIPE, text=True, timeout=60
+        ).stdout
         assert 'transport: INTRAPROCESS' in info and '* topic: /t' in info
         assert peer in info.split('* topic: /t')[1]
 
@@ -101,7 +107,7 @@ def test_a_channels_repr_says_what_is_connected(master):
     assert repr(received) == '<InputChannel /t geometry_msgs/Twist of /receiver: 1 INTRAPROCESS>'
     received.close()
     assert repr(received) == '<InputChannel /t geometry_msgs/Twist of /receiver: closed>'
-    assert (sent.connections, received.connections) == ([], [])    # at once (ros_comm #927)
+    assert (sent.connections, received.connections) == ([], [])  # at once (ros_comm #927)
 
 
 def test_nodes_of_different_masters_do_not_mix(master, mailbox):
@@ -122,10 +128,14 @@ def test_another_type_is_refused_and_both_are_named(master, capfd):
     channel.connect_timeout = 0.1
     assert channel.output_channel('/t', STRING).connections == []
     said = capfd.readouterr().err
-    assert '/receiver wants /t as geometry_msgs/Twist' in said and '/sender publishes std_msgs/String' in said
+    assert (
+        '/receiver wants /t as geometry_msgs/Twist' in said
+        and '/sender publishes std_msgs/String' in said
+    )
 
 
-# -- the same as TCPROS -----------------------------------------------------------------------------------------------
+# -- the same as TCPROS
+
 
 def test_a_receivers_message_is_its_own(master):
     sent, _, first = pair(master, '/t', 'geometry_msgs/PoseArray')
@@ -172,24 +182,34 @@ def test_headers_are_as_tcpros_has_them(master, kwargs):
 def test_any_type_and_numpy_types_are_received(master):
     from rospy.numpy_msg import numpy_msg
     from sensor_msgs.msg import LaserScan
+
     sent, _, _ = pair(master, '/t', 'sensor_msgs/LaserScan')
     node = create(master, '/tools')
     raw, arrays = Mailbox(), Mailbox()
     node.interested_in('/t', node.ros.AnyMsg, delegate=raw)
     create(master, '/arrays', delegate=arrays).interested_in('/t', numpy_msg(LaserScan))
     message = sent.send(ranges=[1.0, 2.5])
-    assert connected(sent, 3) == [('/arrays', 'INTRAPROCESS'), ('/receiver', 'INTRAPROCESS'), ('/tools', 'INTRAPROCESS')]
+    assert connected(sent, 3) == [
+        ('/arrays', 'INTRAPROCESS'),
+        ('/receiver', 'INTRAPROCESS'),
+        ('/tools', 'INTRAPROCESS'),
+    ]
     assert LaserScan().deserialize(raw.get()._buff) == message
     ranges = arrays.get().ranges
     assert type(ranges).__name__ == 'ndarray' and ranges.tolist() == [1.0, 2.5]
 
 
 def test_a_type_made_at_run_time_is_received(master):
-    pharos.define_message('made_up/Thing', 'Part[] parts\nstring name\n' + '=' * 80 + '\nMSG: made_up/Part\nint8 x\ntime t')
+    pharos.define_message(
+        'made_up/Thing',
+        'Part[] parts\nstring name\n' + '=' * 80 + '\nMSG: made_up/Part\nint8 x\ntime t',
+    )
     sent, _, mailbox = pair(master, '/t', 'made_up/Thing')
     sent.send(parts=[{'x': 5}], name='it')
     message = mailbox.get()
-    assert message.parts[0].x == 5 and message.name == 'it' and type(message.parts[0].t) is genpy.Time
+    assert (
+        message.parts[0].x == 5 and message.name == 'it' and type(message.parts[0].t) is genpy.Time
+    )
 
 
 def test_a_latched_message_reaches_those_who_come_late_as_it_was(master):
@@ -224,7 +244,8 @@ def test_each_latched_channel_of_a_node_keeps_its_message(master):
     assert later.get().data == 'second'
 
 
-# -- delegates --------------------------------------------------------------------------------------------------------
+# -- delegates
+
 
 def test_messages_arrive_in_order_and_none_is_lost_while_there_is_room(master):
     sent, received, mailbox = pair(master, '/t', 'std_msgs/Int32', queue_size=10000)
@@ -242,6 +263,7 @@ def test_a_full_queue_drops_the_oldest_and_counts(master, transport):
         entered.set()
         release.wait(TIMEOUT)
         mailbox(message, channel)
+
     node = create(master, '/receiver', delegate=slow)
     if transport == 'TCPROS':
         speak_tcpros_only(node)
@@ -271,6 +293,7 @@ def test_the_publisher_does_not_wait_for_a_receiver_that_is_busy(master):
     def stuck(message, channel):
         release.wait(TIMEOUT)
         mailbox(message, channel)
+
     sent, received, _ = pair(master, '/t', TWIST)
     received.delegate = stuck
     for _ in range(100):
@@ -296,9 +319,10 @@ def test_a_node_may_publish_to_itself_from_its_delegate(master, mailbox, inline)
 
     def count(message, input_channel):
         if message.data < 2000:
-            channel.send(data=message.data + 1)    # would overflow the stack if it recursed
+            channel.send(data=message.data + 1)  # would overflow the stack if it recursed
         else:
             mailbox(message, input_channel)
+
     node.interested_in('/t', delegate=count, inline=inline)
     channel.send(data=0)
     assert mailbox.get().data == 2000 and not node.errors
@@ -308,16 +332,25 @@ def test_two_nodes_may_publish_to_each_other_inline_from_two_threads(master):
     """With rospy's publish lock held while delegates run, these deadlock."""
     done = Mailbox()
     nodes = [create(master, name) for name in ('/ping', '/pong')]
-    outs = [node.output_channel(topic, 'std_msgs/Int32') for node, topic in zip(nodes, ('/to_pong', '/to_ping'))]
+    outs = [
+        node.output_channel(topic, 'std_msgs/Int32')
+        for node, topic in zip(nodes, ('/to_pong', '/to_ping'))
+    ]
     for node, out, topic in zip(nodes, outs, ('/to_ping', '/to_pong')):
+
         def play(message, channel, out=out):
             if message.data:
                 out.send(data=message.data - 1)
             else:
                 done(message, channel)
+
         node.interested_in(topic, 'std_msgs/Int32', delegate=play, inline=True)
-    threads = [threading.Thread(target=lambda out=out: [out.send(data=20) for _ in range(200)], daemon=True)
-               for out in outs]
+    threads = [
+        threading.Thread(
+            target=lambda out=out: [out.send(data=20) for _ in range(200)], daemon=True
+        )
+        for out in outs
+    ]
     for thread in threads:
         thread.start()
     done.take(400)
@@ -333,6 +366,7 @@ def test_a_delegate_may_subscribe_close_and_publish_a_lot(master, mailbox):
         node.interested_in('/many', delegate=mailbox)
         for number in range(1000):
             out.send(data=number)
+
     node.interested_in('/start', 'std_msgs/Empty', delegate=delegate)
     create(master, '/sender').send_to('/start')
     assert [message.data for message in mailbox.take(1000)] == list(range(1000))
@@ -346,6 +380,7 @@ def test_a_delegate_may_stop_another_node_and_its_own(master):
         second.stop()
         first.stop()
         stopped.set()
+
     first.interested_in('/stop', 'std_msgs/Empty', delegate=stop_both)
     second.send_to('/stop')
     assert stopped.wait(TIMEOUT)
@@ -356,7 +391,10 @@ def test_a_failing_inline_delegate_does_not_reach_the_publisher(master, transcri
     sent, received, _ = pair(master, '/t', TWIST, inline=True)
     received.delegate = lambda message, channel: 1 / 0
     sent.send()
-    assert isinstance(received.node.errors[-1], ZeroDivisionError) and 'ZeroDivisionError' in transcript[0]
+    assert (
+        isinstance(received.node.errors[-1], ZeroDivisionError)
+        and 'ZeroDivisionError' in transcript[0]
+    )
 
 
 @pytest.mark.parametrize('inline, laps', [(False, 200), (True, 50)])
@@ -377,12 +415,18 @@ def test_a_ring_of_ten_nodes_loses_nothing(master, inline, laps):
                 out.publish(message)
             else:
                 arrived(message, channel)
-        node.interested_in('/link%d' % i, 'std_msgs/Int64MultiArray', delegate=pass_on, inline=inline)
+
+        node.interested_in(
+            '/link%d' % i, 'std_msgs/Int64MultiArray', delegate=pass_on, inline=inline
+        )
 
     def feed(number):
-        out = create(master, '/feeder%d' % number).output_channel('/link0', 'std_msgs/Int64MultiArray')
+        out = create(master, '/feeder%d' % number).output_channel(
+            '/link0', 'std_msgs/Int64MultiArray'
+        )
         for token in range(tokens):
             out.send(data=(0, number * tokens + token))
+
     threads = [threading.Thread(target=feed, args=(number,), daemon=True) for number in range(2)]
     for thread in threads:
         thread.start()
@@ -391,10 +435,13 @@ def test_a_ring_of_ten_nodes_loses_nothing(master, inline, laps):
     for number in range(2):
         mine = [token for token in tokens_seen if token // tokens == number]
         assert mine == sorted(mine)
-    assert all(not node.errors and not any(c.dropped for c in node.channels if hasattr(c, 'dropped')) for node in nodes)
+    assert all(
+        not node.errors and not any(c.dropped for c in node.channels if hasattr(c, 'dropped'))
+        for node in nodes
+    )
 
 
-# -- mixed topics -----------------------------------------------------------------------------------------------------
+# -- mixed topics
 
 SUBSCRIBER = """
 import sys, rospy, std_msgs.msg
@@ -418,7 +465,9 @@ rospy.spin()
 
 def test_receivers_here_and_elsewhere_get_everything_once(master):
     sent, _, mailbox = pair(master, '/t', STRING)
-    with subprocess.Popen([sys.executable, '-c', SUBSCRIBER], stdout=subprocess.PIPE, text=True) as external:
+    with subprocess.Popen(
+        [sys.executable, '-c', SUBSCRIBER], stdout=subprocess.PIPE, text=True
+    ) as external:
         assert connected(sent, 2) == [('/external', 'TCPROS'), ('/receiver', 'INTRAPROCESS')]
         for number in range(100):
             sent.send(data=str(number))
@@ -435,8 +484,13 @@ def test_a_receiver_gets_everything_once_from_publishers_here_and_elsewhere(mast
             sent.send(data='here %d' % number)
         texts = [message.data for message in mailbox.take(200)]
         for source in 'here', 'external':
-            assert [text for text in texts if text.startswith(source)] == ['%s %d' % (source, i) for i in range(100)]
-        assert sorted(received.connections) == [('/external', 'TCPROS'), ('/sender', 'INTRAPROCESS')]
+            assert [text for text in texts if text.startswith(source)] == [
+                '%s %d' % (source, i) for i in range(100)
+            ]
+        assert sorted(received.connections) == [
+            ('/external', 'TCPROS'),
+            ('/sender', 'INTRAPROCESS'),
+        ]
         external.terminate()
 
 
@@ -446,7 +500,9 @@ def test_a_node_that_moves_is_found_again_by_the_right_transport(master, mailbox
     for turn in range(2):
         here = create(master, '/external')
         here.send_to('/t', data='here')
-        assert mailbox.get().data == 'here' and channel.connections == [('/external', 'INTRAPROCESS')]
+        assert mailbox.get().data == 'here' and channel.connections == [
+            ('/external', 'INTRAPROCESS')
+        ]
         here.stop()
         with subprocess.Popen([sys.executable, '-c', PUBLISHER]) as elsewhere:
             assert mailbox.take(100)[-1].data == 'external 99'
@@ -458,7 +514,7 @@ def test_a_node_that_moves_is_found_again_by_the_right_transport(master, mailbox
 def wait_until_gone(master, name):
     pause = threading.Event()
     while any(node.name == name for node in master.nodes()):
-        pause.wait(0.01)    # another process: the master is all there is to ask
+        pause.wait(0.01)  # another process: the master is all there is to ask
 
 
 def test_one_nodes_messages_only(master):
@@ -470,7 +526,9 @@ def test_one_nodes_messages_only(master):
     with subprocess.Popen([sys.executable, '-c', PUBLISHER]) as external:
         everything.take(100)
         from_external = Mailbox()
-        create(master, '/picky', delegate=from_external).interested_in('/t', STRING, from_='/external')
+        create(master, '/picky', delegate=from_external).interested_in(
+            '/t', STRING, from_='/external'
+        )
         external.terminate()
     two.send_to('/t', data='from two')
     one.send_to('/t', data='from one')
@@ -517,8 +575,12 @@ def test_counters_hold_over_many_publishers(master, mailbox):
 
 def test_a_publisher_gives_way_to_a_receiver_that_takes_nothing_once_in_a_while(monkeypatch):
     now, naps = [1.0], []
-    monkeypatch.setattr(dispatcher, 'time', types.SimpleNamespace(perf_counter=lambda: now[0], sleep=naps.append))
-    inbox = dispatcher.Inbox(types.SimpleNamespace(queue_size=10), dispatcher.Dispatcher(None), inline=True)
+    monkeypatch.setattr(
+        dispatcher, 'time', types.SimpleNamespace(perf_counter=lambda: now[0], sleep=naps.append)
+    )
+    inbox = dispatcher.Inbox(
+        types.SimpleNamespace(queue_size=10), dispatcher.Dispatcher(None), inline=True
+    )
     for number in range(1000):
         inbox.put(number)
     assert len(naps) == 1 and inbox.dropped == 990

@@ -15,14 +15,18 @@ TRANSPORTS = 'INTRAPROCESS', 'TCPROS'
 @pytest.fixture(params=TRANSPORTS)
 def come(request, master):
     """``come(name, topic)``: a node becomes interested; returns what it gets, and its handle."""
+
     def come(name, topic):
         mailbox = Mailbox()
         node = master.create(BlockNode, named=name, domain='127.0.0.1')
         if request.param == 'TCPROS':
-            speak_tcpros_only(node).ros.Subscriber(topic, std_msgs.msg.String, lambda message: mailbox(message, None))
+            speak_tcpros_only(node).ros.Subscriber(
+                topic, std_msgs.msg.String, lambda message: mailbox(message, None)
+            )
         else:
             node.interested_in(topic, STRING, delegate=mailbox)
         return mailbox, node
+
     return come
 
 
@@ -35,7 +39,8 @@ def texts(mailbox, count):
     return [message.data for message in mailbox.take(count)]
 
 
-# -- for whom ---------------------------------------------------------------------------------------------------------
+# -- for whom
+
 
 def test_what_is_sent_to_one_node_is_latched_for_that_one_alone(master, come):
     channel = latched_channel(master, '/latch/one')
@@ -49,7 +54,7 @@ def test_what_is_sent_to_one_node_is_latched_for_that_one_alone(master, come):
     assert texts(other, 1) == ['for all']
     receiver.stop()
     again, _ = come('/b', '/latch/one')
-    assert texts(again, 1) == ['for b']    # the last message for it
+    assert texts(again, 1) == ['for b']  # the last message for it
     channel.send(data='news')
     assert texts(again, 1) == texts(other, 1) == ['news']
     assert mailbox.empty()
@@ -72,15 +77,22 @@ def test_what_a_rospy_publisher_sends_to_one_listener_is_latched_for_that_one_al
 
         def peer_subscribe(self, topic_name, topic_publish, peer_publish):
             peer_publish(std_msgs.msg.String('welcome'))
-    publisher = node.ros.Publisher('/latch/greeted', std_msgs.msg.String, latch=True, queue_size=5,
-                                   subscriber_listener=Greeter())
+
+    publisher = node.ros.Publisher(
+        '/latch/greeted',
+        std_msgs.msg.String,
+        latch=True,
+        queue_size=5,
+        subscriber_listener=Greeter(),
+    )
     publisher.publish('for all')
     for name in '/b', '/c':
         mailbox, _ = come(name, '/latch/greeted')
         assert texts(mailbox, 2) == ['for all', 'welcome']
 
 
-# -- for how long -----------------------------------------------------------------------------------------------------
+# -- for how long
+
 
 def test_a_latched_value_survives_a_restart_of_its_node(master, come):
     channel = latched_channel(master, '/latch/restart')
@@ -90,7 +102,7 @@ def test_a_latched_value_survives_a_restart_of_its_node(master, come):
     for _ in range(2):
         channel.node.stop()
         channel.node.start()
-        assert texts(present, 1) == ['kept']    # as each who connects gets it
+        assert texts(present, 1) == ['kept']  # as each who connects gets it
     late, _ = come('/late', '/latch/restart')
     assert texts(late, 1) == ['kept']
     until(lambda: len(channel.connections) == 2)
@@ -136,7 +148,9 @@ def test_a_latched_value_survives_a_restart_of_the_master():
         first.stop()
         first = InProcessMaster(port)
         late = Mailbox()
-        master.create(BlockNode, named='/late', domain='127.0.0.1').interested_in('/latch/master', STRING, delegate=late)
+        master.create(BlockNode, named='/late', domain='127.0.0.1').interested_in(
+            '/latch/master', STRING, delegate=late
+        )
         assert texts(late, 1) == ['kept']
         with Program(master.url, 'rostopic', 'echo', '-n1', '/latch/master') as echo:
             echo.wait_for('data: "kept"')
@@ -145,7 +159,8 @@ def test_a_latched_value_survives_a_restart_of_the_master():
         first.stop()
 
 
-# -- what a receiver sees ---------------------------------------------------------------------------------------------
+# -- what a receiver sees
+
 
 def test_a_late_receiver_of_one_node_gets_what_that_one_latched(master):
     one = latched_channel(master, '/latch/from', '/one')
@@ -171,4 +186,7 @@ def test_a_shared_receiver_that_comes_late_gets_a_message_of_its_own(master):
     sent.data = 'changed since'
     one, two = first.get(), second.get()
     assert one.data == two.data == 'as it was' and one is not two
-    assert one._connection_header == two._connection_header and one._connection_header['callerid'] == '/sender'
+    assert (
+        one._connection_header == two._connection_header
+        and one._connection_header['callerid'] == '/sender'
+    )

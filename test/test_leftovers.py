@@ -1,7 +1,7 @@
 """What a stopped node leaves behind: nothing, however often it was started.
 
-The counting is done in a process of its own, whose threads, descriptors and memory are those of its nodes alone; the
-master and the peers are elsewhere.
+The counting is done in a process of its own, whose threads, descriptors and memory are those of its
+nodes alone; the master and the peers are elsewhere.
 """
 import gc
 import json
@@ -32,9 +32,11 @@ def count():
     gc.collect()
     for thread in threading.enumerate():
         if thread.name.startswith('watcher') and not pharos.running.nodes():
-            thread.join(20)    # it watches the master while there are nodes, and ends once it sees that there are none
+            thread.join(20)    # it watches the master while there are nodes, and ends once it sees
+            that there are none
     deadline = time.monotonic() + 20
-    while len(os.listdir('/proc/self/task')) > threading.active_count() and time.monotonic() < deadline:
+    while len(os.listdir('/proc/self/task')) > threading.active_count() and time.monotonic() <
+    deadline:
         threading.Event().wait(0.001)    # a thread that was joined has still to leave the kernel
     open_files = []
     for descriptor in os.listdir('/proc/self/fd'):
@@ -46,7 +48,8 @@ def count():
             'descriptors': len(open_files), 'registrations': registrations()}
 
 def registrations():
-    return sum(nodes.count(name) for kind in master.system_state() for nodes in kind.values() for name in ours)
+    return sum(nodes.count(name) for kind in master.system_state() for nodes in kind.values() for
+    name in ours)
 
 def cpu_share():
     """The share of a core that is used while nothing happens."""
@@ -62,7 +65,9 @@ def timed(block):
 master = Master()
 '''
 
-ROUNDS = COUNTED + r'''
+ROUNDS = (
+    COUNTED
+    + r'''
 import queue
 ours = ['/round']
 received, turned = queue.SimpleQueue(), threading.Event()
@@ -96,35 +101,46 @@ stopped_cpu = cpu_share()
 node.start()
 running_cpu = cpu_share()
 node.stop()
-print(json.dumps({'counts': counts, 'stops': stops, 'memory': memory, 'cpu': [stopped_cpu, running_cpu]}))
-'''
+print(json.dumps({'counts': counts, 'stops': stops, 'memory': memory, 'cpu': [stopped_cpu,
+running_cpu]})) '''
+)
 
-HUNDRED = COUNTED + r'''
+HUNDRED = (
+    COUNTED
+    + r'''
 ours = ['/many/n%d' % number for number in range(100)]
-master.create(BlockNode, named='/first', domain='127.0.0.1').stop()    # what is loaded once per process
-before = count()
+master.create(BlockNode, named='/first', domain='127.0.0.1').stop()    # what is loaded once per
+process before = count()
 nodes = []
-started = timed(lambda: nodes.extend(master.create(BlockNode, named=name, domain='127.0.0.1') for name in ours))
-running = count()
+started = timed(lambda: nodes.extend(master.create(BlockNode, named=name, domain='127.0.0.1') for
+name in ours)) running = count()
 stopped = timed(lambda: [node.stop() for node in nodes])
 nodes.clear()
 after = count()
-print(json.dumps({'before': before, 'running': running, 'after': after, 'started': started, 'stopped': stopped}))
-'''
+print(json.dumps({'before': before, 'running': running, 'after': after, 'started': started,
+'stopped': stopped})) '''
+)
 
 
 def run(master, code, **constants):
     """Run a program, and return what it found out."""
     lines = ['%s = %r\n' % constant for constant in constants.items()]
-    done = subprocess.run([sys.executable, '-c', ''.join(lines) + code], env=environment(master.url), timeout=120,
-                          stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    done = subprocess.run(
+        [sys.executable, '-c', ''.join(lines) + code],
+        env=environment(master.url),
+        timeout=120,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
 
 
 @pytest.fixture(scope='module')
 def rounds(ros_master):
-    """What fifty rounds of start and stop of one node on fixed ports left, with peers in this process."""
+    """What fifty rounds of start and stop of one node on fixed ports left, with peers in this
+    process."""
     master, heard = pharos.Master(ros_master.url), Mailbox()
     with master.create(BlockNode, named='/peer', domain='127.0.0.1', delegate=heard) as peer:
         peer.output_channel('/in', 'std_msgs/Int32', latch=True).send(data=7)
@@ -138,17 +154,19 @@ def rounds(ros_master):
 
 
 def test_fifty_rounds_of_stop_and_start_leave_nothing(rounds):
-    """Always on the same ports; rospy's TCPROS port still listens after a shutdown, and cannot be bound again."""
+    """Always on the same ports; rospy's TCPROS port still listens after a shutdown, and cannot be
+    bound again."""
     assert rounds['counts'][-1] == rounds['counts'][1]
     assert rounds['counts'][-1]['registrations'] == 0
 
 
 def test_memory_does_not_grow_from_round_to_round(rounds):
-    assert rounds['memory'][-1] - rounds['memory'][9] < 8    # MB; a run of a node that stayed would be 0.7 each
+    # MB; a run of a node that stayed would be 0.7 each
+    assert rounds['memory'][-1] - rounds['memory'][9] < 8
 
 
 def test_a_stop_is_quick(rounds):
-    assert sorted(rounds['stops'])[25] < 0.1    # s; 6 ms where nothing else goes on
+    assert sorted(rounds['stops'])[25] < 0.1  # s; 6 ms where nothing else goes on
 
 
 def test_a_node_that_was_stopped_or_has_nothing_to_do_uses_no_cpu(rounds):
@@ -161,7 +179,7 @@ def test_a_hundred_nodes_start_and_stop(master):
     found = run(master, HUNDRED)
     assert found['running']['registrations'] >= 100
     assert found['after'] == found['before']
-    assert found['started'] < 30 and found['stopped'] < 10    # s; the benchmark looks closer
+    assert found['started'] < 30 and found['stopped'] < 10  # s; the benchmark looks closer
 
 
 def test_what_a_stopped_node_held_is_freed(master):
@@ -171,7 +189,7 @@ def test_what_a_stopped_node_held_is_freed(master):
     node.serve('/b', 'std_srvs/Empty', lambda request: None)
     held = [weakref.ref(thing) for thing in (node._rospy, node.ros, node.ros.Publisher)]
     node.stop()
-    node.start()    # under the same name, another rospy
+    node.start()  # under the same name, another rospy
     gc.collect()
     assert [ref() for ref in held] == [None] * 3
     node.stop()
@@ -218,7 +236,8 @@ def test_a_library_of_a_stopped_node_is_freed(master, library):
         node.stop()
         del node
     gc.collect()
-    # not the last one: actionlib hangs a function of its own on the class GoalStatus, which all nodes share
+    # not the last one: actionlib hangs a function of its own on the class GoalStatus, which all
+    # nodes share
     assert [ref() for ref in held[:2]] == [None] * 2
 
 
@@ -227,6 +246,7 @@ def test_a_node_that_could_not_start_is_freed(master, broken):
     class Mortal(BlockNode):
         def __init__(self):
             made.append(weakref.ref(self))
+
     made = []
     other = master.create(BlockNode, named='/taken', domain='127.0.0.1')
     taken = {'tcp_port': other.tcp_port, 'xmlrpc_port': other.xmlrpc_port, 'named': other.name}

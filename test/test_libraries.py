@@ -1,4 +1,5 @@
-"""Libraries written on rospy, and rospy itself, as each node's own: between two nodes of one process."""
+"""Libraries written on rospy, and rospy itself, as each node's own: between two nodes of one
+process."""
 import threading
 
 import actionlib.msg
@@ -20,7 +21,9 @@ LIBRARIES = 'message_filters', 'actionlib', 'tf2_ros'
 @pytest.fixture
 def pair(master):
     """Two nodes: one that sends or asks, one that receives or serves."""
-    return [master.create(BlockNode, named=name, domain='127.0.0.1') for name in ('/asking', '/serving')]
+    return [
+        master.create(BlockNode, named=name, domain='127.0.0.1') for name in ('/asking', '/serving')
+    ]
 
 
 def kept_in(mailbox):
@@ -53,7 +56,8 @@ def test_a_stopped_node_imports_nothing(pair):
         pair[0].ros
 
 
-# -- message_filters ---------------------------------------------------------------------------------------------------
+# -- message_filters
+
 
 def header(seconds, frame_id=''):
     return std_msgs.msg.Header(stamp=rospy.Time(seconds), frame_id=frame_id)
@@ -62,10 +66,14 @@ def header(seconds, frame_id=''):
 def test_message_filters_bring_messages_of_the_same_time_together(pair):
     asking, serving = pair
     filters, matched = serving.ros_import('message_filters'), Mailbox()
-    sides = [filters.Subscriber(topic, geometry_msgs.msg.PointStamped) for topic in ('/left', '/right')]
+    sides = [
+        filters.Subscriber(topic, geometry_msgs.msg.PointStamped) for topic in ('/left', '/right')
+    ]
     filters.TimeSynchronizer(sides, 10).registerCallback(kept_in(matched))
     for seconds in (1, 2):
-        asking.send_to('/left', typed_as='geometry_msgs/PointStamped', header=header(seconds, 'left'))
+        asking.send_to(
+            '/left', typed_as='geometry_msgs/PointStamped', header=header(seconds, 'left')
+        )
     asking.send_to('/right', typed_as='geometry_msgs/PointStamped', header=header(2, 'right'))
     left, right = matched.get()
     assert (left.header.frame_id, right.header.frame_id) == ('left', 'right')
@@ -84,17 +92,21 @@ def test_message_filters_cache_keeps_what_a_node_published(pair):
     assert (cache.getOldestTime(), cache.getLastestTime()) == (rospy.Time(2), rospy.Time(3))
 
 
-# -- actionlib ---------------------------------------------------------------------------------------------------------
+# -- actionlib
+
 
 def action(pair, execute):
-    """A running action server of the second node, and a client of the first that is connected to it."""
+    """A running action server of the second node, and a client of the first that is connected to
+    it."""
     asking, serving = pair
     server = serving.ros_import('actionlib').SimpleActionServer(
-        '/count', actionlib.msg.TestAction, lambda goal: execute(server, goal), auto_start=False)
+        '/count', actionlib.msg.TestAction, lambda goal: execute(server, goal), auto_start=False
+    )
     server.start()
     client = asking.ros_import('actionlib').SimpleActionClient('/count', actionlib.msg.TestAction)
     assert client.wait_for_server(asking.ros.Duration(TIMEOUT))
-    # a subscriber is connected a moment before its publisher knows; what is published in between goes to nobody
+    # a subscriber is connected a moment before its publisher knows; what is published in between
+    # goes to nobody
     until(lambda: server.action_server.feedback_pub.get_num_connections() == 1)
     return client
 
@@ -105,11 +117,15 @@ def test_an_action_runs_with_feedback_to_its_result(pair):
     def execute(server, goal):
         for number in range(goal.goal):
             server.publish_feedback(actionlib.msg.TestFeedback(feedback=number))
-            assert heard.acquire(timeout=TIMEOUT)    # the result may overtake it, and actionlib then drops it
+            # the result may overtake it, and actionlib then drops it
+            assert heard.acquire(timeout=TIMEOUT)
         server.set_succeeded(actionlib.msg.TestResult(result=goal.goal), 'counted')
+
     client = action(pair, execute)
-    client.send_goal(actionlib.msg.TestGoal(goal=3),
-                     feedback_cb=lambda message: (feedback.append(message.feedback), heard.release()))
+    client.send_goal(
+        actionlib.msg.TestGoal(goal=3),
+        feedback_cb=lambda message: (feedback.append(message.feedback), heard.release()),
+    )
     assert client.wait_for_result(pair[0].ros.Duration(TIMEOUT))
     assert client.get_state() == actionlib_msgs.msg.GoalStatus.SUCCEEDED
     assert (client.get_result().result, client.get_goal_status_text()) == (3, 'counted')
@@ -124,6 +140,7 @@ def test_an_action_is_cancelled(pair):
         started.set()
         assert cancelled.wait(TIMEOUT)
         server.set_preempted()
+
     client = action(pair, execute)
     client.send_goal(actionlib.msg.TestGoal(goal=1))
     assert started.wait(TIMEOUT)
@@ -132,10 +149,13 @@ def test_an_action_is_cancelled(pair):
     assert client.get_state() == actionlib_msgs.msg.GoalStatus.PREEMPTED
 
 
-# -- tf2 ---------------------------------------------------------------------------------------------------------------
+# -- tf2
+
 
 def transform(parent, child, x, seconds=1):
-    message = geometry_msgs.msg.TransformStamped(header=header(seconds, parent), child_frame_id=child)
+    message = geometry_msgs.msg.TransformStamped(
+        header=header(seconds, parent), child_frame_id=child
+    )
     message.transform.translation.x, message.transform.rotation.w = x, 1.0
     return message
 
@@ -147,10 +167,17 @@ def test_a_transform_is_looked_up_in_another_node(pair):
     tf2.TransformListener(buffer, tcp_nodelay=True)
     tf2_sending.StaticTransformBroadcaster().sendTransform(transform('map', 'odom', 1.0))
     broadcaster = tf2_sending.TransformBroadcaster()
-    # moving frames are told of again and again, for what was sent before the listener connected is lost
-    asking.fork(lambda me: [broadcaster.sendTransform(transform('odom', 'base', 2.0, seconds))
-                            for seconds, _ in enumerate(me.every(0.01), 1)])
-    found = buffer.lookup_transform('map', 'base', serving.ros.Time(0), serving.ros.Duration(TIMEOUT))
+    # moving frames are told of again and again, for what was sent before the listener connected is
+    # lost
+    asking.fork(
+        lambda me: [
+            broadcaster.sendTransform(transform('odom', 'base', 2.0, seconds))
+            for seconds, _ in enumerate(me.every(0.01), 1)
+        ]
+    )
+    found = buffer.lookup_transform(
+        'map', 'base', serving.ros.Time(0), serving.ros.Duration(TIMEOUT)
+    )
     assert (found.header.frame_id, found.child_frame_id) == ('map', 'base')
     assert found.transform.translation.x == 3.0
 
@@ -161,7 +188,8 @@ def test_a_missing_transform_raises_the_librarys_own_error(pair):
         tf2.Buffer().lookup_transform('map', 'nowhere', pair[0].ros.Time(0))
 
 
-# -- rospy itself ------------------------------------------------------------------------------------------------------
+# -- rospy itself
+
 
 def test_a_publisher_and_a_subscriber_of_two_rospys(pair, mailbox):
     asking, serving = pair
@@ -177,7 +205,9 @@ def test_a_plain_subscriber_hears_a_channel_and_a_channel_a_plain_publisher(pair
     asking.send_to('/there', data='to rospy', typed_as='std_msgs/String')
     assert mailbox.get().data == 'to rospy'
     serving.interested_in('/back', 'std_msgs/String', delegate=mailbox)
-    asking.ros.Publisher('/back', std_msgs.msg.String, latch=True, queue_size=1).publish('to pharos')
+    asking.ros.Publisher('/back', std_msgs.msg.String, latch=True, queue_size=1).publish(
+        'to pharos'
+    )
     assert mailbox.get().data == 'to pharos'
 
 
@@ -216,7 +246,7 @@ def test_a_timer_fires_until_its_node_stops(pair, mailbox):
 
 def test_a_rate_ends_with_its_node(pair):
     asking, _ = pair
-    ros, turned = asking.ros, Mailbox()    # node.ros is for a node that runs
+    ros, turned = asking.ros, Mailbox()  # node.ros is for a node that runs
     rate = ros.Rate(1e-3)
 
     def turn():
@@ -224,6 +254,7 @@ def test_a_rate_ends_with_its_node(pair):
             turned('turn', None)
             rate.sleep()
         turned('end', None)
+
     threading.Thread(target=turn, daemon=True).start()
     assert turned.get() == 'turn'
     asking.stop()

@@ -1,6 +1,7 @@
 """The report's listings, each as the program that a reader runs.
 
-Other nodes of the tests live in this process; the programs are processes of their own, told apart by `__name`.
+Other nodes of the tests live in this process; the programs are processes of their own, told apart
+by `__name`.
 """
 import importlib.machinery
 import importlib.util
@@ -48,15 +49,19 @@ def classes_of(name):
 
 
 def free_ports():
-    with socket.create_server(('127.0.0.1', 0)) as one, socket.create_server(('127.0.0.1', 0)) as other:
+    with socket.create_server(('127.0.0.1', 0)) as one, socket.create_server(
+        ('127.0.0.1', 0)
+    ) as other:
         return one.getsockname()[1], other.getsockname()[1]
 
 
-# -- the listings ------------------------------------------------------------------------------------------------------
+# -- the listings
+
 
 def test_listing_3_1_a_publisher_node_is_a_class_with_a_loop_that_stop_ends(master, turtle):
     driver = master.create(
-        classes_of('turtle_driver').TurtleDriver, named='/my_turtle_driver', argv=['_period:=0.02'])
+        classes_of('turtle_driver').TurtleDriver, named='/my_turtle_driver', argv=['_period:=0.02']
+    )
     for _ in range(3):
         assert next_command(turtle) == (2.0, 1.0)
     process = driver.process
@@ -67,11 +72,23 @@ def test_listing_3_1_a_publisher_node_is_a_class_with_a_loop_that_stop_ends(mast
     driver.stop()
 
 
-def test_listing_3_2_a_driver_runs_under_the_name_the_address_and_the_ports_it_is_given(master, turtle):
+def test_listing_3_2_a_driver_runs_under_the_name_the_address_and_the_ports_it_is_given(
+    master, turtle
+):
     tcp_port, xmlrpc_port = free_ports()
     with Program(
-            master.url, script('turtle_driver'), '--domain', '127.0.0.1', '--tcp-port', str(tcp_port),
-            '--xmlrpc-port', str(xmlrpc_port), '_linear:=0.5', '_angular:=-1', '_period:=0.02') as driver:
+        master.url,
+        script('turtle_driver'),
+        '--domain',
+        '127.0.0.1',
+        '--tcp-port',
+        str(tcp_port),
+        '--xmlrpc-port',
+        str(xmlrpc_port),
+        '_linear:=0.5',
+        '_angular:=-1',
+        '_period:=0.02',
+    ) as driver:
         assert next_command(turtle) == (0.5, -1.0)
         assert master.node('/my_turtle_driver').uri == f'http://127.0.0.1:{xmlrpc_port}/'
         socket.create_connection(('127.0.0.1', tcp_port), TIMEOUT).close()
@@ -79,9 +96,13 @@ def test_listing_3_2_a_driver_runs_under_the_name_the_address_and_the_ports_it_i
     assert COMMANDS not in master.system_state()[0]
 
 
-def test_listing_3_3_a_subscriber_node_is_a_class_with_a_delegate_that_shows_each_message(master, transcript):
+def test_listing_3_3_a_subscriber_node_is_a_class_with_a_delegate_that_shows_each_message(
+    master, transcript
+):
     logger = master.create(classes_of('turtle_logger').TurtleLogger, named='/my_turtle_logger')
-    assert [(channel.topic, channel.type) for channel in logger.channels] == [(COMMANDS, 'turtlesim/Velocity')]
+    assert [(channel.topic, channel.type) for channel in logger.channels] == [
+        (COMMANDS, 'turtlesim/Velocity')
+    ]
     shown = threading.Event()
     Transcript.on_show(lambda text: transcript.append(text) or shown.set())
     master.create(BlockNode, named='/driver').send_to(COMMANDS, linear=2.0, angular=1.0)
@@ -90,8 +111,9 @@ def test_listing_3_3_a_subscriber_node_is_a_class_with_a_delegate_that_shows_eac
 
 
 def test_listing_3_4_a_logger_prints_what_it_hears(master):
-    with Program(master.url, script('turtle_logger'), '__name:=listener') as logger, \
-            Program(master.url, script('turtle_driver'), '_linear:=1.25', '_period:=0.02'):
+    with Program(master.url, script('turtle_logger'), '__name:=listener') as logger, Program(
+        master.url, script('turtle_driver'), '_linear:=1.25', '_period:=0.02'
+    ):
         logger.wait_for('linear: 1.25')
         logger.wait_for('angular: 1.0')
         assert master.node('/listener').is_alive()
@@ -103,12 +125,18 @@ def clear(master):
     """A service /clear in the turtle's place; a list of the names of those who called it."""
     callers = []
     turtle = master.create(BlockNode, named='/turtlesim')
-    turtle.serve('/clear', 'std_srvs/Empty', lambda request: callers.append(request._connection_header['callerid']))
+    turtle.serve(
+        '/clear',
+        'std_srvs/Empty',
+        lambda request: callers.append(request._connection_header['callerid']),
+    )
     return callers
 
 
 @pytest.mark.parametrize('arguments', [[], [f'_md5sum:={EMPTY_MD5SUM}']])
-def test_listing_3_5_a_service_is_called_by_name_with_its_md5sum_found_or_set_by_hand(master, clear, arguments):
+def test_listing_3_5_a_service_is_called_by_name_with_its_md5sum_found_or_set_by_hand(
+    master, clear, arguments
+):
     done = run(master.url, script('clear_turtle'), *arguments)
     assert (done.returncode, done.stderr) == (0, '')
     assert f'/clear (std_srvs/Empty, md5sum {EMPTY_MD5SUM}) answered' in done.stdout
@@ -137,7 +165,9 @@ def test_listing_3_5_an_md5sum_that_yaml_reads_as_a_number_is_told(master, clear
     assert done.returncode == 1 and "the md5sum of /clear is a text such as 'd41d8" in done.stderr
     assert 'in quotes' in done.stderr and not clear
     done = run(master.url, script('clear_turtle'), "_md5sum:='0'")
-    assert done.returncode == 1 and "the md5sum '0' is not that of /clear" in done.stderr and not clear
+    assert (
+        done.returncode == 1 and "the md5sum '0' is not that of /clear" in done.stderr and not clear
+    )
 
 
 def test_listing_3_5_a_call_follows_remappings(master):
@@ -169,8 +199,9 @@ def test_listing_3_8_a_soul_in_the_background_sends_every_second(master, turtle)
 
 
 def test_listing_3_9_a_delegate_given_at_creation_shows_each_message(master):
-    with Program(master.url, script('block_subscriber'), '__name:=listener') as subscriber, \
-            Program(master.url, script('block_publisher'), '--background'):
+    with Program(master.url, script('block_subscriber'), '__name:=listener') as subscriber, Program(
+        master.url, script('block_publisher'), '--background'
+    ):
         subscriber.wait_for('linear: -2.0')
         subscriber.wait_for('angular: 1.0')
         assert subscriber.end() == 0
@@ -185,7 +216,8 @@ def test_listing_3_10_a_node_both_sends_and_receives(master, turtle):
     assert turtle.delegate.empty()
 
 
-# -- what holds for every program --------------------------------------------------------------------------------------
+# -- what holds for every program
+
 
 @pytest.mark.parametrize('name', SCRIPTS)
 def test_help_names_the_listing(name):
@@ -223,14 +255,20 @@ def test_a_subscriber_follows_remappings(master, name):
 
 
 @pytest.mark.parametrize('with_signal', [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize('name', ['turtle_driver', 'turtle_logger', 'block_subscriber', 'block_both'])
-def test_a_signal_ends_a_program_with_status_0_and_leaves_nothing_of_it(master, turtle, name, with_signal):
+@pytest.mark.parametrize(
+    'name', ['turtle_driver', 'turtle_logger', 'block_subscriber', 'block_both']
+)
+def test_a_signal_ends_a_program_with_status_0_and_leaves_nothing_of_it(
+    master, turtle, name, with_signal
+):
     driver = master.create(BlockNode, named='/driver')
     with Program(master.url, script(name), '__name:=program') as program:
         if name in PUBLISHERS:
             turtle.delegate.get()
         else:
-            assert driver.output_channel(COMMANDS, 'turtlesim/Velocity').wait_for_subscribers(2, TIMEOUT)
+            assert driver.output_channel(COMMANDS, 'turtlesim/Velocity').wait_for_subscribers(
+                2, TIMEOUT
+            )
         # it may not have come to spin() yet, and is then ended as any program
         assert program.end(with_signal) in (0, 128 + signal.SIGTERM)
     assert '/program' not in str(master.system_state())

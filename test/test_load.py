@@ -1,4 +1,5 @@
-"""Load: receivers that are too slow, many nodes and topics, nodes that come and go. tools/soak has more of each."""
+"""Load: receivers that are too slow, many nodes and topics, nodes that come and go. tools/soak has
+more of each."""
 import contextlib
 import gc
 import json
@@ -17,9 +18,9 @@ from load import CAMERA, IMAGE_SIZE, TOPICS, Busy, Viewer, camera, create, image
 from pharos.intraprocess import dispatcher
 from programs import ROOT, Program, environment
 
-COUNT = 40        # images, 37 MB: several times what fits into the buffers of a connection
-MARGIN = 10       # images that may be under way, beyond those in queues
-PATHS = '%s:%s' % (ROOT / 'src', ROOT / 'test')
+COUNT = 40  # images, 37 MB: several times what fits into the buffers of a connection
+MARGIN = 10  # images that may be under way, beyond those in queues
+PATHS = f"{ROOT / 'src'}:{ROOT / 'test'}"
 
 
 @contextlib.contextmanager
@@ -34,7 +35,7 @@ def few_images_held(count):
         tracemalloc.stop()
 
 
-# -- a receiver that is too slow --------------------------------------------------------------------------------------
+# -- a receiver that is too slow
 
 ROSPY_CAMERA = '''
 import rospy
@@ -42,7 +43,8 @@ from load import Image, Int32, image
 rospy.init_node('camera')
 images = rospy.Publisher('/load/images', Image, queue_size=%d)
 def publish(message):
-    while not images.get_num_connections():    # a subscriber knows of a connection before its publisher does
+    while not images.get_num_connections():    # a subscriber knows of a connection before its
+    publisher does
         rospy.sleep(0.01)
     for number in range(message.data):
         images.publish(image(number))
@@ -53,10 +55,12 @@ rospy.spin()
 
 @pytest.fixture(params=['here', 'pharos', 'rospy'])
 def receiving(request, master):
-    """``receiving(queue_size)`` -> a delegate busy with its first image, and the channel that has got COUNT more.
+    """``receiving(queue_size)`` -> a delegate busy with its first image, and the channel that has
+    got COUNT more.
 
     They come from a node here, or from a pharos or rospy node of another process.
     """
+
     def receive(queue_size):
         busy = Busy()
         viewer = Viewer(master, busy, queue_size)
@@ -65,6 +69,7 @@ def receiving(request, master):
         viewer.ask(COUNT)
         viewer.wait_for_all()
         return busy, viewer.channel
+
     with contextlib.ExitStack() as peers:
         if request.param == 'here':
             camera(master, COUNT)
@@ -77,7 +82,8 @@ def receiving(request, master):
 def test_a_slow_receiver_gets_the_newest_image_next(receiving):
     """With rospy and queue_size=1, it gets each of the 40, the oldest first (ros_comm #536, #1901).
 
-    Its thread does not read from the socket meanwhile, and of what one read brings later, the queue keeps the last.
+    Its thread does not read from the socket meanwhile, and of what one read brings later, the queue
+    keeps the last.
     """
     busy, channel = receiving(queue_size=1)
     busy.go_on()
@@ -117,7 +123,8 @@ def test_a_receiver_that_turns_slow_gets_an_old_image_once_at_the_most(master, m
         busy.go_on()
 
 
-# -- a receiver that does not read ------------------------------------------------------------------------------------
+# -- a receiver that does not read
+
 
 def test_a_receiver_that_did_not_read_for_long_gets_the_newest_image(master):
     """What it has missed is dropped here, the oldest first, but for what was with the socket."""
@@ -129,17 +136,27 @@ def test_a_receiver_that_did_not_read_for_long_gets_the_newest_image(master):
             images.publish(image(number))
         numbers = [-1]
         while numbers[-1] < COUNT - 1:
-            numbers.append(Image().deserialize(unread.read(*struct.unpack('<I', unread.read(4)))).step)
+            numbers.append(
+                Image().deserialize(unread.read(*struct.unpack('<I', unread.read(4)))).step
+            )
         assert len(numbers) < COUNT / 2
 
 
-# -- many of everything -----------------------------------------------------------------------------------------------
+# -- many of everything
+
 
 def run(master, what):
-    """What a function of load.py returns, in a process of its own; ``master`` there is a Master too."""
-    code = 'import json, load, pharos; master = pharos.Master(); print(json.dumps(%s))' % what
-    done = subprocess.run([sys.executable, '-c', code], env=environment(master.url, PYTHONPATH=PATHS),
-                          timeout=6 * TIMEOUT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    """What a function of load.py returns, in a process of its own; ``master`` there is a Master
+    too."""
+    code = f'import json, load, pharos; master = pharos.Master(); print(json.dumps({what}))'
+    done = subprocess.run(
+        [sys.executable, '-c', code],
+        env=environment(master.url, PYTHONPATH=PATHS),
+        timeout=6 * TIMEOUT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
 

@@ -1,4 +1,5 @@
-"""Logging: each line once, under the node's name, with the caller's file and line; the host's logging untouched."""
+"""Logging: each line once, under the node's name, with the caller's file and line; the host's
+logging untouched."""
 import inspect
 import logging
 import os
@@ -21,7 +22,9 @@ def create(master, name, **kwargs):
 def hear(master):
     """What goes to /rosout, as the node that listens hears it, without the chatter about itself."""
     lines = Mailbox()
-    create(master, '/auditor', delegate=lines).interested_in('/rosout', 'rosgraph_msgs/Log', from_=None)
+    create(master, '/auditor', delegate=lines).interested_in(
+        '/rosout', 'rosgraph_msgs/Log', from_=None
+    )
     return lines
 
 
@@ -29,13 +32,13 @@ def test_each_line_is_on_rosout_once_with_name_file_and_line(master):
     lines = hear(master)
     nodes = [create(master, '/robot%d/talker' % i) for i in range(3)]
     for node in nodes:
-        node.log('%s says 100%% hello' % node.name, level='warn')
+        node.log(f'{node.name} says 100% hello', level='warn')
         line = inspect.currentframe().f_lineno - 1
         node.ros.loginfo('and through rospy')
     heard = [lines.get() for _ in range(6)]
     for node in nodes:
         own, through_rospy = [log for log in heard if log.name == node.name]
-        assert own.msg == '%s says 100%% hello' % node.name and own.level == own.WARN
+        assert own.msg == f'{node.name} says 100% hello' and own.level == own.WARN
         assert (os.path.basename(own.file), own.line) == (os.path.basename(__file__), line)
         assert own.function.endswith('test_each_line_is_on_rosout_once_with_name_file_and_line')
         assert (through_rospy.msg, through_rospy.line) == ('and through rospy', line + 2)
@@ -45,7 +48,9 @@ def test_each_line_is_on_rosout_once_with_name_file_and_line(master):
 def test_a_log_level_is_set_per_node(master):
     lines = hear(master)
     quiet, normal = create(master, '/quiet'), create(master, '/normal')
-    levels = master.lookup_service('/quiet/set_logger_level').call(logger='rosout', level='error', timeout=10)
+    levels = master.lookup_service('/quiet/set_logger_level').call(
+        logger='rosout', level='error', timeout=10
+    )
     assert levels is not None
     for node in quiet, normal:
         node.log('a detail')
@@ -98,9 +103,15 @@ except rospy.ROSException:
 a.stop(); b.stop()
 assert not rospy.is_shutdown() and a.lifecycle.value == 'stopped'
 '''
-    result = subprocess.run([sys.executable, '-c', program], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-                            env=dict(os.environ, PYTHONPATH=str(pathlib.Path(pharos.__file__).parent.parent)),
-                            timeout=60, check=False)
+    result = subprocess.run(
+        [sys.executable, '-c', program],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=dict(os.environ, PYTHONPATH=str(pathlib.Path(pharos.__file__).parent.parent)),
+        timeout=60,
+        check=False,
+    )
     assert result.returncode == 0, result.stdout
     assert result.stdout.count('the host speaks') == 1 and result.stdout.count('node a speaks') == 1
     assert 'caught' in result.stdout
@@ -119,12 +130,18 @@ me.stop()
 open(sys.argv[1], 'w').write('went on')
 """
     told = tmp_path / 'told'
-    status = subprocess.run(['sh', '-c', f'exec "$0" "$@" {closed}', sys.executable, '-c', code, told],
-                            env=environment(master.url), check=False, timeout=TIMEOUT).returncode
+    status = subprocess.run(
+        ['sh', '-c', f'exec "$0" "$@" {closed}', sys.executable, '-c', code, told],
+        env=environment(master.url),
+        check=False,
+        timeout=TIMEOUT,
+    ).returncode
     assert (status, told.read_text()) == (0, 'went on')
 
 
-def test_a_node_whose_log_file_finds_the_disk_full_stops_and_starts_again(master, monkeypatch, tmp_path, capsys):
+def test_a_node_whose_log_file_finds_the_disk_full_stops_and_starts_again(
+    master, monkeypatch, tmp_path, capsys
+):
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path))
     (tmp_path / 'unwritten.log').symlink_to('/dev/full')
     node = create(master, '/unwritten')

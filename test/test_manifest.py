@@ -10,20 +10,33 @@ ROOT = pathlib.Path(__file__).resolve().parent.parent
 STANDARD_LIBRARY = sysconfig.get_path('stdlib')
 
 #: the module of each package that is called otherwise
-KEYS = {'PIL': 'python3-pil', 'hypothesis': 'python3-hypothesis', 'numpy': 'python3-numpy', 'pytest': 'python3-pytest',
-        'rospkg': 'python3-rospkg', 'tkinter': 'python3-tk', 'yaml': 'python3-yaml'}
+KEYS = {
+    'PIL': 'python3-pil',
+    'hypothesis': 'python3-hypothesis',
+    'numpy': 'python3-numpy',
+    'pytest': 'python3-pytest',
+    'rospkg': 'python3-rospkg',
+    'tkinter': 'python3-tk',
+    'yaml': 'python3-yaml',
+}
 #: what is part of this package: its modules, those of its tests, and types that it defines itself
 OWN = {'pharos', 'nested', 'turtlesim', *(path.stem for path in (ROOT / 'test').glob('*.py'))}
 
 
 def sources(*folders):
     """The Python files there, scripts without a suffix among them."""
-    files = [path for folder in folders for path in (ROOT / folder).rglob('*') if path.suffix in ('', '.py')]
+    files = [
+        path
+        for folder in folders
+        for path in (ROOT / folder).rglob('*')
+        if path.suffix in ('', '.py')
+    ]
     return [path for path in files if path.is_file()]
 
 
 def imports(source):
-    """The top-level modules that it imports, in its functions and in the programs that it has in strings, too."""
+    """The top-level modules that it imports, in its functions and in the programs that it has in
+    strings, too."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             yield from (alias.name.partition('.')[0] for alias in node.names)
@@ -36,7 +49,7 @@ def imports(source):
 def program_imports(text):
     try:
         return list(imports(text))
-    except SyntaxError:    # a sentence that begins so, or half a program
+    except SyntaxError:  # a sentence that begins so, or half a program
         return []
 
 
@@ -48,7 +61,7 @@ def types(source):
 
 
 def is_standard(module):
-    if module in KEYS:    # tkinter is a package of its own in Debian
+    if module in KEYS:  # tkinter is a package of its own in Debian
         return False
     spec = find_spec(module)
     if spec is None or spec.origin in (None, 'built-in', 'frozen'):

@@ -36,12 +36,17 @@ def listen(master, topic, type_=STRING, name='/listener'):
     return mailbox
 
 
-# -- side by side -----------------------------------------------------------------------------------------------------
+# -- side by side
+
 
 def test_nodes_of_one_name_live_on_two_masters(masters):
     nodes = [create(master, '/same') for master in masters]
     for master, node in zip(masters, nodes):
-        assert master.nodes() == [node] and master.node('/same') is node and master.own_nodes() == [node]
+        assert (
+            master.nodes() == [node]
+            and master.node('/same') is node
+            and master.own_nodes() == [node]
+        )
         assert run(master.url, 'rosnode', 'list').stdout == '/same\n'
         assert node.uri in run(master.url, 'rosnode', 'info', '/same').stdout
     nodes[0].stop()
@@ -53,11 +58,18 @@ def test_topics_services_and_parameters_of_two_masters_do_not_mix(masters):
     heard = [listen(master, '/t') for master in masters]
     for master, text in (one, 'of one'), (two, 'of two'):
         node = create(master, '/speaker')
-        node.serve('/who', 'std_srvs/Trigger', lambda request, text=text: {'success': True, 'message': text})
+        node.serve(
+            '/who',
+            'std_srvs/Trigger',
+            lambda request, text=text: {'success': True, 'message': text},
+        )
         node.parameter('~text', initialized=text)
         node.send_to('/t', data=text)
     assert [mailbox.get().data for mailbox in heard] == ['of one', 'of two']
-    assert [master.lookup_service('/who').call().message for master in masters] == ['of one', 'of two']
+    assert [master.lookup_service('/who').call().message for master in masters] == [
+        'of one',
+        'of two',
+    ]
     assert [master.parameters['/speaker/text'] for master in masters] == ['of one', 'of two']
     assert all(mailbox.empty() for mailbox in heard)
     assert len(one.topic('/t').channels) == 2 == len(two.topic('/t').channels)
@@ -65,8 +77,9 @@ def test_topics_services_and_parameters_of_two_masters_do_not_mix(masters):
 
 def test_each_master_has_rospy_peers_of_its_own(masters):
     heard = [listen(master, '/t') for master in masters]
-    with Program(masters[0].url, 'rostopic', 'pub', '/t', STRING, 'data: one'), \
-            Program(masters[1].url, 'rostopic', 'pub', '/t', STRING, 'data: two'):
+    with Program(masters[0].url, 'rostopic', 'pub', '/t', STRING, 'data: one'), Program(
+        masters[1].url, 'rostopic', 'pub', '/t', STRING, 'data: two'
+    ):
         assert [mailbox.get().data for mailbox in heard] == ['one', 'two']
 
 
@@ -85,12 +98,17 @@ def test_a_block_joins_two_masters(masters):
     heard = listen(masters[1], '/map')
     speaker = create(masters[0], '/speaker')
     sent = speaker.output_channel('/map', STRING)
-    lines = [line.strip() for line in run(masters[0].url, script('bridge'), '--help').stdout.splitlines()]
+    lines = [
+        line.strip() for line in run(masters[0].url, script('bridge'), '--help').stdout.splitlines()
+    ]
     start = next(number for number, line in enumerate(lines) if line.startswith('a = Master'))
-    code = '\n'.join(lines[start:start + 4])
-    assert lines[start + 4:start + 6] == ['spin()', '']
-    for old, new in (('http://robot-a:11311/', masters[0].url), ('http://robot-b:11311/', masters[1].url),
-                     ('nav_msgs/OccupancyGrid', STRING)):
+    code = '\n'.join(lines[start : start + 4])
+    assert lines[start + 4 : start + 6] == ['spin()', '']
+    for old, new in (
+        ('http://robot-a:11311/', masters[0].url),
+        ('http://robot-b:11311/', masters[1].url),
+        ('nav_msgs/OccupancyGrid', STRING),
+    ):
         assert old in code
         code = code.replace(old, new)
     exec(code, vars(pharos).copy())
@@ -100,7 +118,8 @@ def test_a_block_joins_two_masters(masters):
     assert [message.data for message in heard.take(100)] == [str(number) for number in range(100)]
 
 
-# -- one master, spelt in several ways --------------------------------------------------------------------------------
+# -- one master, spelt in several ways
+
 
 @pytest.fixture
 def spellings(master):
@@ -112,10 +131,16 @@ def test_masters_of_one_address_are_one(spellings):
     given, other = spellings
     assert given == other and hash(given) == hash(other) and len({given, other}) == 1
     assert other.url == given.url.replace('127.0.0.1', 'localhost')
-    assert given.topic('/t') == other.topic('/t') and len({given.topic('/t'), other.topic('/t')}) == 1
+    assert (
+        given.topic('/t') == other.topic('/t') and len({given.topic('/t'), other.topic('/t')}) == 1
+    )
     assert pharos.ExternalNode(given, '/n') == pharos.ExternalNode(other, '/n')
     node = create(given, '/own')
-    assert other.node('/own') is node and other.own_nodes() == [node] and other.wait_for_node('/own', TIMEOUT) is node
+    assert (
+        other.node('/own') is node
+        and other.own_nodes() == [node]
+        and other.wait_for_node('/own', TIMEOUT) is node
+    )
     assert other.nodes() == [node]
     assert pharos.watcher.watcher_of(given) is pharos.watcher.watcher_of(other)
 
@@ -130,7 +155,9 @@ def test_an_address_that_is_any_of_this_host_is_this_hosts(master):
 @pytest.mark.parametrize('url', ['', 'robot1', 'http://robot1/'])
 def test_the_variable_that_gives_no_masters_url_is_named(monkeypatch, url):
     monkeypatch.setenv('ROS_MASTER_URI', url)
-    with pytest.raises(ValueError, match=f"^ROS_MASTER_URI is '{url}', which is not the URL of a ROS master"):
+    with pytest.raises(
+        ValueError, match=f"^ROS_MASTER_URI is '{url}', which is not the URL of a ROS master"
+    ):
         Master()
 
 
@@ -152,19 +179,22 @@ def test_an_embedded_master_stops_the_nodes_that_spell_it_otherwise():
     assert not node.is_running
 
 
-@pytest.mark.parametrize('one, other, are_one', [
-    ('http://127.0.0.1:11311', 'HTTP://127.0.0.1:011311/', True),
-    ('http://localhost:11311', 'http://127.0.0.1:11311', True),
-    ('http://me:11311', 'http://localhost:11311', True),
-    ('http://me:11311', 'http://ME:11311', True),
-    ('http://me:11311', 'http://10.0.0.1:11311', True),
-    ('http://robot:11311', 'http://10.0.0.2:11311', True),
-    ('http://robot:11311', 'http://me:11311', False),
-    ('http://127.0.0.2:11311', 'http://127.0.0.1:11311', False),
-    ('http://127.0.0.1:11311', 'http://127.0.0.1:11312', False),
-    ('http://nowhere:11311', 'http://nowhere:11311', True),
-    ('http://nowhere:11311', 'http://127.0.0.1:11311', False),
-])
+@pytest.mark.parametrize(
+    'one, other, are_one',
+    [
+        ('http://127.0.0.1:11311', 'HTTP://127.0.0.1:011311/', True),
+        ('http://localhost:11311', 'http://127.0.0.1:11311', True),
+        ('http://me:11311', 'http://localhost:11311', True),
+        ('http://me:11311', 'http://ME:11311', True),
+        ('http://me:11311', 'http://10.0.0.1:11311', True),
+        ('http://robot:11311', 'http://10.0.0.2:11311', True),
+        ('http://robot:11311', 'http://me:11311', False),
+        ('http://127.0.0.2:11311', 'http://127.0.0.1:11311', False),
+        ('http://127.0.0.1:11311', 'http://127.0.0.1:11312', False),
+        ('http://nowhere:11311', 'http://nowhere:11311', True),
+        ('http://nowhere:11311', 'http://127.0.0.1:11311', False),
+    ],
+)
 def test_which_urls_mean_one_address(monkeypatch, one, other, are_one):
     """On a host called me, as Debian sets one up, with a robot beside it."""
     looked_up = []
@@ -175,13 +205,16 @@ def test_which_urls_mean_one_address(monkeypatch, one, other, are_one):
         if host == 'nowhere':
             raise socket.gaierror('Name or service not known')
         return [(socket.AF_INET, socket.SOCK_STREAM, 6, '', (known.get(host, host), 0))]
+
     addresses._of_master.cache_clear()
     monkeypatch.setattr(addresses.socket, 'getaddrinfo', getaddrinfo)
     monkeypatch.setattr(addresses.socket, 'gethostname', lambda: 'me')
-    monkeypatch.setattr(addresses.rosgraph.network, 'get_local_addresses', lambda: ['127.0.0.1', '10.0.0.1'])
+    monkeypatch.setattr(
+        addresses.rosgraph.network, 'get_local_addresses', lambda: ['127.0.0.1', '10.0.0.1']
+    )
     try:
         one, other = Master(one), Master(other)
-        assert {one: 1} and not looked_up    # neither by making one nor by keeping one
+        assert {one: 1} and not looked_up  # neither by making one nor by keeping one
         assert (one == other, other == one) == (are_one, are_one)
         assert len({one, other}) == (1 if are_one else 2)
     finally:
@@ -189,14 +222,19 @@ def test_which_urls_mean_one_address(monkeypatch, one, other, are_one):
 
 
 def test_a_master_at_a_host_that_does_not_resolve_is_unreachable():
-    with pytest.raises(pharos.MasterUnreachableError, match='http://nowhere.invalid:11311/ .*not known'):
+    with pytest.raises(
+        pharos.MasterUnreachableError, match='http://nowhere.invalid:11311/ .*not known'
+    ):
         create(Master('http://nowhere.invalid:11311'), '/n')
 
 
-# -- the script -------------------------------------------------------------------------------------------------------
+# -- the script
+
 
 def bridge(masters, *arguments, wait_for=None):
-    program = Program(masters[0].url, script('bridge'), *(master.url for master in masters), *arguments)
+    program = Program(
+        masters[0].url, script('bridge'), *(master.url for master in masters), *arguments
+    )
     for topic in wait_for or ():
         program.wait_for(f'{topic} (')
     return program
@@ -214,33 +252,42 @@ def test_the_bridge_passes_messages_both_ways_without_echo(masters):
         for mailbox in heard:
             told = [message.data for message in mailbox.take(200)]
             for side in 'ab':
-                assert [text for text in told if text[0] == side] == ['%s%d' % (side, i) for i in range(100)]
+                assert [text for text in told if text[0] == side] == [
+                    '%s%d' % (side, i) for i in range(100)
+                ]
         # what echoed would come before what is sent after it
         for speaker in speakers:
             speaker.send(data='end')
         for mailbox in heard:
-            assert [message.data for message in mailbox.take(2)] == ['end', 'end'] and mailbox.empty()
+            assert [message.data for message in mailbox.take(2)] == [
+                'end',
+                'end',
+            ] and mailbox.empty()
 
 
 def test_the_bridge_joins_rospys_nodes(masters):
     one, two = (master.url for master in masters)
-    with bridge(masters, '/t'), Program(two, 'rostopic', 'echo', '/t') as echo, \
-            Program(one, 'rostopic', 'pub', '-r', '20', '/t', STRING, 'data: across'):
+    with bridge(masters, '/t'), Program(two, 'rostopic', 'echo', '/t') as echo, Program(
+        one, 'rostopic', 'pub', '-r', '20', '/t', STRING, 'data: across'
+    ):
         assert echo.wait_for('across')
-    with Program(one, 'rostopic', 'echo', '/back') as echo, bridge(masters, '/back'), \
-            Program(two, 'rostopic', 'pub', '-r', '20', '/back', STRING, 'data: and back'):
+    with Program(one, 'rostopic', 'echo', '/back') as echo, bridge(masters, '/back'), Program(
+        two, 'rostopic', 'pub', '-r', '20', '/back', STRING, 'data: and back'
+    ):
         assert echo.wait_for('and back')
 
 
 def test_the_type_is_found_on_whichever_side_names_it_first(masters):
     with bridge(masters, '/a_first', '/b_first', '/later') as program:
-        heard = [listen(masters[1], '/a_first', 'geometry_msgs/Twist'),
-                 listen(masters[0], '/b_first', 'sensor_msgs/LaserScan', name='/second')]
+        heard = [
+            listen(masters[1], '/a_first', 'geometry_msgs/Twist'),
+            listen(masters[0], '/b_first', 'sensor_msgs/LaserScan', name='/second'),
+        ]
         line = program.wait_for('/b_first (')
         assert 'sensor_msgs/LaserScan' in line + ''.join(program.printed)
         first, second = create(masters[0], '/one'), create(masters[1], '/two')
         wait_for_subscriber(masters[0], '/a_first')
-        first.send_to('/a_first', linear={'x': 2})    # the first message is not lost on the way
+        first.send_to('/a_first', linear={'x': 2})  # the first message is not lost on the way
         second.send_to('/b_first', ranges=[1, 2])
         assert (heard[0].get().linear.x, heard[1].get().ranges) == (2, (1, 2))
         listen(masters[1], '/later', name='/third')
@@ -249,11 +296,13 @@ def test_the_type_is_found_on_whichever_side_names_it_first(masters):
 
 def wait_for_subscriber(master, topic):
     while not master.topic(topic).subscribers:
-        threading.Event().wait(0.01)    # another process: the master is all there is to ask
+        threading.Event().wait(0.01)  # another process: the master is all there is to ask
 
 
 def test_a_latched_message_is_latched_on_the_other_side(masters):
-    create(masters[0], '/map_server').output_channel('/map', STRING, latch=True).send(data='the map')
+    create(masters[0], '/map_server').output_channel('/map', STRING, latch=True).send(
+        data='the map'
+    )
     first = listen(masters[1], '/map')
     with bridge(masters, '/map'):
         assert first.get().data == 'the map'
@@ -262,8 +311,9 @@ def test_a_latched_message_is_latched_on_the_other_side(masters):
 
 def test_two_bridges_to_one_robot_have_names_of_their_own(masters):
     heard = listen(masters[1], '/one'), listen(masters[1], '/two', name='/other')
-    with bridge(masters, '/one', wait_for=['/one']), \
-            bridge(masters, '/two', '__name:=second', wait_for=['/two']):
+    with bridge(masters, '/one', wait_for=['/one']), bridge(
+        masters, '/two', '__name:=second', wait_for=['/two']
+    ):
         assert {'/bridge', '/second'} <= {node.name for node in masters[0].nodes()}
         speaker = create(masters[0], '/speaker')
         speaker.send_to('/one', data='1')
@@ -283,10 +333,12 @@ def test_the_bridge_ends_when_it_is_told(masters, with_signal):
 
 def test_a_bridge_that_cannot_start_says_why_in_one_line(masters):
     url = masters[0].url
-    for arguments, reason in (((url, refused_url(), '/t'), 'bridge: no ROS master answers at '),
-                              ((refused_url(), url, '/t'), 'bridge: no ROS master answers at '),
-                              ((url, url, '/t'), 'bridge: the node name /bridge is taken'),
-                              ((url, 'robot-b', '/t'), "bridge: 'robot-b' is not the URL of a ROS master")):
+    for arguments, reason in (
+        ((url, refused_url(), '/t'), 'bridge: no ROS master answers at '),
+        ((refused_url(), url, '/t'), 'bridge: no ROS master answers at '),
+        ((url, url, '/t'), 'bridge: the node name /bridge is taken'),
+        ((url, 'robot-b', '/t'), "bridge: 'robot-b' is not the URL of a ROS master"),
+    ):
         ended = run(url, script('bridge'), *arguments)
         assert ended.returncode == 1
         assert len(ended.stderr.splitlines()) == 1 and ended.stderr.startswith(reason)

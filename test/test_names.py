@@ -1,4 +1,5 @@
-"""Names: checked alike wherever they are given, resolved once, and what `from_=` and `to=` make of them."""
+"""Names: checked alike wherever they are given, resolved once, and what `from_=` and `to=` make of
+them."""
 import pytest
 
 import pharos
@@ -9,7 +10,25 @@ from programs import Program, until
 STRING = 'std_msgs/String'
 SWAP = ['one:=two', 'two:=one']
 CHAIN = ['first:=second', 'second:=third']
-NO_NAMES = ['/1a', '1a', '~', 'a~b', '', '/', '//', 'a//b', '/a//', 'a b', '/a-b', 'é', '_a', '/a\n', None, 5, b'/a']
+NO_NAMES = [
+    '/1a',
+    '1a',
+    '~',
+    'a~b',
+    '',
+    '/',
+    '//',
+    'a//b',
+    '/a//',
+    'a b',
+    '/a-b',
+    'é',
+    '_a',
+    '/a\n',
+    None,
+    5,
+    b'/a',
+]
 
 
 def create(master, name, **kwargs):
@@ -21,7 +40,7 @@ def node(master):
     return create(master, '/node')
 
 
-# -- what can be a name -----------------------------------------------------------------------------------------------
+# -- what can be a name
 
 USES = {
     'a node created': lambda node, name: create(node.master, name),
@@ -31,7 +50,9 @@ USES = {
     'a topic heard': lambda node, name: node.interested_in(name, STRING),
     'a topic published': lambda node, name: node.output_channel(name, STRING),
     'a topic sent to': lambda node, name: node.send_to(name, typed_as=STRING),
-    'a service offered': lambda node, name: node.serve(name, 'std_srvs/Empty', lambda request: None),
+    'a service offered': lambda node, name: node.serve(
+        name, 'std_srvs/Empty', lambda request: None
+    ),
     'a service looked up': lambda node, name: node.master.lookup_service(name),
     'a caller': lambda node, name: node.master.lookup_service('/s', caller_id=name),
     'a parameter': lambda node, name: node.parameter(name),
@@ -39,7 +60,9 @@ USES = {
     'a parameter sought': lambda node, name: name in node.master.parameters,
     'a sender': lambda node, name: node.interested_in('/named', STRING, from_=name),
     'a receiver': lambda node, name: node.send_to('/named', typed_as=STRING, to=name),
-    'a receiver of a channel': lambda node, name: node.output_channel('/named', STRING).send(to=name),
+    'a receiver of a channel': lambda node, name: node.output_channel('/named', STRING).send(
+        to=name
+    ),
 }
 
 
@@ -47,8 +70,14 @@ USES = {
 def test_what_is_no_name_is_refused_wherever_one_is_given(node, use):
     refused = []
     for name in NO_NAMES:
-        if (use, name) in [('a sender', None), ('a receiver', None), ('a receiver of a channel', None),    # all of them
-                           ('a parameter set', '/'), ('a parameter sought', '/')]:    # the namespace of all
+        # the namespace of all
+        if (use, name) in [
+            ('a sender', None),
+            ('a receiver', None),
+            ('a receiver of a channel', None),  # all of them
+            ('a parameter set', '/'),
+            ('a parameter sought', '/'),
+        ]:
             continue
         with pytest.raises(ValueError):
             USES[use](node, name)
@@ -71,9 +100,23 @@ def test_a_nodes_name_can_be_that_of_its_log_file(master):
             create(master, name, argv=argv)
 
 
-@pytest.mark.parametrize('name, at', [
-    ('/1a', 1), ('1a', 0), ('a~b', 1), ('//', 1), ('a//b', 2), ('/a//', 3), ('a b', 1), ('/a/b-c', 4), ('_a', 0),
-    ('~1', 1), ('~//', 2), ('/a/é', 3)])
+@pytest.mark.parametrize(
+    'name, at',
+    [
+        ('/1a', 1),
+        ('1a', 0),
+        ('a~b', 1),
+        ('//', 1),
+        ('a//b', 2),
+        ('/a//', 3),
+        ('a b', 1),
+        ('/a/b-c', 4),
+        ('_a', 0),
+        ('~1', 1),
+        ('~//', 2),
+        ('/a/é', 3),
+    ],
+)
 def test_a_caret_stands_under_the_first_bad_character(node, name, at):
     for use in 'a topic heard', 'a service offered', 'a parameter', 'a sender':
         with pytest.raises(ValueError) as error:
@@ -86,7 +129,14 @@ def test_names_that_ros_takes_are_taken(node):
     for name in '/robots/1/pose', 'a', '/a/', '~state', '~/state', '/_hidden', 'A1_/b2':
         node.interested_in(name, STRING)
     assert [channel.topic for channel in node.channels] == [
-        '/robots/1/pose', '/a', '/a', '/node/state', '/node/state', '/_hidden', '/A1_/b2']
+        '/robots/1/pose',
+        '/a',
+        '/a',
+        '/node/state',
+        '/node/state',
+        '/_hidden',
+        '/A1_/b2',
+    ]
 
 
 def test_a_private_name_is_for_a_node_alone(node):
@@ -103,7 +153,8 @@ def test_a_name_that_is_remapped_to_none_is_refused_when_it_is_used(master):
         node.interested_in('image', STRING)
 
 
-# -- remapped once ----------------------------------------------------------------------------------------------------
+# -- remapped once
+
 
 def test_swapped_topics_are_swapped(master):
     node, one, two = create(master, '/swapped/node', argv=SWAP), Mailbox(), Mailbox()
@@ -121,17 +172,26 @@ def test_swapped_topics_are_swapped(master):
     for opened in node.channels:
         opened.close()
     publishers, subscribers, _ = master.system_state()
-    assert '/swapped/node' not in str([publishers.get(name, []) + subscribers.get(name, [])
-                                       for name in ('/swapped/one', '/swapped/two')])
+    assert '/swapped/node' not in str(
+        [
+            publishers.get(name, []) + subscribers.get(name, [])
+            for name in ('/swapped/one', '/swapped/two')
+        ]
+    )
 
 
 def test_a_chain_is_followed_one_step(master):
     node, heard = create(master, '/chained/node', argv=CHAIN), Mailbox()
-    node.serve('first', 'std_srvs/Trigger', lambda request: {'success': True, 'message': 'the second'})
+    node.serve(
+        'first', 'std_srvs/Trigger', lambda request: {'success': True, 'message': 'the second'}
+    )
     assert master.lookup_service('/chained/second').call().message == 'the second'
     assert '/chained/third' not in master.services()
     node.parameter('first', initialized=1)
-    assert (master.parameters['/chained/second'], '/chained/third' in master.parameters) == (1, False)
+    assert (master.parameters['/chained/second'], '/chained/third' in master.parameters) == (
+        1,
+        False,
+    )
     latched = node.output_channel('first', STRING, latch=True)
     latched.send(data='kept')
     create(master, '/chained/late', delegate=heard).interested_in('second', STRING)
@@ -149,7 +209,7 @@ def test_remapped_channels_survive_a_restart_and_their_masters(master):
     node.stop()
     node.start()
     api = master._api('/again/node')
-    api.unregisterSubscriber('/again/two', node.uri)    # as a master that has been restarted
+    api.unregisterSubscriber('/again/two', node.uri)  # as a master that has been restarted
     until(lambda: master.topic('/again/two').subscribers == ['/again/node'], 'the repair')
     assert not master.topic('/again/one').subscribers
     assert '/again/one' in master.services() and '/again/two' not in master.services()
@@ -179,7 +239,7 @@ def test_plain_rospy_in_a_node_remaps_as_ever(master):
     assert node.ros.resolve_name('~here') == '/plain/there'
 
 
-# -- from_ and to -----------------------------------------------------------------------------------------------------
+# -- from_ and to
 
 PEERS = {
     'relative': lambda node: 'peer',
@@ -223,7 +283,17 @@ def test_a_private_name_is_that_of_a_node_below(master, mailbox):
 def test_from_a_node_that_is_not_there_yet(master, mailbox):
     node = create(master, '/waiting', delegate=mailbox)
     node.interested_in('/calls', STRING, from_='caller')
-    with Program(master.url, 'rostopic', 'pub', '-r', '20', '/calls', STRING, 'data: called', '__name:=caller'):
+    with Program(
+        master.url,
+        'rostopic',
+        'pub',
+        '-r',
+        '20',
+        '/calls',
+        STRING,
+        'data: called',
+        '__name:=caller',
+    ):
         assert mailbox.get().data == 'called'
 
 
@@ -232,7 +302,9 @@ def test_to_a_node_that_is_not_there_is_an_error_and_not_counted(master, node, m
     create(master, '/listener', delegate=mailbox).interested_in('/orders', STRING)
     channel = node.output_channel('/orders', STRING)
     for send in channel.send, lambda **kwargs: node.send_to('/orders', **kwargs):
-        with pytest.raises(pharos.UnknownNodeError, match='no node /lisener at .*did you mean /listener'):
+        with pytest.raises(
+            pharos.UnknownNodeError, match='no node /lisener at .*did you mean /listener'
+        ):
             send(data='lost', to=to)
     channel.send(data='found', to='listener')
     assert mailbox.get().data == 'found' and mailbox.empty()
@@ -253,12 +325,13 @@ def test_to_a_node_that_is_not_interested_is_said_once_and_not_counted(master, n
     while not lines or lines[-1] != 'end':
         lines.append(log.get().msg)
     assert [line for line in lines if '/elsewhere' in line] == [
-        '/elsewhere is not interested in /orders, or not connected yet: what /node sends to it alone goes nowhere']
+        '/elsewhere is not interested in /orders, or not connected yet: what /node sends to it alone goes nowhere'
+    ]
     assert channel.sent == 1
 
 
 def test_to_a_program_elsewhere(master, node):
-    node.output_channel('/afar', STRING)    # rostopic waits for the type
+    node.output_channel('/afar', STRING)  # rostopic waits for the type
     with Program(master.url, 'rostopic', 'echo', '/afar', '__name:=hearer') as echo:
         until(lambda: master.topic('/afar').subscribers, 'the subscriber')
         hearer = master.topic('/afar').subscribers[0]
@@ -278,7 +351,9 @@ def test_a_node_of_another_master_is_refused(master, node):
             node.interested_in('/t_of_one', STRING, from_=stranger)
 
 
-def test_to_costs_the_master_nothing_where_the_peer_is_connected(master, node, mailbox, monkeypatch):
+def test_to_costs_the_master_nothing_where_the_peer_is_connected(
+    master, node, mailbox, monkeypatch
+):
     create(master, '/listener', delegate=mailbox).interested_in('/quick', STRING)
     channel = node.output_channel('/quick', STRING)
     assert channel.wait_for_subscribers(1, TIMEOUT)

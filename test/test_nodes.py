@@ -24,7 +24,9 @@ def registered(master):
 
 
 def run(*command):
-    return subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=60).stdout
+    return subprocess.run(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=60
+    ).stdout
 
 
 def test_ten_nodes_of_one_process_are_ten_ros_nodes(master):
@@ -49,8 +51,11 @@ def test_a_message_goes_from_node_to_node(master, mailbox):
 
 
 def test_the_first_message_to_an_external_node_is_not_lost(master):
-    """In one call, its type found. rospy has no such call (ros_comm #1377), and loses 3 of 3 (#176, #286)."""
-    with subprocess.Popen([sys.executable, '-c', RECEIVE_ONE, '/first'], stdout=subprocess.PIPE, text=True) as echo:
+    """In one call, its type found. rospy has no such call (ros_comm #1377), and loses 3 of 3 (#176,
+    #286)."""
+    with subprocess.Popen(
+        [sys.executable, '-c', RECEIVE_ONE, '/first'], stdout=subprocess.PIPE, text=True
+    ) as echo:
         wait_for_subscriber(master, '/first')
         create(master, '/sender').send_to('/first', data='not lost')
         assert 'not lost' in echo.communicate(timeout=60)[0]
@@ -66,7 +71,7 @@ print(rospy.wait_for_message(sys.argv[1], std_msgs.msg.String).data)
 def wait_for_subscriber(master, topic):
     ready = threading.Event()
     while not master.topic(topic).subscribers:
-        ready.wait(0.01)    # another process: the master is all there is to ask
+        ready.wait(0.01)  # another process: the master is all there is to ask
 
 
 def test_rostopic_publishes_to_a_node(master, mailbox):
@@ -83,8 +88,12 @@ def test_a_roscpp_relay_passes_messages_between_two_nodes(master, mailbox):
         sender = create(master, '/sender')
         wait_for_subscriber(master, '/direct')
         # relay advertises only once it has received something, so its own first messages are lost
-        sender.fork(lambda me: [me.send_to('/direct', data='through C++', typed_as='std_msgs/String')
-                                for _ in me.every(0.02)])
+        sender.fork(
+            lambda me: [
+                me.send_to('/direct', data='through C++', typed_as='std_msgs/String')
+                for _ in me.every(0.02)
+            ]
+        )
         assert mailbox.get().data == 'through C++'
 
 
@@ -100,7 +109,7 @@ def test_a_node_starts_again_under_the_same_name_and_ports(master, mailbox):
         node.start()
         assert node.lifecycle is Lifecycle.RUNNING and (node.tcp_port, node.xmlrpc_port) == ports
         sender.stop()
-        sender.start()    # its channels come back as well, and wait for who is interested
+        sender.start()  # its channels come back as well, and wait for who is interested
         sender.send_to('/ashes', data=str(turn), typed_as='std_msgs/String')
         assert mailbox.get().data == str(turn)
 
@@ -155,8 +164,10 @@ def test_who_asks_a_node_to_stop_finds_it_gone(master):
         with xmlrpc.client.ServerProxy(victim.uri) as proxy:
             assert proxy.shutdown('/test', 'enough') == [1, 'shutdown', 0]
         assert not rosnode.rosnode_ping('/victim', max_count=1)
-        assert not any('/victim' in users for kind in master.system_state() for users in kind.values())
-        victim.stop()    # waits for the rest
+        assert not any(
+            '/victim' in users for kind in master.system_state() for users in kind.values()
+        )
+        victim.stop()  # waits for the rest
 
 
 def test_rosnode_kill_stops_that_node_and_no_other(master):
@@ -167,14 +178,18 @@ def test_rosnode_kill_stops_that_node_and_no_other(master):
     assert stopped.wait(TIMEOUT)
     with victim._changing:
         assert victim._changing.wait_for(lambda: victim.lifecycle is Lifecycle.STOPPED, TIMEOUT)
-    assert other.is_running and '/victim' not in registered(master) and '/other' in registered(master)
+    assert (
+        other.is_running and '/victim' not in registered(master) and '/other' in registered(master)
+    )
 
 
 def test_a_shutdown_meant_for_an_earlier_owner_of_the_uri_does_not_reach_a_node(master):
-    """The master tells the old URI of a name to shut down, and a rospy node there by now does so (ros_comm #2241)."""
+    """The master tells the old URI of a name to shut down, and a rospy node there by now does so
+    (ros_comm #2241)."""
     node = create(master, '/heir')
     code, reason, _ = pharos.private_rospy.proxies.ServerProxy(node.uri).shutdown(
-        '/master', '[/old] Reason: new node registered with same name')
+        '/master', '[/old] Reason: new node registered with same name'
+    )
     assert node.is_running and 'still this node' in reason
 
 
@@ -184,6 +199,7 @@ def test_a_node_stops_from_its_own_delegate(master):
     def stop(message, channel):
         channel.node.stop()
         done.set()
+
     node = create(master, '/suicide', delegate=stop)
     node.interested_in('/poison', 'std_msgs/Empty')
     create(master, '/sender').send_to('/poison')
@@ -195,7 +211,9 @@ def test_what_was_sent_before_the_stop_arrives(master, mailbox):
     with create(master, '/sender') as sender:
         for number in range(200):
             sender.send_to('/late', data=str(number) + 'x' * 20000, typed_as='std_msgs/String')
-    assert [message.data.rstrip('x') for message in mailbox.take(200)] == [str(number) for number in range(200)]
+    assert [message.data.rstrip('x') for message in mailbox.take(200)] == [
+        str(number) for number in range(200)
+    ]
 
 
 def test_a_soul_says_farewell(master, mailbox):
@@ -209,6 +227,7 @@ def test_a_soul_says_farewell(master, mailbox):
                 me.sleep(3600)
         finally:
             me.send_to('/speed', data=0.0)
+
     driver = create(master, '/driver', soul=drive)
     driver.fork()
     assert mailbox.get().data == 1.0
@@ -228,10 +247,12 @@ def test_a_soul_that_ignores_the_stop_is_named_and_left_behind(master, capfd):
 
 def test_an_exception_in_a_delegate_ends_only_that_run(master, transcript, mailbox):
     """rospy logs it, and nothing in the program is told."""
+
     def delegate(message, channel):
         if message.data == 'bad':
             raise ValueError('this one is bad')
         mailbox(message, channel)
+
     node = create(master, '/careful', delegate=delegate)
     node.interested_in('/mixed', 'std_msgs/String')
     sender = create(master, '/sender')
@@ -239,7 +260,11 @@ def test_an_exception_in_a_delegate_ends_only_that_run(master, transcript, mailb
     sender.send_to('/mixed', data='good')
     assert mailbox.get().data == 'good'
     assert [str(error) for error in node.errors] == ['this one is bad']
-    assert '/careful' in transcript[0] and '/mixed' in transcript[0] and 'ValueError: this one is bad' in transcript[0]
+    assert (
+        '/careful' in transcript[0]
+        and '/mixed' in transcript[0]
+        and 'ValueError: this one is bad' in transcript[0]
+    )
 
 
 def test_execute_runs_the_soul_here_and_returns_its_value(master):
@@ -282,11 +307,13 @@ def test_every_and_sleep_follow_simulated_time(master):
         def soul(me):
             for _ in me.every(10):
                 turns(me.ros.Time.now().secs, None)
+
         node.fork(soul)
-        for seconds in (100, 110, 125, 130, 140):    # a turn that comes late does not delay those after it
+        # a turn that comes late does not delay those after it
+        for seconds in (100, 110, 125, 130, 140):
             clock.send(clock={'secs': seconds})
             assert turns.get() == seconds
-        node.stop()    # time stands still, the soul ends all the same
+        node.stop()  # time stands still, the soul ends all the same
     finally:
         master._api().deleteParam('/use_sim_time')
 
@@ -302,6 +329,7 @@ def test_delegates_of_a_node_run_one_at_a_time(master, mailbox):
         else:
             busy.release()
         mailbox(message, channel)
+
     node = create(master, '/single', delegate=delegate)
     senders = [create(master, '/sender%d' % i) for i in range(4)]
     for i in range(4):
@@ -312,4 +340,6 @@ def test_delegates_of_a_node_run_one_at_a_time(master, mailbox):
     received = [mailbox.get_with_channel() for _ in range(200)]
     assert not overlaps
     for i in range(4):
-        assert [m.data for m, channel in received if channel.topic == '/lane%d' % i] == list(range(50))
+        assert [m.data for m, channel in received if channel.topic == '/lane%d' % i] == list(
+            range(50)
+        )

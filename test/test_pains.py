@@ -1,7 +1,9 @@
-"""What hurts rospy's users, by the issues of ros_comm, which is archived: doc/robustness.md says which test shows what.
+"""What hurts rospy's users, by the issues of ros_comm, which is archived: doc/robustness.md says
+which test shows what.
 
-Here are the tests that fit nowhere else, and for most of the pains a twin: it wishes of bare rospy what a node of this
-package does, and is expected to fail. Where that would depend on luck or take minutes, a docstring says what came out.
+Here are the tests that fit nowhere else, and for most of the pains a twin: it wishes of bare rospy
+what a node of this package does, and is expected to fail. Where that would depend on luck or take
+minutes, a docstring says what came out.
 """
 import contextlib
 import inspect
@@ -40,6 +42,7 @@ def until(condition):
 
 def receive(sock):
     """The next thing that comes: the connection header, or a message."""
+
     def exactly(size):
         data = b''
         while len(data) < size:
@@ -48,13 +51,15 @@ def receive(sock):
                 raise EOFError('closed')
             data += more
         return data
+
     return exactly(*struct.unpack('<I', exactly(4)))
 
 
 def leave(sock):
     """Close a connection, and wait until the other side could know."""
     sock.shutdown(socket.SHUT_WR)
-    until(lambda: sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 1)[0] != 4)    # FIN_WAIT1: not acknowledged yet
+    # FIN_WAIT1: not acknowledged yet
+    until(lambda: sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 1)[0] != 4)
     sock.close()
 
 
@@ -62,7 +67,7 @@ def is_without_delay(sock):
     return bool(sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
 
 
-# -- bare rospy -------------------------------------------------------------------------------------------------------
+# -- bare rospy
 
 BARE = '''
 import json, os, queue, socket, struct, sys, threading, time, xmlrpc.client
@@ -77,7 +82,9 @@ def show(found):
 def tcp_port():
     return rospy.impl.tcpros_base.get_tcpros_server_address()[1]
 
-''' + '\n\n'.join(inspect.getsource(function) for function in (until, subscribe, receive, leave, is_without_delay))
+''' + '\n\n'.join(
+    inspect.getsource(function) for function in (until, subscribe, receive, leave, is_without_delay)
+)
 NODE = '''
 rospy.init_node('bare', anonymous=True)
 '''
@@ -87,18 +94,24 @@ rospy.init_node('bare', anonymous=True)
 def bare(ros_master):
     """``bare(code)`` runs a program with rospy alone, and returns what it shows.
 
-    ``bare(code, node='')`` starts no node. The programs end in their own time, half a second, while others run.
+    ``bare(code, node='')`` starts no node. The programs end in their own time, half a second, while
+    others run.
     """
     with contextlib.ExitStack() as programs:
+
         def run(code, node=NODE):
-            program = Program(ros_master.url, sys.executable, '-W', 'ignore', '-c', BARE + node + code)
+            program = Program(
+                ros_master.url, sys.executable, '-W', 'ignore', '-c', BARE + node + code
+            )
             programs.callback(program.end)
             programs.callback(program.read_to_the_end)
             try:
                 line = program.wait_for('found ')
-            except AssertionError as error:    # no twin is to pass for failing because its program did
+            except AssertionError as error:
+                # no twin is to pass for failing because its program did
                 raise RuntimeError(error) from error
             return json.loads(line.partition(' ')[2])
+
         yield run
 
 
@@ -109,29 +122,41 @@ def fails(issue):
 
 @fails('#185')
 def test_bare_rospy_gives_a_process_a_second_node(bare):
-    assert bare('''
+    assert (
+        bare(
+            '''
 try:
     rospy.init_node('second')
     show('another node')
 except rospy.ROSException as error:
     show(str(error))
-''') == 'another node'
+'''
+        )
+        == 'another node'
+    )
 
 
 @fails('#214')
 def test_bare_rospy_starts_a_node_again(bare):
     """It says nothing, and stays shut down."""
-    assert bare('''
+    assert (
+        bare(
+            '''
 rospy.signal_shutdown('stop')
 rospy.init_node('bare', anonymous=True)
 show('shut down' if rospy.is_shutdown() else 'running')
-''') == 'running'
+'''
+        )
+        == 'running'
+    )
 
 
 @fails('#2238')
 def test_bare_rospy_uses_no_cpu_after_its_shutdown(bare):
     """Its XML-RPC thread turns on a closed socket: 1.99 s of CPU in 2 s."""
-    assert bare('''
+    assert (
+        bare(
+            '''
 rospy.signal_shutdown('stop')
 begin = time.process_time() - time.thread_time()
 try:
@@ -139,12 +164,17 @@ try:
     show('busy')
 except RuntimeError:
     show('at rest')
-''') == 'at rest'
+'''
+        )
+        == 'at rest'
+    )
 
 
 @fails('(no issue)')
 def test_bare_rospy_frees_its_port_at_its_shutdown(bare):
-    assert bare('''
+    assert (
+        bare(
+            '''
 port = tcp_port()
 rospy.signal_shutdown('stop')
 try:
@@ -152,13 +182,17 @@ try:
     show('free')
 except OSError as error:
     show(error.strerror)
-''') == 'free'
+'''
+        )
+        == 'free'
+    )
 
 
 @fails('PR #1918')
 def test_bare_rospy_serves_others_beside_a_silent_client(bare):
     """The client that comes second is served as soon as the first has gone, and no earlier."""
-    assert bare('''
+    assert bare(
+        '''
 publisher = rospy.Publisher('/pains/silent', String, queue_size=1)
 silent = socket.create_connection(('127.0.0.1', tcp_port()))
 client = subscribe(tcp_port(), '/pains/silent')
@@ -171,7 +205,8 @@ silent.close()
 client.settimeout(20)
 receive(client)
 show(found)
-''')
+'''
+    )
 
 
 BUSY = '''
@@ -179,7 +214,8 @@ busy = socket.create_server(('127.0.0.1', 0))
 port = busy.getsockname()[1]
 try:
     rospy.init_node('bare', anonymous=True, %s=port)
-    show('no error; the TCPROS server is at %%s:%%s' %% rospy.impl.tcpros_base.get_tcpros_server_address())
+    show('no error; the TCPROS server is at %%s:%%s' %%
+    rospy.impl.tcpros_base.get_tcpros_server_address())
 except Exception as error:
     show(str(error).replace(str(port), 'the port'))
 '''
@@ -199,16 +235,23 @@ def test_bare_rospy_names_a_tcpros_port_that_is_busy(bare):
 
 @fails('#2241')
 def test_bare_rospy_is_not_shut_down_for_an_earlier_owner_of_its_uri(bare):
-    assert bare('''
-xmlrpc.client.ServerProxy(rospy.get_node_uri()).shutdown('/master', '[/old] Reason: new node registered with same name')
-show(rospy.is_shutdown())
-''') is False
+    assert (
+        bare(
+            '''
+xmlrpc.client.ServerProxy(rospy.get_node_uri()).shutdown('/master', '[/old] Reason: new node
+registered with same name') show(rospy.is_shutdown())
+'''
+        )
+        is False
+    )
 
 
 @fails('#176, #286')
 def test_bare_rospy_loses_no_first_message(bare):
     """The subscriber is there and the master knows it; 3 of 3 are lost."""
-    assert bare('''
+    assert (
+        bare(
+            '''
 found = []
 for topic in '/pains/first0', '/pains/first1', '/pains/first2':
     heard = queue.SimpleQueue()
@@ -218,23 +261,30 @@ for topic in '/pains/first0', '/pains/first1', '/pains/first2':
     until(lambda: publisher.publish('later') or not heard.empty())
     found.append(heard.get().data)
 show(found)
-''') == ['first'] * 3
+'''
+        )
+        == ['first'] * 3
+    )
 
 
 @fails('#1362, #2318')
 def test_bare_rospy_sends_small_messages_without_delay(bare):
     """Nagle's algorithm is on: 42.9 ms once in 50 messages."""
-    assert bare('''
+    assert bare(
+        '''
 subscriber = rospy.Subscriber('/pains/small', String)
 publisher = rospy.Publisher('/pains/small', String, queue_size=1)
 until(publisher.get_num_connections)
 show(is_without_delay(publisher.impl.connections[0].socket))
-''')
+'''
+    )
 
 
 @fails('#1481')
 def test_bare_rospy_latches_a_message_as_it_was(bare):
-    assert bare('''
+    assert (
+        bare(
+            '''
 heard = queue.SimpleQueue()
 publisher = rospy.Publisher('/pains/latched', String, queue_size=1, latch=True)
 message = String('as it was')
@@ -242,12 +292,17 @@ publisher.publish(message)
 message.data = 'changed since'
 subscriber = rospy.Subscriber('/pains/latched', String, heard.put)
 show(heard.get(timeout=20).data)
-''') == 'as it was'
+'''
+        )
+        == 'as it was'
+    )
 
 
 @fails('#146')
 def test_bare_rospy_latches_for_each_publisher_of_a_node(bare):
-    assert bare('''
+    assert (
+        bare(
+            '''
 heard = []
 for text in 'first', 'second':
     publisher = rospy.Publisher('/pains/latches', String, queue_size=10, latch=True)
@@ -256,13 +311,19 @@ subscriber = rospy.Subscriber('/pains/latches', String, lambda message: heard.ap
 until(lambda: heard)
 until(lambda: publisher.publish('later') or 'later' in heard)
 show(heard[:2])
-''') == ['first', 'second']
+'''
+        )
+        == ['first', 'second']
+    )
 
 
 @fails('#927')
 def test_bare_rospy_knows_that_a_subscriber_has_left(bare):
-    """It looks twice a second, and at the next publish; who waits for a subscriber has that one: 16 of 30 lost."""
-    assert all(bare('''
+    """It looks twice a second, and at the next publish; who waits for a subscriber has that one: 16
+    of 30 lost."""
+    assert all(
+        bare(
+            '''
 found = []
 publisher = rospy.Publisher('/pains/leaving', String, queue_size=1)
 for number in range(10):
@@ -271,19 +332,26 @@ for number in range(10):
     leave(client)
     found.append(publisher.get_num_connections() == 0)
 show(found)
-'''))
+'''
+        )
+    )
 
 
 @fails('#152')
 def test_bare_rospy_takes_a_time_limit_for_a_service_call(bare):
-    assert bare('''
+    assert (
+        bare(
+            '''
 try:
     rospy.ServiceProxy('/pains/no_service', Empty)(timeout=0.01)
 except rospy.ServiceException as error:
     show('given up')
 except Exception as error:
     show(str(error))
-''') == 'given up'
+'''
+        )
+        == 'given up'
+    )
 
 
 PUBLISH_BESIDE_ONE_THAT_READS_NOTHING = '''
@@ -314,7 +382,9 @@ def test_bare_rospy_publishes_to_others_while_one_does_not_read(bare):
 
 @fails('#1377')
 def test_bare_rospy_runs_one_callback_at_a_time(bare):
-    assert bare('''
+    assert (
+        bare(
+            '''
 both, found = threading.Barrier(2), queue.SimpleQueue()
 def callback(message):
     try:
@@ -322,41 +392,57 @@ def callback(message):
         found.put('two at a time')
     except threading.BrokenBarrierError:
         found.put('one at a time')
-subscribers = [rospy.Subscriber(topic, String, callback) for topic in ('/pains/left', '/pains/right')]
-publishers = [rospy.Publisher(topic, String, queue_size=1, latch=True) for topic in ('/pains/left', '/pains/right')]
-for publisher in publishers:
+subscribers = [rospy.Subscriber(topic, String, callback) for topic in ('/pains/left',
+'/pains/right')] publishers = [rospy.Publisher(topic, String, queue_size=1, latch=True) for topic in
+('/pains/left', '/pains/right')] for publisher in publishers:
     publisher.publish('go')
 show(found.get(timeout=40))
-''') == 'one at a time'
+'''
+        )
+        == 'one at a time'
+    )
 
 
 @fails('(no issue)')
 def test_bare_rospy_subscribes_without_a_type(bare):
-    assert bare('''
+    assert (
+        bare(
+            '''
 try:
     rospy.Subscriber('/pains/untyped', None, print)
     show('subscribed')
 except ValueError as error:
     show(str(error))
-''') == 'subscribed'
+'''
+        )
+        == 'subscribed'
+    )
 
 
 @fails('#315')
 def test_bare_rospy_listens_on_one_interface(bare):
-    """This is where both its servers bind, for the environment of the whole process alone says otherwise."""
-    assert bare('''
+    """This is where both its servers bind, for the environment of the whole process alone says
+    otherwise."""
+    assert (
+        bare(
+            '''
 del os.environ['ROS_HOSTNAME']
 show(rosgraph.network.get_bind_address())
-''', node='') != '0.0.0.0'
+''',
+            node='',
+        )
+        != '0.0.0.0'
+    )
 
 
 @fails('(by design)')
 def test_bare_rospy_tells_of_an_exception_in_a_callback(bare):
     """It is logged; Python's own hooks hear nothing of it either."""
-    assert bare('''
+    assert bare(
+        '''
 told, done = [], threading.Event()
-sys.excepthook = threading.excepthook = lambda *arguments: 'bad' in str(arguments) and told.append(arguments)
-def callback(message):
+sys.excepthook = threading.excepthook = lambda *arguments: 'bad' in str(arguments) and
+told.append(arguments) def callback(message):
     if message.data == 'good':
         done.set()
     raise ValueError(message.data)
@@ -364,29 +450,34 @@ subscriber = rospy.Subscriber('/pains/raising', String, callback)
 publisher = rospy.Publisher('/pains/raising', String, queue_size=10)
 until(lambda: publisher.publish('bad') or publisher.publish('good') or done.is_set())
 show(len(told))
-''')
+'''
+    )
 
 
-# -- the same, of nodes of this package -------------------------------------------------------------------------------
+# -- the same, of nodes of this package
+
 
 def test_small_messages_are_sent_without_delay_whatever_the_subscriber_asks_for(master):
-    """rospy's and roscpp's ask for Nagle's algorithm unless they are told otherwise: 40 ms (#1362, #2318)."""
+    """rospy's and roscpp's ask for Nagle's algorithm unless they are told otherwise: 40 ms (#1362,
+    #2318)."""
     node = create(master, '/quick')
     channel = node.output_channel('/pains/small', STRING)
     with subscribe(node.tcp_port, channel.topic) as client:
         receive(client)
         until(lambda: channel.connections)
-        connection, = node._rospy.publisher(channel.topic).connections
+        (connection,) = node._rospy.publisher(channel.topic).connections
         assert is_without_delay(connection.socket)
 
 
 def test_a_rospy_publisher_sends_small_messages_to_a_node_without_delay(master, bare):
     create(master, '/asking').interested_in('/pains/asked', STRING)
-    assert bare('''
+    assert bare(
+        '''
 publisher = rospy.Publisher('/pains/asked', String, queue_size=1)
 until(publisher.get_num_connections)
 show(is_without_delay(publisher.impl.connections[0].socket))
-''')
+'''
+    )
 
 
 def test_a_subscriber_that_has_left_is_not_taken_for_the_next_one(master):
@@ -410,21 +501,33 @@ def test_a_subscriber_that_reads_nothing_takes_nothing_from_the_others(master, m
     channel = sender.output_channel('/pains/stuck', STRING, queue_size=20)
     with subscribe(sender.tcp_port, channel.topic) as client:
         receive(client)
-        receiver.ros.Subscriber(channel.topic, channel.message_class, lambda message: mailbox(message, None))
+        receiver.ros.Subscriber(
+            channel.topic, channel.message_class, lambda message: mailbox(message, None)
+        )
         assert channel.wait_for_subscribers(2, TIMEOUT)
-        sender.fork(lambda me: [channel.send(data='%d %s' % (number, 'x' * 1000000)) for number in range(20)])
+        sender.fork(
+            lambda me: [
+                channel.send(data='%d %s' % (number, 'x' * 1000000)) for number in range(20)
+            ]
+        )
         assert [int(message.data.split()[0]) for message in mailbox.take(20)] == list(range(20))
 
 
 @pytest.mark.parametrize('transport', ['INTRAPROCESS', 'TCPROS'])
 def test_a_delegate_is_not_run_beside_another(master, transport):
     """With rospy, each connection's callbacks run in a thread of its own (#1377)."""
-    node, sender, began, go_on = create(master, '/careful'), create(master, '/sender'), Mailbox(), threading.Event()
+    node, sender, began, go_on = (
+        create(master, '/careful'),
+        create(master, '/sender'),
+        Mailbox(),
+        threading.Event(),
+    )
 
     def delegate(message, channel):
         began(message, channel)
         if message.data == 'wait':
             go_on.wait(TIMEOUT)
+
     topics = '/pains/left', '/pains/right'
     if transport == 'TCPROS':
         speak_tcpros_only(node)
@@ -432,30 +535,38 @@ def test_a_delegate_is_not_run_beside_another(master, transport):
     to_left, to_right = (sender.output_channel(topic, STRING) for topic in topics)
     for channel in to_left, to_right:
         until(lambda: channel.connections == [('/careful', transport)])
-        channel.send(data='quick')    # with TCPROS, such delegates are then run by the thread that reads the socket
+        # with TCPROS, such delegates are then run by the thread that reads the socket
+        channel.send(data='quick')
         began.get()
     to_left.send(data='wait')
     assert began.get().data == 'wait'
     for text in 'dropped', 'kept':
         to_right.send(data=text)
-    until(lambda: right.dropped == 1)    # both have come, and neither was begun with
+    until(lambda: right.dropped == 1)  # both have come, and neither was begun with
     assert began.empty()
     go_on.set()
     assert began.get().data == 'kept'
 
 
-# -- the document -----------------------------------------------------------------------------------------------------
+# -- the document
+
 
 def rows(heading):
     """The rows of the table under that heading of the document, as lists of cells."""
-    section = DOCUMENT.read_text(encoding='utf-8').partition('\n## %s\n' % heading)[2].partition('\n## ')[0]
+    section = (
+        DOCUMENT.read_text(encoding='utf-8').partition(f'\n## {heading}\n')[2].partition('\n## ')[0]
+    )
     table = [line for line in section.splitlines() if line.startswith('|')]
     return [[cell.strip() for cell in line.strip('|').split('|')] for line in table[2:]]
 
 
 def functions_of(file):
     """The names of the test functions of a file of this folder."""
-    return set(re.findall(r'^def (test_\w+)\(', (ROOT / 'test' / file).read_text(encoding='utf-8'), re.MULTILINE))
+    return set(
+        re.findall(
+            r'^def (test_\w+)\(', (ROOT / 'test' / file).read_text(encoding='utf-8'), re.MULTILINE
+        )
+    )
 
 
 def test_each_pain_in_the_document_has_a_test_and_each_test_there_exists():

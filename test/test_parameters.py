@@ -12,7 +12,7 @@ from conftest import TIMEOUT, InProcessMaster, Mailbox
 from pharos import BlockNode, Master, MasterUnreachableError, NodeStoppedError, running
 from pharos.private_rospy.instance import PrivateRospy
 from programs import run
-from test_survival import mortal_master, until    # noqa: F401 (a fixture)
+from test_survival import mortal_master, until  # noqa: F401 (a fixture)
 
 PRIVATE = '/robot1/driver/rate'
 
@@ -35,8 +35,10 @@ def forget_all(url):
 class Changes:
     """What the blocks of a node's parameters are told, in order.
 
-    A master makes its calls to one node one after the other, so that a further parameter marks the end.
+    A master makes its calls to one node one after the other, so that a further parameter marks the
+    end.
     """
+
     _marks = itertools.count(1)
 
     def __init__(self, node):
@@ -46,7 +48,9 @@ class Changes:
 
     def of(self, *parameters):
         for parameter in parameters:
-            parameter.on_change(lambda value, name=parameter.name: self._mailbox((name, value), None))
+            parameter.on_change(
+                lambda value, name=parameter.name: self._mailbox((name, value), None)
+            )
         return self
 
     def get(self):
@@ -60,7 +64,8 @@ class Changes:
         return list(iter(self._mailbox.get, (self._end.name, mark)))
 
 
-# -- rosparam, the program --------------------------------------------------------------------------------------------
+# -- rosparam, the program
+
 
 def test_what_rosparam_sets_and_deletes_reaches_the_block_at_once(master):
     rate = create(master).parameter('~rate', initialized=1.0)
@@ -81,7 +86,10 @@ def test_what_a_node_sets_is_what_rosparam_gets(master):
     node.parameter('~gains').set({'p': 0.5, 'limits': (1, 'a', True)})
     assert run(master.url, 'rosparam', 'get', PRIVATE).stdout == '2.0\n'
     assert run(master.url, 'rosparam', 'get', '/robot1/driver/gains/p').stdout == '0.5\n'
-    assert run(master.url, 'rosparam', 'get', '/robot1/driver/gains/limits').stdout == '- 1\n- a\n- true\n\n'
+    assert (
+        run(master.url, 'rosparam', 'get', '/robot1/driver/gains/limits').stdout
+        == '- 1\n- a\n- true\n\n'
+    )
 
 
 def test_what_rosparam_sets_to_another_type_is_reported_and_the_block_not_run(master, transcript):
@@ -89,31 +97,37 @@ def test_what_rosparam_sets_to_another_type_is_reported_and_the_block_not_run(ma
     changes = Changes(rate.node).of(rate)
     assert run(master.url, 'rosparam', 'set', PRIVATE, 'fast').returncode == 0
     assert changes.until_now() == []
-    error, = rate.node.errors
-    assert isinstance(error, ValueError) and str(error).startswith(PRIVATE + " holds float, and 'fast' is none")
-    assert any('parameter %s' % PRIVATE in line for line in transcript)
+    (error,) = rate.node.errors
+    assert isinstance(error, ValueError) and str(error).startswith(
+        PRIVATE + " holds float, and 'fast' is none"
+    )
+    assert any(f'parameter {PRIVATE}' in line for line in transcript)
     with pytest.raises(ValueError, match=PRIVATE):
         rate.value
     master.parameters[PRIVATE] = 3.0
     assert changes.get() == rate.value == 3.0
 
 
-# -- names ------------------------------------------------------------------------------------------------------------
+# -- names
 
-@pytest.mark.parametrize('named, argv, asked, name', [
-    ('/driver', None, '~rate', '/driver/rate'),
-    ('/robot1/driver', None, '~rate', '/robot1/driver/rate'),
-    ('/robot1/driver', None, '~gains/p/', '/robot1/driver/gains/p'),
-    ('/robot1/driver', None, 'rate', '/robot1/rate'),
-    ('/robot1/driver', None, 'wheels/left', '/robot1/wheels/left'),
-    ('/robot1/driver', None, '/rate', '/rate'),
-    ('/robot1/driver', ['__ns:=/robot2', '__name:=pilot'], '~rate', '/robot2/pilot/rate'),
-    ('/robot1/driver', ['rate:=/common/rate'], 'rate', '/common/rate'),
-    ('/robot1/driver', ['rate:=/common/rate'], '~rate', '/robot1/driver/rate'),
-    ('/robot1/driver', ['~rate:=/common/rate'], '~rate', '/common/rate'),
-    ('/robot1/driver', ['/rate:=speed'], '/rate', '/robot1/speed'),
-    ('/robot1/driver', ['/a:=/b', '/b:=/a'], '/a', '/b'),
-])
+
+@pytest.mark.parametrize(
+    'named, argv, asked, name',
+    [
+        ('/driver', None, '~rate', '/driver/rate'),
+        ('/robot1/driver', None, '~rate', '/robot1/driver/rate'),
+        ('/robot1/driver', None, '~gains/p/', '/robot1/driver/gains/p'),
+        ('/robot1/driver', None, 'rate', '/robot1/rate'),
+        ('/robot1/driver', None, 'wheels/left', '/robot1/wheels/left'),
+        ('/robot1/driver', None, '/rate', '/rate'),
+        ('/robot1/driver', ['__ns:=/robot2', '__name:=pilot'], '~rate', '/robot2/pilot/rate'),
+        ('/robot1/driver', ['rate:=/common/rate'], 'rate', '/common/rate'),
+        ('/robot1/driver', ['rate:=/common/rate'], '~rate', '/robot1/driver/rate'),
+        ('/robot1/driver', ['~rate:=/common/rate'], '~rate', '/common/rate'),
+        ('/robot1/driver', ['/rate:=speed'], '/rate', '/robot1/speed'),
+        ('/robot1/driver', ['/a:=/b', '/b:=/a'], '/a', '/b'),
+    ],
+)
 def test_names_are_resolved_and_remapped(master, named, argv, asked, name):
     parameter = create(master, named, argv=argv).parameter(asked, initialized=1)
     changes = Changes(parameter.node).of(parameter)
@@ -137,19 +151,35 @@ def test_what_is_no_name_is_refused(master, name):
         create(master).parameter(name)
 
 
-# -- the first value --------------------------------------------------------------------------------------------------
+# -- the first value
+
 
 def test_a_parameter_without_a_value_gets_the_first_one_and_another_keeps_its_own(master):
     master.parameters['/robot1/driver/set'] = 7
     node = create(master, argv=['_rate:=5'])
     assert (node.parameter('~rate', initialized=1.0).value, master.parameters[PRIVATE]) == (5.0, 5)
     assert node.parameter('~set', initialized=1).value == 7
-    assert node.parameter('~new', initialized=1).value == master.parameters['/robot1/driver/new'] == 1
+    assert (
+        node.parameter('~new', initialized=1).value == master.parameters['/robot1/driver/new'] == 1
+    )
     assert node.parameter('~none').value is None and '/robot1/driver/none' not in master.parameters
 
 
-@pytest.mark.parametrize('value', [0, False, '', 0.0, [], 'ü\n<&>', -2 ** 31, 1e300, [1, 'a', [True]],
-                                   {'p': 1, 'limits': {'low': [0.5]}}])
+@pytest.mark.parametrize(
+    'value',
+    [
+        0,
+        False,
+        '',
+        0.0,
+        [],
+        'ü\n<&>',
+        -(2**31),
+        1e300,
+        [1, 'a', [True]],
+        {'p': 1, 'limits': {'low': [0.5]}},
+    ],
+)
 def test_any_value_that_the_server_can_hold_may_be_the_first(master, value):
     parameter = create(master).parameter('~value', initialized=value)
     assert (parameter.value, type(parameter.value)) == (value, type(value))
@@ -158,18 +188,34 @@ def test_any_value_that_the_server_can_hold_may_be_the_first(master, value):
 
 def test_a_value_of_another_type_that_is_there_already_is_refused_by_name(master):
     rate = create(master, argv=['_rate:=fast']).parameter('~rate', initialized=1.0)
-    with pytest.raises(ValueError, match="%s holds float, and 'fast' is none.*None to allow any" % PRIVATE):
+    with pytest.raises(
+        ValueError, match=f"{PRIVATE} holds float, and 'fast' is none.*None to allow any"
+    ):
         rate.value
 
 
-# -- types ------------------------------------------------------------------------------------------------------------
+# -- types
 
-@pytest.mark.parametrize('initialized, value', [
-    (1.0, '2.0'), (1.0, True), (1, 2.5), (1, True), (True, 1), (False, 'no'), ('a', 1), ([1], {'a': 1}), ([1], 'a'),
-    ({'a': 1}, [1]), ('a', ['a'])])
+
+@pytest.mark.parametrize(
+    'initialized, value',
+    [
+        (1.0, '2.0'),
+        (1.0, True),
+        (1, 2.5),
+        (1, True),
+        (True, 1),
+        (False, 'no'),
+        ('a', 1),
+        ([1], {'a': 1}),
+        ([1], 'a'),
+        ({'a': 1}, [1]),
+        ('a', ['a']),
+    ],
+)
 def test_a_value_of_another_type_is_refused_by_name(master, initialized, value):
     parameter = create(master).parameter('~rate', initialized)
-    with pytest.raises(ValueError, match='%s holds %s' % (PRIVATE, type(initialized).__name__)):
+    with pytest.raises(ValueError, match=f'{PRIVATE} holds {type(initialized).__name__}'):
         parameter.set(value)
     assert parameter.value == initialized
 
@@ -183,8 +229,22 @@ def test_initialized_with_none_any_value_is_taken(master):
     assert changes.until_now() == []
 
 
-@pytest.mark.parametrize('value', [None, 2 ** 31, object(), {1: 'a'}, 'a\0b', [1, None], 1j, {'a': 2 ** 40}, '\ud800',
-                                   {1, 2}, datetime.date(2020, 2, 3)])
+@pytest.mark.parametrize(
+    'value',
+    [
+        None,
+        2**31,
+        object(),
+        {1: 'a'},
+        'a\0b',
+        [1, None],
+        1j,
+        {'a': 2**40},
+        '\ud800',
+        {1, 2},
+        datetime.date(2020, 2, 3),
+    ],
+)
 def test_a_value_that_the_server_cannot_hold_is_refused_by_name(master, value):
     parameter = create(master).parameter('~any')
     with pytest.raises(ValueError, match='/robot1/driver/any cannot be'):
@@ -198,27 +258,33 @@ def test_a_value_that_the_server_cannot_hold_is_refused_by_name(master, value):
             parameter.node.parameter('~any', initialized=value)
 
 
-# -- namespaces -------------------------------------------------------------------------------------------------------
+# -- namespaces
+
 
 @pytest.fixture
 def gains(master):
-    """A namespace and what is in it, watched by one node; ``gains.until_now()`` tells the changes."""
+    """A namespace and what is in it, watched by one node; ``gains.until_now()`` tells the
+    changes."""
     node = create(master)
     master.parameters['/gains'] = {'p': 1, 'd': {'low': 2}}
     return Changes(node).of(*map(node.parameter, ('/gains', '/gains/p', '/gains/d/low')))
 
 
 @pytest.mark.parametrize('set_by_the_node', [False, True])
-@pytest.mark.parametrize('name, value, told', [
-    ('/gains/p', 5, {'/gains': {'p': 5, 'd': {'low': 2}}, '/gains/p': 5}),
-    ('/gains/d/high', 5, {'/gains': {'p': 1, 'd': {'low': 2, 'high': 5}}}),
-    ('/gains/d', {'low': 5}, {'/gains': {'p': 1, 'd': {'low': 5}}, '/gains/d/low': 5}),
-    ('/gains', {'p': 5}, {'/gains': {'p': 5}, '/gains/p': 5, '/gains/d/low': None}),
-    ('/gains', 5, {'/gains': 5, '/gains/p': None, '/gains/d/low': None}),
-    ('/gainsaid', 5, {}),
-])
-def test_a_namespace_and_its_parts_hear_once_of_a_change_in_one_another(master, gains, set_by_the_node, name, value,
-                                                                        told):
+@pytest.mark.parametrize(
+    'name, value, told',
+    [
+        ('/gains/p', 5, {'/gains': {'p': 5, 'd': {'low': 2}}, '/gains/p': 5}),
+        ('/gains/d/high', 5, {'/gains': {'p': 1, 'd': {'low': 2, 'high': 5}}}),
+        ('/gains/d', {'low': 5}, {'/gains': {'p': 1, 'd': {'low': 5}}, '/gains/d/low': 5}),
+        ('/gains', {'p': 5}, {'/gains': {'p': 5}, '/gains/p': 5, '/gains/d/low': None}),
+        ('/gains', 5, {'/gains': 5, '/gains/p': None, '/gains/d/low': None}),
+        ('/gainsaid', 5, {}),
+    ],
+)
+def test_a_namespace_and_its_parts_hear_once_of_a_change_in_one_another(
+    master, gains, set_by_the_node, name, value, told
+):
     if set_by_the_node:
         gains._node.parameter(name).set(value)
     else:
@@ -228,7 +294,9 @@ def test_a_namespace_and_its_parts_hear_once_of_a_change_in_one_another(master, 
 
 @pytest.mark.parametrize('set_by_the_node', [False, True])
 @pytest.mark.parametrize('value, told', [({'p': 5}, 5), ({'d': 5}, None)])
-def test_a_part_hears_once_of_a_change_of_the_namespace_around_it(master, set_by_the_node, value, told):
+def test_a_part_hears_once_of_a_change_of_the_namespace_around_it(
+    master, set_by_the_node, value, told
+):
     node = create(master)
     changes = Changes(node).of(node.parameter('/gains/p', initialized=1))
     if set_by_the_node:
@@ -238,10 +306,13 @@ def test_a_part_hears_once_of_a_change_of_the_namespace_around_it(master, set_by
     assert changes.until_now() == [('/gains/p', told)]
 
 
-@pytest.mark.parametrize('name, told', [
-    ('/gains/p', {'/gains': {'d': {'low': 2}}, '/gains/p': None}),
-    ('/gains', {'/gains': None, '/gains/p': None, '/gains/d/low': None}),
-])
+@pytest.mark.parametrize(
+    'name, told',
+    [
+        ('/gains/p', {'/gains': {'d': {'low': 2}}, '/gains/p': None}),
+        ('/gains', {'/gains': None, '/gains/p': None, '/gains/d/low': None}),
+    ],
+)
 def test_what_is_deleted_is_none(master, gains, name, told):
     del master.parameters[name]
     assert sorted(gains.until_now()) == sorted(told.items())
@@ -255,7 +326,8 @@ def test_a_part_watched_before_its_namespace_is_not_told_twice(master):
     assert sorted(changes.until_now()) == [('/gains', {'p': 5}), ('/gains/p', 5)]
 
 
-# -- blocks -----------------------------------------------------------------------------------------------------------
+# -- blocks
+
 
 def test_each_block_of_a_parameter_is_run_and_a_failing_one_alone_is_reported(master, transcript):
     node = create(master)
@@ -266,14 +338,24 @@ def test_each_block_of_a_parameter_is_run_and_a_failing_one_alone_is_reported(ma
     @rate.on_change
     def failing(value):
         raise KeyError('not with %d' % value)
+
     rate.on_change(lambda value: second(value, None))
     node.parameter('~rate', 1).on_change(lambda value: again(value, None))
-    for value, set_ in (2, lambda: master.parameters.update({rate.name: 2})), (3, lambda: rate.set(3)):
+    for value, set_ in (2, lambda: master.parameters.update({rate.name: 2})), (
+        3,
+        lambda: rate.set(3),
+    ):
         set_()
         assert first.get() == second.get() == again.get() == value
         error = node.errors.pop()
-        assert isinstance(error, KeyError) and 'not with %d' % value in str(error) and not node.errors
-    assert 'parameter %s' % PRIVATE in transcript[-1] and 'failing' in transcript[-1] and 'KeyError' in transcript[-1]
+        assert (
+            isinstance(error, KeyError) and 'not with %d' % value in str(error) and not node.errors
+        )
+    assert (
+        f'parameter {PRIVATE}' in transcript[-1]
+        and 'failing' in transcript[-1]
+        and 'KeyError' in transcript[-1]
+    )
 
 
 @pytest.mark.parametrize('block', [None, 5, lambda: None, lambda value, more: None])
@@ -283,7 +365,9 @@ def test_what_is_no_block_is_refused(master, block):
 
 
 def test_two_nodes_of_one_process_watch_one_parameter(master):
-    one, other = create(master, '/one').parameter('/shared', 1), create(master, '/other').parameter('/shared', 2)
+    one, other = create(master, '/one').parameter('/shared', 1), create(master, '/other').parameter(
+        '/shared', 2
+    )
     assert one.value == other.value == 1
     changes = [Changes(parameter.node).of(parameter) for parameter in (one, other)]
     one.set(3)
@@ -303,6 +387,7 @@ def test_a_block_may_read_set_and_watch_parameters(master):
     def follow(value):
         second.set(first.value + second.value)
         changes.of(node.parameter('~third'))
+
     first.on_change(follow)
     master.parameters[first.name] = 4
     assert changes.get() == 4
@@ -311,7 +396,8 @@ def test_a_block_may_read_set_and_watch_parameters(master):
     assert not node.errors
 
 
-# -- life -------------------------------------------------------------------------------------------------------------
+# -- life
+
 
 class _Server(socketserver.ThreadingMixIn, xmlrpc.server.SimpleXMLRPCServer):
     daemon_threads = True
@@ -321,17 +407,19 @@ def test_a_master_no_longer_calls_where_a_stopped_node_was(master):
     node = create(master)
     for name in '~rate', '/gains', '/gains/p':
         Changes(node).of(node.parameter(name))
-    assert node.ros.get_param_cached('~rate', 1) == 1    # rospy itself subscribes here
+    assert node.ros.get_param_cached('~rate', 1) == 1  # rospy itself subscribes here
     node.stop()
     calls = Mailbox()
     with _Server(('127.0.0.1', node.xmlrpc_port), logRequests=False) as server:
-        server.register_function(lambda caller, name, value: calls(name, None) or [1, '', 0], 'paramUpdate')
+        server.register_function(
+            lambda caller, name, value: calls(name, None) or [1, '', 0], 'paramUpdate'
+        )
         thread = threading.Thread(target=server.serve_forever, args=(0.01,))
         thread.start()
         master._api(node.name).subscribeParam(node.uri, '/sentinel')
         for name in PRIVATE, '/gains', '/gains/p', '/sentinel':
             master.parameters[name] = 5
-        assert calls.get() == '/sentinel/'    # a master calls one node in order
+        assert calls.get() == '/sentinel/'  # a master calls one node in order
         server.shutdown()
         thread.join(TIMEOUT)
     master._api(node.name).unsubscribeParam(node.uri, '/sentinel')
@@ -341,11 +429,15 @@ def test_a_parameter_needs_a_running_node_and_goes_on_with_the_next_run(master):
     rate = create(master).parameter('~rate', 1)
     changes = Changes(rate.node).of(rate)
     rate.node.stop()
-    for use in (lambda: rate.value, lambda: rate.set(2), lambda: rate.on_change(print),
-                lambda: rate.node.parameter('~other')):
+    for use in (
+        lambda: rate.value,
+        lambda: rate.set(2),
+        lambda: rate.on_change(print),
+        lambda: rate.node.parameter('~other'),
+    ):
         with pytest.raises(NodeStoppedError, match='/robot1/driver is stopped'):
             use()
-    assert repr(rate) == '<Parameter %s of /robot1/driver>' % PRIVATE
+    assert repr(rate) == f'<Parameter {PRIVATE} of /robot1/driver>'
     master.parameters[rate.name] = 2
     rate.node.start()
     assert changes.until_now() == [] and rate.value == 2
@@ -359,12 +451,18 @@ def test_a_parameter_needs_a_running_node_and_goes_on_with_the_next_run(master):
 
 
 @pytest.mark.parametrize('known_again', [False, True], ids=['unknown', 'known_again'])
-def test_values_and_watches_are_back_after_a_restart_of_the_master(mortal_master, monkeypatch,    # noqa: F811
-                                                                   known_again):
-    """Also where the node opens a channel with the new master before anybody notices that it is new."""
+def test_values_and_watches_are_back_after_a_restart_of_the_master(
+    mortal_master, monkeypatch, known_again  # noqa: F811
+):
+    """Also where the node opens a channel with the new master before anybody notices that it is
+    new."""
     master = Master(mortal_master.url)
     node = create(master, argv=['_given:=7'])
-    rate, gains, none = node.parameter('~rate', 1.5), node.parameter('/gains', {'p': 1}), node.parameter('~none')
+    rate, gains, none = (
+        node.parameter('~rate', 1.5),
+        node.parameter('/gains', {'p': 1}),
+        node.parameter('~none'),
+    )
     part = node.parameter('/gains/p', 1)
     master.parameters['/cached'] = 1
     assert node.ros.get_param_cached('/cached') == 1
@@ -384,13 +482,18 @@ def test_values_and_watches_are_back_after_a_restart_of_the_master(mortal_master
     master.parameters[none.name] = 'something'
     master.parameters['/gains/p'] = 2
     told = changes.until_now()
-    assert sorted(told, key=str) == [('/gains', {'p': 2}), ('/gains/p', 2), (none.name, 'something')]
+    assert sorted(told, key=str) == [
+        ('/gains', {'p': 2}),
+        ('/gains/p', 2),
+        (none.name, 'something'),
+    ]
     master.parameters['/cached'] = 2
     assert node.ros.get_param_cached('/cached') == node.ros.get_param('/cached') == 2
 
 
 def told_of(changes, master, name, value):
-    """Whether the master tells the node of a change, which it does once the node has asked for it."""
+    """Whether the master tells the node of a change, which it does once the node has asked for
+    it."""
     master.parameters[name] = value
     return not changes._mailbox.empty() and changes.until_now()
 
@@ -400,8 +503,12 @@ def test_a_master_that_is_away_is_named(monkeypatch):
     monkeypatch.setenv('ROS_MASTER_URI', ros_master.url)
     rate = create(Master(ros_master.url)).parameter('~rate', 1)
     ros_master.stop()
-    for use in (lambda: rate.value, lambda: rate.set(2), lambda: rate.on_change(print),
-                lambda: rate.node.parameter('~other', 1)):
+    for use in (
+        lambda: rate.value,
+        lambda: rate.set(2),
+        lambda: rate.on_change(print),
+        lambda: rate.node.parameter('~other', 1),
+    ):
         with pytest.raises(MasterUnreachableError, match=ros_master.url):
             use()
     running.stop_all()

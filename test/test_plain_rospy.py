@@ -1,4 +1,5 @@
-"""Plain rospy subscriptions of this process: through INTRAPROCESS like channels, to their users as over TCPROS."""
+"""Plain rospy subscriptions of this process: through INTRAPROCESS like channels, to their users as
+over TCPROS."""
 import collections
 import threading
 import types
@@ -38,14 +39,18 @@ def ended(thread):
 def listen(node, topic, message_class, **kwargs):
     """A plain Subscriber of the node, and what it gets."""
     mailbox = Mailbox()
-    return node.ros.Subscriber(topic, message_class, lambda message: mailbox(message, None), **kwargs), mailbox
+    return (
+        node.ros.Subscriber(topic, message_class, lambda message: mailbox(message, None), **kwargs),
+        mailbox,
+    )
 
 
 def link_threads(node):
     return [thread for thread in threading.enumerate() if thread.name == node.name + ' dispatcher']
 
 
-# -- beside channels ---------------------------------------------------------------------------------------------------
+# -- beside channels
+
 
 def test_nothing_is_lost_when_a_plain_subscriber_comes_and_goes_beside_a_channel(master, mailbox):
     """The link used to go down, and TCPROS to take its place 50 ms later."""
@@ -59,6 +64,7 @@ def test_nothing_is_lost_when_a_plain_subscriber_comes_and_goes_beside_a_channel
             subscriber, _ = listen(both, '/beside/numbers', INT)
             both.ros.wait_for_message('/beside/numbers', INT, timeout=TIMEOUT)
             subscriber.unregister()
+
     thread = in_thread(come_and_go)
     count = 0
     while count < 5000 or not over.is_set():
@@ -66,7 +72,7 @@ def test_nothing_is_lost_when_a_plain_subscriber_comes_and_goes_beside_a_channel
         count += 1
         if count == 5000:
             over.set()
-    while thread.is_alive():    # it may wait for one more message
+    while thread.is_alive():  # it may wait for one more message
         sent.send(data=count)
         count += 1
     assert [message.data for message in mailbox.take(count)] == list(range(count))
@@ -83,7 +89,10 @@ def test_nothing_is_lost_when_channels_open_and_close_beside_another(master, mai
 
     def come_and_go():
         while not over.is_set():
-            both.interested_in('/beside/others', INT, delegate=lambda message, channel: None).close()
+            both.interested_in(
+                '/beside/others', INT, delegate=lambda message, channel: None
+            ).close()
+
     threads = [in_thread(come_and_go) for _ in range(3)]
     for number in range(5000):
         sent.send(data=number)
@@ -112,7 +121,8 @@ def test_a_channel_gets_its_own_type_beside_a_subscriber_of_any_type(master, mai
         node.stop()
 
 
-# -- as over TCPROS ----------------------------------------------------------------------------------------------------
+# -- as over TCPROS
+
 
 @pytest.fixture(params=['INTRAPROCESS', 'TCPROS'])
 def pair(request, master):
@@ -186,15 +196,20 @@ def test_a_latched_message_reaches_each_callback_that_comes_late(pair):
     assert delegate.get().data == 'next'
 
 
-def test_callbacks_run_in_a_thread_for_each_connection_so_that_they_may_wait_for_each_other(pair, master):
+def test_callbacks_run_in_a_thread_for_each_connection_so_that_they_may_wait_for_each_other(
+    pair, master
+):
     publishing, subscribing = pair
     other = create(master, '/other_publisher')
-    publishers = [node.ros.Publisher('/plain/meet', STRING, queue_size=1) for node in (publishing, other)]
+    publishers = [
+        node.ros.Publisher('/plain/meet', STRING, queue_size=1) for node in (publishing, other)
+    ]
     meeting, met = threading.Barrier(2), threading.Semaphore(0)
 
     def meet(message):
         meeting.wait(TIMEOUT)
         met.release()
+
     subscribing.ros.Subscriber('/plain/meet', STRING, meet)
     for publisher in publishers:
         connected(publisher)
@@ -211,6 +226,7 @@ def test_a_callback_that_fails_ends_nothing(pair):
         if message.data == 0:
             raise ValueError('zero')
         mailbox(message, None)
+
     subscribing.ros.Subscriber('/plain/failing', INT, fail)
     connected(publisher)
     for number in range(3):
@@ -227,6 +243,7 @@ def test_a_subscriber_with_a_queue_of_one_gets_the_newest(pair):
         entered.set()
         release.wait(TIMEOUT)
         mailbox(message, None)
+
     subscribing.ros.Subscriber('/plain/newest', INT, slow, queue_size=1, buff_size=1 << 20)
     connected(publisher)
     publisher.publish(0)
@@ -239,12 +256,14 @@ def test_a_subscriber_with_a_queue_of_one_gets_the_newest(pair):
     while following[-1] != 49:
         following.append(mailbox.get().data)
     assert following == sorted(following)
-    if subscribing.transport == 'INTRAPROCESS':    # else some may not have come yet when the callback ended
+    # else some may not have come yet when the callback ended
+    if subscribing.transport == 'INTRAPROCESS':
         assert following == [49]
 
 
 def test_messages_that_come_faster_than_they_are_taken_are_kept_as_sockets_do(pair):
-    """With queue_size=1, too: a hundred small messages fit into the sockets between two processes."""
+    """With queue_size=1, too: a hundred small messages fit into the sockets between two
+    processes."""
     publishing, subscribing = pair
     publisher = publishing.ros.Publisher('/plain/burst', INT, queue_size=1)
     entered, release, mailbox = threading.Event(), threading.Event(), Mailbox()
@@ -253,6 +272,7 @@ def test_messages_that_come_faster_than_they_are_taken_are_kept_as_sockets_do(pa
         entered.set()
         release.wait(TIMEOUT)
         mailbox(message, None)
+
     subscribing.ros.Subscriber('/plain/burst', INT, slow)
     connected(publisher)
     for number in range(100):
@@ -272,6 +292,7 @@ def test_a_publisher_without_a_queue_waits_for_a_slow_callback_and_loses_nothing
         entered.set()
         release.wait(TIMEOUT)
         sizes(len(message.data), None)
+
     subscribing.ros.Subscriber('/plain/waits', ARRAY, slow)
     connected(publisher)
     published = []
@@ -280,10 +301,11 @@ def test_a_publisher_without_a_queue_waits_for_a_slow_callback_and_loses_nothing
         for number in range(40):
             publisher.publish(data=bytes((1 << 20) + number))
             published.append(number)
+
     thread = in_thread(publish)
     assert entered.wait(TIMEOUT)
     thread.join(0.5)
-    assert thread.is_alive()    # memory is bounded
+    assert thread.is_alive()  # memory is bounded
     assert len(published) < 30
     release.set()
     assert ended(thread)
@@ -300,6 +322,7 @@ def test_a_publisher_that_waits_goes_on_when_the_subscriber_ends(pair, ends):
     def stuck(message):
         entered.set()
         release.wait(TIMEOUT)
+
     subscriber = subscribing.ros.Subscriber('/plain/waits_for_end', ARRAY, stuck)
     connected(publisher)
     thread = in_thread(lambda: [publisher.publish(data=bytes(1 << 20)) for _ in range(40)])
@@ -313,11 +336,14 @@ def test_a_publisher_that_waits_goes_on_when_the_subscriber_ends(pair, ends):
 @pytest.mark.filterwarnings('ignore:The publisher should be created')
 @pytest.mark.parametrize('comes', ['channel', 'wait_for_message', 'latched'])
 def test_nobody_waits_for_a_publisher_that_waits_for_another(pair, master, comes):
-    """It holds its lock, and interested_in() and wait_for_message(timeout=1) waited for that without end."""
+    """It holds its lock, and interested_in() and wait_for_message(timeout=1) waited for that
+    without end."""
     publishing, subscribing = pair
     latch = comes == 'latched'
     if latch and subscribing.transport == 'TCPROS':
-        pytest.skip('as in rospy: what is latched is sent under the lock of a publisher that writes into a socket')
+        pytest.skip(
+            'as in rospy: what is latched is sent under the lock of a publisher that writes into a socket'
+        )
     topic = f'/plain/others_wait/{comes}'
     publisher = publishing.ros.Publisher(topic, ARRAY, latch=latch)
     entered, release = threading.Event(), threading.Event()
@@ -325,6 +351,7 @@ def test_nobody_waits_for_a_publisher_that_waits_for_another(pair, master, comes
     def stuck(message):
         entered.set()
         release.wait(TIMEOUT)
+
     subscribing.ros.Subscriber(topic, ARRAY, stuck)
     connected(publisher)
     thread = in_thread(lambda: [publisher.publish(data=bytes(1 << 20)) for _ in range(40)])
@@ -339,6 +366,7 @@ def test_nobody_waits_for_a_publisher_that_waits_for_another(pair, master, comes
                 other.ros.wait_for_message(topic, ARRAY, timeout=0.1)
         else:
             other.interested_in(topic, ARRAY).close()
+
     coming = in_thread(come)
     assert ended(coming)
     release.set()
@@ -359,9 +387,10 @@ def test_a_callback_may_unregister_subscribe_and_publish(pair):
         _, mailbox = listen(subscribing, '/plain/busy', ARRAY)
         mailboxes.append(mailbox)
         back.publish('changed')
+
     mailboxes = []
     subscribers.append(subscribing.ros.Subscriber('/plain/busy', ARRAY, change))
-    listen(subscribing, '/plain/busy', ARRAY)    # so that the connection stays
+    listen(subscribing, '/plain/busy', ARRAY)  # so that the connection stays
     connected(publisher)
     thread = in_thread(lambda: [publisher.publish(data=bytes(1 << 20)) for _ in range(20)])
     assert answers.get().data == 'changed'
@@ -377,18 +406,20 @@ def test_a_listener_greets_each_subscriber(pair):
     class Greeter(rospy.SubscribeListener):
         def peer_subscribe(self, topic_name, topic_publish, peer_publish):
             peer_publish(STRING('welcome'))
+
     publishing.ros.Publisher('/plain/greeted', STRING, subscriber_listener=Greeter(), queue_size=1)
     assert subscribing.ros.wait_for_message('/plain/greeted', STRING, TIMEOUT).data == 'welcome'
 
 
-# -- what is left ------------------------------------------------------------------------------------------------------
+# -- what is left
+
 
 def test_a_link_has_a_thread_for_callbacks_only_while_there_are_some(master, mailbox):
     node = create(master, '/subscriber')
     publisher = create(master, '/publisher').ros.Publisher('/plain/threads', STRING, queue_size=1)
     channel = node.interested_in('/plain/threads', STRING, delegate=mailbox)
     connected(publisher)
-    assert len(link_threads(node)) == 1    # the channels'
+    assert len(link_threads(node)) == 1  # the channels'
     subscribers = [listen(node, '/plain/threads', STRING)[0] for _ in range(3)]
     assert len(link_threads(node)) == 2
     for subscriber in subscribers:
@@ -399,7 +430,9 @@ def test_a_link_has_a_thread_for_callbacks_only_while_there_are_some(master, mai
     assert channel.dropped == 0
 
 
-def test_no_thread_is_left_when_a_channel_opens_while_the_last_callback_goes(master, mailbox, monkeypatch):
+def test_no_thread_is_left_when_a_channel_opens_while_the_last_callback_goes(
+    master, mailbox, monkeypatch
+):
     both, sender = create(master, '/both'), create(master, '/sender')
     channel = sender.output_channel('/threads/last', INT)
     subscriber, _ = listen(both, '/threads/last', INT)
@@ -409,10 +442,11 @@ def test_no_thread_is_left_when_a_channel_opens_while_the_last_callback_goes(mas
     def open_first(link):
         both.interested_in('/threads/last', INT, delegate=mailbox)
         removed(link)
+
     monkeypatch.setattr(intraprocess.Link, 'callback_removed', open_first)
     both.interested_in('/threads/last', INT, delegate=mailbox)
     subscriber.unregister()
-    until(lambda: len(link_threads(both)) == 1)    # the node's own
+    until(lambda: len(link_threads(both)) == 1)  # the node's own
 
 
 def test_a_link_that_is_closed_opens_no_thread_for_callbacks(master):
@@ -423,7 +457,7 @@ def test_a_link_that_is_closed_opens_no_thread_for_callbacks(master):
     link = publisher.impl.connections[0].link
     publisher.unregister()
     until(lambda: not link_threads(node))
-    link.match_receivers()    # as a thread may that changes the subscription just then
+    link.match_receivers()  # as a thread may that changes the subscription just then
     until(lambda: not link_threads(node))
 
 
@@ -436,6 +470,7 @@ def test_what_was_published_before_the_publisher_left_still_arrives(pair):
         entered.set()
         release.wait(TIMEOUT)
         mailbox(message, None)
+
     subscribing.ros.Subscriber('/plain/leaving', INT, slow)
     connected(publisher)
     for number in range(100):
@@ -454,6 +489,7 @@ def test_what_is_put_while_another_thread_takes_is_counted():
             if meanwhile:
                 inbox.put(meanwhile.pop(), size=1000)
             return size
+
     meanwhile = ['third']
     publisher = types.SimpleNamespace(queue_size=10, queue_bytes=1 << 20)
     subscriber = types.SimpleNamespace(queue_size=1, callbacks=None)
@@ -476,6 +512,7 @@ def test_large_messages_are_dropped_from_a_full_queue_the_oldest_first(master):
         entered.set()
         release.wait(TIMEOUT)
         sizes(len(message.data), None)
+
     subscribing.ros.Subscriber('/plain/full', ARRAY, slow)
     connected(publisher)
     publisher.publish(data=b'')

@@ -19,7 +19,8 @@ def create(master, name, cls=BlockNode, **kwargs):
 
 
 class Gate:
-    """A delegate that is entered with the first message, and keeps all others waiting until it is opened."""
+    """A delegate that is entered with the first message, and keeps all others waiting until it is
+    opened."""
 
     def __init__(self):
         self.entered, self.opened, self.sizes = threading.Event(), threading.Event(), Mailbox()
@@ -35,9 +36,13 @@ class Small(Node):
 
 
 @pytest.mark.parametrize('shared', [False, True])
-def test_large_messages_wait_up_to_so_many_bytes_and_the_oldest_are_dropped_and_counted(master, shared):
+def test_large_messages_wait_up_to_so_many_bytes_and_the_oldest_are_dropped_and_counted(
+    master, shared
+):
     gate = Gate()
-    received = create(master, '/receiver', Small, delegate=gate).interested_in('/large', BYTES, shared=shared)
+    received = create(master, '/receiver', Small, delegate=gate).interested_in(
+        '/large', BYTES, shared=shared
+    )
     sent = create(master, '/sender').output_channel('/large', BYTES)
     sent.send(data=b'')
     assert gate.entered.wait(TIMEOUT)
@@ -59,7 +64,7 @@ def test_messages_are_large_too_where_their_definition_fixes_their_size(master):
     for _ in range(10):
         sent.send()
     gate.opened.set()
-    assert received.dropped == 7    # three, and a little for each, are less than four megabytes
+    assert received.dropped == 7  # three, and a little for each, are less than four megabytes
 
 
 def test_the_newest_message_has_room_however_large_it_is(master):
@@ -114,6 +119,7 @@ def test_a_queue_never_holds_more_than_it_may_and_counts_what_it_drops(steps):
     class Channel(Receiver):
         _delegate = staticmethod(lambda message, channel: taken.append(message))
         node = None
+
     inbox = dispatcher.Inbox(Channel(), dispatcher.Dispatcher(None), inline=True)
     put = []
     for size in steps:
@@ -123,13 +129,14 @@ def test_a_queue_never_holds_more_than_it_may_and_counts_what_it_drops(steps):
             put.append(size)
             inbox.put(size, size)
             waiting = list(inbox._queue)
-            assert waiting == put[len(put) - len(waiting):]
+            assert waiting == put[len(put) - len(waiting) :]
             assert len(waiting) <= 5 and (sum(waiting) <= 100 or len(waiting) == 1)
         assert inbox.dropped == len(put) - len(taken) - len(inbox._queue)
 
 
 class Connection:
     """A connection whose socket is full, and stays so."""
+
     done, socket = False, None
 
     def __init__(self):
@@ -146,7 +153,9 @@ class Connection:
 @given(st.lists(st.integers(1, 150), max_size=30))
 def test_what_waits_for_a_subscriber_elsewhere_is_bounded_too(sizes):
     threads = []
-    way = sender.Sender(Connection(), 5, lambda target, name: threads.append(target), queue_bytes=100)
+    way = sender.Sender(
+        Connection(), 5, lambda target, name: threads.append(target), queue_bytes=100
+    )
     way._is_idle = False
     for size in sizes:
         way.write_data(bytes(size))

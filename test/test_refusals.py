@@ -1,4 +1,5 @@
-"""Two ends of a topic that have different types: not connected, told once on each side, and shown."""
+"""Two ends of a topic that have different types: not connected, told once on each side, and
+shown."""
 import contextlib
 import itertools
 import sys
@@ -16,7 +17,7 @@ from pharos.private_rospy import refusals
 from pharos.intraprocess.link import Link
 from programs import Program, until
 from test_graph_types import Publisher
-from test_survival import mortal_master    # noqa: F401 (a fixture)
+from test_survival import mortal_master  # noqa: F401 (a fixture)
 
 STRING, INT32 = 'std_msgs/String', 'std_msgs/Int32'
 MD5SUM = {STRING: '992ce8a1687cec8c8bd883ec73ca41d1', INT32: 'da5909fbe378aeaf85e547e830cc1bb7'}
@@ -36,12 +37,13 @@ else:
 print('ready', flush=True)
 rospy.spin()
 '''
-numbers = itertools.count()    # the master never forgets the type of a topic
+numbers = itertools.count()  # the master never forgets the type of a topic
 
 
 def create(master, name, **kwargs):
     node = master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
-    node.connect_timeout = 100 * TIMEOUT    # what waits for a connection that never comes would not return
+    # what waits for a connection that never comes would not return
+    node.connect_timeout = 100 * TIMEOUT
     return node
 
 
@@ -62,7 +64,9 @@ def topic():
 
 @contextlib.contextmanager
 def rospy_peer(url, topic, type_, text, kind='publisher', name='/far'):
-    with Program(url, sys.executable, '-c', PEER, kind, name.strip('/'), topic, type_, text) as peer:
+    with Program(
+        url, sys.executable, '-c', PEER, kind, name.strip('/'), topic, type_, text
+    ) as peer:
         peer.wait_for('ready')
         yield name
 
@@ -79,7 +83,11 @@ def roscpp_publisher(url, topic, type_, text):
 @contextlib.contextmanager
 def publisher_here(url, topic, type_, text):
     sender = create(pharos.Master(url), '/far')
-    in_time(lambda: sender.output_channel(topic, message_types.class_from_definition(type_, text), latch=True))
+    in_time(
+        lambda: sender.output_channel(
+            topic, message_types.class_from_definition(type_, text), latch=True
+        )
+    )
     yield '/far'
     sender.stop()
 
@@ -92,7 +100,9 @@ def careless_publisher(url, topic, type_, text):
         yield '/far'
 
 
-publishing = pytest.mark.parametrize('publishing', [rospy_peer, roscpp_publisher, publisher_here, careless_publisher])
+publishing = pytest.mark.parametrize(
+    'publishing', [rospy_peer, roscpp_publisher, publisher_here, careless_publisher]
+)
 
 
 @pytest.fixture
@@ -103,6 +113,7 @@ def screen(capfd):
     def with_text(text):
         lines.extend(capfd.readouterr().err.splitlines())
         return [line for line in lines if text in line]
+
     return with_text
 
 
@@ -113,7 +124,8 @@ def attempts(node):
     return made
 
 
-# -- the subscriber ----------------------------------------------------------------------------------------------------
+# -- the subscriber
+
 
 @publishing
 @pytest.mark.parametrize('first', ['the subscriber', 'the publisher'])
@@ -127,28 +139,33 @@ def test_a_publisher_of_another_type_is_told_once(master, topic, publishing, fir
             there.enter_context(publishing(master.url, topic, INT32, 'int32 data'))
         until(lambda: node.health().refused)
         until(lambda: node.errors)
-        error, = node.errors
+        (error,) = node.errors
         assert isinstance(error, MessageTypeError)
         assert str(error) == (
             f'/near wants {topic} as {STRING} [{MD5SUM[STRING]}] (data: string), but /far publishes {INT32} '
-            f'[{MD5SUM[INT32]}] (data: int32), and is not heard: use one type, or another topic')
+            f'[{MD5SUM[INT32]}] (data: int32), and is not heard: use one type, or another topic'
+        )
         assert (channel.refused, channel.connections, node.health().refused) == (1, [], 1)
         assert '1 refused' in str(node.health()) and '1 refused' in repr(channel)
         until(lambda: screen('ERROR'))
         assert len(screen('ERROR')) == 1 and '/near wants' in screen('ERROR')[0]
-        failure, = node.failures
+        (failure,) = node.failures
         assert failure.count == 1
-    until(lambda: node.health().refused == 0)    # it has gone
+    until(lambda: node.health().refused == 0)  # it has gone
 
 
 @publishing
-def test_a_type_that_is_defined_otherwise_there_is_told_with_both_definitions(master, topic, publishing):
+def test_a_type_that_is_defined_otherwise_there_is_told_with_both_definitions(
+    master, topic, publishing
+):
     node = create(master, '/near')
     node.interested_in(topic, STRING)
     with publishing(master.url, topic, STRING, 'int8 data'):
         until(lambda: node.errors)
-    error, = node.errors
-    assert f'as {STRING} [{MD5SUM[STRING]}] (data: string), but /far publishes {STRING} [' in str(error)
+    (error,) = node.errors
+    assert f'as {STRING} [{MD5SUM[STRING]}] (data: string), but /far publishes {STRING} [' in str(
+        error
+    )
     assert '(data: int8), and is not heard: have both sides use the same String.msg' in str(error)
 
 
@@ -159,19 +176,21 @@ def test_who_is_refused_and_tries_again_does_not_tell_again(master, topic, publi
     node.interested_in(topic, STRING, delegate=mailbox)
     with publishing(master.url, topic, INT32, 'int32 data'):
         until(lambda: made)
-        node.interested_in(topic, STRING)    # another channel
+        node.interested_in(topic, STRING)  # another channel
         # the master tells of both publishers, and rospy tries both
         before = len(made)
         with rospy_peer(master.url, topic, STRING, 'string data', name='/right'):
             assert mailbox.get().data == ''
             until(lambda: len(made) > before)
         assert node.health().refused == 1
-    failure, = node.failures
+    (failure,) = node.failures
     assert failure.count == 1
 
 
 @pytest.mark.parametrize('publishing', [rospy_peer, publisher_here])
-def test_a_master_that_has_restarted_is_no_reason_to_tell_again(mortal_master, topic, publishing):    # noqa: F811
+def test_a_master_that_has_restarted_is_no_reason_to_tell_again(
+    mortal_master, topic, publishing
+):  # noqa: F811
     node = create(pharos.Master(mortal_master.url), '/near')
     node.interested_in(topic, STRING)
     with publishing(mortal_master.url, topic, INT32, 'int32 data'):
@@ -180,10 +199,10 @@ def test_a_master_that_has_restarted_is_no_reason_to_tell_again(mortal_master, t
         mortal_master.end()
         mortal_master.come_back()
         until(lambda: '/near' in node.master.topic(topic).subscribers)
-        if publishing is publisher_here:    # rospy's does not come back
+        if publishing is publisher_here:  # rospy's does not come back
             until(lambda: '/far' in node.master.topic(topic).publishers)
             until(lambda: made)
-    failure, = node.failures
+    (failure,) = node.failures
     assert failure.count == 1
 
 
@@ -219,7 +238,10 @@ def test_a_subscriber_of_any_type_hears_all(master, topic):
     create(master, '/here').output_channel(topic, STRING, latch=True).send(data='from here')
     with rospy_peer(master.url, topic, INT32, 'int32 data'):
         node.interested_in(topic, rospy.AnyMsg, delegate=mailbox)
-        assert sorted(message._connection_header['type'] for message in mailbox.take(2)) == [INT32, STRING]
+        assert sorted(message._connection_header['type'] for message in mailbox.take(2)) == [
+            INT32,
+            STRING,
+        ]
     assert not node.errors and node.health().refused == 0
 
 
@@ -228,18 +250,24 @@ def test_a_publisher_of_any_type_is_told_as_one(master, topic):
     create(master, '/far').ros.Publisher(topic, rospy.AnyMsg, queue_size=1)
     in_time(lambda: node.interested_in(topic, STRING))
     until(lambda: node.errors)
-    assert '/far publishes messages of any type, and is not heard: only subscribers of any' in str(node.errors[0])
+    assert '/far publishes messages of any type, and is not heard: only subscribers of any' in str(
+        node.errors[0]
+    )
 
 
 @pytest.mark.parametrize('publishing', [rospy_peer, publisher_here])
 @pytest.mark.parametrize('first', ['the subscribers', 'the publisher'])
-def test_a_channel_beside_a_subscriber_of_any_type_hears_its_own_type_alone(master, topic, publishing, first):
-    """rospy connects a node once to a publisher: by the md5sum of its first subscriber, which here is none."""
+def test_a_channel_beside_a_subscriber_of_any_type_hears_its_own_type_alone(
+    master, topic, publishing, first
+):
+    """rospy connects a node once to a publisher: by the md5sum of its first subscriber, which here
+    is none."""
     node, mailbox, anything = create(master, '/near'), Mailbox(), Mailbox()
 
     def subscribe():
         node.ros.Subscriber(topic, rospy.AnyMsg, lambda message: anything(message, None))
         in_time(lambda: node.interested_in(topic, STRING, delegate=mailbox))
+
     with contextlib.ExitStack() as there:
         if first == 'the subscribers':
             subscribe()
@@ -247,8 +275,10 @@ def test_a_channel_beside_a_subscriber_of_any_type_hears_its_own_type_alone(mast
         if first == 'the publisher':
             subscribe()
         if publishing is publisher_here:
-            far, = [channel for channel in master.topic(topic).channels if hasattr(channel, 'send')]
-            far.send(data=0)    # which, read as a string, is an empty one
+            (far,) = [
+                channel for channel in master.topic(topic).channels if hasattr(channel, 'send')
+            ]
+            far.send(data=0)  # which, read as a string, is an empty one
         assert anything.get()._buff == bytes(4)
         until(lambda: node.errors)
         assert f'/near wants {topic} as {STRING}' in str(node.errors[0]) and len(node.errors) == 1
@@ -270,13 +300,17 @@ def test_a_publisher_that_refuses_for_another_reason_is_no_matter_of_types(maste
     """It has just closed its topic, or another node has its address by now."""
     node, other = create(master, '/near'), create(master, '/far')
     made = attempts(node)
-    with Publisher(master, topic, STRING, name='/busy', answer=[1, '', ['TCPROS', '127.0.0.1', other.tcp_port]]):
+    with Publisher(
+        master, topic, STRING, name='/busy', answer=[1, '', ['TCPROS', '127.0.0.1', other.tcp_port]]
+    ):
         node.interested_in(topic, STRING)
         until(lambda: made)
     assert not node.errors and node.health().refused == 0
 
 
-def test_a_channel_that_is_opened_while_its_node_connects_hears_the_publisher(master, topic, monkeypatch):
+def test_a_channel_that_is_opened_while_its_node_connects_hears_the_publisher(
+    master, topic, monkeypatch
+):
     """The subscription is connected already, but the link was made without the channel."""
     node, sender, mailbox = create(master, '/near'), create(master, '/far'), Mailbox()
     node._rospy.wiring.takes_plain_callbacks = True
@@ -285,10 +319,13 @@ def test_a_channel_that_is_opened_while_its_node_connects_hears_the_publisher(ma
     def match_and_open(self):
         new = match(self)
         if not opened:
-            opened.append(threading.Thread(target=lambda: node.interested_in(topic, STRING, delegate=mailbox)))
+            opened.append(
+                threading.Thread(target=lambda: node.interested_in(topic, STRING, delegate=mailbox))
+            )
             opened[0].start()
             until(lambda: len(node._rospy.subscriber(topic).callbacks) == 2)
         return new
+
     monkeypatch.setattr(Link, 'match_receivers', match_and_open)
     node.ros.Subscriber(topic, rospy.AnyMsg, lambda message: None)
     channel = sender.output_channel(topic, STRING)
@@ -297,30 +334,39 @@ def test_a_channel_that_is_opened_while_its_node_connects_hears_the_publisher(ma
     assert mailbox.get().data == 'heard'
 
 
-# -- the publisher -----------------------------------------------------------------------------------------------------
+# -- the publisher
+
 
 @pytest.mark.parametrize('where', ['here', 'elsewhere'])
 @pytest.mark.parametrize('first', ['the subscriber', 'the publisher'])
-def test_a_subscriber_of_another_type_is_warned_of_once_and_not_waited_for(master, topic, where, first, screen):
+def test_a_subscriber_of_another_type_is_warned_of_once_and_not_waited_for(
+    master, topic, where, first, screen
+):
     sender = create(master, '/near')
     with contextlib.ExitStack() as there:
+
         def subscribe():
             if where == 'here':
                 create(master, '/far').interested_in(topic, STRING)
             else:
-                there.enter_context(rospy_peer(master.url, topic, STRING, 'string data', 'subscriber'))
+                there.enter_context(
+                    rospy_peer(master.url, topic, STRING, 'string data', 'subscriber')
+                )
+
         if first == 'the subscriber':
             subscribe()
         in_time(lambda: sender.send_to(topic, typed_as=INT32, data=7))
         if first == 'the publisher':
             subscribe()
         until(lambda: screen('WARN'))
-        in_time(lambda: create(master, '/other').output_channel(topic, INT32))    # so that it tries again
+        # so that it tries again
+        in_time(lambda: create(master, '/other').output_channel(topic, INT32))
         until(lambda: len(screen('WARN')) == 2)
         mine, others = screen('WARN')
         for line in mine, others:
             assert topic in line and '/far' in line and STRING in line and INT32 in line
-        in_time(lambda: sender.output_channel(topic, INT32))    # another one, for which the master is asked
+        # another one, for which the master is asked
+        in_time(lambda: sender.output_channel(topic, INT32))
         assert sender._rospy.refusals.subscribers(topic) == ['/far']
 
 

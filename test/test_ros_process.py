@@ -15,8 +15,9 @@ from pharos import BlockNode, ExternalNode, RosProcess, UnknownNodeError
 from programs import Program
 from sockets import wait_for_end
 
-MANIFEST = """<package format="2"><name>%s</name><version>0.0.0</version><description>d</description>
-<maintainer email="a@b.org">m</maintainer><license>BSD</license></package>"""
+MANIFEST = """<package
+format="2"><name>%s</name><version>0.0.0</version><description>d</description> <maintainer
+email="a@b.org">m</maintainer><license>BSD</license></package>"""
 
 TALKER = """#!/usr/bin/python3
 import rospy, std_msgs.msg
@@ -50,7 +51,8 @@ def program(package, name, text):
     return name
 
 
-# -- finding them -----------------------------------------------------------------------------------------------------
+# -- finding them
+
 
 def test_a_program_of_the_source_space_is_run(master, package):
     with master.run('fake_robot', 'talker') as process:
@@ -69,7 +71,9 @@ def test_a_program_of_a_catkin_space_is_run(master, tmp_path, monkeypatch, space
     if space == 'install':
         write(prefix / 'share' / 'fake_robot' / 'package.xml', MANIFEST % 'fake_robot')
     monkeypatch.setenv('CMAKE_PREFIX_PATH', str(prefix))
-    monkeypatch.setenv('ROS_PACKAGE_PATH', str(tmp_path / 'src' if space == 'devel' else prefix / 'share'))
+    monkeypatch.setenv(
+        'ROS_PACKAGE_PATH', str(tmp_path / 'src' if space == 'devel' else prefix / 'share')
+    )
     with master.run('fake_robot', 'tell') as process:
         assert process.wait(TIMEOUT) == 0
         assert process.output == str(prefix / 'lib' / 'fake_robot' / 'tell')
@@ -77,15 +81,20 @@ def test_a_program_of_a_catkin_space_is_run(master, tmp_path, monkeypatch, space
 
 def test_a_program_of_debians_is_run_though_it_has_no_manifest(master):
     with master.run('topic_tools', 'relay', '/untyped', '/b', name='passes_on'):
-        while '/passes_on' not in master.topic('/untyped').subscribers:    # then it heeds Ctrl-C
+        while '/passes_on' not in master.topic('/untyped').subscribers:  # then it heeds Ctrl-C
             threading.Event().wait(0.01)
-        assert master.node('/passes_on').subscriptions == {'/untyped': None}    # a master never forgets a type
+        # a master never forgets a type
+        assert master.node('/passes_on').subscriptions == {'/untyped': None}
 
 
 def test_an_unknown_package_or_program_is_said(master, package):
-    with pytest.raises(UnknownNodeError, match="no ROS package 'no_such_robot' on ROS_PACKAGE_PATH"):
+    with pytest.raises(
+        UnknownNodeError, match="no ROS package 'no_such_robot' on ROS_PACKAGE_PATH"
+    ):
         master.run('no_such_robot', 'talker')
-    with pytest.raises(UnknownNodeError, match="fake_robot has no program 'listener'.*rosrun fake_robot <Tab>"):
+    with pytest.raises(
+        UnknownNodeError, match="fake_robot has no program 'listener'.*rosrun fake_robot <Tab>"
+    ):
         master.run('fake_robot', 'listener')
     with pytest.raises(UnknownNodeError, match="topic_tools has no program 'relai'"):
         master.run('topic_tools', 'relai')
@@ -95,12 +104,17 @@ def test_an_unknown_package_or_program_is_said(master, package):
         master.launch('fake_robot', 'b.launch')
 
 
-# -- what they are told, and what they tell ----------------------------------------------------------------------------
+# -- what they are told, and what they tell
+
 
 def test_name_remappings_and_parameters_reach_it(master, package):
     mailbox = Mailbox()
-    master.create(BlockNode, named='/listener', delegate=mailbox).interested_in('/said', 'std_msgs/String')
-    with master.run('fake_robot', 'talker', name='robot7', remap={'talk': '/said'}, params={'text': 'two words'}):
+    master.create(BlockNode, named='/listener', delegate=mailbox).interested_in(
+        '/said', 'std_msgs/String'
+    )
+    with master.run(
+        'fake_robot', 'talker', name='robot7', remap={'talk': '/said'}, params={'text': 'two words'}
+    ):
         assert mailbox.get().data == 'two words'
         assert master.wait_for_node('/robot7', TIMEOUT).publications['/said'] == 'std_msgs/String'
         assert master.parameters.pop('/robot7/text') == 'two words'
@@ -123,16 +137,21 @@ def test_it_runs_at_this_master(master, package):
 def test_each_line_goes_to_the_block_as_it_is_printed(master, package):
     lines = queue.SimpleQueue()
     with master.run('fake_robot', 'talker', on_line=lines.put):
-        assert lines.get(timeout=TIMEOUT) == '/talker talks'    # while it runs on: not held back for a full block
+        # while it runs on: not held back for a full block
+        assert lines.get(timeout=TIMEOUT) == '/talker talks'
 
 
 def test_lines_go_to_a_nodes_log(master, package):
     mailbox = Mailbox()
-    master.create(BlockNode, named='/listener', delegate=mailbox).interested_in('/rosout', 'rosgraph_msgs/Log')
+    master.create(BlockNode, named='/listener', delegate=mailbox).interested_in(
+        '/rosout', 'rosgraph_msgs/Log'
+    )
     node = master.create(BlockNode, named='/starter')
     while not node._rospy.publisher('/rosout').get_num_connections():
         node._rospy.ended.wait(0.01)
-    with master.run('fake_robot', program(package, 'grumble', 'echo first; echo second >&2'), on_line=node.log):
+    with master.run(
+        'fake_robot', program(package, 'grumble', 'echo first; echo second >&2'), on_line=node.log
+    ):
         assert take(mailbox, '/starter', 2) == ['first', 'second']
 
 
@@ -149,7 +168,10 @@ def take(mailbox, name, count):
 def test_a_block_that_raises_does_not_end_the_program_or_its_output(master, package, transcript):
     def stumble(line):
         raise RuntimeError('stumbled over ' + line)
-    with master.run('fake_robot', program(package, 'two', 'echo one; echo two'), on_line=stumble) as process:
+
+    with master.run(
+        'fake_robot', program(package, 'two', 'echo one; echo two'), on_line=stumble
+    ) as process:
         assert process.wait(TIMEOUT) == 0
         assert process.output == 'one\ntwo'
     assert len(transcript) == 2 and 'RuntimeError: stumbled over one' in transcript[0]
@@ -166,12 +188,12 @@ def test_its_exit_status_is_told(master, package):
         with pytest.raises(subprocess.TimeoutExpired):
             process.wait(0.01)
         assert process.terminate() == -signal.SIGINT
-        assert process.terminate() == -signal.SIGINT    # harmless
+        assert process.terminate() == -signal.SIGINT  # harmless
 
 
 def test_a_roscpp_node_unregisters_when_it_is_ended(master):
     with master.run('topic_tools', 'relay', '/untyped', '/b', name='passes_on'):
-        while '/passes_on' not in master.topic('/untyped').subscribers:    # then it heeds Ctrl-C
+        while '/passes_on' not in master.topic('/untyped').subscribers:  # then it heeds Ctrl-C
             threading.Event().wait(0.01)
     with pytest.raises(UnknownNodeError):
         master.node('/passes_on')
@@ -206,7 +228,9 @@ def names_registered(master):
     return {name for kind in master.system_state() for names in kind.values() for name in names}
 
 
-@pytest.mark.parametrize('obeys', ['not rospy.is_shutdown()', 'True'], ids=['obeys ROS', 'obeys nobody'])
+@pytest.mark.parametrize(
+    'obeys', ['not rospy.is_shutdown()', 'True'], ids=['obeys ROS', 'obeys nobody']
+)
 @pytest.mark.parametrize('handler', ['SIG_DFL', 'SIG_IGN'])
 def test_nothing_of_a_node_without_handlers_stays_registered(master, package, handler, obeys):
     """As turtlesim: it ends at a signal without unregistering."""
@@ -227,8 +251,21 @@ def test_a_roscpp_node_without_handlers_is_ended_through_ros(master, package, tm
         pytest.skip('needs g++ and the headers of roscpp')
     source, robot = tmp_path / 'robot.cpp', package / 'scripts' / 'robot'
     source.write_text(NO_HANDLER_IN_ROSCPP)
-    subprocess.run(['g++', '-O0', source, '-o', robot, '-lroscpp', '-lrosconsole', '-lrostime',
-                    '-lroscpp_serialization', '-lpthread'], check=True)
+    subprocess.run(
+        [
+            'g++',
+            '-O0',
+            source,
+            '-o',
+            robot,
+            '-lroscpp',
+            '-lrosconsole',
+            '-lrostime',
+            '-lroscpp_serialization',
+            '-lpthread',
+        ],
+        check=True,
+    )
     lines = queue.SimpleQueue()
     process = master.run('fake_robot', 'robot', on_line=lines.put)
     assert lines.get(timeout=TIMEOUT) == 'up'
@@ -239,8 +276,11 @@ def test_a_roscpp_node_without_handlers_is_ended_through_ros(master, package, tm
 
 def test_the_nodes_of_a_launch_file_are_ended_through_ros(master, package):
     write(package / 'scripts' / 'robot', NO_HANDLER % ('SIG_DFL', 'not rospy.is_shutdown()'), 0o755)
-    write(package / 'robots.launch', """<launch><node name="a" pkg="fake_robot" type="robot" />
-        <node name="b" pkg="fake_robot" type="robot" respawn="true" /></launch>""")
+    write(
+        package / 'robots.launch',
+        """<launch><node name="a" pkg="fake_robot" type="robot" />
+        <node name="b" pkg="fake_robot" type="robot" respawn="true" /></launch>""",
+    )
     process = master.launch('fake_robot', 'robots.launch')
     for name in '/a', '/b':
         master.wait_for_node(name, TIMEOUT)
@@ -255,7 +295,9 @@ def test_a_node_registered_with_a_port_that_cannot_be_keeps_no_program_from_endi
         process = master.run('topic_tools', 'relay', '/untyped', '/b', name='passes_on')
         master.wait_for_node('/passes_on', TIMEOUT)
         process.terminate()
-        assert names_registered(master) >= {'/liar'} and '/passes_on' not in names_registered(master)
+        assert names_registered(master) >= {'/liar'} and '/passes_on' not in names_registered(
+            master
+        )
     finally:
         liar.unregisterPublisher('/lies', uri)
 
@@ -275,7 +317,7 @@ def test_a_node_that_is_registered_and_dead_is_not_waited_for_in_vain(master, pa
     for _ in range(2):
         process = master.run('fake_robot', 'robot')
         node = master.wait_for_node('/robot', TIMEOUT)
-        assert node.pid == process.pid    # and not the one before
+        assert node.pid == process.pid  # and not the one before
         os.kill(process.pid, signal.SIGKILL)
         process.wait(TIMEOUT)
     with pytest.raises(UnknownNodeError, match='/robot'):
@@ -285,19 +327,27 @@ def test_a_node_that_is_registered_and_dead_is_not_waited_for_in_vain(master, pa
 
 def test_a_program_that_ignores_ctrl_c_is_terminated(master, package):
     lines = queue.SimpleQueue()
-    deaf = program(package, 'deaf', 'trap "" INT; trap "exit 5" TERM; echo up; while :; do sleep 0.1; done')
+    deaf = program(
+        package, 'deaf', 'trap "" INT; trap "exit 5" TERM; echo up; while :; do sleep 0.1; done'
+    )
     process = master.run('fake_robot', deaf, on_line=lines.put)
     lines.get(timeout=TIMEOUT)
     assert process.terminate(timeout=1) == 5
 
 
-# -- the end -----------------------------------------------------------------------------------------------------------
+# -- the end
 
-@pytest.mark.parametrize('how', ['sleep 1000 & echo $!; wait',
-                                 'setsid sleep 1000 & echo $!; wait',
-                                 'trap "" INT TERM; sh -c "trap \'\' INT TERM; echo \\$\\$; while :; do sleep 1; done"',
-                                 'sleep 1000 </dev/null >/dev/null 2>&1 & echo $!; exit'],
-                         ids=['a child', 'a child with a session', 'both ignore the signals', 'left behind'])
+
+@pytest.mark.parametrize(
+    'how',
+    [
+        'sleep 1000 & echo $!; wait',
+        'setsid sleep 1000 & echo $!; wait',
+        'trap "" INT TERM; sh -c "trap \'\' INT TERM; echo \\$\\$; while :; do sleep 1; done"',
+        'sleep 1000 </dev/null >/dev/null 2>&1 & echo $!; exit',
+    ],
+    ids=['a child', 'a child with a session', 'both ignore the signals', 'left behind'],
+)
 def test_what_it_has_started_ends_with_it(master, package, how):
     lines = queue.SimpleQueue()
     process = master.run('fake_robot', program(package, 'parent', how), on_line=lines.put)
@@ -306,18 +356,21 @@ def test_what_it_has_started_ends_with_it(master, package, how):
     assert wait_for_end(child, TIMEOUT)
 
 
-@pytest.mark.parametrize('end', ['', 'raise RuntimeError', 'os.kill(os.getpid(), signal.SIGTERM)'],
-                         ids=['end', 'exception', 'SIGTERM'])
+@pytest.mark.parametrize(
+    'end',
+    ['', 'raise RuntimeError', 'os.kill(os.getpid(), signal.SIGTERM)'],
+    ids=['end', 'exception', 'SIGTERM'],
+)
 def test_nothing_is_left_behind_when_the_program_ends(master, package, end):
-    code = """
+    code = f"""
 import os, queue, signal
 from pharos import BlockNode, Master
 Master().create(BlockNode, named='/n')
 lines = queue.SimpleQueue()
-process = Master().run('fake_robot', %r, on_line=lines.put)
-print('PIDS', process.pid, lines.get(), flush=True)
-%s
-""" % (program(package, 'parent', 'sleep 1000 & echo $!; wait'), end)
+process = Master().run('fake_robot', {program(package, 'parent', 'sleep 1000 & echo $!; wait')!r},
+on_line=lines.put) print('PIDS', process.pid, lines.get(), flush=True)
+{end}
+"""
     with Program(master.url, sys.executable, '-c', code) as started:
         pids = started.wait_for('PIDS').split()[1:]
         started.process.wait(TIMEOUT)
@@ -334,7 +387,13 @@ process = Master().run('fake_robot', %r, on_line=lines.put)
 print('PIDS', process.pid, lines.get(), flush=True)
 threading.Thread(target=lambda: print(lines.get(), flush=True), daemon=True).start()
 process.terminate(timeout=4)
-""" % (program(package, 'deaf', 'trap "echo heard" INT; trap "" TERM; echo $$; while :; do sleep 0.1; done'))
+""" % (
+        program(
+            package,
+            'deaf',
+            'trap "echo heard" INT; trap "" TERM; echo $$; while :; do sleep 0.1; done',
+        )
+    )
     with Program(master.url, sys.executable, '-c', code) as started:
         pids = started.wait_for('PIDS').split()[1:]
         started.wait_for('heard')
@@ -345,8 +404,11 @@ process.terminate(timeout=4)
 
 def test_a_program_may_be_ended_by_the_block_for_its_output(master, package):
     ended = queue.SimpleQueue()
-    process = master.run('fake_robot', program(package, 'talks', 'echo enough; sleep 1000'),
-                         on_line=lambda text: ended.put((process.terminate(), process.wait())))
+    process = master.run(
+        'fake_robot',
+        program(package, 'talks', 'echo enough; sleep 1000'),
+        on_line=lambda text: ended.put((process.terminate(), process.wait())),
+    )
     assert ended.get(timeout=TIMEOUT) == (-signal.SIGINT, -signal.SIGINT)
 
 
@@ -354,24 +416,29 @@ def test_a_program_that_ended_long_ago_is_not_signalled_again(master, package, m
     with master.run('fake_robot', program(package, 'ends', 'exit 0')) as process:
         process.wait(TIMEOUT)
         process._reader.join(TIMEOUT)
-        monkeypatch.setattr(os, 'killpg', None)    # its number may be another's by now
+        monkeypatch.setattr(os, 'killpg', None)  # its number may be another's by now
 
 
-# -- launch files ------------------------------------------------------------------------------------------------------
+# -- launch files
 
 LAUNCH = """<launch>
   <arg name="who" /><arg name="text" default="hello" />
-  <node name="$(arg who)" pkg="fake_robot" type="talker" output="screen"><param name="text" value="$(arg text)" /></node>
-  <node name="second" pkg="fake_robot" type="talker"><remap from="talk" to="talk2" /></node>
+  <node name="$(arg who)" pkg="fake_robot" type="talker" output="screen"><param name="text"
+  value="$(arg text)" /></node> <node name="second" pkg="fake_robot" type="talker"><remap
+  from="talk" to="talk2" /></node>
 </launch>"""
 
 
 def test_a_launch_file_is_started_and_ended_with_all_its_nodes(master, package):
     write(package / 'launch' / 'robot.launch', LAUNCH)
     mailbox = Mailbox()
-    master.create(BlockNode, named='/listener', delegate=mailbox).interested_in('/talk', 'std_msgs/String')
+    master.create(BlockNode, named='/listener', delegate=mailbox).interested_in(
+        '/talk', 'std_msgs/String'
+    )
     lines = queue.SimpleQueue()
-    with master.launch('fake_robot', 'robot.launch', on_line=lines.put, who='robot7', text='two words') as process:
+    with master.launch(
+        'fake_robot', 'robot.launch', on_line=lines.put, who='robot7', text='two words'
+    ) as process:
         assert mailbox.get().data == 'two words'
         nodes = [master.wait_for_node(name, TIMEOUT) for name in ('/robot7', '/second')]
         pids = [node.pid for node in nodes]
@@ -391,12 +458,18 @@ def test_what_a_launch_file_cannot_do_is_told(master, package):
 
 
 def test_launched_nodes_that_ignore_the_end_are_ended(master, package):
-    program(package, 'stubborn', 'trap "" INT TERM; echo "stubborn pid $$"; while :; do sleep 1; done')
-    write(package / 'stubborn.launch', '<launch><node name="s" pkg="fake_robot" type="stubborn" output="screen"/></launch>')
+    program(
+        package, 'stubborn', 'trap "" INT TERM; echo "stubborn pid $$"; while :; do sleep 1; done'
+    )
+    write(
+        package / 'stubborn.launch',
+        '<launch><node name="s" pkg="fake_robot" type="stubborn" output="screen"/></launch>',
+    )
     lines = queue.SimpleQueue()
     process = master.launch('fake_robot', 'stubborn.launch', on_line=lines.put)
     told = None
-    while not told:    # not at the beginning of the line: roslaunch sets the terminal's title, without a line's end
+    # not at the beginning of the line: roslaunch sets the terminal's title, without a line's end
+    while not told:
         told = re.search(r'stubborn pid (\d+)', lines.get(timeout=TIMEOUT))
     process.terminate(timeout=0.2)
     assert wait_for_end(int(told.group(1)), TIMEOUT)

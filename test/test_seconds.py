@@ -15,14 +15,18 @@ WAITS = {
     'wait': lambda node, seconds: node.master.wait(seconds),
     'wait_for_node': lambda node, seconds: node.master.wait_for_node('/nobody', seconds),
     'wait_for_subscribers': lambda node, seconds: node.output_channel(
-        '/seconds', 'std_msgs/Empty').wait_for_subscribers(timeout=seconds),
-    'call': lambda node, seconds: node.master.lookup_service('/waiting/get_loggers').call(timeout=seconds),
+        '/seconds', 'std_msgs/Empty'
+    ).wait_for_subscribers(timeout=seconds),
+    'call': lambda node, seconds: node.master.lookup_service('/waiting/get_loggers').call(
+        timeout=seconds
+    ),
     'sleep': lambda node, seconds: node.sleep(seconds),
     'every': lambda node, seconds: node.every(seconds),
     'interested_in': lambda node, seconds: node.interested_in('/seconds_of_nobody', wait=seconds),
     'send_to': lambda node, seconds: node.send_to('/seconds_of_nobody', wait=seconds),
-    'connect_timeout': lambda node, seconds: node.send_to('/seconds', typed_as='std_msgs/Empty',
-                                                          connect_timeout=seconds),
+    'connect_timeout': lambda node, seconds: node.send_to(
+        '/seconds', typed_as='std_msgs/Empty', connect_timeout=seconds
+    ),
 }
 
 
@@ -38,9 +42,20 @@ def test_what_is_no_number_of_seconds_is_refused(node, wait, seconds):
         wait(node, seconds)
 
 
-@pytest.mark.parametrize('seconds, expected', [
-    (math.inf, LONGEST), (1e300, LONGEST), (10 ** 400, LONGEST), (-math.inf, None), (-10 ** 400, -LONGEST), (True, 1),
-    (0.5, 0.5), (genpy.Duration(1, 500000000), 1.5)], ids=repr)
+@pytest.mark.parametrize(
+    'seconds, expected',
+    [
+        (math.inf, LONGEST),
+        (1e300, LONGEST),
+        (10**400, LONGEST),
+        (-math.inf, None),
+        (-(10**400), -LONGEST),
+        (True, 1),
+        (0.5, 0.5),
+        (genpy.Duration(1, 500000000), 1.5),
+    ],
+    ids=repr,
+)
 def test_more_seconds_than_anything_can_wait_are_as_many_as_it_can(seconds, expected):
     if expected is None:
         with pytest.raises(ValueError):
@@ -49,7 +64,7 @@ def test_more_seconds_than_anything_can_wait_are_as_many_as_it_can(seconds, expe
         assert check_seconds('timeout', seconds) == expected
 
 
-@pytest.mark.parametrize('seconds', [math.inf, 1e300, 10 ** 400], ids=repr)
+@pytest.mark.parametrize('seconds', [math.inf, 1e300, 10**400], ids=repr)
 def test_a_wait_without_end_ends_with_what_is_waited_for(master, node, seconds):
     assert master.wait(seconds) is master
     assert master.wait_for_node('/waiting', seconds) is node
@@ -67,6 +82,7 @@ def test_a_sleep_without_end_ends_with_the_node(node, seconds):
     def soul(me):
         asleep.set()
         me.sleep(seconds)
+
     thread = node.fork(soul)
     assert asleep.wait(TIMEOUT)
     node.stop()

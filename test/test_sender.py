@@ -1,4 +1,5 @@
-"""The way of messages into the socket of one subscriber: whole, in order, and never waiting for the reader."""
+"""The way of messages into the socket of one subscriber: whole, in order, and never waiting for the
+reader."""
 import itertools
 import socket
 import struct
@@ -12,8 +13,11 @@ from pharos.private_rospy.host import rospy
 from pharos.private_rospy.sender import AT_ONCE, Sender
 from programs import until
 
-SIZES = strategies.one_of(strategies.integers(0, 2000), strategies.integers(AT_ONCE - 9, AT_ONCE + 9),
-                          strategies.integers(0, 4 * AT_ONCE))
+SIZES = strategies.one_of(
+    strategies.integers(0, 2000),
+    strategies.integers(AT_ONCE - 9, AT_ONCE + 9),
+    strategies.integers(0, 4 * AT_ONCE),
+)
 
 
 class Link:
@@ -95,12 +99,12 @@ def test_of_what_is_not_read_the_newest_are_kept(sizes, queue_size):
         read = [link.read()]
         while read[-1] != len(sizes):
             read.append(link.read())
-        assert read == sorted(set(read)) and read[-len(newest):] == newest
+        assert read == sorted(set(read)) and read[-len(newest) :] == newest
 
 
 def test_a_small_message_is_sent_by_its_publisher():
     with Link() as link:
-        link.transport.write_data = None    # the thread's way
+        link.transport.write_data = None  # the thread's way
         link.write(1000)
         assert link.read() == 0 and link.transport.stat_num_msg == 1
 
@@ -108,7 +112,7 @@ def test_a_small_message_is_sent_by_its_publisher():
 def test_flush_waits_until_the_socket_has_everything():
     with Link() as link:
         link.write(4 * AT_ONCE)
-        link.sender.flush(0.0)    # and gives up at its time limit
+        link.sender.flush(0.0)  # and gives up at its time limit
         reader = threading.Thread(target=link.read)
         reader.start()
         link.sender.flush(TIMEOUT)
@@ -120,11 +124,13 @@ def test_flush_waits_until_the_socket_has_everything():
 def test_who_publishes_after_the_link_broke_is_told(size):
     before = senders()
     with Link() as link:
+
         def is_told():
             try:
                 link.write(size)
             except (OSError, rospy.exceptions.TransportException):
                 return True
+
         link.leave()
         until(is_told)
     until(lambda: senders() <= before, 'the end of the thread')

@@ -15,8 +15,8 @@ from pharos import BlockNode
 from pharos.private_rospy.host import rospy
 from programs import run
 
-SPAWN = 'turtlesim/Spawn'        # x, y, theta, name -> name
-SET_BOOL = 'std_srvs/SetBool'    # data -> success, message
+SPAWN = 'turtlesim/Spawn'  # x, y, theta, name -> name
+SET_BOOL = 'std_srvs/SetBool'  # data -> success, message
 SET_BOOL_MD5SUM = std_srvs.srv.SetBool._md5sum
 
 
@@ -39,15 +39,22 @@ def call_through_tcp(master, service, /, **fields):
 both_ways = pytest.mark.parametrize('call', [call_here, call_through_tcp], ids=['here', 'tcp'])
 
 
-# -- offered -----------------------------------------------------------------------------------------------------------
+# -- offered
+
 
 @both_ways
-@pytest.mark.parametrize('block', [
-    lambda request: pharos.service_class(SET_BOOL)._response_class(success=request.data, message='done'),
-    lambda request: {'success': request.data, 'message': 'done'},
-    lambda request: (request.data, 'done'),
-    lambda request: [request.data, 'done'],
-], ids=['a response', 'a dict', 'a tuple', 'a list'])
+@pytest.mark.parametrize(
+    'block',
+    [
+        lambda request: pharos.service_class(SET_BOOL)._response_class(
+            success=request.data, message='done'
+        ),
+        lambda request: {'success': request.data, 'message': 'done'},
+        lambda request: (request.data, 'done'),
+        lambda request: [request.data, 'done'],
+    ],
+    ids=['a response', 'a dict', 'a tuple', 'a list'],
+)
 def test_a_block_returns_a_response_or_its_fields(master, call, block):
     create(master).serve('/set', SET_BOOL, block)
     response = call(master, '/set', data=True)
@@ -55,11 +62,15 @@ def test_a_block_returns_a_response_or_its_fields(master, call, block):
 
 
 @both_ways
-@pytest.mark.parametrize('block', [
-    lambda request: request.name + '!',
-    lambda request: {'name': request.name + '!'},
-    lambda request: (request.name + '!',),
-], ids=['the field', 'a dict', 'a tuple'])
+@pytest.mark.parametrize(
+    'block',
+    [
+        lambda request: request.name + '!',
+        lambda request: {'name': request.name + '!'},
+        lambda request: (request.name + '!',),
+    ],
+    ids=['the field', 'a dict', 'a tuple'],
+)
 def test_a_block_returns_the_only_field(master, call, block):
     create(master).serve('/spawn', SPAWN, block)
     assert call(master, '/spawn', name='bob').name == 'bob!'
@@ -88,21 +99,25 @@ def test_the_block_gets_the_request(master, call):
     got = []
     create(master).serve('/spawn', SPAWN, lambda request: got.append(request) or '')
     call(master, '/spawn', x=1.0, y=2, name='bob')
-    request, = got
+    (request,) = got
     assert (request.x, request.y, request.theta, request.name) == (1.0, 2.0, 0.0, 'bob')
     assert request._connection_header['callerid'] == '/caller'
 
 
 @both_ways
-@pytest.mark.parametrize('value, said', [
-    (None, r'must return .* its fields \(success: bool, message: string\); it returned None'),
-    (True, r'must return a response, a dict, tuple or list of its fields .* it returned True'),
-    ((True,), r'must return a response, .* it returned \(True,\)'),
-    ((7, 7), r'SetBoolResponse.message = 7 does not fit string'),
-    ({'ok': True}, r'SetBoolResponse has no field .ok.'),
-    ({'message': 7}, r'SetBoolResponse.message = 7 does not fit string'),
-    (std_srvs.srv.EmptyResponse(), 'must return a response'),
-], ids=repr)
+@pytest.mark.parametrize(
+    'value, said',
+    [
+        (None, r'must return .* its fields \(success: bool, message: string\); it returned None'),
+        (True, r'must return a response, a dict, tuple or list of its fields .* it returned True'),
+        ((True,), r'must return a response, .* it returned \(True,\)'),
+        ((7, 7), r'SetBoolResponse.message = 7 does not fit string'),
+        ({'ok': True}, r'SetBoolResponse has no field .ok.'),
+        ({'message': 7}, r'SetBoolResponse.message = 7 does not fit string'),
+        (std_srvs.srv.EmptyResponse(), 'must return a response'),
+    ],
+    ids=repr,
+)
 def test_what_does_not_fit_is_an_error_at_both_ends(master, transcript, call, value, said):
     node = create(master)
     node.serve('/set', SET_BOOL, lambda request: value)
@@ -117,16 +132,20 @@ def test_what_does_not_fit_is_an_error_at_both_ends(master, transcript, call, va
 def test_an_exception_in_the_block_reaches_the_caller(master, transcript, call):
     node = create(master)
     offered = node.serve('/spawn', SPAWN, no_room)
-    with pytest.raises((pharos.ServiceCallError, rospy.ServiceException), match='RuntimeError: no room for bob'):
+    with pytest.raises(
+        (pharos.ServiceCallError, rospy.ServiceException), match='RuntimeError: no room for bob'
+    ):
         call(master, '/spawn', name='bob')
     assert [str(error) for error in node.errors] == ['no room for bob']
-    assert transcript == ['service /spawn no_room of /provider raised RuntimeError: no room for bob']
-    offered.block = lambda request: 'room again'    # the node goes on
+    assert transcript == [
+        'service /spawn no_room of /provider raised RuntimeError: no room for bob'
+    ]
+    offered.block = lambda request: 'room again'  # the node goes on
     assert call(master, '/spawn').name == 'room again'
 
 
 def no_room(request):
-    raise RuntimeError('no room for %s' % request.name)
+    raise RuntimeError(f'no room for {request.name}')
 
 
 def test_a_failed_call_is_a_service_call_error(master, transcript):
@@ -143,13 +162,20 @@ def test_rosservice_knows_an_offered_service(master):
     assert '/set' in run(master.url, 'rosservice', 'list').stdout.split()
     assert run(master.url, 'rosservice', 'type', '/set').stdout.strip() == SET_BOOL
     assert run(master.url, 'rosservice', 'info', '/set').stdout.splitlines() == [
-        'Node: /provider', 'URI: rosrpc://127.0.0.1:%d' % node.tcp_port, 'Type: ' + SET_BOOL, 'Args: data']
+        'Node: /provider',
+        'URI: rosrpc://127.0.0.1:%d' % node.tcp_port,
+        'Type: ' + SET_BOOL,
+        'Args: data',
+    ]
 
 
 def test_rosservice_calls_an_offered_service(master, transcript):
     node = create(master)
     node.serve('/set', SET_BOOL, lambda request: {'success': request.data, 'message': 'done'})
-    assert run(master.url, 'rosservice', 'call', '/set', 'true').stdout == 'success: True\nmessage: "done"\n'
+    assert (
+        run(master.url, 'rosservice', 'call', '/set', 'true').stdout
+        == 'success: True\nmessage: "done"\n'
+    )
     node.serve('/fail', 'std_srvs/Empty', lambda request: 1 / 0)
     failed = run(master.url, 'rosservice', 'call', '/fail')
     assert failed.returncode and 'division by zero' in failed.stderr
@@ -164,20 +190,25 @@ def test_close_ends_the_offer(master):
     assert '/clear' not in master.services() and '/provider/get_loggers' in master.services()
     with pytest.raises((pharos.ServiceCallError, pharos.UnknownServiceError), match='/clear'):
         service.call(timeout=TIMEOUT)
-    node.serve('/clear', 'std_srvs/Empty', lambda request: None).close()    # the name is free
+    node.serve('/clear', 'std_srvs/Empty', lambda request: None).close()  # the name is free
 
 
 def test_a_node_offers_a_name_once(master):
     node = create(master)
     node.serve('/clear', 'std_srvs/Empty', lambda request: None)
-    with pytest.raises(pharos.PharosError, match='/provider offers /clear already: close that one first'):
+    with pytest.raises(
+        pharos.PharosError, match='/provider offers /clear already: close that one first'
+    ):
         node.serve('/clear', SET_BOOL, lambda request: None)
     assert call_here(master, '/clear') == std_srvs.srv.EmptyResponse()
 
 
 def test_names_are_resolved_in_the_nodes_namespace(master):
     node = create(master, '/robot1/driver')
-    names = [node.serve(name, 'std_srvs/Empty', lambda request: None).name for name in ('~halt', 'stop', '/all')]
+    names = [
+        node.serve(name, 'std_srvs/Empty', lambda request: None).name
+        for name in ('~halt', 'stop', '/all')
+    ]
     assert names == ['/robot1/driver/halt', '/robot1/stop', '/all']
     assert set(names) <= set(master.services())
     remapped = create(master, '/other', argv=['stop:=/elsewhere'])
@@ -192,7 +223,9 @@ def test_a_service_needs_a_block_of_one_argument(master, block):
 
 
 def test_an_unknown_service_type(master):
-    with pytest.raises(pharos.UnknownTypeError, match="unknown service type 'std_srvs/Emty'.*did you mean"):
+    with pytest.raises(
+        pharos.UnknownTypeError, match="unknown service type 'std_srvs/Emty'.*did you mean"
+    ):
         create(master).serve('/clear', 'std_srvs/Emty', lambda request: None)
     assert '/clear' not in master.services()
 
@@ -207,16 +240,19 @@ def test_services_come_back_with_their_node(master):
         with pytest.raises((pharos.ServiceCallError, pharos.UnknownServiceError), match='/spawn'):
             service.call(name='nobody', timeout=TIMEOUT)
         node.start()
-        assert service.call(name=name).name == name    # the same address again
+        assert service.call(name=name).name == name  # the same address again
         assert call_through_tcp(master, '/spawn', name=name).name == name
 
 
-def test_a_service_is_the_newest_nodes_that_offers_it_and_the_olders_again_when_that_has_gone(master):
+def test_a_service_is_the_newest_nodes_that_offers_it_and_the_olders_again_when_that_has_gone(
+    master,
+):
     def look_again():
         for node in newer, older:
             if node.is_running:
-                node._rospy.repair(master.system_state(), False)    # as the watcher does every second
+                node._rospy.repair(master.system_state(), False)  # as the watcher does every second
         return call_here(master, '/taken').message
+
     older, newer = create(master, '/older'), create(master, '/newer')
     for node in older, newer:
         node.serve('/taken', SET_BOOL, lambda request, name=node.name: {'message': name})
@@ -233,22 +269,28 @@ def test_a_closed_service_does_not_come_back(master):
     assert '/clear' not in master.services()
 
 
-# -- called ------------------------------------------------------------------------------------------------------------
+# -- called
+
 
 def test_a_name_is_enough(master):
     create(master).serve('/spawn', SPAWN, lambda request: request.name)
     service = master.lookup_service('/spawn', '/me')
     assert (service.name, service.caller_id, service.type) == ('/spawn', '/me', SPAWN)
-    assert service.md5sum == '0b2d2e872a8e2887d5ed626f2bf2c561' and service.uri.startswith('rosrpc://127.0.0.1:')
+    assert service.md5sum == '0b2d2e872a8e2887d5ed626f2bf2c561' and service.uri.startswith(
+        'rosrpc://127.0.0.1:'
+    )
     assert service.response is None
     assert service.call(name='bob') is service.response
 
 
 def test_a_block_and_keywords_fill_the_request(master):
-    create(master).serve('/spawn', SPAWN, lambda request: '%g %g %s' % (request.x, request.y, request.name))
+    create(master).serve(
+        '/spawn', SPAWN, lambda request: f'{request.x:g} {request.y:g} {request.name}'
+    )
 
     def fill(request):
         request.x, request.y = 1.0, 2.0
+
     service = master.lookup_service('/spawn')
     assert service.call(fill).name == '1 2 '
     assert service.call(fill, y=3.0, name='bob').name == '1 3 bob'
@@ -256,8 +298,11 @@ def test_a_block_and_keywords_fill_the_request(master):
 
 def test_an_unknown_service_names_the_near_ones(master):
     create(master).serve('/turtle1/teleport', 'std_srvs/Empty', lambda request: None)
-    with pytest.raises(pharos.UnknownServiceError, match='offers the service /turtle1/telport.*did you mean '
-                                                         '/turtle1/teleport: see rosservice list'):
+    with pytest.raises(
+        pharos.UnknownServiceError,
+        match='offers the service /turtle1/telport.*did you mean '
+        '/turtle1/teleport: see rosservice list',
+    ):
         master.lookup_service('/turtle1/telport')
 
 
@@ -267,7 +312,9 @@ def test_a_service_of_nobody_that_answers(master):
         dead = 'rosrpc://127.0.0.1:%d' % sock.getsockname()[1]
     master._api('/dead').registerService('/dead/clear', dead, 'http://127.0.0.1:1/')
     try:
-        with pytest.raises(pharos.ServiceCallError, match='provider of /dead/clear at %s does not answer' % dead):
+        with pytest.raises(
+            pharos.ServiceCallError, match=f'provider of /dead/clear at {dead} does not answer'
+        ):
             master.lookup_service('/dead/clear')
     finally:
         master._api('/dead').unregisterService('/dead/clear', dead)
@@ -278,24 +325,45 @@ def test_an_md5sum_by_hand_is_what_is_sent(master):
     service = master.lookup_service('/set')
     service.md5sum = SET_BOOL_MD5SUM
     assert service.call().success
-    service.md5sum = '*'    # ROS's own for "whatever it is"
+    service.md5sum = '*'  # ROS's own for "whatever it is"
     assert service.call().success
-    service.md5sum = 'd41d8cd98f00b204e9800998ecf8427e'    # std_srvs/Empty
+    service.md5sum = 'd41d8cd98f00b204e9800998ecf8427e'  # std_srvs/Empty
     with pytest.raises(pharos.ServiceTypeError) as error:
         service.call()
-    for said in ('/set', SET_BOOL, service.md5sum, SET_BOOL_MD5SUM, 'request: data: bool',
-                 'response: success: bool, message: string'):
+    for said in (
+        '/set',
+        SET_BOOL,
+        service.md5sum,
+        SET_BOOL_MD5SUM,
+        'request: data: bool',
+        'response: success: bool, message: string',
+    ):
         assert said in str(error.value)
     service.md5sum = SET_BOOL_MD5SUM
     assert service.call().success
 
 
-@pytest.mark.parametrize('block, fields, said', [
-    (None, {'nam': 'bob'}, 'turtlesim/SpawnRequest has no field .nam. .*did you mean .name.'),
-    (None, {'x': 'far'}, 'turtlesim/SpawnRequest.x = .far. does not fit float32: give a number'),
-    (lambda request: setattr(request, 'x', 'far'), {}, 'turtlesim/SpawnRequest.x = .far. does not fit float32'),
-    (lambda request: setattr(request, 'nam', 'bob'), {}, 'turtlesim/SpawnRequest has no field .nam.'),
-])
+@pytest.mark.parametrize(
+    'block, fields, said',
+    [
+        (None, {'nam': 'bob'}, 'turtlesim/SpawnRequest has no field .nam. .*did you mean .name.'),
+        (
+            None,
+            {'x': 'far'},
+            'turtlesim/SpawnRequest.x = .far. does not fit float32: give a number',
+        ),
+        (
+            lambda request: setattr(request, 'x', 'far'),
+            {},
+            'turtlesim/SpawnRequest.x = .far. does not fit float32',
+        ),
+        (
+            lambda request: setattr(request, 'nam', 'bob'),
+            {},
+            'turtlesim/SpawnRequest has no field .nam.',
+        ),
+    ],
+)
 def test_a_field_that_does_not_exist_or_does_not_fit(master, block, fields, said):
     called = []
     create(master).serve('/spawn', SPAWN, lambda request: called.append(request) or '')
@@ -306,9 +374,14 @@ def test_a_field_that_does_not_exist_or_does_not_fit(master, block, fields, said
 
 def test_calls_of_several_threads_do_not_wait_for_each_other(master):
     together = threading.Barrier(3)
-    create(master).serve('/meet', 'std_srvs/Trigger', lambda request: {'success': together.wait(TIMEOUT) >= 0})
+    create(master).serve(
+        '/meet', 'std_srvs/Trigger', lambda request: {'success': together.wait(TIMEOUT) >= 0}
+    )
     service, answers = master.lookup_service('/meet'), []
-    threads = [threading.Thread(target=lambda: answers.append(service.call().success), daemon=True) for _ in range(3)]
+    threads = [
+        threading.Thread(target=lambda: answers.append(service.call().success), daemon=True)
+        for _ in range(3)
+    ]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -319,14 +392,20 @@ def test_calls_of_several_threads_do_not_wait_for_each_other(master):
 @pytest.mark.parametrize('timeout', [None, TIMEOUT])
 def test_a_service_calls_its_own_node_and_itself(master, timeout):
     def countdown(request):
-        return request.name if len(request.name) > 3 else inner.call(name=request.name + '!', timeout=timeout).name
+        return (
+            request.name
+            if len(request.name) > 3
+            else inner.call(name=request.name + '!', timeout=timeout).name
+        )
+
     node = create(master)
     node.serve('/spawn', SPAWN, countdown)
     inner = master.lookup_service('/spawn')
     assert inner.call(name='', timeout=timeout).name == '!!!!'
 
 
-# -- time limits -------------------------------------------------------------------------------------------------------
+# -- time limits
+
 
 class SilentProvider:
     """A provider at a real address: it tells its type, accepts a call, and never answers it."""
@@ -346,9 +425,16 @@ class SilentProvider:
                 connection = self._listening.accept()[0]
                 self._taken.append(connection)
                 header = rosgraph.network.read_ros_handshake_header(connection, io.BytesIO(), 4096)
-                rosgraph.network.write_ros_handshake_header(connection, {
-                    'callerid': '/silent', 'type': SPAWN, 'md5sum': '0b2d2e872a8e2887d5ed626f2bf2c561',
-                    'request_type': SPAWN + 'Request', 'response_type': SPAWN + 'Response'})
+                rosgraph.network.write_ros_handshake_header(
+                    connection,
+                    {
+                        'callerid': '/silent',
+                        'type': SPAWN,
+                        'md5sum': '0b2d2e872a8e2887d5ed626f2bf2c561',
+                        'request_type': SPAWN + 'Request',
+                        'response_type': SPAWN + 'Response',
+                    },
+                )
                 if header.get('probe') != '1':
                     connection.sendall(self._answer)
 
@@ -387,14 +473,20 @@ def test_a_provider_that_never_answers_is_given_up(master, silent):
     silent._taken.clear()
     before = set(threading.enumerate())
     for _ in range(3):
-        with pytest.raises(pharos.ServiceCallError, match='/silent/spawn did not answer in time.*longer timeout='):
+        with pytest.raises(
+            pharos.ServiceCallError, match='/silent/spawn did not answer in time.*longer timeout='
+        ):
             service.call(timeout=0.05)
     assert silent.callers_gone() and service.response is None
     assert set(threading.enumerate()) <= before
 
 
-@pytest.mark.parametrize('silent', [b'\x01', b'\x01\x08\x00\x00\x00\x04\x00'], indirect=True,
-                         ids=['within the length', 'within the response'])
+@pytest.mark.parametrize(
+    'silent',
+    [b'\x01', b'\x01\x08\x00\x00\x00\x04\x00'],
+    indirect=True,
+    ids=['within the length', 'within the response'],
+)
 def test_a_provider_that_stops_in_the_middle_is_given_up(master, silent):
     with pytest.raises(pharos.ServiceCallError, match='did not answer in time'):
         master.lookup_service('/silent/spawn').call(timeout=0.05)
@@ -422,7 +514,9 @@ def test_a_time_limit_holds_for_a_block_of_this_process(master):
     release.set()
     assert service.call(timeout=TIMEOUT).success
     node.stop()
-    assert [thread.name for thread in threading.enumerate() if thread.name.startswith('/provider')] == []
+    assert [
+        thread.name for thread in threading.enumerate() if thread.name.startswith('/provider')
+    ] == []
 
 
 def test_many_calls_leave_no_descriptor(master):
@@ -432,4 +526,4 @@ def test_many_calls_leave_no_descriptor(master):
     before = descriptors()
     for _ in range(200):
         service.call(timeout=TIMEOUT)
-    assert descriptors() <= before + 5    # the master of the tests is in this process, too
+    assert descriptors() <= before + 5  # the master of the tests is in this process, too

@@ -15,17 +15,20 @@ def create(master, name, **kwargs):
     return master.create(BlockNode, named=name, **{'domain': '127.0.0.1', **kwargs})
 
 
-@pytest.mark.parametrize('named, argv, namespace, name', [
-    ('/driver', None, None, '/driver'),
-    ('driver', None, None, '/driver'),
-    ('/robot1/driver', None, None, '/robot1/driver'),
-    ('driver', None, '/robot2', '/robot2/driver'),
-    ('arm/driver', None, '/robot2', '/robot2/arm/driver'),
-    ('/driver', None, '/robot2', '/driver'),
-    ('/driver', ['__name:=pilot'], None, '/pilot'),
-    ('/robot1/driver', ['__ns:=/robot3', '__name:=pilot'], None, '/robot3/pilot'),
-    ('driver', ['script', '--option', '__name:=pilot'], '/robot2', '/robot2/pilot'),
-])
+@pytest.mark.parametrize(
+    'named, argv, namespace, name',
+    [
+        ('/driver', None, None, '/driver'),
+        ('driver', None, None, '/driver'),
+        ('/robot1/driver', None, None, '/robot1/driver'),
+        ('driver', None, '/robot2', '/robot2/driver'),
+        ('arm/driver', None, '/robot2', '/robot2/arm/driver'),
+        ('/driver', None, '/robot2', '/driver'),
+        ('/driver', ['__name:=pilot'], None, '/pilot'),
+        ('/robot1/driver', ['__ns:=/robot3', '__name:=pilot'], None, '/robot3/pilot'),
+        ('driver', ['script', '--option', '__name:=pilot'], '/robot2', '/robot2/pilot'),
+    ],
+)
 def test_the_name_of_a_node(master, monkeypatch, named, argv, namespace, name):
     if namespace:
         monkeypatch.setenv('ROS_NAMESPACE', namespace)
@@ -37,8 +40,10 @@ def test_the_name_of_a_node(master, monkeypatch, named, argv, namespace, name):
 def test_topics_are_resolved_and_remapped_for_each_node(master):
     plain = create(master, '/robot1/plain')
     remapped = create(master, '/robot1/remapped', argv=['pose:=/elsewhere/pose', '~state:=/state'])
-    for node, pose, state in ((plain, '/robot1/pose', '/robot1/plain/state'),
-                              (remapped, '/elsewhere/pose', '/state')):
+    for node, pose, state in (
+        (plain, '/robot1/pose', '/robot1/plain/state'),
+        (remapped, '/elsewhere/pose', '/state'),
+    ):
         assert node.output_channel('pose', 'std_msgs/Empty').topic == pose
         assert node.output_channel('~state', 'std_msgs/Empty').topic == state
 
@@ -49,45 +54,70 @@ def test_private_parameters_come_from_argv(master):
     assert master._api().getParam('/robot1/driver/name') == 'bob'
 
 
-@pytest.mark.parametrize('value, said', [
-    ('99999999999999999999', '~bad cannot be 99999999999999999999: .*integers of 32 bits'),
-    ('-2147483649', '~bad cannot be -2147483649'),
-    ('[1, [2, {a: 2147483648}]]', '~bad cannot be .*2147483648'),
-    ('~', '~bad cannot be None'),
-    ('[1, null]', '~bad cannot be .1, None.'),
-    ('2020-02-03', '~bad cannot be datetime.date.2020, 2, 3.'),
-    ('{1: a}', "~bad cannot be {1: 'a'}: .*key must be string"),
-    ('{a: {2: b}}', '~bad cannot be .*key must be string'),
-    ('!!set {a, b}', '~bad cannot be {'),
-    ('&loop [*loop]', '~bad cannot be .*recursive'),
-    ('{', "'_bad:={' sets no private parameter, for its value is no YAML"),
-    ('!!python/object:os.system x', 'its value is no YAML: .*constructor'),
-    ('a\x01b', 'its value is no YAML'),
-    ('"a\\x01b"', '~bad cannot be'),
-    ('[' * 2000, 'its value is no YAML'),
-    ('a:=b', 'maps to several names or values'),
-])
+@pytest.mark.parametrize(
+    'value, said',
+    [
+        ('99999999999999999999', '~bad cannot be 99999999999999999999: .*integers of 32 bits'),
+        ('-2147483649', '~bad cannot be -2147483649'),
+        ('[1, [2, {a: 2147483648}]]', '~bad cannot be .*2147483648'),
+        ('~', '~bad cannot be None'),
+        ('[1, null]', '~bad cannot be .1, None.'),
+        ('2020-02-03', '~bad cannot be datetime.date.2020, 2, 3.'),
+        ('{1: a}', "~bad cannot be {1: 'a'}: .*key must be string"),
+        ('{a: {2: b}}', '~bad cannot be .*key must be string'),
+        ('!!set {a, b}', '~bad cannot be {'),
+        ('&loop [*loop]', '~bad cannot be .*recursive'),
+        ('{', "'_bad:={' sets no private parameter, for its value is no YAML"),
+        ('!!python/object:os.system x', 'its value is no YAML: .*constructor'),
+        ('a\x01b', 'its value is no YAML'),
+        ('"a\\x01b"', '~bad cannot be'),
+        ('[' * 2000, 'its value is no YAML'),
+        ('a:=b', 'maps to several names or values'),
+    ],
+)
 def test_a_private_parameter_that_the_server_cannot_hold_is_refused_by_name(master, value, said):
     before = master.system_state(), dict(master.parameters)
     with pytest.raises(ValueError, match=said):
         create(master, '/holds/driver', argv=['_good:=1', '_bad:=' + value])
     assert (master.system_state(), dict(master.parameters)) == before
-    create(master, '/holds/driver').stop()    # the name is free
+    create(master, '/holds/driver').stop()  # the name is free
 
 
-HELD = ['0', '2147483647', '0123', '0x10', '1e400', '.inf', '-.inf', 'yes', '"0"', "'yes'", 'ü', '12:30:45', '[a, [1.5]]',
-        '{a: {b: [true]}}', '2020-02-03 10:00:00', '!!omap [a: 1]', '""', ' padded ', '1_000']
+HELD = [
+    '0',
+    '2147483647',
+    '0123',
+    '0x10',
+    '1e400',
+    '.inf',
+    '-.inf',
+    'yes',
+    '"0"',
+    "'yes'",
+    'ü',
+    '12:30:45',
+    '[a, [1.5]]',
+    '{a: {b: [true]}}',
+    '2020-02-03 10:00:00',
+    '!!omap [a: 1]',
+    '""',
+    ' padded ',
+    '1_000',
+]
 
 
 def test_private_parameters_are_what_plain_rospy_makes_of_them(master):
     arguments = ['_p%d:=%s' % numbered for numbered in enumerate(HELD)]
     create(master, '/ours', argv=arguments)
-    done = run(master.url, sys.executable, '-c', "import rospy; rospy.init_node('theirs')", *arguments)
+    done = run(
+        master.url, sys.executable, '-c', "import rospy; rospy.init_node('theirs')", *arguments
+    )
     assert done.returncode == 0, done.stderr
     ours, theirs = master.parameters['/ours'], master.parameters['/theirs']
     forget_parameters(master.url)
     assert {name: (type(value), value) for name, value in ours.items()} == {
-        name: (type(value), value) for name, value in theirs.items()}
+        name: (type(value), value) for name, value in theirs.items()
+    }
     assert len(ours) == len(HELD)
 
 
@@ -103,7 +133,8 @@ def test_the_process_keeps_its_arguments_and_environment(master):
 
 
 def test_a_loopback_domain_listens_on_loopback_alone(master):
-    """rospy listens on all interfaces unless the whole process is told otherwise (ros_comm #315)."""
+    """rospy listens on all interfaces unless the whole process is told otherwise (ros_comm
+    #315)."""
     before = listening()
     node = create(master, '/local', domain='127.0.0.2')
     assert node.domain == '127.0.0.2' and node.uri == 'http://127.0.0.2:%d/' % node.xmlrpc_port
@@ -120,8 +151,22 @@ def test_parameters_of_the_server_have_the_nodes_names(master):
         rate.set('fast')
 
 
-NO_DOMAINS = ['http://127.0.0.1', 'http://localhost:80', '127.0.0.1:80', '::1', '[::1]', 'a b', ' localhost', 'x..y',
-              'nowhere.invalid', '0.0.0.0', '5', '224.0.0.1', '255.255.255.255', 'robot1/']
+NO_DOMAINS = [
+    'http://127.0.0.1',
+    'http://localhost:80',
+    '127.0.0.1:80',
+    '::1',
+    '[::1]',
+    'a b',
+    ' localhost',
+    'x..y',
+    'nowhere.invalid',
+    '0.0.0.0',
+    '5',
+    '224.0.0.1',
+    '255.255.255.255',
+    'robot1/',
+]
 
 
 @pytest.fixture
@@ -129,18 +174,22 @@ def nothing_left(master):
     before = master.system_state()
     yield
     assert master.system_state() == before
-    create(master, '/nowhere').stop()    # the name is free
+    create(master, '/nowhere').stop()  # the name is free
 
 
 @pytest.mark.parametrize('domain', [*NO_DOMAINS, '', 5, b'127.0.0.1', True])
-def test_an_address_that_nobody_would_reach_is_refused_before_anything_is_registered(master, nothing_left, domain):
+def test_an_address_that_nobody_would_reach_is_refused_before_anything_is_registered(
+    master, nothing_left, domain
+):
     with pytest.raises(ValueError, match='^domain .*: give a host name or an IPv4 address'):
         create(master, '/nowhere', domain=domain)
 
 
 @pytest.mark.parametrize('variable', ['ROS_HOSTNAME', 'ROS_IP'])
 @pytest.mark.parametrize('domain', NO_DOMAINS)
-def test_the_environments_address_is_checked_alike(master, nothing_left, monkeypatch, variable, domain):
+def test_the_environments_address_is_checked_alike(
+    master, nothing_left, monkeypatch, variable, domain
+):
     monkeypatch.delenv('ROS_HOSTNAME')
     monkeypatch.setenv(variable, domain)
     with pytest.raises(ValueError, match=f'^{variable} .*: give a host name or an IPv4 address'):
@@ -173,7 +222,7 @@ def test_the_hosts_name_is_taken_without_complaint(master, monkeypatch, capfd):
     monkeypatch.delenv('ROS_HOSTNAME')
     monkeypatch.setattr(socket, 'gethostname', lambda: 'localhost')
     assert create(master, '/here', domain=None).domain == 'localhost'
-    assert 'invalid' not in capfd.readouterr().err    # rosgraph's word for a name in ROS_IP
+    assert 'invalid' not in capfd.readouterr().err  # rosgraph's word for a name in ROS_IP
 
 
 def test_an_empty_variable_says_nothing(master, monkeypatch):

@@ -30,9 +30,11 @@ def test_a_relay_of_a_shared_message_changes_nothing_that_others_hold(master, ty
     relayed = listener(master, '/end', '/sharing/out', type_)
     relay = create(master, '/relay')
     out = relay.output_channel('/sharing/out', type_)
-    out.send()    # so that its numbers are others
+    out.send()  # so that its numbers are others
     relayed.get()
-    relay.interested_in('/sharing/in', type_, delegate=lambda message, channel: out.publish(message), shared=True)
+    relay.interested_in(
+        '/sharing/in', type_, delegate=lambda message, channel: out.publish(message), shared=True
+    )
     sent = create(master, '/sender').output_channel('/sharing/in', type_)
     message = sent.send()
     held = holder.get()
@@ -41,14 +43,21 @@ def test_a_relay_of_a_shared_message_changes_nothing_that_others_hold(master, ty
     passed_on = relayed.get()
     assert snapshot(held) == before
     assert passed_on == held or type_ is POINT
-    assert snapshot(passed_on) == (2 if type_ is POINT else None, {**before[1], 'callerid': '/relay', 'topic': '/sharing/out'})
+    assert snapshot(passed_on) == (
+        2 if type_ is POINT else None,
+        {**before[1], 'callerid': '/relay', 'topic': '/sharing/out'},
+    )
 
 
 def test_a_message_with_a_shared_header_gets_a_header_of_its_own(master):
     held_by = listener(master, '/holder', '/sharing/points', POINT)
-    out = create(master, '/relay').output_channel('/sharing/vectors', 'geometry_msgs/Vector3Stamped')
+    out = create(master, '/relay').output_channel(
+        '/sharing/vectors', 'geometry_msgs/Vector3Stamped'
+    )
     others = listener(master, '/end', '/sharing/vectors', 'geometry_msgs/Vector3Stamped')
-    create(master, '/sender').output_channel('/sharing/points', POINT).send(header={'frame_id': 'here'})
+    create(master, '/sender').output_channel('/sharing/points', POINT).send(
+        header={'frame_id': 'here'}
+    )
     held = held_by.get()
     for number in 1, 2:
         message = out.send(header=held.header)

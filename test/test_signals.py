@@ -1,4 +1,5 @@
-"""How programs with nodes end: by Ctrl-C, by SIGTERM, or by themselves; nothing stays registered."""
+"""How programs with nodes end: by Ctrl-C, by SIGTERM, or by themselves; nothing stays
+registered."""
 import signal
 import sys
 
@@ -8,8 +9,9 @@ from conftest import Mailbox
 from pharos import BlockNode
 from programs import TIMEOUT, Program
 
-SIGNALS = pytest.mark.parametrize('with_signal', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP],
-                                  ids=lambda number: number.name)
+SIGNALS = pytest.mark.parametrize(
+    'with_signal', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name
+)
 
 PREPARED = '''
 import signal, sys, threading
@@ -28,7 +30,8 @@ def wait_for(event):
         pass
 
 def ready_in_wait():
-    """Tell when the main thread waits in something of ours; before that, it runs code of its own."""
+    """Tell when the main thread waits in something of ours; before that, it runs code of its
+    own."""
     def tell():
         while not pharos.signals._waiting:
             threading.Event().wait(0.001)
@@ -47,11 +50,17 @@ def program(master):
         if wait_for:
             started[-1].wait_for(wait_for)
         return started[-1]
+
     yield start
     for each in started:
         each.end(signal.SIGKILL)
-    assert [name for kind in master.system_state() for names in kind.values() for name in names
-            if name.startswith('/program')] == []
+    assert [
+        name
+        for kind in master.system_state()
+        for names in kind.values()
+        for name in names
+        if name.startswith('/program')
+    ] == []
 
 
 def ended_by(with_signal):
@@ -59,7 +68,7 @@ def ended_by(with_signal):
     return -signal.SIGINT if with_signal == signal.SIGINT else 128 + with_signal
 
 
-# -- signals -----------------------------------------------------------------------------------------------------------
+# -- signals
 
 WAITS = {
     'spin': 'pharos.spin()',
@@ -72,19 +81,27 @@ WAITS = {
 @SIGNALS
 @pytest.mark.parametrize('wait', WAITS.values(), ids=WAITS)
 def test_a_wait_of_ours_ends_and_the_program_goes_on(program, with_signal, wait):
-    running = program('me, other = node(), node("/program_too")\nready_in_wait()\n' + wait
-                      + '\npharos.spin()\nprint("went on", me.lifecycle.value, other.lifecycle.value)')
+    running = program(
+        'me, other = node(), node("/program_too")\nready_in_wait()\n'
+        + wait
+        + '\npharos.spin()\nprint("went on", me.lifecycle.value, other.lifecycle.value)'
+    )
     assert running.end(with_signal) == 0
     assert 'went on stopped stopped' in running.read_to_the_end()
 
 
-@pytest.mark.parametrize('with_signal', [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
+@pytest.mark.parametrize(
+    'with_signal', [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name
+)
 @pytest.mark.parametrize('first', ['rospy', 'pharos'])
 def test_spin_ends_where_the_program_is_a_rospy_node_itself(program, with_signal, first):
     """rospy's handlers of signals keep Ctrl-C to themselves."""
     begin = ['rospy.init_node("program_itself")', 'me = node()']
-    running = program('import rospy\n' + '\n'.join(begin if first == 'rospy' else begin[::-1])
-                      + '\nready_in_wait()\npharos.spin()\nprint("went on", me.lifecycle.value)')
+    running = program(
+        'import rospy\n'
+        + '\n'.join(begin if first == 'rospy' else begin[::-1])
+        + '\nready_in_wait()\npharos.spin()\nprint("went on", me.lifecycle.value)'
+    )
     assert running.end(with_signal) == 0
     assert 'went on stopped' in running.read_to_the_end()
 
@@ -96,32 +113,41 @@ def test_plain_code_is_ended_as_without_nodes(program, with_signal, busy):
     assert running.end(with_signal) == ended_by(with_signal)
 
 
-@pytest.mark.parametrize('line', [
-    'ready()\n    wait_for(threading.Event())', 'ready_in_wait()\n    me.sleep(3600)',
-    'ready_in_wait()\n    me.execute()'])
+@pytest.mark.parametrize(
+    'line',
+    [
+        'ready()\n    wait_for(threading.Event())',
+        'ready_in_wait()\n    me.sleep(3600)',
+        'ready_in_wait()\n    me.execute()',
+    ],
+)
 def test_ctrl_c_at_the_prompt_ends_the_line_and_no_node(program, line):
     """It was silent, and all nodes were gone, when a line was mistyped and given up."""
-    running = program(f"""
+    running = program(
+        f"""
 sys.ps1 = '>>> '
 me = node(soul=lambda me: [None for _ in me.every(3600)])
 try:
     {line}
 except KeyboardInterrupt:
     print('interrupted', me.lifecycle.value, flush=True)
-""")
+"""
+    )
     running.process.send_signal(signal.SIGINT)
     running.wait_for('interrupted running')
     assert running.process.wait(TIMEOUT) == 0
 
 
 def test_ctrl_c_at_the_prompt_ends_spin_and_the_nodes(program):
-    running = program("""
+    running = program(
+        """
 sys.ps1 = '>>> '
 me = node()
 ready_in_wait()
 pharos.spin()
 print('went on', me.lifecycle.value)
-""")
+"""
+    )
     assert running.end(signal.SIGINT) == 0
     assert 'went on stopped' in running.read_to_the_end()
 
@@ -137,7 +163,8 @@ def test_a_soul_says_farewell(program, master, with_signal):
     heard = Mailbox()
     with master.create(BlockNode, named='/wheels', domain='127.0.0.1', delegate=heard) as wheels:
         wheels.interested_in('/speed', 'std_msgs/Float32')
-        running = program("""
+        running = program(
+            """
 def drive(me):
     try:
         for _ in me.every(3600):
@@ -146,72 +173,84 @@ def drive(me):
         me.send_to('/speed', data=0.0)
 node(soul=drive).fork()
 pharos.spin()
-""", wait_for=None)
+""",
+            wait_for=None,
+        )
         assert heard.get().data == 1.0
         assert running.end(with_signal) == 0
         assert heard.get().data == 0.0
 
 
 def test_a_handler_that_the_program_had_before_is_kept(program):
-    running = program("""
+    running = program(
+        """
 asked = threading.Event()
 signal.signal(signal.SIGINT, lambda *signal: asked.set())
 me = node()
 ready()
 wait_for(asked)
 print('asked', me.lifecycle.value)
-""")
+"""
+    )
     assert running.end(signal.SIGINT) == 0
     assert 'asked running' in running.read_to_the_end()
 
 
 def test_a_handler_that_the_program_sets_afterwards_is_kept(program):
-    running = program("""
+    running = program(
+        """
 me, asked = node(), threading.Event()
 signal.signal(signal.SIGTERM, lambda *signal: asked.set())
 node('/program_too')
 ready()
 wait_for(asked)
 print('asked', me.lifecycle.value)
-""")
+"""
+    )
     assert running.end(signal.SIGTERM) == 0
     assert 'asked running' in running.read_to_the_end()
 
 
 def test_a_signal_that_the_program_ignores_stays_ignored(program):
     """As nohup and a shell's & have it."""
-    running = program("""
+    running = program(
+        """
 signal.signal(signal.SIGINT, signal.SIG_IGN)
 me = node()
 ready_in_wait()
 pharos.spin()
-""")
+"""
+    )
     running.process.send_signal(signal.SIGINT)
     assert running.end(signal.SIGTERM) == 0
 
 
 def test_a_node_of_another_thread_leaves_the_signals_alone(program):
     """Only the main thread may set handlers; spin() stops the nodes all the same on Ctrl-C."""
-    running = program("""
+    running = program(
+        """
 thread = threading.Thread(target=node)
 thread.start()
 thread.join()
 assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 ready_in_wait()
 pharos.spin()
-""")
+"""
+    )
     assert running.end(signal.SIGINT) == 0
 
 
 @SIGNALS
 def test_a_node_of_another_thread_is_stopped(program, with_signal):
-    running = program("""
+    running = program(
+        """
 thread = threading.Thread(target=node)
 thread.start()
 thread.join()
 ready()
 wait_for(threading.Event())
-""")
+"""
+    )
     assert running.end(with_signal) == ended_by(with_signal)
 
 
@@ -222,19 +261,23 @@ def test_a_signal_after_the_last_node_is_pythons(program, with_signal):
 
 
 def test_sighup_is_ignored_as_nohup_has_it(program):
-    running = program("""
+    running = program(
+        """
 import os
-os.execv(sys.executable, [sys.executable, '-c', 'import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN); '
+os.execv(sys.executable, [sys.executable, '-c', 'import signal; signal.signal(signal.SIGHUP,
+signal.SIG_IGN); '
     'import pharos; me = pharos.Master().create(pharos.BlockNode, "/program"); '
     'print("ready", flush=True); pharos.spin()'])
-""")
+"""
+    )
     running.process.send_signal(signal.SIGHUP)
-    assert running.end(signal.SIGTERM) in (0, ended_by(signal.SIGTERM))    # in spin(), or just before
+    assert running.end(signal.SIGTERM) in (0, ended_by(signal.SIGTERM))  # in spin(), or just before
 
 
 @SIGNALS
 def test_what_a_signal_has_ended_is_not_kept(program, with_signal):
-    running = program("""
+    running = program(
+        """
 import weakref
 
 class Thing:
@@ -253,7 +296,8 @@ try:
 except (KeyboardInterrupt, SystemExit):
     pass
 print('freed' if kept[0]() is None else 'kept')
-""")
+"""
+    )
     assert running.end(with_signal) == 0
     assert 'freed' in running.read_to_the_end()
 
@@ -262,8 +306,8 @@ CAREFUL = """
 import os
 class Careful(pharos.Node):
     def stop(self):
-        os.write(1, b'\\nbegun\\n')    # at once, and on a line of its own, beside a traceback of the main thread
-        super().stop()
+        os.write(1, b'\\nbegun\\n')    # at once, and on a line of its own, beside a traceback of
+        the main thread super().stop()
         threading.Event().wait(0.3)    # other threads go on meanwhile
         os.write(1, b'\\nended\\n')
 me = Master().create(Careful, named='/program', domain='127.0.0.1')
@@ -282,21 +326,22 @@ CAREFUL_ENDS = {
 def test_an_overridden_stop_runs_once_to_its_end(program, with_signal, end):
     running = program(CAREFUL + ('ready_in_wait()\n' if end in WAITS.values() else '') + end)
     assert running.end(with_signal) in (0, ended_by(with_signal))
-    printed = running.read_to_the_end().split('\n')    # by lines: a traceback may show the code, too
+    printed = running.read_to_the_end().split('\n')  # by lines: a traceback may show the code, too
     assert (printed.count('begun'), printed.count('ended')) == (1, 1)
 
 
 def test_an_overridden_stop_runs_to_its_end_when_the_program_ends(program):
     running = program(CAREFUL + 'me.fork(lambda me: me.stop()); me._rospy.ended.wait(); ready()')
     assert running.process.wait(60) == 0
-    printed = running.read_to_the_end().split('\n')    # by lines: a traceback may show the code, too
+    printed = running.read_to_the_end().split('\n')  # by lines: a traceback may show the code, too
     assert (printed.count('begun'), printed.count('ended')) == (1, 1)
 
 
 @SIGNALS
 def test_a_signal_ends_a_start(program, with_signal):
     """At a master that says nothing, which takes seconds."""
-    running = program("""
+    running = program(
+        """
 import socket
 silent = socket.create_server(('127.0.0.1', 0))
 def tell():
@@ -305,29 +350,35 @@ def tell():
     threading.Event().wait()
 threading.Thread(target=tell, daemon=True).start()
 Master('http://127.0.0.1:%d' % silent.getsockname()[1]).create(BlockNode, named='/program')
-""")
+"""
+    )
     assert running.end(with_signal) == ended_by(with_signal)
     assert 'NodeStoppedError' in running.read_to_the_end() or with_signal != signal.SIGINT
 
 
 def test_a_second_ctrl_c_while_the_nodes_stop_does_no_harm(program):
-    running = program("""
+    running = program(
+        """
 me = node(soul=lambda me: threading.Event().wait(60))
 me.stop_timeout = 0.5
 me.fork()
-threading.Thread(target=lambda: (me._rospy.ended.wait(), print('stopping', flush=True)), daemon=True).start()
-ready_in_wait()
+threading.Thread(target=lambda: (me._rospy.ended.wait(), print('stopping', flush=True)),
+daemon=True).start() ready_in_wait()
 pharos.spin()
-""")
+"""
+    )
     running.process.send_signal(signal.SIGINT)
     running.wait_for('stopping')
     assert running.end(signal.SIGINT) == 0
 
 
 @SIGNALS
-@pytest.mark.parametrize('busy', ['', 'wait_for(threading.Event())'], ids=['at its end', 'ended by a signal'])
+@pytest.mark.parametrize(
+    'busy', ['', 'wait_for(threading.Event())'], ids=['at its end', 'ended by a signal']
+)
 def test_signals_while_the_program_ends_cut_nothing_off(program, with_signal, busy):
-    running = program(f"""
+    running = program(
+        f"""
 def goes_on():
     while not pharos.signals._held:    # the main thread may be on its way to the end still
         threading.Event().wait(0.001)
@@ -346,7 +397,8 @@ def go():
 threading.Thread(target=go, daemon=True).start()
 ready()
 {busy}
-""")
+"""
+    )
     if busy:
         running.process.send_signal(with_signal)
     running.wait_for('stopping')
@@ -360,16 +412,18 @@ ready()
 
 
 def test_what_else_is_to_end_with_the_program_does_though_one_cannot(program):
-    running = program("""
+    running = program(
+        """
 pharos.running.at_end(lambda: print('other ended', flush=True))
 pharos.running.at_end(lambda: 1 / 0)
 ready()
-""")
+"""
+    )
     running.wait_for('other ended')
     assert 'ZeroDivisionError' in running.read_to_the_end()
 
 
-# -- while the main thread runs a block --------------------------------------------------------------------------------
+# -- while the main thread runs a block
 
 BLOCKS = {
     'a soul': 'me.soul = lambda me: busy()\nme.execute()',
@@ -412,7 +466,8 @@ def test_ctrl_c_as_python_has_it_ends_a_block(program):
 
 
 def test_a_block_that_raises_what_a_signal_would_ends_nothing(program):
-    running = program("""
+    running = program(
+        """
 def block(*args):
     raise KeyboardInterrupt
 me = node(soul=block, delegate=block)
@@ -421,31 +476,42 @@ me.interested_in('/interrupts', 'std_msgs/Empty', inline=True)
 me.send_to('/interrupts')
 print('went on', *map(type, me.errors))
 ready()
-""")
-    assert running.read_to_the_end().count("<class 'KeyboardInterrupt'>") == 2 and running.process.wait(60) == 0
+"""
+    )
+    assert (
+        running.read_to_the_end().count("<class 'KeyboardInterrupt'>") == 2
+        and running.process.wait(60) == 0
+    )
 
 
-# -- ends without a signal ---------------------------------------------------------------------------------------------
+# -- ends without a signal
 
-@pytest.mark.parametrize('code, status', [
-    ('', 0),
-    ('sys.exit(3)', 3),
-    ('1 / 0', 1),
-    ('pharos.Transcript.show("done")', 0),
-    ('me.stop()', 0),
-    ('me.fork(lambda me: [None for _ in me.every(3600)])', 0),
-    ('me.fork(lambda me: me.send_to("/a", data="x", typed_as="std_msgs/String"))', 0),
-    ('me.ros_import("actionlib")', 0),
-    ('me.ros.Timer(me.ros.Duration(0.001), lambda event: None)', 0),
-    ('threading.Thread(target=me.sleep, args=(3600,), daemon=True).start()', 0),
-])
+
+@pytest.mark.parametrize(
+    'code, status',
+    [
+        ('', 0),
+        ('sys.exit(3)', 3),
+        ('1 / 0', 1),
+        ('pharos.Transcript.show("done")', 0),
+        ('me.stop()', 0),
+        ('me.fork(lambda me: [None for _ in me.every(3600)])', 0),
+        ('me.fork(lambda me: me.send_to("/a", data="x", typed_as="std_msgs/String"))', 0),
+        ('me.ros_import("actionlib")', 0),
+        ('me.ros.Timer(me.ros.Duration(0.001), lambda event: None)', 0),
+        ('threading.Thread(target=me.sleep, args=(3600,), daemon=True).start()', 0),
+    ],
+)
 def test_a_script_ends_with_its_nodes_running(program, code, status):
-    running = program("""
+    running = program(
+        """
 me, other = node(), node('/program_too')
 me.interested_in('/a', 'std_msgs/String')
 other.serve('/b', 'std_srvs/Empty', lambda request: None)
 ready()
-""" + code)
+"""
+        + code
+    )
     printed = running.read_to_the_end()
     assert running.process.wait(60) == status
     assert ('Traceback' in printed) == (status == 1)
@@ -456,11 +522,13 @@ def test_spin_without_nodes_returns_at_once(program):
 
 
 def test_spin_returns_when_the_last_node_has_stopped(program):
-    running = program("""
+    running = program(
+        """
 me, other = node(), node('/program_too')
 me.stop()
 other.fork(lambda other: (ready(), other.ros.signal_shutdown('done')))
 pharos.spin()
-""")
+"""
+    )
     running.read_to_the_end()
     assert running.process.wait(60) == 0

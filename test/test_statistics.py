@@ -1,4 +1,5 @@
-"""/statistics, where the parameter /enable_statistics is true: of INTRAPROCESS connections as of TCPROS ones."""
+"""/statistics, where the parameter /enable_statistics is true: of INTRAPROCESS connections as of
+TCPROS ones."""
 import io
 import threading
 
@@ -45,6 +46,7 @@ def tell(statistics, channel, *mailboxes):
         if not statistics.empty():
             said.append(statistics.get())
         return any(one.delivered_msgs > 1 for one in said)
+
     until(next_statistics)
     return next(one for one in said if one.delivered_msgs > 1), sent[-1]
 
@@ -53,7 +55,8 @@ def tell(statistics, channel, *mailboxes):
 def test_statistics_tell_of_a_connection(master, statistics, transport):
     mailbox, receiver = listen(master, '/receiver', f'/statistics_of/{transport}', transport)
     channel = master.create(BlockNode, named='/sender', domain='127.0.0.1').output_channel(
-        f'/statistics_of/{transport}', POINT)
+        f'/statistics_of/{transport}', POINT
+    )
     told, sent = tell(statistics, channel, mailbox)
     assert channel.connections == [('/receiver', transport)]
     assert (told.topic, told.node_sub, told.node_pub) == (channel.topic, '/receiver', '/sender')
@@ -72,7 +75,9 @@ def test_a_node_with_two_channels_counts_a_message_once(master, statistics):
     first, receiver = listen(master, '/receiver', '/statistics_of/two', 'INTRAPROCESS')
     second = Mailbox()
     receiver.interested_in('/statistics_of/two', delegate=second, shared=True)
-    channel = master.create(BlockNode, named='/sender', domain='127.0.0.1').output_channel('/statistics_of/two', POINT)
+    channel = master.create(BlockNode, named='/sender', domain='127.0.0.1').output_channel(
+        '/statistics_of/two', POINT
+    )
     told, _ = tell(statistics, channel, first, second)
     assert told.delivered_msgs <= channel.sent
 
@@ -82,12 +87,16 @@ def test_a_subscription_that_ends_tells_no_more(master, statistics, transport):
     topic = f'/statistics_of/ending_{transport}'
     mailbox, receiver = listen(master, '/receiver', topic, 'INTRAPROCESS')
     other, _ = listen(master, '/other', topic, transport)
-    channel = master.create(BlockNode, named='/sender', domain='127.0.0.1').output_channel(topic, POINT)
+    channel = master.create(BlockNode, named='/sender', domain='127.0.0.1').output_channel(
+        topic, POINT
+    )
     tell(statistics, channel, mailbox, other)
     until(lambda: '/receiver' in master.topic('/statistics').publishers)
     receiver.channels[0].close()
     until(lambda: '/receiver' not in master.topic('/statistics').publishers)
-    until(lambda: not any(thread.name == '/receiver statistics' for thread in threading.enumerate()))
+    until(
+        lambda: not any(thread.name == '/receiver statistics' for thread in threading.enumerate())
+    )
     until(lambda: len(channel.connections) == 1)
     tell(statistics, channel, other)
     assert receiver.is_running
@@ -96,7 +105,9 @@ def test_a_subscription_that_ends_tells_no_more(master, statistics, transport):
 def test_without_the_parameter_there_is_nothing_to_tell(master):
     """It is read when a subscription begins, as in rospy."""
     mailbox, _ = listen(master, '/receiver', '/statistics_of/none', 'INTRAPROCESS')
-    channel = master.create(BlockNode, named='/sender', domain='127.0.0.1').output_channel('/statistics_of/none', POINT)
+    channel = master.create(BlockNode, named='/sender', domain='127.0.0.1').output_channel(
+        '/statistics_of/none', POINT
+    )
     channel.send()
     mailbox.get()
     assert not any(thread.name == '/receiver statistics' for thread in threading.enumerate())

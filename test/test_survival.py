@@ -18,7 +18,10 @@ def create(master, name, **kwargs):
 
 
 def registrations(master, name):
-    return [sorted(topic for topic, nodes in kind.items() if name in nodes) for kind in master.system_state()]
+    return [
+        sorted(topic for topic, nodes in kind.items() if name in nodes)
+        for kind in master.system_state()
+    ]
 
 
 @pytest.fixture
@@ -39,16 +42,19 @@ def mortal_master(monkeypatch):
 
         def come_back(self):
             self._embedded = Master.embedded(port=int(self.url.rsplit(':', 1)[1].strip('/')))
+
     master = MortalMaster()
     yield master
     running.stop_all()
     master.end()
 
 
-# -- the master restarts ----------------------------------------------------------------------------------------------
+# -- the master restarts
+
 
 def test_everything_is_registered_again_when_the_master_comes_back_empty(mortal_master, mailbox):
-    """With rospy, the node is never registered again: rosnode list lacked it 20 s later, and nothing in rospy tries."""
+    """With rospy, the node is never registered again: rosnode list lacked it 20 s later, and
+    nothing in rospy tries."""
     master = Master(mortal_master.url)
     receiver = create(master, '/receiver', delegate=mailbox, argv=['_private:=7'])
     receiver.interested_in('/t', 'std_msgs/String')
@@ -68,7 +74,10 @@ def test_everything_is_registered_again_when_the_master_comes_back_empty(mortal_
     late = create(master, '/late')
     late.send_to('/t', data='from a new peer')
     sent.send(data='from the old one')
-    assert {message.data for message in mailbox.take(2)} == {'from a new peer', 'from the old one'} and mailbox.empty()
+    assert {message.data for message in mailbox.take(2)} == {
+        'from a new peer',
+        'from the old one',
+    } and mailbox.empty()
     master.lookup_service('/service').call(timeout=TIMEOUT)
     master.parameters['/receiver/watched'] = 2
     assert changes.get() == 2
@@ -83,10 +92,11 @@ def test_a_node_stops_while_the_master_is_away(mortal_master):
 
 
 def test_there_is_one_watcher_per_master_and_none_without_a_node(master):
-    watching = 'watcher of %s' % master.url
+    watching = f'watcher of {master.url}'
 
     def watchers():
         return [thread.name for thread in threading.enumerate()].count(watching)
+
     nodes = [create(master, '/n%d' % i) for i in range(3)]
     assert watchers() == 1
     for node in nodes:
@@ -94,7 +104,7 @@ def test_there_is_one_watcher_per_master_and_none_without_a_node(master):
     until(lambda: watchers() == 0)
 
 
-# -- peers that die ---------------------------------------------------------------------------------------------------
+# -- peers that die
 
 PEER = """
 import rospy, std_msgs.msg
@@ -116,10 +126,12 @@ def test_a_peer_killed_outright_is_let_go_and_found_again(master, mailbox):
             peer.kill()
         until(lambda: not heard.connections and not told.connections)
         told.send(data='into the void')
-    create(master, '/peer')    # whose name it is from now on: nothing of the killed one stays with the master
+    # whose name it is from now on: nothing of the killed one stays with the master
+    create(master, '/peer')
 
 
-# -- stop at any moment -----------------------------------------------------------------------------------------------
+# -- stop at any moment
+
 
 def test_two_threads_may_stop_a_node_at_once(master):
     for round_ in range(10):
@@ -147,14 +159,18 @@ def test_a_node_stops_while_it_publishes_receives_and_calls(master):
                 service.call(data=True)
                 busy.set()
                 me.sleep(0)
+
         node.interested_in('/t', delegate=lambda message, channel: service.call(data=True))
         node.fork(work)
         assert busy.wait(TIMEOUT)
         node.stop()
-        assert not [error for error in node.errors if not isinstance(error, pharos.NodeStoppedError)]
+        assert not [
+            error for error in node.errors if not isinstance(error, pharos.NodeStoppedError)
+        ]
 
 
-# -- peers that answer nonsense ---------------------------------------------------------------------------------------
+# -- peers that answer nonsense
+
 
 def test_a_publisher_that_once_answers_nonsense_is_asked_again(master):
     node = create(master, '/node')
@@ -166,6 +182,7 @@ def test_a_publisher_that_once_answers_nonsense_is_asked_again(master):
         asked.release()
         proceed.wait(TIMEOUT)
         return 1, 'a dict is no protocol', {'protocol': 'TCPROS'}
+
     with xmlrpc.server.SimpleXMLRPCServer(('127.0.0.1', 0), logRequests=False) as publisher:
         publisher.register_function(request_topic, 'requestTopic')
         threading.Thread(target=publisher.serve_forever, daemon=True).start()
@@ -174,10 +191,11 @@ def test_a_publisher_that_once_answers_nonsense_is_asked_again(master):
         def connect():
             with pytest.raises(KeyError):
                 handler._connect_topic('/survival/nonsense', uri)
+
         first = threading.Thread(target=connect, daemon=True)
         first.start()
         assert asked.acquire(timeout=TIMEOUT)
-        assert handler._connect_topic('/survival/nonsense', uri)[0] == 1    # it is being asked
+        assert handler._connect_topic('/survival/nonsense', uri)[0] == 1  # it is being asked
         proceed.set()
         first.join(TIMEOUT)
         connect()

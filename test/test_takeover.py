@@ -1,4 +1,5 @@
-"""Another process starts a node of our name: ROS's rule is that the newer one stays, and the older one ends."""
+"""Another process starts a node of our name: ROS's rule is that the newer one stays, and the older
+one ends."""
 import sys
 
 import pytest
@@ -11,8 +12,8 @@ from programs import Program, forget_parameters, until
 ROSPY_NODE = """
 import rospy, std_msgs.msg
 rospy.init_node('contested', disable_signals=False)
-sub = rospy.Subscriber('/newer_hears', std_msgs.msg.String, lambda message: print('heard', message.data, flush=True))
-print('ready', flush=True)
+sub = rospy.Subscriber('/newer_hears', std_msgs.msg.String, lambda message: print('heard',
+message.data, flush=True)) print('ready', flush=True)
 rospy.spin()
 print('ended', flush=True)
 """
@@ -57,7 +58,9 @@ def test_a_newer_node_of_rospys_stays(master, logs_before):
 
 def test_a_newer_node_of_roscpps_stays(master):
     ours = create(master)
-    with master.run('topic_tools', 'relay', '/newer_takes', '/newer_gives', name='contested') as newer:
+    with master.run(
+        'topic_tools', 'relay', '/newer_takes', '/newer_gives', name='contested'
+    ) as newer:
         wait_for_stop(ours)
         until(lambda: '/newer_takes' in ExternalNode(master, '/contested').subscriptions)
         check_it_stays(master, '/newer_takes')
@@ -73,6 +76,7 @@ def test_what_a_node_opens_and_says_while_it_gives_way_is_not_registered(master)
             self.parameter('/ours/parameter', 1).on_change(print)
             super().stop()
             self.log('I went')
+
     ours = master.create(Talkative, named='/contested', domain='127.0.0.1')
     with rospy_node(master) as newer:
         newer.wait_for('ready')
@@ -86,7 +90,8 @@ def test_what_a_node_opens_and_says_while_it_gives_way_is_not_registered(master)
 def test_a_node_that_was_not_told_notices(master, monkeypatch):
     """It finds its registrations gone, and does not take the name back."""
     monkeypatch.setattr(watcher, 'PERIOD', 0.05)
-    monkeypatch.setattr(registration, '_name_is_anothers', lambda handler: False)    # it does not obey
+    # it does not obey
+    monkeypatch.setattr(registration, '_name_is_anothers', lambda handler: False)
     ours = create(master)
     ours.output_channel('/ours', 'std_msgs/String')
     with rospy_node(master) as newer:

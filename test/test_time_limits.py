@@ -14,12 +14,13 @@ from pharos.private_rospy.proxies import ServerProxy, time_limit
 from sockets import refused_url
 
 STRING = 'std_msgs/String'
-LIMIT = 0.5     # seconds, of all that has a limit
-MARGIN = 2.5    # seconds beyond, on a busy machine; what knew no limit took 5 to 15 s
+LIMIT = 0.5  # seconds, of all that has a limit
+MARGIN = 2.5  # seconds beyond, on a busy machine; what knew no limit took 5 to 15 s
 
 
 class BadMaster:
-    """A ROS master behind a proxy that hangs, dribbles its answers, or leaves, when it is told to."""
+    """A ROS master behind a proxy that hangs, dribbles its answers, or leaves, when it is told
+    to."""
 
     def __init__(self, url):
         self.mood, self.asked, self.hangs_after = 'good', 0, None
@@ -32,11 +33,17 @@ class BadMaster:
             def do_POST(self):
                 body = self.rfile.read(int(self.headers['content-length']))
                 bad.asked += 1
-                if bad.mood == 'hanging' or bad.hangs_after is not None and bad.asked > bad.hangs_after:
+                if (
+                    bad.mood == 'hanging'
+                    or bad.hangs_after is not None
+                    and bad.asked > bad.hangs_after
+                ):
                     bad._over.wait()
                     self.close_connection = True
                     return
-                with urllib.request.urlopen(urllib.request.Request(url, body, {'Content-Type': 'text/xml'})) as answer:
+                with urllib.request.urlopen(
+                    urllib.request.Request(url, body, {'Content-Type': 'text/xml'})
+                ) as answer:
                     text = answer.read()
                 self.send_response(200)
                 self.send_header('Content-Length', str(len(text)))
@@ -44,11 +51,11 @@ class BadMaster:
                 self._write(text)
 
             def _write(self, text):
-                if bad.mood == 'dribbling':    # never silent for long, and never through
+                if bad.mood == 'dribbling':  # never silent for long, and never through
                     for at in range(len(text)):
                         if bad._over.wait(0.1):
                             return
-                        self.wfile.write(text[at:at + 1])
+                        self.wfile.write(text[at : at + 1])
                 else:
                     self.wfile.write(text)
 
@@ -59,7 +66,7 @@ class BadMaster:
             daemon_threads, block_on_close = True, False
 
             def handle_error(self, *_):
-                pass    # clients leave: that is what is tested
+                pass  # clients leave: that is what is tested
 
         self._server = Server(('127.0.0.1', 0), Handler)
         self.url = 'http://127.0.0.1:%d/' % self._server.server_address[1]
@@ -96,15 +103,22 @@ def timed(function, *errors):
 USES = {
     'wait': lambda bad: bad.master.wait(LIMIT),
     'wait_for_node': lambda bad: bad.master.wait_for_node('/nobody', LIMIT),
-    'wait_for_node of one that is registered': lambda bad: bad.master.wait_for_node('/external', LIMIT),
-    'interested_in without a type': lambda bad: bad.node.interested_in('/limits/untyped', wait=LIMIT),
-    'output_channel without a type': lambda bad: bad.node.output_channel('/limits/untyped', wait=LIMIT),
+    'wait_for_node of one that is registered': lambda bad: bad.master.wait_for_node(
+        '/external', LIMIT
+    ),
+    'interested_in without a type': lambda bad: bad.node.interested_in(
+        '/limits/untyped', wait=LIMIT
+    ),
+    'output_channel without a type': lambda bad: bad.node.output_channel(
+        '/limits/untyped', wait=LIMIT
+    ),
     'send_to without a type': lambda bad: bad.node.send_to('/limits/untyped', wait=LIMIT),
     'interested_in': lambda bad: bad.node.interested_in('/limits/in', STRING),
     'output_channel': lambda bad: bad.node.output_channel('/limits/out', STRING),
     'send_to': lambda bad: bad.node.send_to('/limits/out', typed_as=STRING, connect_timeout=LIMIT),
-    'send_to a subscriber that has gone': lambda bad: bad.node.send_to('/limits/gone', typed_as=STRING,
-                                                                       connect_timeout=LIMIT),
+    'send_to a subscriber that has gone': lambda bad: bad.node.send_to(
+        '/limits/gone', typed_as=STRING, connect_timeout=LIMIT
+    ),
     'a second channel': lambda bad: bad.node.output_channel('/limits/open', STRING),
     'send_to one node': lambda bad: bad.channel.send(to='/nobody'),
     'call': lambda bad: bad.moved.call(timeout=LIMIT),
@@ -121,7 +135,7 @@ def prepared(bad, master, monkeypatch):
     """What the uses need, made while all was good."""
     monkeypatch.setattr(BlockNode, 'connect_timeout', LIMIT)
     monkeypatch.setattr(BlockNode, 'stop_timeout', LIMIT)
-    with socket.socket() as silent:    # a node that is registered, and says nothing
+    with socket.socket() as silent:  # a node that is registered, and says nothing
         silent.bind(('127.0.0.1', 0))
         silent.listen()
         uri = 'http://127.0.0.1:%d/' % silent.getsockname()[1]
@@ -173,14 +187,18 @@ def test_waiting_for_a_node_at_a_hanging_master_says_that_the_master_does_not_an
 
 
 @pytest.mark.parametrize('answers', range(0, 24, 3))
-def test_a_start_at_a_master_that_hangs_midway_is_given_up_in_time(bad, master, monkeypatch, answers):
+def test_a_start_at_a_master_that_hangs_midway_is_given_up_in_time(
+    bad, master, monkeypatch, answers
+):
     monkeypatch.setattr(BlockNode, 'connect_timeout', LIMIT)
     before = set(threading.enumerate())
     bad.hangs_after = bad.asked + answers
     made = []
-    took = timed(lambda: made.append(bad.master.create(BlockNode, named='/midway', domain='127.0.0.1')),
-                 pharos.MasterUnreachableError)
-    assert took < LIMIT + MARGIN + 2.0    # of unregistering
+    took = timed(
+        lambda: made.append(bad.master.create(BlockNode, named='/midway', domain='127.0.0.1')),
+        pharos.MasterUnreachableError,
+    )
+    assert took < LIMIT + MARGIN + 2.0  # of unregistering
     bad.hangs_after = None
     for node in made:
         node.stop()

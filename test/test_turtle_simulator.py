@@ -1,4 +1,5 @@
-"""The turtle simulator: the field without ROS, then the program as a process, driven by ROS's own tools."""
+"""The turtle simulator: the field without ROS, then the program as a process, driven by ROS's own
+tools."""
 import math
 import re
 import shutil
@@ -20,11 +21,14 @@ STEP = 0.016
 
 velocities = strategies.floats(-1e6, 1e6)
 lengths = strategies.floats(-1e6, 1e6)
-actions = strategies.lists(strategies.one_of(
-    strategies.tuples(strategies.just(Turtle.drive), velocities, velocities, velocities),
-    strategies.tuples(strategies.just(Turtle.teleport_absolute), lengths, lengths, lengths),
-    strategies.tuples(strategies.just(Turtle.teleport_relative), lengths, lengths),
-    strategies.tuples(strategies.just(Turtle.update), strategies.just(STEP))))
+actions = strategies.lists(
+    strategies.one_of(
+        strategies.tuples(strategies.just(Turtle.drive), velocities, velocities, velocities),
+        strategies.tuples(strategies.just(Turtle.teleport_absolute), lengths, lengths, lengths),
+        strategies.tuples(strategies.just(Turtle.teleport_relative), lengths, lengths),
+        strategies.tuples(strategies.just(Turtle.update), strategies.just(STEP)),
+    )
+)
 
 
 def updates(turtle, seconds):
@@ -42,7 +46,8 @@ def turtle(field):
     return field.turtles['turtle1']
 
 
-# -- the field ---------------------------------------------------------------------------------------------------------
+# -- the field
+
 
 def test_a_field_is_as_large_as_turtlesims_and_has_one_turtle_in_its_middle_facing_right(field):
     assert FIELD_SIZE == pytest.approx(11.088889, abs=1e-6)
@@ -88,7 +93,9 @@ def test_a_command_repeated_every_second_keeps_the_turtle_going_round(turtle):
         updates(turtle, 1)
         assert (turtle.linear_velocity, turtle.angular_velocity) == (2.0, 1.0)
         # a circle of radius 2 around a point to the left of the start
-        assert math.dist((turtle.x, turtle.y), (FIELD_SIZE / 2, FIELD_SIZE / 2 + 2)) == pytest.approx(2, abs=0.05)
+        assert math.dist(
+            (turtle.x, turtle.y), (FIELD_SIZE / 2, FIELD_SIZE / 2 + 2)
+        ) == pytest.approx(2, abs=0.05)
 
 
 def test_a_turtle_also_goes_backwards_and_sideways(turtle):
@@ -122,7 +129,8 @@ def test_a_number_that_is_not_finite_is_refused_by_name_and_changes_nothing(fiel
     assert list(field.turtles) == ['turtle1']
 
 
-# -- pens and colours --------------------------------------------------------------------------------------------------
+# -- pens and colours
+
 
 def test_a_pen_draws_where_the_turtle_goes_and_clear_wipes_it(field, turtle):
     turtle.drive(1.0, 0.0)
@@ -143,7 +151,10 @@ def test_a_teleport_draws_a_line_with_the_pens_colour_and_width(field, turtle):
 
 def test_a_relative_teleport_turns_first(turtle):
     turtle.teleport_relative(2.0, math.pi / 2)
-    assert (turtle.x, turtle.y) == (pytest.approx(FIELD_SIZE / 2), pytest.approx(FIELD_SIZE / 2 + 2))
+    assert (turtle.x, turtle.y) == (
+        pytest.approx(FIELD_SIZE / 2),
+        pytest.approx(FIELD_SIZE / 2 + 2),
+    )
 
 
 def test_a_lifted_pen_draws_nothing(field, turtle):
@@ -166,7 +177,8 @@ def test_the_picture_shows_each_turtle_but_the_turtle_leaves_no_mark(field, turt
     assert field.colour_at(*where) == BACKGROUND
 
 
-# -- several turtles ---------------------------------------------------------------------------------------------------
+# -- several turtles
+
 
 def test_a_turtle_without_a_name_gets_the_next_free_one(field):
     field.spawn('turtle2', 1, 1, 0)
@@ -193,7 +205,8 @@ def test_a_reset_brings_back_the_first_turtle_and_an_empty_field(field, turtle):
     assert field.spawn('', 2, 2, 0) == 'turtle2'
 
 
-# -- the program -------------------------------------------------------------------------------------------------------
+# -- the program
+
 
 @pytest.fixture(autouse=True)
 def no_parameters_left(master):
@@ -205,9 +218,13 @@ def no_parameters_left(master):
 def simulator(master, tmp_path):
     """The running program, whose picture goes to `simulator.picture`."""
     picture = tmp_path / 'drive.png'
-    with Program(master.url, script('turtle_simulator'), f'_picture:={picture}', cwd=tmp_path) as program:
+    with Program(
+        master.url, script('turtle_simulator'), f'_picture:={picture}', cwd=tmp_path
+    ) as program:
         program.picture = picture
-        program.wait_for('Spawning turtle [turtle1] at x=[5.544444], y=[5.544444], theta=[0.000000]')
+        program.wait_for(
+            'Spawning turtle [turtle1] at x=[5.544444], y=[5.544444], theta=[0.000000]'
+        )
         program.wait_for('There is no window')
         yield program
 
@@ -234,20 +251,32 @@ def wait_until(poses, condition):
     return next(pose for pose in iter(poses.get, None) if condition(pose))
 
 
-def test_it_is_a_node_called_turtlesim_with_turtlesims_topics_services_and_parameters(master, simulator):
+def test_it_is_a_node_called_turtlesim_with_turtlesims_topics_services_and_parameters(
+    master, simulator
+):
     publications, subscriptions, services = master.system_state()
-    for topics, names in (publications, ('pose', 'color_sensor')), (subscriptions, ('command_velocity', 'cmd_vel')):
+    for topics, names in (publications, ('pose', 'color_sensor')), (
+        subscriptions,
+        ('command_velocity', 'cmd_vel'),
+    ):
         for name in names:
             assert topics[f'/turtle1/{name}'] == ['/turtlesim']
     for service, service_type in {
-            '/clear': 'std_srvs/Empty', '/reset': 'std_srvs/Empty', '/spawn': 'turtlesim/Spawn',
-            '/kill': 'turtlesim/Kill', '/turtle1/set_pen': 'turtlesim/SetPen',
-            '/turtle1/teleport_absolute': 'turtlesim/TeleportAbsolute',
-            '/turtle1/teleport_relative': 'turtlesim/TeleportRelative'}.items():
+        '/clear': 'std_srvs/Empty',
+        '/reset': 'std_srvs/Empty',
+        '/spawn': 'turtlesim/Spawn',
+        '/kill': 'turtlesim/Kill',
+        '/turtle1/set_pen': 'turtlesim/SetPen',
+        '/turtle1/teleport_absolute': 'turtlesim/TeleportAbsolute',
+        '/turtle1/teleport_relative': 'turtlesim/TeleportRelative',
+    }.items():
         assert services[service] == ['/turtlesim']
         assert master.lookup_service(service).type == service_type
     for name, value in ('r', '69'), ('g', '86'), ('b', '255'):
-        assert run(master.url, 'rosparam', 'get', f'/turtlesim/background_{name}').stdout.strip() == value
+        assert (
+            run(master.url, 'rosparam', 'get', f'/turtlesim/background_{name}').stdout.strip()
+            == value
+        )
 
 
 def test_it_tells_the_pose_and_the_colour_62_and_a_half_times_a_second(simulator, client):
@@ -259,7 +288,7 @@ def test_it_tells_the_pose_and_the_colour_62_and_a_half_times_a_second(simulator
     assert (colour.r, colour.g, colour.b) == BACKGROUND
     started = time.monotonic()
     poses.take(125)
-    assert 1.6 < time.monotonic() - started < 20    # s; 2 where nothing else goes on
+    assert 1.6 < time.monotonic() - started < 20  # s; 2 where nothing else goes on
 
 
 def test_a_velocity_drives_the_turtle_for_a_second(simulator, client):
@@ -297,15 +326,22 @@ def test_turtles_are_spawned_and_killed(master, simulator, client):
     assert (pose.x, pose.y, pose.theta) == (1.0, 2.0, 0.5)
     call(master, '/kill', name='turtle2')
     assert not [name for kind in master.system_state() for name in kind if 'turtle2' in name]
-    simulator.wait_for('Spawning turtle [robots/leo] at x=[1.000000], y=[2.000000], theta=[0.500000]')
+    simulator.wait_for(
+        'Spawning turtle [robots/leo] at x=[1.000000], y=[2.000000], theta=[0.500000]'
+    )
 
 
-@pytest.mark.parametrize('service, name, reason', [
-    ('/spawn', 'turtle1', 'A turtle named [turtle1] already exists'),
-    ('/spawn', 'no name!', 'A turtle cannot be named [no name!]'),
-    ('/kill', 'nobody', 'Tried to kill turtle [nobody], which does not exist')])
+@pytest.mark.parametrize(
+    'service, name, reason',
+    [
+        ('/spawn', 'turtle1', 'A turtle named [turtle1] already exists'),
+        ('/spawn', 'no name!', 'A turtle cannot be named [no name!]'),
+        ('/kill', 'nobody', 'Tried to kill turtle [nobody], which does not exist'),
+    ],
+)
 def test_a_name_that_is_taken_bad_or_unknown_is_refused_and_everything_goes_on(
-        master, simulator, client, service, name, reason):
+    master, simulator, client, service, name, reason
+):
     with pytest.raises(ServiceCallError, match=re.escape(reason)):
         call(master, service, name=name)
     assert 'ERROR' in simulator.wait_for(reason)
@@ -319,11 +355,17 @@ def test_a_turtle_is_teleported_and_draws_with_the_pen_it_was_given(master, simu
     call(master, '/turtle1/teleport_absolute', x=2.0, y=3.0, theta=0.0)
     call(master, '/turtle1/teleport_relative', linear=1.0, angular=math.pi / 2)
     pose = wait_until(poses, lambda pose: pose.x < 3 and pose.y > 3.9)
-    assert (pose.x, pose.y, pose.theta) == (pytest.approx(2.0), pytest.approx(4.0), pytest.approx(math.pi / 2))
+    assert (pose.x, pose.y, pose.theta) == (
+        pytest.approx(2.0),
+        pytest.approx(4.0),
+        pytest.approx(math.pi / 2),
+    )
     assert wait_until(colours, lambda colour: colour.r == 255).g == 128
 
 
-def test_rosservice_clears_the_field_with_the_background_colour_that_rosparam_set(master, simulator, client):
+def test_rosservice_clears_the_field_with_the_background_colour_that_rosparam_set(
+    master, simulator, client
+):
     colours = hear(client, '/turtle1/color_sensor', 'turtlesim/Color')
     call(master, '/turtle1/teleport_relative', linear=1.0, angular=0.0)
     wait_until(colours, lambda colour: colour.r == PEN_COLOUR[0])
@@ -338,7 +380,9 @@ def test_rosservice_clears_the_field_with_the_background_colour_that_rosparam_se
 
 def test_a_background_that_is_no_colour_is_refused_by_name(master, simulator):
     run(master.url, 'rosparam', 'set', '/turtlesim/background_b', 'blue')
-    with pytest.raises(ServiceCallError, match="background_b is 'blue': a colour is made of numbers from 0 to 255"):
+    with pytest.raises(
+        ServiceCallError, match="background_b is 'blue': a colour is made of numbers from 0 to 255"
+    ):
         call(master, '/clear')
 
 
@@ -363,7 +407,8 @@ def test_it_draws_the_picture_on_demand_and_at_the_end(master, simulator, client
     wait_until(poses, lambda pose: pose.theta > 0.9)
     assert simulator.end() == 0
     assert f'The picture of the field is {simulator.picture}' in simulator.read_to_the_end()
-    assert pixels(PIL.Image.open(simulator.picture).convert('RGB'))[PEN_COLOUR] > 2 * 45    # 2 m, several pixels wide
+    # 2 m, several pixels wide
+    assert pixels(PIL.Image.open(simulator.picture).convert('RGB'))[PEN_COLOUR] > 2 * 45
 
 
 def pixels(image):
@@ -372,7 +417,9 @@ def pixels(image):
 
 
 def test_a_picture_that_cannot_be_written_is_said_so(master, tmp_path):
-    with Program(master.url, script('turtle_simulator'), '_picture:=/nowhere/drive.png', cwd=tmp_path) as program:
+    with Program(
+        master.url, script('turtle_simulator'), '_picture:=/nowhere/drive.png', cwd=tmp_path
+    ) as program:
         program.wait_for('There is no window')
         answer = call(master, '/turtlesim/save_picture')
         assert not answer.success
@@ -383,8 +430,14 @@ def test_a_picture_that_cannot_be_written_is_said_so(master, tmp_path):
 
 def test_it_follows_its_name_its_namespace_and_remappings(master, client, tmp_path):
     with Program(
-            master.url, script('turtle_simulator'), '__name:=sim', '__ns:=/robot1', 'turtle1/pose:=where',
-            "_picture:=''", cwd=tmp_path) as program:
+        master.url,
+        script('turtle_simulator'),
+        '__name:=sim',
+        '__ns:=/robot1',
+        'turtle1/pose:=where',
+        "_picture:=''",
+        cwd=tmp_path,
+    ) as program:
         program.wait_for('Starting turtlesim with node name /robot1/sim')
         hear(client, '/robot1/where', 'turtlesim/Pose').get()
         assert '/robot1/turtle1/set_pen' in master.services()
@@ -393,7 +446,9 @@ def test_it_follows_its_name_its_namespace_and_remappings(master, client, tmp_pa
 
 
 def test_the_reports_nodes_drive_and_log_it(master, simulator):
-    with Program(master.url, script('turtle_logger')) as logger, Program(master.url, script('turtle_driver')):
+    with Program(master.url, script('turtle_logger')) as logger, Program(
+        master.url, script('turtle_driver')
+    ):
         logger.wait_for('linear: 2.0')
         logger.wait_for('angular: 1.0')
     assert run(master.url, script('clear_turtle')).returncode == 0
@@ -405,8 +460,12 @@ def display():
     """The name of a display of its own, without a screen."""
     if not shutil.which('Xvfb'):
         pytest.skip('no Xvfb: apt install xvfb')
-    with subprocess.Popen(['Xvfb', '-displayfd', '1', '-screen', '0', '600x600x24'], stdout=subprocess.PIPE,
-                          stderr=subprocess.DEVNULL, text=True) as server:
+    with subprocess.Popen(
+        ['Xvfb', '-displayfd', '1', '-screen', '0', '600x600x24'],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    ) as server:
         yield f':{server.stdout.readline().strip()}'
         server.terminate()
 
@@ -423,9 +482,12 @@ def test_a_window_shows_the_field_where_there_is_a_display(master, display, tmp_
 
 
 @pytest.mark.parametrize('with_signal', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_a_program_with_a_window_with_status_0(master, display, tmp_path, with_signal):
+def test_a_signal_ends_a_program_with_a_window_with_status_0(
+    master, display, tmp_path, with_signal
+):
     with Program(
-            master.url, script('turtle_simulator'), f'_picture:={tmp_path}/drive.png', DISPLAY=display) as program:
+        master.url, script('turtle_simulator'), f'_picture:={tmp_path}/drive.png', DISPLAY=display
+    ) as program:
         program.wait_for('The field is shown in a window')
         assert program.end(with_signal) == 0
         assert 'Traceback' not in program.read_to_the_end()

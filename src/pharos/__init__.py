@@ -1,11 +1,29 @@
 """PhaROS for Python: many ROS nodes in one process, written with blocks."""
 from pharos.channel import InputChannel, OutputChannel
-from pharos.errors import (MasterUnreachableError, MessageTypeError, NodeNameInUseError, NodeStoppedError, PharosError, PortInUseError, ServiceCallError, ServiceTypeError, UnknownNodeError, UnknownServiceError, UnknownTopicError, UnknownTypeError)
+from pharos.errors import (
+    MasterUnreachableError,
+    MessageTypeError,
+    NodeNameInUseError,
+    NodeStoppedError,
+    PharosError,
+    PortInUseError,
+    ServiceCallError,
+    ServiceTypeError,
+    UnknownNodeError,
+    UnknownServiceError,
+    UnknownTopicError,
+    UnknownTypeError,
+)
 from pharos.external_node import ExternalNode
 from pharos.failures import Failure
 from pharos.life import Lifecycle
 from pharos.master import Master
-from pharos.messages.message_types import (define_message, define_service, message_class, service_class)
+from pharos.messages.message_types import (
+    define_message,
+    define_service,
+    message_class,
+    service_class,
+)
 from pharos.node import BlockNode, Node
 from pharos.parameter import Parameter
 from pharos.ros_process import RosProcess
@@ -16,10 +34,35 @@ from pharos.transcript import Transcript
 
 __version__ = '0.1.0'
 __all__ = [
-    'Master', 'Node', 'BlockNode', 'Lifecycle', 'ExternalNode', 'Topic', 'InputChannel', 'OutputChannel', 'Service',
-    'Parameter', 'Transcript', 'RosProcess', 'Failure', 'message_class', 'service_class', 'define_message',
-    'define_service', 'spin', '__version__',
-    'PharosError', 'MasterUnreachableError', 'NodeNameInUseError', 'PortInUseError', 'UnknownNodeError',
-    'UnknownTopicError', 'UnknownTypeError', 'MessageTypeError', 'UnknownServiceError', 'ServiceTypeError',
-    'ServiceCallError', 'NodeStoppedError',
+    'Master',
+    'Node',
+    'BlockNode',
+    'Lifecycle',
+    'ExternalNode',
+    'Topic',
+    'InputChannel',
+    'OutputChannel',
+    'Service',
+    'Parameter',
+    'Transcript',
+    'RosProcess',
+    'Failure',
+    'message_class',
+    'service_class',
+    'define_message',
+    'define_service',
+    'spin',
+    '__version__',
+    'PharosError',
+    'MasterUnreachableError',
+    'NodeNameInUseError',
+    'PortInUseError',
+    'UnknownNodeError',
+    'UnknownTopicError',
+    'UnknownTypeError',
+    'MessageTypeError',
+    'UnknownServiceError',
+    'ServiceTypeError',
+    'ServiceCallError',
+    'NodeStoppedError',
 ]

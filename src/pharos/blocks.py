@@ -1,4 +1,5 @@
-"""Blocks: the callables that a node is made of, and the souls among them that run in threads of their own."""
+"""Blocks: the callables that a node is made of, and the souls among them that run in threads of
+their own."""
 import functools
 import inspect
 import threading
@@ -11,38 +12,46 @@ _ASYNC = inspect.CO_COROUTINE | inspect.CO_ITERABLE_COROUTINE | inspect.CO_ASYNC
 
 
 def check_block(block, what, parameters):
-    """``block`` if it can be called with so many arguments (or is None), else TypeError that says how it is called."""
+    """``block`` if it can be called with so many arguments (or is None), else TypeError that says
+    how it is called."""
     if block is None:
         return None
-    call = '%s(%s)' % (what.split()[-1], ', '.join(parameters))
+    call = f"{what.split()[-1]}({', '.join(parameters)})"
     if not callable(block):
-        raise TypeError('a %s is called as %s; %r cannot be called' % (what, call, block))
+        raise TypeError(f'a {what} is called as {call}; {block!r} cannot be called')
     check_runs(block, 'a ' + what)
     try:
         signature = inspect.signature(block)
     except (TypeError, ValueError):
-        return block    # some built-in functions do not tell
+        return block  # some built-in functions do not tell
     try:
         signature.bind(*parameters)
     except TypeError as error:
-        raise TypeError('a %s is called as %s; %r does not take that: %s' % (what, call, block, error)) from None
+        raise TypeError(
+            f'a {what} is called as {call}; {block!r} does not take that: {error}'
+        ) from None
     return block
 
 
 def check_runs(block, what):
-    """Raise TypeError for a function that does not run when it is called: ``async def``, or one with ``yield``."""
+    """Raise TypeError for a function that does not run when it is called: ``async def``, or one
+    with ``yield``."""
     function = block
     while isinstance(function, functools.partial):
         function = function.func
     flags = getattr(code_of(function), 'co_flags', 0)
     if flags & _ASYNC:
-        raise TypeError(f'{what} is called and not awaited, so that {block!r}, which is async, would never run: write '
-                        'a plain function that calls asyncio.run_coroutine_threadsafe(coroutine, loop) or '
-                        'asyncio.run(coroutine)')
+        raise TypeError(
+            f'{what} is called and not awaited, so that {block!r}, which is async, would never run:'
+            ' write a plain function that calls asyncio.run_coroutine_threadsafe(coroutine, loop)'
+            ' or asyncio.run(coroutine)'
+        )
     if flags & inspect.CO_GENERATOR:
-        raise TypeError(f'{what} is called and not iterated, so that {block!r}, which has a yield, would never run: '
-                        'write a plain function; to do something again and again, a soul loops over '
-                        'node.every(seconds)')
+        raise TypeError(
+            f'{what} is called and not iterated, so that {block!r}, which has a yield, would never'
+            ' run: write a plain function; to do something again and again, a soul loops over'
+            ' node.every(seconds)'
+        )
 
 
 def check_delegate(block):
@@ -90,7 +99,7 @@ class Souls:
     def __init__(self, node):
         self._node = node
         self._threads = set()
-        self._here = threading.local()    # .depth: how many souls of the node run in this thread
+        self._here = threading.local()  # .depth: how many souls of the node run in this thread
 
     def run(self, block, present):
         """Run a soul in this thread; an exception in it is reported and ends nothing else.
@@ -102,8 +111,9 @@ class Souls:
             with self._node._live_rospy().here():
                 return block(self._node)
         except BaseException as error:
-            self._node._report(error, block, 'soul',
-                               again=lambda nothing: self.run(present(), present))
+            self._node._report(
+                error, block, 'soul', again=lambda nothing: self.run(present(), present)
+            )
             return None
         finally:
             self._here.depth -= 1
@@ -118,21 +128,25 @@ class Souls:
                 self.run(block, present)
             finally:
                 self._threads.discard(threading.current_thread())
+
         thread = start_thread(run, name=name)
         self._threads.add(thread)
         known.set()
         return thread
 
     def end(self, timeout):
-        """Wait for all but this thread's, up to ``timeout`` seconds; returns the threads that went on."""
-        threads = [thread for thread in tuple(self._threads) if thread is not threading.current_thread()]
+        """Wait for all but this thread's, up to ``timeout`` seconds; returns the threads that went
+        on."""
+        threads = [
+            thread for thread in tuple(self._threads) if thread is not threading.current_thread()
+        ]
         running.join(threads, timeout)
         return [thread for thread in threads if thread.is_alive()]
 
     def end_here(self):
         """End the soul that runs in this thread, if one does."""
         if self._depth():
-            raise NodeStoppedError('%s stops, and this soul with it' % self._node.name)
+            raise NodeStoppedError(f'{self._node.name} stops, and this soul with it')
 
     def _depth(self):
         return getattr(self._here, 'depth', 0)

@@ -16,8 +16,11 @@ from pharos.private_rospy.proxies import time_limit
 from pharos.seconds import check_limit
 from pharos.private_rospy.registration import REGISTER_TIMEOUT
 
-ANSWER_TIMEOUT = 0.5      # seconds in which the master has told a live subscriber; then it is asked whether it lives
-BUFFER_SIZE = 1 << 20     # bytes read from a socket at once; rospy's 64 KiB let subscribers of images fall behind
+ANSWER_TIMEOUT = (
+    0.5  # seconds in which the master has told a live subscriber; then it is asked whether it lives
+)
+# bytes read from a socket at once; rospy's 64 KiB let subscribers of images fall behind
+BUFFER_SIZE = 1 << 20
 
 
 class _Channel:
@@ -27,14 +30,17 @@ class _Channel:
 
     def __init__(self, node, topic, message_class, queue_size):
         if isinstance(queue_size, bool) or not isinstance(queue_size, int) or queue_size < 1:
-            raise ValueError('queue_size must be a number of messages, 1 or more, not %r' % (queue_size,))
+            raise ValueError(
+                f'queue_size must be a number of messages, 1 or more, not {queue_size!r}'
+            )
         self.node = node
         self.topic = topic
         self.message_class = message_class
         self.queue_size, self.queue_bytes = queue_size, node.queue_bytes
-        self.closed = False      # whether close() was called
-        self._endpoint = None    # rospy's Publisher or Subscriber while the channel is open
-        self._lock = threading.Lock()    # guards the above against two threads that close it, and what a subclass has
+        self.closed = False  # whether close() was called
+        self._endpoint = None  # rospy's Publisher or Subscriber while the channel is open
+        # guards the above against two threads that close it, and what a subclass has
+        self._lock = threading.Lock()
 
     def _begin(self, *arguments):
         """Open it for the first time; where that fails, nothing is left behind."""
@@ -62,10 +68,10 @@ class _Channel:
     def close(self):
         """End it: the node no longer publishes, or is interested. Harmless when done twice.
 
-        When it returns, no delegate runs for the channel any more; but for the one that calls it, if one does, and one
-        that does not end within the node's :attr:`stop_timeout`.
+        When it returns, no delegate runs for the channel any more; but for the one that calls it,
+        if one does, and one that does not end within the node's :attr:`stop_timeout`.
         """
-        self.closed = True    # where it is only just being opened, it is closed right after that
+        self.closed = True  # where it is only just being opened, it is closed right after that
         self.node._forget_channel(self)
         self._release()
 
@@ -91,9 +97,13 @@ class _Channel:
         counts = collections.Counter(transport for _, transport in self.connections)
         if self.refused:
             counts['refused'] = self.refused
-        state = ', '.join('%d %s' % (count, transport) for transport, count in sorted(counts.items()))
-        return '<%s %s %s of %s: %s>' % (type(self).__name__, self.topic, self.type, self.node.name,
-                                         (state or 'not connected') if self.is_open else 'closed')
+        state = ', '.join(
+            '%d %s' % (count, transport) for transport, count in sorted(counts.items())
+        )
+        return (
+            f"<{type(self).__name__} {self.topic} {self.type} of {self.node.name}:"
+            f" {state or 'not connected' if self.is_open else 'closed'}>"
+        )
 
 
 class InputChannel(_Channel):
@@ -102,8 +112,17 @@ class InputChannel(_Channel):
     :attr:`received` counts the messages that the node has taken from the channel.
     """
 
-    def __init__(self, node, topic, message_class, delegate=None, queue_size=1, inline=False, shared=False,
-                 from_=None):
+    def __init__(
+        self,
+        node,
+        topic,
+        message_class,
+        delegate=None,
+        queue_size=1,
+        inline=False,
+        shared=False,
+        from_=None,
+    ):
         super().__init__(node, topic, message_class, queue_size)
         self.delegate = delegate
         self.inline = inline
@@ -118,10 +137,14 @@ class InputChannel(_Channel):
         dispatcher = self.node._dispatcher
         if not self.inline:
             dispatcher.need_thread()
-        self._tcpros = self._add_inbox(Inbox(self, dispatcher, True) if self.inline else SocketInbox(self, dispatcher))
+        self._tcpros = self._add_inbox(
+            Inbox(self, dispatcher, True) if self.inline else SocketInbox(self, dispatcher)
+        )
         # rospy's queue_size would drop without counting; the inbox has ours
-        self._opened(self.node._rospy.wiring.subscribe(self, tcp_nodelay=True, buff_size=BUFFER_SIZE))
-        dispatcher.run()    # what came latched
+        self._opened(
+            self.node._rospy.wiring.subscribe(self, tcp_nodelay=True, buff_size=BUFFER_SIZE)
+        )
+        dispatcher.run()  # what came latched
 
     def _unregister(self, endpoint):
         self.node._rospy.wiring.unsubscribe(self, endpoint)
@@ -142,12 +165,14 @@ class InputChannel(_Channel):
 
     @property
     def refused(self):
-        """How many publishers the channel cannot hear, for they publish another type; see the node's errors."""
+        """How many publishers the channel cannot hear, for they publish another type; see the
+        node's errors."""
         return self.node._rospy.refusals.count(self.topic) if self.is_open else 0
 
     @property
     def delegate(self):
-        """The channel's own block, called as ``delegate(message, channel)``; None: the node's is run."""
+        """The channel's own block, called as ``delegate(message, channel)``; None: the node's is
+        run."""
         return self._delegate
 
     @delegate.setter
@@ -162,8 +187,10 @@ class InputChannel(_Channel):
     def _run(self, message):
         block = self.node._delegate if self._delegate is None else self._delegate
         if block is None:
-            raise PharosError(f'{self.topic} has no delegate any more: give {self.node.name} or its '
-                              'channel one first')
+            raise PharosError(
+                f'{self.topic} has no delegate any more: give {self.node.name} or its '
+                'channel one first'
+            )
         try:
             block(message, self)
         except BaseException as error:
@@ -171,14 +198,17 @@ class InputChannel(_Channel):
 
     @property
     def dropped(self):
-        """How many messages were dropped, the oldest first, because the node was slower than they came."""
+        """How many messages were dropped, the oldest first, because the node was slower than they
+        came."""
         return self._dropped_before + sum(inbox.dropped for inbox in self._inboxes)
 
     def _new_inbox(self, thaw, header):
         """An inbox for what a node of this process sends."""
-        if self.shared:    # the messages are marked with the header when they are handed over
+        if self.shared:  # the messages are marked with the header when they are handed over
             thaw = header = None
-        return self._add_inbox(Inbox(self, self.node._dispatcher, self.inline, thaw, header, self.shared))
+        return self._add_inbox(
+            Inbox(self, self.node._dispatcher, self.inline, thaw, header, self.shared)
+        )
 
     def _add_inbox(self, inbox):
         with self._lock:
@@ -194,13 +224,14 @@ class InputChannel(_Channel):
                 message = self._of_own_class(message)
                 if message is None:
                     return
-            with self._lock:    # TCPROS connections offer side by side
+            with self._lock:  # TCPROS connections offer side by side
                 self._tcpros.put(message, self._size(message) if self._size else 0)
 
-    _offer.is_of_channel = True    # unlike other callbacks of rospy's
+    _offer.is_of_channel = True  # unlike other callbacks of rospy's
 
     def _of_own_class(self, message):
-        """The message, where the first subscriber of the node, which rospy goes by, wants another class: AnyMsg, say.
+        """The message, where the first subscriber of the node, which rospy goes by, wants another
+        class: AnyMsg, say.
 
         None where it is of another type.
         """
@@ -215,7 +246,8 @@ class InputChannel(_Channel):
 
 
 class OutputChannel(_Channel):
-    """The end at which a node sends: made by :meth:`Node.output_channel`, or by the first ``send_to``.
+    """The end at which a node sends: made by :meth:`Node.output_channel`, or by the first
+    ``send_to``.
 
     :attr:`sent` counts the messages published.
     """
@@ -225,7 +257,7 @@ class OutputChannel(_Channel):
         self.latch = latch
         self.latched = Latch()
         self.sent = 0
-        self._uninterested = set()    # names of nodes of which the log says so
+        self._uninterested = set()  # names of nodes of which the log says so
         self._begin(connect_timeout)
 
     def _open(self, connect_timeout=None):
@@ -233,15 +265,17 @@ class OutputChannel(_Channel):
         deadline = time.monotonic() + timeout
         self._opener, self._connected = threading.current_thread(), threading.Event()
         try:
-            endpoint, self._send = self.node._rospy.wiring.advertise(self, timeout, tcp_nodelay=True,
-                                                                     queue_size=self.queue_size)
+            endpoint, self._send = self.node._rospy.wiring.advertise(
+                self, timeout, tcp_nodelay=True, queue_size=self.queue_size
+            )
             self._opened(endpoint)
             self._wait_for_known_subscribers(timeout, deadline)
         finally:
             self._connected.set()
 
     def wait_until_connected(self, timeout):
-        """Wait while another thread opens the channel and connects it to the subscribers that the master knows.
+        """Wait while another thread opens the channel and connects it to the subscribers that the
+        master knows.
 
         :param timeout: seconds
         """
@@ -269,7 +303,8 @@ class OutputChannel(_Channel):
             self.sent += 1
 
     def _check_is_there(self, name):
-        """Raise UnknownNodeError if a message for that node alone has nowhere to go, since there is no such node."""
+        """Raise UnknownNodeError if a message for that node alone has nowhere to go, since there is
+        no such node."""
         endpoint = self._endpoint
         if endpoint is None or self.node._rospy.wiring.reaches(endpoint, name):
             return
@@ -277,68 +312,89 @@ class OutputChannel(_Channel):
             self.node.master._find(name)
         if name not in self._uninterested and not self.latch:
             self._uninterested.add(name)
-            self.node.log(f'{name} is not interested in {self.topic}, or not connected yet: what {self.node.name} sends '
-                          'to it alone goes nowhere', level='warning')
+            self.node.log(
+                (
+                    f'{name} is not interested in {self.topic}, or not connected yet: what'
+                    f' {self.node.name} sends to it alone goes nowhere'
+                ),
+                level='warning',
+            )
 
     def _check_type(self, message):
-        if not isinstance(message, genpy.Message) or message._md5sum not in (self.message_class._md5sum, '*'):
-            raise MessageTypeError('%s carries %s (%s), not %s' % (
-                self.topic, self.type, message_types.describe_fields(self.message_class),
-                getattr(message, '_type', None) or repr(message)))
+        if not isinstance(message, genpy.Message) or message._md5sum not in (
+            self.message_class._md5sum,
+            '*',
+        ):
+            raise MessageTypeError(
+                f"{self.topic} carries"
+                f" {self.type} ({message_types.describe_fields(self.message_class)}), not"
+                f" {getattr(message, '_type', None) or repr(message)}"
+            )
 
     def _explain(self, error, message):
         """Raise our error for one that publishing raised."""
         if not self.is_open or self.node._rospy.wiring.is_closed(self._endpoint):
-            raise NodeStoppedError('the channel of %s on %s is closed: open another with output_channel()'
-                                   % (self.node.name, self.topic)) from error
+            raise NodeStoppedError(
+                f'the channel of {self.node.name} on {self.topic} is closed: open another with'
+                ' output_channel()'
+            ) from error
         message_types.check_fits(message)
-        raise MessageTypeError('%s cannot be sent on %s: %s' % (self.type, self.topic, error)) from error
+        raise MessageTypeError(f'{self.type} cannot be sent on {self.topic}: {error}') from error
 
     def _unregister(self, endpoint):
         self._send = _closed
         self.node._rospy.wiring.unadvertise(self, endpoint)
 
     def send(self, block=None, *, to=None, **fields):
-        """Fill a fresh message with ``block(message)`` and by keywords, publish it, and return it."""
+        """Fill a fresh message with ``block(message)`` and by keywords, publish it, and return
+        it."""
         if block is not None:
             if not callable(block):
-                check_block(block, 'block', ('message',))    # says how it is called
+                check_block(block, 'block', ('message',))  # says how it is called
             check_runs(block, 'a block')
         message = message_types.build(self.message_class, block, fields)
         if not self.connections:
-            message_types.check_fits(message)    # with nobody interested, rospy does not look at it
+            message_types.check_fits(message)  # with nobody interested, rospy does not look at it
         self.publish(message, to)
         return message
 
     def wait_for_subscribers(self, count=1, timeout=None):
-        """Wait until ``count`` subscribers are connected, for up to ``timeout`` seconds (None: without limit).
+        """Wait until ``count`` subscribers are connected, for up to ``timeout`` seconds (None:
+        without limit).
 
-        Returns whether they are; ends early, with False, when the node stops; a soul of the node is ended by that.
+        Returns whether they are; ends early, with False, when the node stops; a soul of the node is
+        ended by that.
         """
         timeout = check_limit('timeout', timeout)
         if self.is_open:
-            self.node._rospy.wait_until(lambda: len(self.connections) >= count or not self.is_open, timeout)
+            self.node._rospy.wait_until(
+                lambda: len(self.connections) >= count or not self.is_open, timeout
+            )
         self.node._end_soul()
         return self.is_open and len(self.connections) >= count
 
     def _wait_for_known_subscribers(self, timeout, deadline):
-        """Wait until those that the master knows are connected, until the deadline, ``timeout`` after the beginning.
+        """Wait until those that the master knows are connected, until the deadline, ``timeout``
+        after the beginning.
 
         rospy loses what is published before (ros_comm #176, #286).
         """
         missing = self.node._rospy.wiring.known_subscribers(self.topic)
-        if missing is None:    # not always: a large graph's state takes long to read
+        if missing is None:  # not always: a large graph's state takes long to read
             try:
                 with time_limit(max(REGISTER_TIMEOUT, deadline - time.monotonic())):
                     missing = set(self.node.master.topic(self.topic).subscribers)
-            except MasterUnreachableError:    # the topic is registered already
+            except MasterUnreachableError:  # the topic is registered already
                 return
 
         def connected():
             missing.difference_update(name for name, _ in self.connections)
-            missing.difference_update(node.name for node in self.node.master.own_nodes() if node._is_ending())
+            missing.difference_update(
+                node.name for node in self.node.master.own_nodes() if node._is_ending()
+            )
             missing.difference_update(self.node._rospy.refusals.subscribers(self.topic))
             return not missing or not self.is_open
+
         wait_until = self.node._rospy.wait_until
         wait_until(connected, min(deadline - time.monotonic(), ANSWER_TIMEOUT))
         if not connected() and self.node.is_running:
@@ -354,10 +410,15 @@ class OutputChannel(_Channel):
         told = self.node._rospy.wiring.told_late
         if self.topic not in told:
             told.add(self.topic)
-            self.node.log(f'{self.topic}: {", ".join(sorted(names))} did not connect within {timeout:g} s, though the '
-                          f'master has them as subscribers, and may miss the first messages of {self.node.name}: can '
-                          'they reach this host, and are they of the same type? A longer connect_timeout waits longer',
-                          level='warning')
+            self.node.log(
+                (
+                    f'{self.topic}: {", ".join(sorted(names))} did not connect within'
+                    f' {timeout:g} s, though the master has them as subscribers, and may miss the'
+                    f' first messages of {self.node.name}: can they reach this host, and are they'
+                    ' of the same type? A longer connect_timeout waits longer'
+                ),
+                level='warning',
+            )
 
     def _stopped(self):
         super()._stopped()

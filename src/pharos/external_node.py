@@ -5,7 +5,7 @@ from pharos.errors import UnknownNodeError
 from pharos.private_rospy.proxies import ServerProxy
 from pharos.private_rospy.registration import COMMUNICATION_ERRORS
 
-TIMEOUT = 2.0    # seconds that a node may take to answer
+TIMEOUT = 2.0  # seconds that a node may take to answer
 
 
 class ExternalNode:
@@ -35,7 +35,8 @@ class ExternalNode:
 
     @property
     def publications(self):
-        """``{topic: type}`` that it publishes, as the master knows it; the type is None where nobody has named it."""
+        """``{topic: type}`` that it publishes, as the master knows it; the type is None where
+        nobody has named it."""
         return self._topics(0)
 
     @property
@@ -45,35 +46,45 @@ class ExternalNode:
 
     def _topics(self, kind):
         types = dict(self.master.topic_types())
-        return {topic: types.get(topic) for topic, nodes in self.master.system_state()[kind].items()
-                if self.name in nodes}
+        return {
+            topic: types.get(topic)
+            for topic, nodes in self.master.system_state()[kind].items()
+            if self.name in nodes
+        }
 
     @property
     def services(self):
         """Names of the services that it offers."""
-        return sorted(name for name, nodes in self.master.system_state()[2].items() if self.name in nodes)
+        return sorted(
+            name for name, nodes in self.master.system_state()[2].items() if self.name in nodes
+        )
 
     def shutdown(self):
         """Ask it to stop, as ``rosnode kill`` does."""
-        self._ask('getPid')    # tells whether it is there to be asked
+        self._ask('getPid')  # tells whether it is there to be asked
         try:
             self._ask('shutdown', 'asked for by pharos')
         except UnknownNodeError:
-            pass    # it was gone before its answer was through
+            pass  # it was gone before its answer was through
 
     def _ask(self, method, *args):
         uri = self.uri
         try:
             return getattr(ServerProxy(uri, TIMEOUT), method)('/pharos', *args)[2]
         except COMMUNICATION_ERRORS as error:
-            raise UnknownNodeError('%s is registered at %s but does not answer (%s): if it is gone, rosnode cleanup '
-                                   'removes it' % (self.name, uri, error)) from error
+            raise UnknownNodeError(
+                f'{self.name} is registered at {uri} but does not answer ({error}): if it is gone,'
+                ' rosnode cleanup removes it'
+            ) from error
 
     def __eq__(self, other):
-        return isinstance(other, ExternalNode) and (self.master, self.name) == (other.master, other.name)
+        return isinstance(other, ExternalNode) and (self.master, self.name) == (
+            other.master,
+            other.name,
+        )
 
     def __hash__(self):
         return hash((self.master, self.name))
 
     def __repr__(self):
-        return '<ExternalNode %s of %s>' % (self.name, self.master.url)
+        return f'<ExternalNode {self.name} of {self.master.url}>'

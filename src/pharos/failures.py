@@ -12,12 +12,12 @@ from pharos.blocks import attempt, text_of
 from pharos.errors import PharosError
 from pharos.signals import code_of, is_from_signal
 
-KEPT = 100           # failures of a node; the oldest go, but for the first, which may be the cause
-WHOLE = 5            # of them, the newest, whose messages and frames are kept
-TEXTS = 3            # texts of failures at one place that are told; then the 10th, 100th ... there
-PLACES = 1000        # at which failures are counted
-TEXT_LIMIT = 2000    # characters of the text of an exception
-LARGE = 10000        # bytes of a thing that an exception without its frames may hold on to
+KEPT = 100  # failures of a node; the oldest go, but for the first, which may be the cause
+WHOLE = 5  # of them, the newest, whose messages and frames are kept
+TEXTS = 3  # texts of failures at one place that are told; then the 10th, 100th ... there
+PLACES = 1000  # at which failures are counted
+TEXT_LIMIT = 2000  # characters of the text of an exception
+LARGE = 10000  # bytes of a thing that an exception without its frames may hold on to
 
 
 class Failure:
@@ -41,10 +41,10 @@ class Failure:
         self._failures, self._where, self._place = failures, where, place
         self._frames = self._again = None
         self._had_message = False
-        self._traceback = None    # the text of what was let go
+        self._traceback = None  # the text of what was let go
 
     def _happened(self, error, message, again):
-        if error is self.error:    # one raised again and again collects the frames of each time
+        if error is self.error:  # one raised again and again collects the frames of each time
             _cut(error.__traceback__, self._frames)
         self.error, self.message, self._frames = error, message, error.__traceback__
         self._again, self._traceback = again, None
@@ -81,8 +81,10 @@ class Failure:
         if self._again is None:
             raise PharosError(f'{self._where} cannot be run again: do by hand what made it run')
         if not self.is_whole and self._had_message:
-            raise PharosError(f'{self._where} cannot be run again: messages are kept of the newest '
-                              f'{WHOLE} failures of a node only; retry() one of those')
+            raise PharosError(
+                f'{self._where} cannot be run again: messages are kept of the newest '
+                f'{WHOLE} failures of a node only; retry() one of those'
+            )
         return self._failures._retry(self)
 
     def debug(self):
@@ -91,10 +93,13 @@ class Failure:
         :raises PharosError: if they have been let go
         """
         if self._frames is None:
-            raise PharosError(f'the frames of this failure of {self._where} are gone: they are kept '
-                              f'of the newest {WHOLE} failures of a node only; debug() one of those, '
-                              'or read its .traceback')
-        import pdb    # only here: it is slow to import
+            raise PharosError(
+                f'the frames of this failure of {self._where} are gone: they are kept '
+                f'of the newest {WHOLE} failures of a node only; debug() one of those, '
+                'or read its .traceback'
+            )
+        import pdb  # only here: it is slow to import
+
         pdb.post_mortem(self._frames)
 
     def __repr__(self):
@@ -136,7 +141,8 @@ class Errors(collections.abc.Sequence):
 
 
 class Failures:
-    """The failures of the blocks of one node, or of something else that runs blocks; for any thread.
+    """The failures of the blocks of one node, or of something else that runs blocks; for any
+    thread.
 
     :param tell: called as ``tell(line, details)`` for those that are worth it; what it raises
         changes nothing
@@ -146,12 +152,12 @@ class Failures:
         self._tell = tell
         # an RLock: what is freed, or shown as text, may run code of the user's
         self._lock = threading.RLock()
-        self._kept = {}                   # (place, text) -> Failure, the newest last
+        self._kept = {}  # (place, text) -> Failure, the newest last
         self._first = None
-        self._times = collections.Counter()    # place -> how many failures there were at it
-        self._texts = collections.Counter()    # place -> of how many texts of them was told
-        self._retrying = threading.local()     # .failed: whether what the thread runs again has
-        self.count = 0                         # of all failures, identical ones too
+        self._times = collections.Counter()  # place -> how many failures there were at it
+        self._texts = collections.Counter()  # place -> of how many texts of them was told
+        self._retrying = threading.local()  # .failed: whether what the thread runs again has
+        self.count = 0  # of all failures, identical ones too
         self.errors = Errors(self)
 
     def all(self):
@@ -181,9 +187,9 @@ class Failures:
 
     def _report(self, error, block, where, channel, message, again):
         text, frames = _brief(text_of(error)), error.__traceback__
-        # The code tells a block from the one that it replaces, typed anew at the prompt perhaps, but
-        # not two closures. Not the channel itself, which may be closed, and should not be kept for
-        # being counted.
+        # The code tells a block from the one that it replaces, typed anew at the prompt perhaps,
+        # but not two closures. Not the channel itself, which may be closed, and should not be kept
+        # for being counted.
         place = where, attempt(lambda: code_of(block)), id(channel), type(error), _raised_at(frames)
         with self._lock:
             failure = self._kept.pop((place, text), None)
@@ -209,7 +215,8 @@ class Failures:
             self._tell(f'{raised}: {text}, {times} times by now{different}', '')
 
     def _count_at(self, place, is_new):
-        """Count a failure; returns how many there were at its place, and whether it is to be told."""
+        """Count a failure; returns how many there were at its place, and whether it is to be
+        told."""
         self._times[place] += 1
         is_told = is_new and self._texts[place] < TEXTS
         if is_told:
@@ -250,7 +257,7 @@ def _raised_at(frames):
 def _formatted(error, frames):
     """A traceback as text."""
     lines = attempt(lambda: traceback.format_exception(type(error), error, frames))
-    if lines is None:    # its __str__, or that of its cause, raises what traceback does not expect
+    if lines is None:  # its __str__, or that of its cause, raises what traceback does not expect
         lines = attempt(lambda: traceback.format_tb(frames), [])
     return _brief(''.join(lines), 10 * TEXT_LIMIT)
 
@@ -270,13 +277,13 @@ def _cut(frames, before):
 
 def _release(error):
     """Have an exception hold on to nothing large: frames, causes, and what it was made of."""
-    set_attribute = BaseException.__setattr__    # that of its class may refuse
+    set_attribute = BaseException.__setattr__  # that of its class may refuse
     for name in '__traceback__', '__cause__', '__context__':
         set_attribute(error, name, None)
     set_attribute(error, 'args', tuple(map(_small, error.args)))
     for name, value in list(vars(error).items()):
         set_attribute(error, name, _small(value))
-    for inner in getattr(error, 'exceptions', ()):    # of an ExceptionGroup
+    for inner in getattr(error, 'exceptions', ()):  # of an ExceptionGroup
         _release(inner)
     if isinstance(error, (UnicodeEncodeError, UnicodeDecodeError)):
         if _small(error.object) is not error.object:

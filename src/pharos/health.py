@@ -12,13 +12,15 @@ from pharos.watcher import watcher_of
 class Health(NamedTuple):
     """What can be said of a node at a glance; as a string, in one line."""
 
-    registered: Optional[bool]          # whether the master has it at its URI; None: the master does not answer
-    reachable_since: Optional[float]    # since when the master answers, in seconds as of time.time(); None: it does not
-    connections: Dict[str, int]         # transport -> how many the node's channels have
-    dropped: int                        # messages that its input channels have dropped
-    errors: int                         # times that its blocks failed; node.errors has identical ones once
-    threads: int                        # of the node
-    refused: int = 0                    # publishers that its channels cannot hear, for they publish another type
+    # whether the master has it at its URI; None: the master does not answer
+    registered: Optional[bool]
+    # since when the master answers, in seconds as of time.time(); None: it does not
+    reachable_since: Optional[float]
+    connections: Dict[str, int]  # transport -> how many the node's channels have
+    dropped: int  # messages that its input channels have dropped
+    errors: int  # times that its blocks failed; node.errors has identical ones once
+    threads: int  # of the node
+    refused: int = 0  # publishers that its channels cannot hear, for they publish another type
 
     def __str__(self):
         return ', '.join(self._parts())
@@ -28,8 +30,10 @@ class Health(NamedTuple):
         if self.registered is not None:
             yield 'registered' if self.registered else 'not registered'
         if self.reachable_since:
-            yield 'master reachable since ' + time.strftime('%H:%M:%S', time.localtime(self.reachable_since))
-        elif self.registered is None:    # else it has just answered
+            yield 'master reachable since ' + time.strftime(
+                '%H:%M:%S', time.localtime(self.reachable_since)
+            )
+        elif self.registered is None:  # else it has just answered
             yield 'master away'
         for transport, count in sorted(self.connections.items()):
             yield f'{count} {transport}'
@@ -41,7 +45,8 @@ class Health(NamedTuple):
 
 
 def health_of(node, ask):
-    """The :class:`Health` of a node; ``ask``: the master too, which may take its time, else ``registered`` is None."""
+    """The :class:`Health` of a node; ``ask``: the master too, which may take its time, else
+    ``registered`` is None."""
     channels, is_running = node.channels, node.is_running
     transports = (transport for channel in channels for _, transport in channel.connections)
     return Health(
@@ -51,7 +56,8 @@ def health_of(node, ask):
         dropped=sum(getattr(channel, 'dropped', 0) for channel in channels),
         errors=node._failures.count,
         threads=node._rospy.thread_count if node._rospy else 0,
-        refused=node._rospy.refusals.count() if is_running else 0)
+        refused=node._rospy.refusals.count() if is_running else 0,
+    )
 
 
 def _is_registered(node):

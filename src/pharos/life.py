@@ -16,6 +16,7 @@ from pharos.watcher import watcher_of
 
 class Lifecycle(enum.Enum):
     """Where a node is in its life; see :attr:`Node.lifecycle`."""
+
     NEW = 'new'
     STARTING = 'starting'
     RUNNING = 'running'
@@ -26,19 +27,26 @@ class Lifecycle(enum.Enum):
 class Life:
     """What a :class:`~pharos.Node` does to live; its blocks, channels and services are there."""
 
-    connect_timeout = 2.0    #: seconds that a topic's first message waits for the subscribers the master knows
-    queue_bytes = 64 << 20   #: bytes of messages, about, that wait for a slow receiver for each publisher, or one message
-    allow_remote_shutdown = False    #: whether any host may ask it to stop, not only this one and the master's
-    stop_timeout = 2.0       #: seconds that :meth:`stop` waits for souls, and for messages under way
+    connect_timeout = (
+        2.0  #: seconds that a topic's first message waits for the subscribers the master knows
+    )
+    queue_bytes = (
+        64 << 20
+    )  #: bytes of messages, about, that wait for a slow receiver for each publisher, or one message
+    allow_remote_shutdown = (
+        False  #: whether any host may ask it to stop, not only this one and the master's
+    )
+    stop_timeout = 2.0  #: seconds that :meth:`stop` waits for souls, and for messages under way
 
     def _configure(self, master, settings):
         self.master = master
         self._settings = settings
         self._lifecycle = Lifecycle.NEW
-        self._changing = stopping.changed         # guards _lifecycle
-        self._rospy = self._dispatcher = None     # of the present run, or the last
-        self._starting = self._starter = None     # the rospy of the run that starts, and the thread that starts it
-        self._is_start_ended = False              # whether a stop() is to end that start
+        self._changing = stopping.changed  # guards _lifecycle
+        self._rospy = self._dispatcher = None  # of the present run, or the last
+        # the rospy of the run that starts, and the thread that starts it
+        self._starting = self._starter = None
+        self._is_start_ended = False  # whether a stop() is to end that start
         self._souls = Souls(self)
         self._channels, self._services = [], []
 
@@ -50,15 +58,18 @@ class Life:
             cls.stop = stopping.once(cls.stop)
 
     def start(self):
-        """Register with the master. A subclass overrides this, calls ``super().start()``, then makes its channels.
+        """Register with the master. A subclass overrides this, calls ``super().start()``, then
+        makes its channels.
 
-        Runs in the thread that creates the node. A stopped node starts again, under the same name and ports. Where a
-        class has no ``start`` of its own, the channels, services and parameters that it had come back too, also where a
-        start in between was interrupted.
+        Runs in the thread that creates the node. A stopped node starts again, under the same name
+        and ports. Where a class has no ``start`` of its own, the channels, services and parameters
+        that it had come back too, also where a start in between was interrupted.
 
         :raises PharosError: if the node is running already
-        :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: and the node is then as it was
-        :raises NodeStoppedError: if :meth:`stop` was called meanwhile, and the node is then as it was
+        :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: and the node is then as
+            it was
+        :raises NodeStoppedError: if :meth:`stop` was called meanwhile, and the node is then as it
+            was
         """
         with signals.held(stopping.LIMIT):
             former = self._rospy
@@ -73,13 +84,14 @@ class Life:
             is_ended = not self.is_running
             self._stop_run()
             for channel in self._channels:
-                channel._stopped()    # opened after another thread had stopped the node
+                channel._stopped()  # opened after another thread had stopped the node
             if is_ended and isinstance(error, Exception):
-                raise NodeStoppedError('%s was stopped while it started' % self.name) from error
+                raise NodeStoppedError(f'{self.name} was stopped while it started') from error
             raise
 
     def _reopen(self):
-        """Open what the node had; it keeps all of that for its next start if this one is interrupted."""
+        """Open what the node had; it keeps all of that for its next start if this one is
+        interrupted."""
         for opened in (*self._channels, *self._services):
             self._live_rospy()
             opened._open()
@@ -89,7 +101,9 @@ class Life:
     def _start_run(self):
         before = self._begin_start()
         try:
-            instance = PrivateRospy(self._settings, self._asked_to_stop, lambda: self.allow_remote_shutdown)
+            instance = PrivateRospy(
+                self._settings, self._asked_to_stop, lambda: self.allow_remote_shutdown
+            )
             with stopping.changed:
                 self._starting = instance
                 is_ended = self._is_start_ended
@@ -102,19 +116,22 @@ class Life:
                 is_ended = self._is_start_ended
                 self._become(before)
             if is_ended and isinstance(error, Exception):
-                raise NodeStoppedError('%s was stopped while it started' % self.name) from error
+                raise NodeStoppedError(f'{self.name} was stopped while it started') from error
             raise
         watcher_of(self.master).check()
 
     def _begin_start(self):
-        """Be STARTING, and known in this process before the master knows the node; returns what it was."""
+        """Be STARTING, and known in this process before the master knows the node; returns what it
+        was."""
         if not self._is_starting():
             with contextlib.suppress(TimeoutError):
-                stopping.wait_for_end(self)    # what an overriding stop() does last
+                stopping.wait_for_end(self)  # what an overriding stop() does last
         with stopping.changed:
             if self._lifecycle not in (Lifecycle.NEW, Lifecycle.STOPPED):
-                raise PharosError('%s is %s already: stop() it before you start it again'
-                                  % (self.name, self._lifecycle.value))
+                raise PharosError(
+                    f'{self.name} is {self._lifecycle.value} already: stop() it before you start it'
+                    ' again'
+                )
             running.claim(self)
             before = self._lifecycle
             self._starter, self._is_start_ended = threading.get_ident(), False
@@ -126,7 +143,10 @@ class Life:
             if not self._is_start_ended:
                 self._rospy = instance
                 # the same ports next time, also where any free one was asked for
-                self._settings.tcp_port, self._settings.xmlrpc_port = instance.tcp_port, instance.xmlrpc_port
+                self._settings.tcp_port, self._settings.xmlrpc_port = (
+                    instance.tcp_port,
+                    instance.xmlrpc_port,
+                )
                 self._dispatcher = Dispatcher(instance.start_thread)
                 instance.on_received = self._dispatcher.run
                 instance.on_failure = self._hook_failed
@@ -154,11 +174,12 @@ class Life:
     def stop(self):
         """End the souls, send what is under way, unregister, close the ports, end the threads.
 
-        A subclass overrides this and calls ``super().stop()``. It runs once for each start, to its end, in the thread
-        that was the first to ask for it: the program (here, a signal, its end) or ROS (``rosnode kill``). Who asks
-        meanwhile, from any thread, waits until it has ended, as does the end of the program, but only until 30 s after
-        its beginning. Called in a thread of the node's own, it does not wait for what that thread runs. A node that is
-        still starting is stopped, too: its start raises NodeStoppedError.
+        A subclass overrides this and calls ``super().stop()``. It runs once for each start, to its
+        end, in the thread that was the first to ask for it: the program (here, a signal, its end)
+        or ROS (``rosnode kill``). Who asks meanwhile, from any thread, waits until it has ended, as
+        does the end of the program, but only until 30 s after its beginning. Called in a thread of
+        the node's own, it does not wait for what that thread runs. A node that is still starting is
+        stopped, too: its start raises NodeStoppedError.
         """
         self._stop_run()
 
@@ -172,13 +193,20 @@ class Life:
             instance.end()
             ignoring = self._souls.end(self.stop_timeout)
             if ignoring:
-                self.log('left behind, for it did not end within %g s of the stop: %s. A soul ends by itself if it '
-                         'waits with node.sleep() or loops over node.every()'
-                         % (self.stop_timeout, ', '.join(thread.name for thread in ignoring)), level='warning')
+                self.log(
+                    (
+                        f"left behind, for it did not end within {self.stop_timeout:g} s of the"
+                        f" stop: {', '.join((thread.name for thread in ignoring))}. A soul ends by"
+                        " itself if it waits with node.sleep() or loops over node.every()"
+                    ),
+                    level='warning',
+                )
             self._dispatcher.close()
             left = instance.stop(self.stop_timeout, ignoring)
             if left:
-                Transcript.show('%s left behind threads that did not end: %s' % (self.name, ', '.join(left)))
+                Transcript.show(
+                    f"{self.name} left behind threads that did not end: {', '.join(left)}"
+                )
             for channel in self._channels:
                 channel._stopped()
         finally:
@@ -202,7 +230,8 @@ class Life:
             stopping.changed.notify_all()
 
     def _is_anothers(self):
-        """This is a process that was forked: the node runs in its parent, and here it is stopped."""
+        """This is a process that was forked: the node runs in its parent, and here it is
+        stopped."""
         self._lifecycle = Lifecycle.STOPPED
         self._changing = stopping.changed
         self._rospy = self._starting = None
@@ -214,11 +243,12 @@ class Life:
         self._failures.report(error, None, f'a hook of on_shutdown of {self.name}')
 
     def _asked_to_stop(self, reason):
-        attempt(lambda: self.log('stops: %s' % (reason,)))
+        attempt(lambda: self.log(f'stops: {reason}'))
         self._stop_for_others()
 
     def _stop_for_others(self):
-        """Stop where no code of the user's asked for it, who would get what an overriding stop() raises."""
+        """Stop where no code of the user's asked for it, who would get what an overriding stop()
+        raises."""
         try:
             self.stop()
         except BaseException as error:
@@ -231,8 +261,11 @@ class Life:
 
     @name.setter
     def name(self, value):
-        raise AttributeError(f'{self.name} is the name by which the master knows the node: give another one to create(), '
-                             f'as named={value!r}, and what else {type(self).__name__} is called to another attribute')
+        raise AttributeError(
+            f'{self.name} is the name by which the master knows the node: give another one to'
+            f' create(), as named={value!r}, and what else {type(self).__name__} is called to'
+            ' another attribute'
+        )
 
     @property
     def lifecycle(self):
@@ -266,7 +299,8 @@ class Life:
             self._souls.end_here()
 
     def every(self, seconds):
-        """An iterator that turns at once and then every ``seconds`` of ROS time, without drift, until the node stops.
+        """An iterator that turns at once and then every ``seconds`` of ROS time, without drift,
+        until the node stops.
 
         A turn that takes longer than ``seconds`` delays the next, which then comes at once.
         """
@@ -284,5 +318,7 @@ class Life:
             hint = ''
             if self._lifecycle is Lifecycle.NEW:
                 hint = '; a start() of its own has to call super().start() before anything else'
-            raise NodeStoppedError(f'{self.name} is {self._lifecycle.value}: start() it first{hint}')
+            raise NodeStoppedError(
+                f'{self.name} is {self._lifecycle.value}: start() it first{hint}'
+            )
         return self._rospy

@@ -24,8 +24,8 @@ from pharos.service import Service
 from pharos.topic import Topic
 from pharos.watcher import watcher_of
 
-TIMEOUT = 5.0    # seconds that a question to the master may take
-POLL = 0.05      # seconds between two questions whether there is a master
+TIMEOUT = 5.0  # seconds that a question to the master may take
+POLL = 0.05  # seconds between two questions whether there is a master
 
 
 class Master:
@@ -36,32 +36,37 @@ class Master:
         master := PhaROSMaster url: 'http://127.0.0.1:11311/'
         master = Master('http://127.0.0.1:11311/')
 
-    Masters whose URLs mean one address ('localhost' and '127.0.0.1') are equal; a host name is looked up where two are
-    compared.
+    Masters whose URLs mean one address ('localhost' and '127.0.0.1') are equal; a host name is
+    looked up where two are compared.
 
-    :param url: URL of the ROS master; None: ROS_MASTER_URI, else ROS's default. Makes no connection yet.
+    :param url: URL of the ROS master; None: ROS_MASTER_URI, else ROS's default. Makes no connection
+        yet.
     :raises ValueError: if it is no URL
     """
 
     def __init__(self, url=None):
-        self.url = check_url(rosgraph.get_master_uri(), ROS_MASTER_URI) if url is None else check_url(url)
-        self._child = None    # the process of an embedded master
+        self.url = (
+            check_url(rosgraph.get_master_uri(), ROS_MASTER_URI) if url is None else check_url(url)
+        )
+        self._child = None  # the process of an embedded master
 
     @classmethod
     def embedded(cls, port=0):
-        """A ROS master of one's own, with /rosout, as a child of this process; ``roscore`` is not needed.
+        """A ROS master of one's own, with /rosout, as a child of this process; ``roscore`` is not
+        needed.
 
-        It ends with :meth:`stop`, its ``with`` block, or this process, however that ends. It is for this host alone
-        unless ROS_IP or ROS_HOSTNAME say otherwise.
+        It ends with :meth:`stop`, its ``with`` block, or this process, however that ends. It is for
+        this host alone unless ROS_IP or ROS_HOSTNAME say otherwise.
 
         :param port: its port, 0 for any free one
         :raises PortInUseError: if the port is taken
         """
-        from pharos import embedded_master    # only here: most programs have a master
+        from pharos import embedded_master  # only here: most programs have a master
+
         child, url = embedded_master.start(check_port('port', port))
         master = cls(url)
         master._child = child
-        running.at_end(master.stop)    # the child would end by itself, but perhaps after us
+        running.at_end(master.stop)  # the child would end by itself, but perhaps after us
         return master
 
     def stop(self):
@@ -70,8 +75,11 @@ class Master:
         :raises PharosError: if it is not embedded: other nodes need it
         """
         from pharos import embedded_master
+
         if self._child is None:
-            raise PharosError('%s is not embedded in this program: stop it where it was started' % self)
+            raise PharosError(
+                f'{self} is not embedded in this program: stop it where it was started'
+            )
         running.not_at_end(self.stop)
         for node in self.own_nodes():
             node._stop_for_others()
@@ -85,39 +93,66 @@ class Master:
         if self._child is not None:
             self.stop()
 
-    def create(self, node_class, named, domain=None, tcp_port=0, xmlrpc_port=0, soul=None, delegate=None, argv=None,
-               **kwargs):
+    def create(
+        self,
+        node_class,
+        named,
+        domain=None,
+        tcp_port=0,
+        xmlrpc_port=0,
+        soul=None,
+        delegate=None,
+        argv=None,
+        **kwargs,
+    ):
         """Create, register and start a node; returns it.
 
         The report (listing 3.7)::
 
-            master create: PhaROSBlockNode named: '/myNode' domain: '127.0.0.1' tcpPort: 9999 xmlRpcPort: 6123
+            master create: PhaROSBlockNode named: '/myNode' domain: '127.0.0.1' tcpPort: 9999
+            xmlRpcPort: 6123
                 soul: [...]
-            master.create(BlockNode, named='/myNode', domain='127.0.0.1', tcp_port=9999, xmlrpc_port=6123, soul=...)
+            master.create(BlockNode, named='/myNode', domain='127.0.0.1', tcp_port=9999,
+            xmlrpc_port=6123, soul=...)
 
         :param node_class: Node, BlockNode or a subclass
         :param named: the node's name, which may carry a namespace: '/robot1/driver'
-        :param domain: the address that the node advertises and, if it is loopback, the only one it listens on; None:
-            what ROS_HOSTNAME, ROS_IP or the host's name say
+        :param domain: the address that the node advertises and, if it is loopback, the only one it
+            listens on; None: what ROS_HOSTNAME, ROS_IP or the host's name say
         :param tcp_port: TCPROS port, 0 for any free one
         :param xmlrpc_port: XML-RPC port, 0 for any free one
         :param soul: block that says what the node does, called as ``soul(node)``
         :param delegate: block run for each message, called as ``delegate(message, channel)``
-        :param argv: ROS remappings and private parameters (a script passes ``sys.argv``). Of several nodes with the same
-            ``argv`` the first takes the ``__name`` in it, for good; the others keep ``named``, in the namespace of
-            ``__ns``; all else holds for all. ``eye:image:=/camera/image``, ``eye:__name:=left`` and ``eye:_rate:=5``
-            are for the one whose ``named`` ends in 'eye'.
+        :param argv: ROS remappings and private parameters (a script passes ``sys.argv``). Of
+            several nodes with the same ``argv`` the first takes the ``__name`` in it, for good; the
+            others keep ``named``, in the namespace of ``__ns``; all else holds for all.
+            ``eye:image:=/camera/image``, ``eye:__name:=left`` and ``eye:_rate:=5`` are for the one
+            whose ``named`` ends in 'eye'.
         :param kwargs: for the node's ``__init__``
-        :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: and nothing is left behind
-        :raises ValueError: if a name, port or address cannot be one, also an address in ROS_HOSTNAME or ROS_IP
+        :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: and nothing is left
+            behind
+        :raises ValueError: if a name, port or address cannot be one, also an address in
+            ROS_HOSTNAME or ROS_IP
         """
-        node = nodes_of_ours.make(node_class, self, named, soul, delegate, kwargs, domain=domain, tcp_port=tcp_port,
-                                  xmlrpc_port=xmlrpc_port, argv=argv)
+        node = nodes_of_ours.make(
+            node_class,
+            self,
+            named,
+            soul,
+            delegate,
+            kwargs,
+            domain=domain,
+            tcp_port=tcp_port,
+            xmlrpc_port=xmlrpc_port,
+            argv=argv,
+        )
         try:
             node.start()
             if node.lifecycle is Lifecycle.NEW:
-                raise PharosError(f'{node.name} did not start: {node_class.__name__}.start() has to call '
-                                  'super().start() before anything else')
+                raise PharosError(
+                    f'{node.name} did not start: {node_class.__name__}.start() has to call '
+                    'super().start() before anything else'
+                )
         except BaseException:
             node._stop_for_others()
             raise
@@ -130,7 +165,8 @@ class Master:
         :param name: the name of its node, for ``__name:=``
         :param remap: ``{name: name}`` of remappings
         :param params: ``{name: value}`` of private parameters
-        :param on_line: block called as ``on_line(text)`` for each line of its output, in a thread of its own
+        :param on_line: block called as ``on_line(text)`` for each line of its output, in a thread
+            of its own
         :raises UnknownNodeError: if there is no such package or program
         """
         mappings = {**(remap or {}), **{'_' + key: value for key, value in (params or {}).items()}}
@@ -140,19 +176,23 @@ class Master:
         return ros_process.run(self.url, package, executable, arguments, on_line)
 
     def launch(self, package, file, on_line=None, **args):
-        """Start a launch file at this master, as ``roslaunch`` does; returns the :class:`RosProcess`.
+        """Start a launch file at this master, as ``roslaunch`` does; returns the
+        :class:`RosProcess`.
 
         :param args: the launch file's arguments
-        :param on_line: block called as ``on_line(text)`` for each line of its output, in a thread of its own
+        :param on_line: block called as ``on_line(text)`` for each line of its output, in a thread
+            of its own
         """
         return ros_process.launch(self.url, package, file, args, on_line)
 
-    # -- what is there -------------------------------------------------------------------------------------------------
+    # -- what is there
 
     def nodes(self):
         """All nodes: a Node where it runs in this process, an ExternalNode elsewhere."""
         own = {node.name: node for node in self.own_nodes()}
-        names = sorted({name for kind in self.system_state() for users in kind.values() for name in users})
+        names = sorted(
+            {name for kind in self.system_state() for users in kind.values() for name in users}
+        )
         return [own[name] if name in own else ExternalNode(self, name) for name in names]
 
     def node(self, name):
@@ -179,7 +219,9 @@ class Master:
         raise self._unknown(name, [node.name for node in self.nodes()])
 
     def _unknown(self, name, known):
-        return UnknownNodeError(f'no node {name} at {self.url}{self.near(name, known)}: see rosnode list')
+        return UnknownNodeError(
+            f'no node {name} at {self.url}{self.near(name, known)}: see rosnode list'
+        )
 
     def wait_for_node(self, name, timeout=None):
         """Wait until a node of that name is there, which means registered and not dead; returns it.
@@ -191,17 +233,20 @@ class Master:
         name, timeout = global_name(name, 'node'), check_limit('timeout', timeout)
         with time_limit(timeout):
             node = watcher_of(self).wait_for_node(name, timeout)
-        if node is None:    # there was no time to look
+        if node is None:  # there was no time to look
             with time_limit(MARGIN):
                 node = self.live_node(name)
         if node is None:
             self._ask('getPid', MARGIN)
-            raise UnknownNodeError('no node %s came to %s within %g s: is it started, with that '
-                                   'master, and under that name?' % (name, self.url, timeout))
+            raise UnknownNodeError(
+                f'no node {name} came to {self.url} within {timeout:g} s: is it started, with that'
+                ' master, and under that name?'
+            )
         return node
 
     def live_node(self, name):
-        """The node of that name, if it is there; one that only starts, has died or is unknown is not: None."""
+        """The node of that name, if it is there; one that only starts, has died or is unknown is
+        not: None."""
         own = next((node for node in self.own_nodes() if node.name == name), None)
         if own is not None:
             return own if own.is_running else None
@@ -216,15 +261,15 @@ class Master:
         except ConnectionRefusedError:
             return None
         except COMMUNICATION_ERRORS:
-            pass    # it is there, and busy perhaps
+            pass  # it is there, and busy perhaps
         return ExternalNode(self, name)
 
     def on_change(self, block):
         """Run ``block(kind, name, is_there)`` for each node, topic and service that comes or goes.
 
-        ``kind`` is 'node', 'topic' or 'service'. It runs in the thread that watches the master, within a second, and
-        may raise: that ends nothing. Returns a function that ends it. What is there by now has not come; a master that
-        is away is taken for one that has nothing yet.
+        ``kind`` is 'node', 'topic' or 'service'. It runs in the thread that watches the master,
+        within a second, and may raise: that ends nothing. Returns a function that ends it. What is
+        there by now has not come; a master that is away is taken for one that has nothing yet.
         """
         if block is None:
             raise TypeError('on_change needs a block to run, called as block(kind, name, is_there)')
@@ -261,7 +306,8 @@ class Master:
 
         The report (listing 3.5): ``master lookupService: '/clear' with: '/myID'``.
 
-        :param persistent: keep connections between calls; they are opened again when the provider comes back
+        :param persistent: keep connections between calls; they are opened again when the provider
+            comes back
         :raises UnknownServiceError: if nobody offers it
         """
         caller_id = global_name(caller_id, 'node')
@@ -271,9 +317,11 @@ class Master:
 
     def system_state(self):
         """``(publishers, subscribers, services)``, each ``{name: [node names]}``."""
-        return tuple({name: list(nodes) for name, nodes in kind} for kind in self._ask('getSystemState'))
+        return tuple(
+            {name: list(nodes) for name, nodes in kind} for kind in self._ask('getSystemState')
+        )
 
-    # -- the master itself ---------------------------------------------------------------------------------------------
+    # -- the master itself
 
     @property
     def pid(self):
@@ -289,7 +337,8 @@ class Master:
         return True
 
     def wait(self, timeout=None):
-        """Wait until the master answers, for up to ``timeout`` seconds (None: without limit); returns this Master.
+        """Wait until the master answers, for up to ``timeout`` seconds (None: without limit);
+        returns this Master.
 
         :raises MasterUnreachableError: if it does not in time
         :raises NodeStoppedError: if the node whose soul or delegate waits stops meanwhile
@@ -306,9 +355,9 @@ class Master:
                 except MasterUnreachableError:
                     if left <= 0:
                         raise
-                    woken.wait(POLL)    # there is nobody yet who could tell
+                    woken.wait(POLL)  # there is nobody yet who could tell
                 if stop.came:
-                    raise NodeStoppedError('the node that waited for the master %s stops' % self.url)
+                    raise NodeStoppedError(f'the node that waited for the master {self.url} stops')
 
     def answers(self, name):
         """Whether the node of that name is registered and its XML-RPC server answers."""
@@ -323,7 +372,7 @@ class Master:
     def near(self, name, names):
         """', did you mean ...' where ``name`` may be a slip for one of ``names``, else nothing."""
         close = difflib.get_close_matches(name, list(names), 3)
-        return ', did you mean %s' % ' or '.join(close) if close else ''
+        return f", did you mean {' or '.join(close)}" if close else ''
 
     def _api(self, caller_id='/pharos', timeout=TIMEOUT):
         return master_api(self.url, caller_id, timeout)
@@ -335,7 +384,9 @@ class Master:
                 return getattr(api, method)()
             except COMMUNICATION_ERRORS as error:
                 if stop.came:
-                    raise NodeStoppedError(f'the node that asked the master {self.url} stops') from error
+                    raise NodeStoppedError(
+                        f'the node that asked the master {self.url} stops'
+                    ) from error
                 raise
 
     def _reached(self):
@@ -345,10 +396,10 @@ class Master:
         return isinstance(other, Master) and is_same_master(self.url, other.url)
 
     def __hash__(self):
-        return urllib.parse.urlsplit(self.url).port    # the host may have several names
+        return urllib.parse.urlsplit(self.url).port  # the host may have several names
 
     def __repr__(self):
-        return '<Master %s>' % self.url
+        return f'<Master {self.url}>'
 
 
 class _Reached:
@@ -362,5 +413,7 @@ class _Reached:
 
     def __exit__(self, kind, error, traceback):
         if isinstance(error, COMMUNICATION_ERRORS):
-            raise MasterUnreachableError('no ROS master answers at %s (%s): start one with roscore or '
-                                         'Master.embedded(), or set ROS_MASTER_URI' % (self._url, error)) from error
+            raise MasterUnreachableError(
+                f'no ROS master answers at {self._url} ({error}): start one with roscore or'
+                ' Master.embedded(), or set ROS_MASTER_URI'
+            ) from error

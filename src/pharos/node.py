@@ -19,7 +19,8 @@ from pharos.transcript import Transcript
 
 
 class Node(Life):
-    """A ROS node of this process: made by :meth:`Master.create`, subclassed to override :meth:`start` and :meth:`stop`.
+    """A ROS node of this process: made by :meth:`Master.create`, subclassed to override
+    :meth:`start` and :meth:`stop`.
 
     The report (listing 3.1), a subclass of PhaROSNode, is in Python::
 
@@ -28,33 +29,39 @@ class Node(Life):
                 super().start()
                 self.fork(TurtleDriver.publishing_loop)
 
-    A node is configured before its ``__init__`` runs, which gets only the further keywords of ``create``.
+    A node is configured before its ``__init__`` runs, which gets only the further keywords of
+    ``create``.
     """
 
     def __init__(self):
         if '_settings' not in vars(self):
             name = type(self).__name__
-            raise TypeError(f'a node is made by a master: Master().create({name}, named=...), not {name}()')
+            raise TypeError(
+                f'a node is made by a master: Master().create({name}, named=...), not {name}()'
+            )
 
     def __init_subclass__(cls, **kwargs):
         super().__init_subclass__(**kwargs)
         for name in ('soul', 'delegate'):
             if name in vars(cls) and not isinstance(vars(cls)[name], property):
-                raise TypeError(f'{cls.__name__}.{name} would never run: each node has a {name} of its own, given to '
-                                f'create() or set. Name it otherwise, and set self.{name} in start()')
+                raise TypeError(
+                    f'{cls.__name__}.{name} would never run: each node has a {name} of its own,'
+                    f' given to create() or set. Name it otherwise, and set self.{name} in start()'
+                )
 
     def _configure(self, master, settings, soul, delegate):
         super()._configure(master, settings)
         self.soul, self.delegate = soul, delegate
-        self._opening = threading.Lock()    # held to change _channels
-        self._first_sends = {}              # topic name -> the lock of the thread that opens its channel
+        self._opening = threading.Lock()  # held to change _channels
+        self._first_sends = {}  # topic name -> the lock of the thread that opens its channel
         self._failures = Failures(self._tell_failure)
 
-    # -- blocks -------------------------------------------------------------------------------------------------------
+    # -- blocks
 
     @property
     def soul(self):
-        """The block that says what the node does, called as ``soul(node)`` by :meth:`execute` and :meth:`fork`.
+        """The block that says what the node does, called as ``soul(node)`` by :meth:`execute` and
+        :meth:`fork`.
 
         May be replaced while the node runs, and takes effect with the next run.
         """
@@ -68,8 +75,9 @@ class Node(Life):
     def delegate(self):
         """The block run for each message received, called as ``delegate(message, channel)``.
 
-        The report: ``self receiverDelegate: [:message :channel | ...]``. Delegates of a node run one at a time. It may
-        be replaced while the node runs, and takes effect with the next message.
+        The report: ``self receiverDelegate: [:message :channel | ...]``. Delegates of a node run
+        one at a time. It may be replaced while the node runs, and takes effect with the next
+        message.
         """
         return self._delegate
 
@@ -80,8 +88,8 @@ class Node(Life):
     def execute(self):
         """Run the soul once, in the calling thread, and return its value.
 
-        The report (listing 3.7): ``node execute``. An exception in the soul is reported (see :attr:`errors`) and
-        ends only this run, which then returns None.
+        The report (listing 3.7): ``node execute``. An exception in the soul is reported (see
+        :attr:`errors`) and ends only this run, which then returns None.
         """
         self._live_rospy()
         return self._souls.run(self._the_soul(), self._the_soul)
@@ -89,7 +97,8 @@ class Node(Life):
     def fork(self, block=None, name=None):
         """Run the soul, or ``block(node)``, in a thread of its own, and return the thread.
 
-        The report (listing 3.8): ``[node execute] fork``. :meth:`stop` ends it at its next :meth:`sleep` or turn of
+        The report (listing 3.8): ``[node execute] fork``. :meth:`stop` ends it at its next
+        :meth:`sleep` or turn of
         :meth:`every`.
         """
         present = self._the_soul if block is None else (lambda: check_soul(block))
@@ -97,7 +106,9 @@ class Node(Life):
 
     def _the_soul(self):
         if self._soul is None:
-            raise PharosError('%s has no soul to run: give it one with soul= or node.soul =' % self.name)
+            raise PharosError(
+                f'{self.name} has no soul to run: give it one with soul= or node.soul ='
+            )
         return self._soul
 
     @property
@@ -111,7 +122,8 @@ class Node(Life):
 
     @property
     def failures(self):
-        """For each of :attr:`errors` its :class:`~pharos.Failure`: what failed, on what, how often."""
+        """For each of :attr:`errors` its :class:`~pharos.Failure`: what failed, on what, how
+        often."""
         return self._failures.all()
 
     def _report(self, error, block, what, channel=None, message=None, again=None):
@@ -119,8 +131,10 @@ class Node(Life):
 
         See :meth:`Failures.report`.
         """
-        if not self.is_running and isinstance(error, (NodeStoppedError, rospy.ROSInterruptException)):
-            return    # that is how the stop of a node ends its souls
+        if not self.is_running and isinstance(
+            error, (NodeStoppedError, rospy.ROSInterruptException)
+        ):
+            return  # that is how the stop of a node ends its souls
         where = f'{what} {name_of(block)} of {self.name}'
         if channel is not None:
             where += f' on {channel.topic}'
@@ -128,18 +142,30 @@ class Node(Life):
         self._failures.report(error, block, where, channel, message, again)
 
     def _report_refusal(self, refusal):
-        """Keep and tell, once, that a publisher's messages do not come, for they are of another type."""
+        """Keep and tell, once, that a publisher's messages do not come, for they are of another
+        type."""
         error = MessageTypeError(graph_types.explain(self.name, refusal))
-        self._failures.report(error, None, f'connection of {self.name} to {refusal.publisher} for {refusal.topic}')
+        self._failures.report(
+            error, None, f'connection of {self.name} to {refusal.publisher} for {refusal.topic}'
+        )
 
     def _tell_failure(self, line, details):
         attempt(lambda: self.log(f'{line}\n{details}' if details else line, level='error'))
         Transcript.show(line)
 
-    # -- topics -------------------------------------------------------------------------------------------------------
+    # -- topics
 
-    def interested_in(self, topic, typed_as=None, delegate=None, queue_size=QUEUE_SIZE, inline=False, shared=False,
-                      from_=None, wait=0):
+    def interested_in(
+        self,
+        topic,
+        typed_as=None,
+        delegate=None,
+        queue_size=QUEUE_SIZE,
+        inline=False,
+        shared=False,
+        from_=None,
+        wait=0,
+    ):
         """Receive the messages of a topic from now on; returns the :class:`InputChannel`.
 
         The report (listing 3.3)::
@@ -147,47 +173,56 @@ class Node(Life):
             self interestedIn: '/turtle1/command_velocity' typedAs: 'turtlesim/Velocity'
             self.interested_in('/turtle1/command_velocity', typed_as='turtlesim/Velocity')
 
-        :param typed_as: type name or message class; None: the master's type for the topic, whose definition comes from
-            a publisher where no package here has it
+        :param typed_as: type name or message class; None: the master's type for the topic, whose
+            definition comes from a publisher where no package here has it
         :param delegate: block for this channel only, instead of the node's
-        :param queue_size: messages kept while the node is busy; the oldest are dropped and counted. Of large messages
-            no more are kept than have :attr:`queue_bytes` bytes, 64 MiB by default.
-        :param inline: run the delegate in the publisher's thread, where that is a node of this process
-        :param shared: get the very message that a node of this process published, and promise not to change it
-        :param from_: only messages of that node: a name, resolved as the topic's is, a Node or ExternalNode; it need not
-            be there yet
+        :param queue_size: messages kept while the node is busy; the oldest are dropped and counted.
+            Of large messages no more are kept than have :attr:`queue_bytes` bytes, 64 MiB by
+            default.
+        :param inline: run the delegate in the publisher's thread, where that is a node of this
+            process
+        :param shared: get the very message that a node of this process published, and promise not
+            to change it
+        :param from_: only messages of that node: a name, resolved as the topic's is, a Node or
+            ExternalNode; it need not be there yet
         :param wait: without ``typed_as``, seconds to wait until somebody has given the topic a type
-        :raises UnknownTopicError, UnknownTypeError, MessageTypeError: if there is no type, or another
+        :raises UnknownTopicError, UnknownTypeError, MessageTypeError: if there is no type, or
+            another
         :raises ValueError: if ``topic`` or ``from_`` cannot be a name
         :raises MasterUnreachableError: if the master does not answer; nothing is left behind then
         """
-        return self._topic(topic).input_channel(self, typed_as, delegate, queue_size, inline, shared, from_, wait)
+        return self._topic(topic).input_channel(
+            self, typed_as, delegate, queue_size, inline, shared, from_, wait
+        )
 
     def output_channel(self, topic, typed_as=None, latch=False, queue_size=QUEUE_SIZE, wait=0):
         """Publish on a topic from now on; returns the :class:`OutputChannel`.
 
         :param typed_as: type name or message class; None: the master's type for the topic
-        :param latch: send the last message to those who become interested later, also after a restart of this node;
-            one sent ``to=`` a node is for that node alone
+        :param latch: send the last message to those who become interested later, also after a
+            restart of this node; one sent ``to=`` a node is for that node alone
         :param queue_size: messages kept for each slow receiver; the oldest are dropped
         :param wait: as in :meth:`interested_in`
         :raises MasterUnreachableError: if the master does not answer; nothing is left behind then
         """
         return self._topic(topic).output_channel(self, typed_as, latch, queue_size, wait=wait)
 
-    def send_to(self, topic, block=None, *, typed_as=None, to=None, connect_timeout=None, wait=0, **fields):
+    def send_to(
+        self, topic, block=None, *, typed_as=None, to=None, connect_timeout=None, wait=0, **fields
+    ):
         """Send one message, filled by ``block(message)``, by keywords, or both; returns it.
 
         The report (listing 3.1)::
 
-            self sendTo: '/turtle1/command_velocity' a: [:message | message angular: 1.0. message linear: 2.0]
-            self.send_to('/turtle1/command_velocity', angular=1.0, linear=2.0)
+            self sendTo: '/turtle1/command_velocity' a: [:message | message angular: 1.0. message
+            linear: 2.0] self.send_to('/turtle1/command_velocity', angular=1.0, linear=2.0)
 
-        The first message on a topic waits for the subscribers that the master knows, for up to ``connect_timeout``
-        seconds (None: the node's), so that it is not lost.
+        The first message on a topic waits for the subscribers that the master knows, for up to
+        ``connect_timeout`` seconds (None: the node's), so that it is not lost.
 
-        :param to: send it to that node alone: a name, resolved as the topic's is, a Node or ExternalNode. One that is
-            not interested in the topic gets nothing, and the log says so once.
+        :param to: send it to that node alone: a name, resolved as the topic's is, a Node or
+            ExternalNode. One that is not interested in the topic gets nothing, and the log says so
+            once.
         :param wait: as in :meth:`interested_in`
         :raises UnknownNodeError: if there is no node ``to``
         :raises ValueError: if ``topic`` or ``to`` cannot be a name
@@ -209,23 +244,31 @@ class Node(Life):
         if channel is None:
             channel = self._open_sending_channel(topic, typed_as, connect_timeout, wait)
         elif typed_as is not None:
-            topic.message_class(self, typed_as)    # refuses another type
+            topic.message_class(self, typed_as)  # refuses another type
         # another thread may be opening it just now
         channel.wait_until_connected(connect_timeout)
         return channel.send(block, to=to, **fields)
 
     def _sending_channel(self, topic):
-        return next((channel for channel in self.channels if channel.topic == topic.name
-                     and hasattr(channel, 'publish')), None)
+        return next(
+            (
+                channel
+                for channel in self.channels
+                if channel.topic == topic.name and hasattr(channel, 'publish')
+            ),
+            None,
+        )
 
     def _open_sending_channel(self, topic, typed_as, connect_timeout, wait):
-        """Open a channel for :meth:`send_to`; of several threads that come at once, one does, and the others wait."""
+        """Open a channel for :meth:`send_to`; of several threads that come at once, one does, and
+        the others wait."""
         opening = self._first_sends.setdefault(topic.name, threading.RLock())
         limit = max(0.0, wait + connect_timeout)
         is_mine = opening.acquire(timeout=min(limit, threading.TIMEOUT_MAX))
         try:
-            return self._sending_channel(topic) or topic.output_channel(self, typed_as, connect_timeout=connect_timeout,
-                                                                        wait=wait)
+            return self._sending_channel(topic) or topic.output_channel(
+                self, typed_as, connect_timeout=connect_timeout, wait=wait
+            )
         finally:
             if is_mine:
                 opening.release()
@@ -253,7 +296,10 @@ class Node(Life):
         """
         if isinstance(peer, (Node, ExternalNode)):
             if peer.master != self.master:
-                raise ValueError(f'{peer} is at another master than {self.name}, and nothing goes from one to the other')
+                raise ValueError(
+                    f'{peer} is at another master than {self.name}, and nothing goes from one to'
+                    ' the other'
+                )
             return Resolved(peer.name)
         if isinstance(peer, Resolved):
             return peer
@@ -264,19 +310,21 @@ class Node(Life):
     def _remember_channel(self, channel):
         with self._opening:
             if channel not in self._channels:
-                self._channels = [*self._channels, channel]    # replaced, so that others may iterate meanwhile
+                # replaced, so that others may iterate meanwhile
+                self._channels = [*self._channels, channel]
 
     def _forget_channel(self, channel):
         with self._opening:
             self._channels = [other for other in self._channels if other is not channel]
 
-    # -- services, parameters, log -------------------------------------------------------------------------------------
+    # -- services, parameters, log
 
     def serve(self, name, typed_as, block):
         """Offer a service; returns a handle with ``close()``.
 
-        ``block(request)`` runs in a thread of the caller's connection and returns a response, a dict, tuple or list of
-        its fields, or its only field. An exception in it goes to the caller, and is reported as a delegate's.
+        ``block(request)`` runs in a thread of the caller's connection and returns a response, a
+        dict, tuple or list of its fields, or its only field. An exception in it goes to the caller,
+        and is reported as a delegate's.
 
         :param typed_as: service type name, such as 'std_srvs/Empty', or class
         :raises MasterUnreachableError: if the master does not answer; nothing is left behind then
@@ -284,31 +332,36 @@ class Node(Life):
         return OfferedService(self, self._resolve(name, 'service'), typed_as, block)
 
     def parameter(self, name, initialized=None):
-        """The :class:`Parameter` of that name ('~rate' is private); set to ``initialized`` where it has no value."""
+        """The :class:`Parameter` of that name ('~rate' is private); set to ``initialized`` where it
+        has no value."""
         return Parameter(self, self._resolve(name, 'parameter'), initialized)
 
     def log(self, text, level='info'):
-        """Log a line on /rosout, the node's log file and the screen, with the file and line of the caller.
+        """Log a line on /rosout, the node's log file and the screen, with the file and line of the
+        caller.
 
         :param level: 'debug', 'info', 'warning' (or 'warn'), 'error' or 'fatal'
         """
         try:
             level = _LEVELS[level]
         except KeyError:
-            raise ValueError('no log level %r: there are %s' % (level, ', '.join(_LEVELS))) from None
+            raise ValueError(f"no log level {level!r}: there are {', '.join(_LEVELS)}") from None
         if self._rospy is not None:
             log = self._rospy.log
-            log('%s', (text,), {}, level=level)    # no wrapper between: rospy looks for the caller of this method
+            # no wrapper between: rospy looks for the caller of this method
+            log('%s', (text,), {}, level=level)
 
-    # -- what rospy offers beyond --------------------------------------------------------------------------------------
+    # -- what rospy offers beyond
 
     @property
     def ros(self):
-        """The node's own rospy, whole: ``node.ros.Timer``, ``node.ros.Time.now()``. It is for this run of the node."""
+        """The node's own rospy, whole: ``node.ros.Timer``, ``node.ros.Time.now()``. It is for this
+        run of the node."""
         return self._live_rospy().rospy
 
     def ros_import(self, name):
-        """A library written on rospy ('actionlib', 'message_filters', 'tf2_ros'), bound to this run of the node."""
+        """A library written on rospy ('actionlib', 'message_filters', 'tf2_ros'), bound to this run
+        of the node."""
         if not isinstance(name, str):
             raise TypeError(f"a library is given by its name, such as 'actionlib', not as {name!r}")
         return self._live_rospy().import_library(name)
@@ -334,7 +387,8 @@ class Node(Life):
         return self._rospy and self._rospy.domain
 
     def health(self):
-        """How the node is doing: ``registered, reachable_since, connections, dropped, errors, threads``, a named tuple.
+        """How the node is doing: ``registered, reachable_since, connections, dropped, errors,
+        threads``, a named tuple.
 
         Asks the master, for up to 5 s; ``str()`` of it is one line, which ``repr(node)`` shows too.
         """
@@ -342,7 +396,10 @@ class Node(Life):
 
     def __repr__(self):
         health = f': {health_of(self, ask=False)}' if self.is_running else ''
-        return f'<{type(self).__name__} {self.name} {self._lifecycle.value}, {len(self.channels)} channels{health}>'
+        return (
+            f'<{type(self).__name__} {self.name} {self._lifecycle.value},'
+            f' {len(self.channels)} channels{health}>'
+        )
 
 
 class BlockNode(Node):
@@ -350,20 +407,29 @@ class BlockNode(Node):
 
     The report (listing 3.7)::
 
-        node := master create: PhaROSBlockNode named: '/myNode' ... soul: [:myNode | ...]. node execute
-        node = master.create(BlockNode, named='/myNode', soul=lambda me: ...); node.execute()
+        node := master create: PhaROSBlockNode named: '/myNode' ... soul: [:myNode | ...]. node
+        execute node = master.create(BlockNode, named='/myNode', soul=lambda me: ...);
+        node.execute()
     """
 
 
 def make(node_class, master, named, soul, delegate, init, **settings):
     """A new node of ``node_class``, configured and not yet started."""
     if not (isinstance(node_class, type) and issubclass(node_class, Node)):
-        raise TypeError('a node is made of a subclass of Node, or BlockNode; not %r' % (node_class,))
+        raise TypeError(f'a node is made of a subclass of Node, or BlockNode; not {node_class!r}')
     node = node_class.__new__(node_class)
     node._configure(master, Settings(named, master.url, **settings), soul, delegate)
     node.__init__(**init)
     return node
 
 
-_LEVELS = {'debug': 'debug', 'info': 'info', 'warning': 'warning', 'warn': 'warning', 'error': 'error',
-           'err': 'error', 'fatal': 'critical', 'critical': 'critical'}
+_LEVELS = {
+    'debug': 'debug',
+    'info': 'info',
+    'warning': 'warning',
+    'warn': 'warning',
+    'error': 'error',
+    'err': 'error',
+    'fatal': 'critical',
+    'critical': 'critical',
+}

@@ -21,24 +21,27 @@ class OfferedService:
         self._check = services.checker(self.service_class._response_class)
         self.block = block
         if any(other.name == name for other in node._services):
-            raise PharosError('%s offers %s already: close that one first' % (node.name, name))
+            raise PharosError(f'{node.name} offers {name} already: close that one first')
         self._open()
 
     def _open(self):
         with time_limit(max(REGISTER_TIMEOUT, self.node.connect_timeout)):
-            self._service = services.offer(self.node._live_rospy(), self.name, self.service_class, self._answer)
+            self._service = services.offer(
+                self.node._live_rospy(), self.name, self.service_class, self._answer
+            )
         if self not in self.node._services:
             self.node._services = [*self.node._services, self]
 
     @property
     def block(self):
-        """The block that answers, called as ``block(request)``; may be replaced, and takes effect with the next call."""
+        """The block that answers, called as ``block(request)``; may be replaced, and takes effect
+        with the next call."""
         return self._block
 
     @block.setter
     def block(self, block):
         if block is None:
-            raise TypeError('%s needs a block that answers, called as block(request)' % self.name)
+            raise TypeError(f'{self.name} needs a block that answers, called as block(request)')
         self._block = check_block(block, 'service block', ('request',))
 
     @property
@@ -51,28 +54,33 @@ class OfferedService:
         try:
             return self._as_response(block(request))
         except BaseException as error:
-            self.node._report(error, block, f'service {self.name}', message=request,
-                              again=self._answer_again)
+            self.node._report(
+                error, block, f'service {self.name}', message=request, again=self._answer_again
+            )
             why = f'{type(error).__name__}: {text_of(error)}'
             raise rospy.ServiceException(why) from error
 
     def _answer_again(self, request):
-        with contextlib.suppress(rospy.ServiceException):    # it is reported
+        with contextlib.suppress(rospy.ServiceException):  # it is reported
             self._answer(request)
 
     def _as_response(self, value):
-        """The response that the block meant: itself, its fields by name or in their order, or its only field."""
+        """The response that the block meant: itself, its fields by name or in their order, or its
+        only field."""
         response = self.service_class._response_class
         if isinstance(value, genpy.Message) and value._type == response._type:
-            if value._md5sum != response._md5sum:    # the caller would read its bytes as other fields
+            if value._md5sum != response._md5sum:  # the caller would read its bytes as other fields
                 raise MessageTypeError(
-                    f'{self.name} answers with a {response._type} of {message_types.describe_fields(response)} '
-                    f'[{response._md5sum}]; its block returned one of {message_types.describe_fields(type(value))} '
-                    f'[{value._md5sum}]: make it of the class that the service was offered with')
+                    f'{self.name} answers with a {response._type} of'
+                    f' {message_types.describe_fields(response)} [{response._md5sum}]; its block'
+                    ' returned one of'
+                    f' {message_types.describe_fields(type(value))} [{value._md5sum}]: make it of'
+                    ' the class that the service was offered with'
+                )
             try:
                 self._check(value)
             except Exception:
-                message_types.check_fits(value)    # tells what of it does not fit
+                message_types.check_fits(value)  # tells what of it does not fit
             return value
         if isinstance(value, dict):
             return message_types.fill(response(), value)
@@ -84,10 +92,11 @@ class OfferedService:
             return message_types.fill(response(), dict(zip(names, value)))
         if len(names) == 1 and value is not None:
             return message_types.fill(response(), {names[0]: value})
-        raise TypeError('the block of %s must return a response, a dict, tuple or list of its fields (%s)%s; it '
-                        'returned %r'
-                        % (self.name, message_types.describe_fields(response),
-                           ' or its only field' if len(response.__slots__) == 1 else '', value))
+        raise TypeError(
+            f"the block of {self.name} must return a response, a dict, tuple or list of its fields"
+            f" ({message_types.describe_fields(response)}){' or its only field' if len(response.__slots__) == 1 else ''};"
+            f" it returned {value!r}"
+        )
 
     def close(self):
         """Offer it no longer. Harmless when done twice."""
@@ -97,4 +106,4 @@ class OfferedService:
                 self._service.shutdown('closed')
 
     def __repr__(self):
-        return '<OfferedService %s %s of %s>' % (self.name, self.type, self.node.name)
+        return f'<OfferedService {self.name} {self.type} of {self.node.name}>'

@@ -10,12 +10,12 @@ from pharos.private_rospy.parameters import carried
 class Parameter:
     """A parameter as a node sees it; made by :meth:`Node.parameter`.
 
-    PhaROS 2018: ``parameter: name initialized: value``. :attr:`name` is its global name. Initialized with None it may
-    hold anything, otherwise only values of that type (a float also takes integers). A namespace is a parameter, too,
-    whose value is a dict of what it holds.
+    PhaROS 2018: ``parameter: name initialized: value``. :attr:`name` is its global name.
+    Initialized with None it may hold anything, otherwise only values of that type (a float also
+    takes integers). A namespace is a parameter, too, whose value is a dict of what it holds.
 
-    The blocks of :meth:`on_change` outlive a restart of the node as its channels do, and one of the master, after which
-    the parameter has its initial value again.
+    The blocks of :meth:`on_change` outlive a restart of the node as its channels do, and one of the
+    master, after which the parameter has its initial value again.
     """
 
     def __init__(self, node, name, initialized=None):
@@ -48,11 +48,14 @@ class Parameter:
     def set(self, value):
         """Set it on the parameter server.
 
-        :raises ValueError: if it was initialized with a value of another type, or the server can hold no such value
+        :raises ValueError: if it was initialized with a value of another type, or the server can
+            hold no such value
         :raises MasterUnreachableError: if there is no answer
         """
         if value is None:
-            raise ValueError('%s cannot be set to None: choose a value, such as an empty text or list' % self.name)
+            raise ValueError(
+                f'{self.name} cannot be set to None: choose a value, such as an empty text or list'
+            )
         value = self._checked(carried(self.name, value))
         watched = self.node._live_rospy().parameters
         with self.node.master._reached():
@@ -60,15 +63,20 @@ class Parameter:
             watched.tell_of_own(self.name, value)
 
     def on_change(self, block):
-        """Run ``block(value)`` whenever somebody sets the parameter, by :meth:`set` this node too; returns the block.
+        """Run ``block(value)`` whenever somebody sets the parameter, by :meth:`set` this node too;
+        returns the block.
 
-        It gets None when the parameter is deleted. It runs in a thread of the node's XML-RPC server, or where
-        :meth:`set` is called. An exception in it is reported as a delegate's, as is a value of another type.
+        It gets None when the parameter is deleted. It runs in a thread of the node's XML-RPC
+        server, or where
+        :meth:`set` is called. An exception in it is reported as a delegate's, as is a value of
+            another type.
 
         :raises MasterUnreachableError: if there is no answer; the block is not run then
         """
         if block is None:
-            raise TypeError('%s needs a block to run when it changes, called as block(value)' % self.name)
+            raise TypeError(
+                f'{self.name} needs a block to run when it changes, called as block(value)'
+            )
         check_block(block, 'parameter block', ('value',))
         watched = self.node._live_rospy().parameters
         self._blocks.append(block)
@@ -87,19 +95,26 @@ class Parameter:
     def _run(self, block, value):
         try:
             if value == {}:
-                value = self._get()    # a master says so of a deleted one, too
+                value = self._get()  # a master says so of a deleted one, too
             block(self._checked(value))
         except BaseException as error:
-            self.node._report(error, block, 'parameter %s' % self.name, message=value,
-                              again=functools.partial(self._run, block))
+            self.node._report(
+                error,
+                block,
+                f'parameter {self.name}',
+                message=value,
+                again=functools.partial(self._run, block),
+            )
 
     def _checked(self, value):
         if value is None or self._kind in (type(None), type(value)):
             return value
         if self._kind is float and type(value) is int:
             return float(value)
-        raise ValueError('%s holds %s, and %r is none: set another value, or initialize it with None to allow any type'
-                         % (self.name, self._kind.__name__, value))
+        raise ValueError(
+            f'{self.name} holds {self._kind.__name__}, and {value!r} is none: set another value, or'
+            ' initialize it with None to allow any type'
+        )
 
     def __repr__(self):
-        return '<Parameter %s of %s>' % (self.name, self.node.name)
+        return f'<Parameter {self.name} of {self.node.name}>'

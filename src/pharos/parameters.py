@@ -10,8 +10,8 @@ from pharos.private_rospy.parameters import carried
 class Parameters(collections.abc.MutableMapping):
     """``{global name: value}`` of a master's parameter server; made by :attr:`Master.parameters`.
 
-    A name may be a namespace, whose value is a dict of what it holds. Iteration gives all full names. Setting a value
-    that the server cannot hold is a ValueError.
+    A name may be a namespace, whose value is a dict of what it holds. Iteration gives all full
+    names. Setting a value that the server cannot hold is a ValueError.
     """
 
     def __init__(self, master):
@@ -38,11 +38,12 @@ class Parameters(collections.abc.MutableMapping):
             return self._master._api().hasParam(name)
 
     def _global_or_there(self, name):
-        """The full form of a name, or one that cannot be a name and that somebody has set all the same."""
+        """The full form of a name, or one that cannot be a name and that somebody has set all the
+        same."""
         try:
             return _global(name)
         except ValueError:
-            if name in self._master._ask('getParamNames'):    # as rosparam and a YAML file may
+            if name in self._master._ask('getParamNames'):  # as rosparam and a YAML file may
                 return name
             raise
 
@@ -51,12 +52,13 @@ class Parameters(collections.abc.MutableMapping):
             try:
                 return getattr(self._master._api(), method)(name, *args)
             except rosgraph.MasterError:
-                raise KeyError('no parameter %s at %s%s' % (name, self._master.url,
-                                                            self._master.near(name, self))) from None
+                raise KeyError(
+                    f'no parameter {name} at {self._master.url}{self._master.near(name, self)}'
+                ) from None
 
     def __repr__(self):
-        return '<Parameters of %s>' % self._master.url
+        return f'<Parameters of {self._master.url}>'
 
 
 def _global(name):
-    return name if name == '/' else global_name(name, 'parameter')    # the namespace of all
+    return name if name == '/' else global_name(name, 'parameter')  # the namespace of all

@@ -12,13 +12,14 @@ from pharos.errors import NodeNameInUseError
 from pharos.private_rospy import host
 from pharos.private_rospy.lifetime import SIGNAL_LATENCY
 
-# A stopped node's rospy is a web of cycles of 0.7 MB, which only the collector frees. It looks at the running nodes,
-# too, so it runs after as many stops as there are nodes left, and at least so many:
+# A stopped node's rospy is a web of cycles of 0.7 MB, which only the collector frees. It looks at
+# the running nodes, too, so it runs after as many stops as there are nodes left, and at least so
+# many:
 COLLECT_EVERY = 20
-_stops = 0     # since it ran
-_nodes = {}    # (master, name) -> Node: those that the master may know, in the order of their starts
-_finalizer = None    # what multiprocessing runs at the end of its processes
-_others = []   # functions that end what else the program has started: programs, masters
+_stops = 0  # since it ran
+_nodes = {}  # (master, name) -> Node: those that the master may know, in the order of their starts
+_finalizer = None  # what multiprocessing runs at the end of its processes
+_others = []  # functions that end what else the program has started: programs, masters
 
 
 def claim(node):
@@ -30,8 +31,10 @@ def claim(node):
     with stopping.changed:
         other = _nodes.setdefault((node.master, node.name), node)
     if other is not node:
-        raise NodeNameInUseError('the node name %s is taken by a %s node of this process: choose another name, or '
-                                 'stop() that node first' % (node.name, other.lifecycle.value))
+        raise NodeNameInUseError(
+            f'the node name {node.name} is taken by a {other.lifecycle.value} node of this process:'
+            ' choose another name, or stop() that node first'
+        )
 
 
 def discard(node):
@@ -61,23 +64,27 @@ def nodes():
 
 
 def at_end(function):
-    """Run ``function()`` when the program ends, after the nodes have stopped; the last that was given first."""
+    """Run ``function()`` when the program ends, after the nodes have stopped; the last that was
+    given first."""
     _end_with_multiprocessing()
     _others.append(function)
 
 
 def not_at_end(function):
     """Do not run it then: what it ends has ended."""
-    with contextlib.suppress(ValueError):    # done already, by another thread perhaps
+    with contextlib.suppress(ValueError):  # done already, by another thread perhaps
         _others.remove(function)
 
 
 def spin():
-    """Block until every node of the process has stopped, or Ctrl-C, SIGTERM or SIGHUP, which stop them."""
+    """Block until every node of the process has stopped, or Ctrl-C, SIGTERM or SIGHUP, which stop
+    them."""
     with signals.waiting():
         try:
-            _wait_until(lambda: all(map(stopping.has_failed, nodes())) and not stopping.is_awaited())
-        except KeyboardInterrupt:    # the host program has a handler of its own
+            _wait_until(
+                lambda: all(map(stopping.has_failed, nodes())) and not stopping.is_awaited()
+            )
+        except KeyboardInterrupt:  # the host program has a handler of its own
             stop_all()
 
 
@@ -87,7 +94,10 @@ def stop_all():
     Returns when each has ended its ``stop()``, or after ``stopping.LIMIT`` seconds.
     """
     deadline = time.monotonic() + stopping.LIMIT
-    threads = [threading.Thread(target=node._stop_for_others, name=node.name + ' stop', daemon=True) for node in nodes()]
+    threads = [
+        threading.Thread(target=node._stop_for_others, name=node.name + ' stop', daemon=True)
+        for node in nodes()
+    ]
     for thread in threads:
         thread.start()
     join(threads, stopping.LIMIT)
@@ -111,7 +121,8 @@ def join(threads, timeout):
 
 
 def _end_with_multiprocessing():
-    """Have a process of multiprocessing end as others do: one that was forked runs nothing that atexit knows."""
+    """Have a process of multiprocessing end as others do: one that was forked runs nothing that
+    atexit knows."""
     global _finalizer
     multiprocessing = sys.modules.get('multiprocessing')
     if _finalizer is None and multiprocessing and multiprocessing.parent_process():
@@ -123,20 +134,23 @@ def _end():
     with signals.held(stopping.LIMIT, is_end=True), contextlib.ExitStack() as others:
         stop_all()
         for function in _others:
-            others.callback(function)    # the last first, and each of them, whatever another one raises
+            # the last first, and each of them, whatever another one raises
+            others.callback(function)
         _others.clear()
 
 
 def _rospy_ended_by(number):
-    """A signal has ended the rospy node that the program itself is; rospy passes on what we had taken on before."""
+    """A signal has ended the rospy node that the program itself is; rospy passes on what we had
+    taken on before."""
     if not signals.is_taken_on(number):
         stop_all()
 
 
 def _forget():
-    """In a process that was forked: the nodes are its parent's, as are the programs, and it must not end them."""
+    """In a process that was forked: the nodes are its parent's, as are the programs, and it must
+    not end them."""
     global _finalizer
-    _finalizer = None    # its parent's, which multiprocessing has dropped
+    _finalizer = None  # its parent's, which multiprocessing has dropped
     former = list(_nodes.values())
     _nodes.clear()
     _others.clear()

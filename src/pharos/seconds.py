@@ -4,18 +4,19 @@ import numbers
 
 import genpy
 
-LONGEST = 2.0e6    # seconds; sockets and locks take no more than 24 days at once, and no infinity
+LONGEST = 2.0e6  # seconds; sockets and locks take no more than 24 days at once, and no infinity
 
 
 def check_seconds(what, seconds, above=-math.inf):
-    """``seconds`` as a number that everything that waits can take; one beyond LONGEST, or infinity, as LONGEST.
+    """``seconds`` as a number that everything that waits can take; one beyond LONGEST, or infinity,
+    as LONGEST.
 
     :param what: the name of the parameter
     :param seconds: a number, or a genpy.Duration
     :raises ValueError: if it is none, or not ``above`` that number
     """
     value = seconds.to_sec() if isinstance(seconds, genpy.Duration) else seconds
-    if not isinstance(value, numbers.Real) or not value > above:    # no comparison holds for NaN
+    if not isinstance(value, numbers.Real) or not value > above:  # no comparison holds for NaN
         least = '' if above == -math.inf else f' above {above:g}'
         raise ValueError(f'{what} is a number of seconds{least}, not {seconds!r}')
     return float(max(-LONGEST, min(value, LONGEST)))

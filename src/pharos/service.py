@@ -16,7 +16,7 @@ from pharos.private_rospy.lifetime import Interruption
 from pharos.seconds import check_limit
 from pharos.tcpros_connection import TcprosConnection
 
-TIMEOUT = 5.0    # seconds in which the master, and a provider asked for its type, must answer
+TIMEOUT = 5.0  # seconds in which the master, and a provider asked for its type, must answer
 
 
 class Service:
@@ -27,50 +27,68 @@ class Service:
         service := master lookupService: '/clear' with: '/myID'. service call
         service = master.lookup_service('/clear', caller_id='/myID'); service.call()
 
-    :attr:`type` and :attr:`md5sum` are found by asking the provider. A call sends the md5sum of the definition that
-    fills the request, so that the provider refuses one of another layout; a ``md5sum`` set by hand is sent instead,
-    until it is set to None. :attr:`response` is the last call's. May be called from several threads at once.
+    :attr:`type` and :attr:`md5sum` are found by asking the provider. A call sends the md5sum of the
+        definition that
+    fills the request, so that the provider refuses one of another layout; a ``md5sum`` set by hand
+    is sent instead, until it is set to None. :attr:`response` is the last call's. May be called
+    from several threads at once.
     """
 
     def __init__(self, master, name, caller_id, persistent=False):
-        self.master, self.name, self.caller_id, self.persistent = master, name, caller_id, persistent
+        self.master, self.name, self.caller_id, self.persistent = (
+            master,
+            name,
+            caller_id,
+            persistent,
+        )
         self.uri = self.type = self.response = self._found_md5sum = self._md5sum_by_hand = None
         self._calls = 0
         self._class = None
-        self._here = None    # the provider, where it is a node of this process
-        self._idle = []      # persistent connections that nobody uses just now
+        self._here = None  # the provider, where it is a node of this process
+        self._idle = []  # persistent connections that nobody uses just now
         self._look_up(None)
         header = self._ask()
         self.type, self._found_md5sum = header.get('type'), header.get('md5sum')
 
     def _look_up(self, deadline):
         """Find the provider, which may have moved; returns its URI."""
-        with time_limit(None if deadline is None else deadline - time.monotonic()), self.master._reached():
+        with time_limit(
+            None if deadline is None else deadline - time.monotonic()
+        ), self.master._reached():
             try:
                 self.uri = self.master._api(self.caller_id, TIMEOUT).lookupService(self.name)
             except rosgraph.MasterError:
-                raise UnknownServiceError('no node of %s offers the service %s%s: see rosservice list' % (
-                    self.master.url, self.name, self.master.near(self.name, self.master.services()))) from None
+                raise UnknownServiceError(
+                    f'no node of {self.master.url} offers the service'
+                    f' {self.name}{self.master.near(self.name, self.master.services())}: see'
+                    ' rosservice list'
+                ) from None
         return self.uri
 
     def _ask(self, deadline=None):
         """The provider's own description of the service: the header that it answers a probe with.
 
-        As ``rosservice.get_service_headers`` asks for it, which hides why there is none, and waits for ever for a
-        provider that sends a byte every four seconds.
+        As ``rosservice.get_service_headers`` asks for it, which hides why there is none, and waits
+        for ever for a provider that sends a byte every four seconds.
         """
         limit, waiting = time.monotonic() + TIMEOUT, Interruption()
         try:
-            connection = self._connect({**self._header('*'), 'probe': '1'},
-                                       limit if deadline is None else min(limit, deadline))
+            connection = self._connect(
+                {**self._header('*'), 'probe': '1'},
+                limit if deadline is None else min(limit, deadline),
+            )
         except OSError as error:
             self._check_awaited(waiting, error)
-            raise ServiceCallError('the provider of %s at %s does not answer (%s): is it still running? '
-                                   'rosnode cleanup removes it if not' % (self.name, self.uri, error)) from error
+            raise ServiceCallError(
+                f'the provider of {self.name} at {self.uri} does not answer ({error}): is it still'
+                ' running? rosnode cleanup removes it if not'
+            ) from error
         connection.close()
         if 'error' in connection.header:
-            raise ServiceCallError('the node at %s says of %s: %s. Its provider is gone: rosnode cleanup removes it'
-                                   % (self.uri, self.name, connection.header['error']))
+            raise ServiceCallError(
+                f"the node at {self.uri} says of {self.name}: {connection.header['error']}. Its"
+                " provider is gone: rosnode cleanup removes it"
+            )
         return connection.header
 
     @property
@@ -81,8 +99,11 @@ class Service:
     @md5sum.setter
     def md5sum(self, md5sum):
         if not isinstance(md5sum, (str, type(None))):
-            raise ValueError(f'the md5sum of {self.name} is a text such as {self._found_md5sum!r}, not {md5sum!r}: where '
-                             "it comes from YAML, as parameters do, put one of digits alone in quotes (\"'0'\")")
+            raise ValueError(
+                f'the md5sum of {self.name} is a text such as {self._found_md5sum!r}, not'
+                f' {md5sum!r}: where it comes from YAML, as parameters do, put one of digits alone'
+                ' in quotes (\"\'0\'\")'
+            )
         self._md5sum_by_hand = md5sum
 
     @property
@@ -98,16 +119,17 @@ class Service:
     def call(self, block=None, *, timeout=None, **fields):
         """Call the service: ``block(request)`` and keywords fill the request. Returns the response.
 
-        A service of a node of this process is called without a socket: without ``timeout`` in this thread, so that
-        no wiring deadlocks, and with one in a thread of that node.
+        A service of a node of this process is called without a socket: without ``timeout`` in this
+        thread, so that no wiring deadlocks, and with one in a thread of that node.
 
         :param timeout: seconds that the whole call may take; None: no limit
-        :raises ServiceTypeError: if the type is defined otherwise here than at the provider, the provider changed it,
-            or the md5sum set by hand does not fit
+        :raises ServiceTypeError: if the type is defined otherwise here than at the provider, the
+            provider changed it, or the md5sum set by hand does not fit
         :raises MessageTypeError: if a field does not exist or does not fit
         :raises UnknownServiceError: if it is no longer offered
         :raises ServiceCallError: if the provider fails, goes away or does not answer in time
-        :raises NodeStoppedError: if the node whose soul or delegate waits for the answer stops meanwhile
+        :raises NodeStoppedError: if the node whose soul or delegate waits for the answer stops
+            meanwhile
         """
         timeout = check_limit('timeout', timeout)
         deadline = None if timeout is None else time.monotonic() + timeout
@@ -122,22 +144,31 @@ class Service:
         try:
             self.response = response = self._exchange(request, deadline)
         except services.Failed as error:
-            raise ServiceCallError('%s failed: %s' % (self.name, error)) from None
+            raise ServiceCallError(f'{self.name} failed: {error}') from None
         except socket.timeout as error:
-            raise ServiceCallError('%s did not answer in time (%s s): is its provider at %s busy? Call it with a '
-                                   'longer timeout=' % (self.name, timeout, self.uri)) from error
+            raise ServiceCallError(
+                f'{self.name} did not answer in time ({timeout} s): is its provider at'
+                f' {self.uri} busy? Call it with a longer timeout='
+            ) from error
         except (OSError, genpy.DeserializationError) as error:
             self._check_awaited(waiting, error)
-            raise ServiceCallError('the connection to %s at %s broke (%s): is its provider still running?'
-                                   % (self.name, self.uri, error)) from error
-        return response    # not self.response, which is another thread's by now
+            raise ServiceCallError(
+                f'the connection to {self.name} at {self.uri} broke ({error}): is its provider'
+                ' still running?'
+            ) from error
+        return response  # not self.response, which is another thread's by now
 
     def _check_definition(self, deadline):
-        """Refuse a definition that is not the provider's, before anybody wonders which fields a request has."""
-        if self._md5sum_by_hand is not None or self._found_md5sum in (None, '*', self.service_class._md5sum):
+        """Refuse a definition that is not the provider's, before anybody wonders which fields a
+        request has."""
+        if self._md5sum_by_hand is not None or self._found_md5sum in (
+            None,
+            '*',
+            self.service_class._md5sum,
+        ):
             return
         self._look_up(deadline)
-        header = self._ask(deadline)    # it may have been built anew since it was looked up
+        header = self._ask(deadline)  # it may have been built anew since it was looked up
         if header.get('md5sum') != self.service_class._md5sum:
             raise self._type_error(header)
         self._found_md5sum = header['md5sum']
@@ -145,10 +176,11 @@ class Service:
     def _check_awaited(self, waiting, error):
         """Raise NodeStoppedError where a connection broke because the node that waits stops."""
         if waiting.came:
-            raise NodeStoppedError('the node that waited for %s stops' % self.name) from error
+            raise NodeStoppedError(f'the node that waited for {self.name} stops') from error
 
     def _exchange(self, request, deadline):
-        """Send the request to the provider, and where that has gone, to where it is now; returns the response."""
+        """Send the request to the provider, and where that has gone, to where it is now; returns
+        the response."""
         uri = self.uri
         try:
             return self._send(request, deadline)
@@ -169,11 +201,15 @@ class Service:
         if here is None or not here.is_offered(self.uri):
             here = self._here = services.find(self.name, self.uri, self.service_class)
         # what is sent by hand as another type's is left to the wire
-        here = here if here and here.md5sum == self._md5sum_sent == self.service_class._md5sum else None
+        here = (
+            here
+            if here and here.md5sum == self._md5sum_sent == self.service_class._md5sum
+            else None
+        )
         try:
             data = here.freeze(request) if here else services.serialize(request)
         except Exception:
-            message_types.check_fits(request)    # tells what of it does not
+            message_types.check_fits(request)  # tells what of it does not
             raise
         if here:
             return here.call(data, self._header(self._md5sum_sent), deadline)
@@ -190,7 +226,7 @@ class Service:
             self._idle.append(connection)
         else:
             connection.close()
-        if not ok:    # roscpp gives no reason
+        if not ok:  # roscpp gives no reason
             raise services.Failed(answer.decode(errors='replace') or 'its provider gives no reason')
         response = self.service_class._response_class().deserialize(answer)
         response._connection_header = connection.header
@@ -210,7 +246,8 @@ class Service:
         """An idle connection that lives, or a new one."""
         header = self._header(self._md5sum_sent)
         for connection in self._take_idle():
-            if connection.sent == header and connection.is_alive():    # not made with an md5sum that was set meanwhile
+            # not made with an md5sum that was set meanwhile
+            if connection.sent == header and connection.is_alive():
                 return connection
             connection.close()
         connection = self._connect(header, deadline)
@@ -220,7 +257,7 @@ class Service:
         return connection
 
     def _take_idle(self):
-        with contextlib.suppress(IndexError):    # another thread has taken the last one
+        with contextlib.suppress(IndexError):  # another thread has taken the last one
             while True:
                 yield self._idle.pop()
 
@@ -231,31 +268,40 @@ class Service:
         """The error of a provider that refuses, by what it says of itself now."""
         header = self._ask(deadline)
         if header.get('md5sum') == self._md5sum_sent:
-            return ServiceCallError('the provider of %s at %s refused the call: %s' % (self.name, self.uri, error))
+            return ServiceCallError(
+                f'the provider of {self.name} at {self.uri} refused the call: {error}'
+            )
         return self._type_error(header)
 
     def _type_error(self, header):
         """The error of a provider whose type is another than what is sent.
 
-        The report: the "error message provides all information about the service including the md5sum".
+        The report: the "error message provides all information about the service including the
+        md5sum".
         """
         type_, md5sum, by_hand = header.get('type'), header.get('md5sum'), self._md5sum_by_hand
         theirs = f'{type_} with md5sum {md5sum} ({self._fields_of(type_, md5sum)})'
         if by_hand is not None:
-            return ServiceTypeError(f'the md5sum {by_hand!r} is not that of {self.name}, which is of type {theirs}: set '
-                                    'that one, or none')
+            return ServiceTypeError(
+                f'the md5sum {by_hand!r} is not that of {self.name}, which is of type {theirs}: set'
+                ' that one, or none'
+            )
         if type_ != self.type:
-            return ServiceTypeError(f'the md5sum {self.service_class._md5sum!r} is not that of {self.name}, which is of '
-                                    f'type {theirs}: it was {self.type} when it was looked up: look it up again')
+            return ServiceTypeError(
+                f'the md5sum {self.service_class._md5sum!r} is not that of {self.name}, which is of'
+                f' type {theirs}: it was {self.type} when it was looked up: look it up again'
+            )
         ours = self.service_class
-        self._class = self._here = None    # the right definition may come, and is sought then
+        self._class = self._here = None  # the right definition may come, and is sought then
         return ServiceTypeError(
-            f'{self.name} is of type {theirs}, but {type_} is defined here with md5sum {ours._md5sum} '
-            f'({message_types.describe_service(ours)}), so nothing was sent: have both sides use the same '
-            f'{type_.rpartition("/")[2]}.srv')
+            f'{self.name} is of type {theirs}, but {type_} is defined here with md5sum'
+            f' {ours._md5sum} ({message_types.describe_service(ours)}), so nothing was sent: have'
+            f' both sides use the same {type_.rpartition("/")[2]}.srv'
+        )
 
     def _fields_of(self, type_, md5sum):
-        """What can be said of the fields of a provider's type; a provider elsewhere tells its md5sum alone."""
+        """What can be said of the fields of a provider's type; a provider elsewhere tells its
+        md5sum alone."""
         here = services.class_of(self.name, self.uri)
         for known in (here, *message_types.known_service_classes(type_)):
             if known is not None and known._md5sum == md5sum:
@@ -268,8 +314,9 @@ class Service:
             connection.close()
 
     def __repr__(self):
-        return '<Service %s %s at %s>' % (self.name, self.type, self.uri)
+        return f'<Service {self.name} {self.type} at {self.uri}>'
 
 
 class _NotShakenHands(Exception):
-    """Refused in the handshake: the md5sum does not fit, or another node is at the provider's old address by now."""
+    """Refused in the handshake: the md5sum does not fit, or another node is at the provider's old
+    address by now."""

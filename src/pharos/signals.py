@@ -8,25 +8,30 @@ import time
 import traceback
 import _thread
 
-_DEFAULTS = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
+_DEFAULTS = {
+    signal.SIGINT: signal.default_int_handler,
+    signal.SIGTERM: signal.SIG_DFL,
+    signal.SIGHUP: signal.SIG_DFL,
+}
 
-#: The attribute of an exception by which a signal ends the main thread. Kept here itself, it would keep the frames of
-#: the program, and what is in them, until Python takes its modules apart.
+#: The attribute of an exception by which a signal ends the main thread. Kept here itself, it would
+#: keep the frames of the program, and what is in them, until Python takes its modules apart.
 _MARK = '_pharos_signal'
 
-_is_needed = _end = None    # see :func:`serve`
-_waiting = 0      # how deep the main thread is in a wait of ours, which ends with the nodes
-_taken_on = set()    # signals for which the program had no handlers
-_held = []        # of each start and stop that the main thread runs, the _Hold
+_is_needed = _end = None  # see :func:`serve`
+_waiting = 0  # how deep the main thread is in a wait of ours, which ends with the nodes
+_taken_on = set()  # signals for which the program had no handlers
+_held = []  # of each start and stop that the main thread runs, the _Hold
 
 
 class _Hold:
-    """A stretch of the main thread's work that no signal may cut off, for up to ``limit`` seconds after it came."""
+    """A stretch of the main thread's work that no signal may cut off, for up to ``limit`` seconds
+    after it came."""
 
     def __init__(self, limit):
         self._limit = limit
-        self.came = None      # the first signal,
-        self._when = None     # and when it came, by time.monotonic()
+        self.came = None  # the first signal,
+        self._when = None  # and when it came, by time.monotonic()
 
     def take(self, number):
         """Keep a signal for the end; returns whether it waits until then."""
@@ -52,7 +57,8 @@ def is_from_signal(error):
 
 
 def code_of(function):
-    """The code object that runs when a function, or another object, is called; None if not Python's."""
+    """The code object that runs when a function, or another object, is called; None if not
+    Python's."""
     if hasattr(function, '__code__'):
         return function.__code__
     return getattr(getattr(type(function), '__call__', None), '__code__', None)
@@ -70,7 +76,8 @@ def serve(is_needed, end):
 
 
 def install(*numbers):
-    """Take on the signals for which the program has no handlers, where this is the main thread, which alone can."""
+    """Take on the signals for which the program has no handlers, where this is the main thread,
+    which alone can."""
     if threading.current_thread() is threading.main_thread():
         for number in numbers:
             if signal.getsignal(number) is _DEFAULTS[number]:
@@ -79,13 +86,15 @@ def install(*numbers):
 
 
 def is_taken_on(number):
-    """Whether the signal has come to be ours, perhaps by way of a handler that the program has installed since."""
+    """Whether the signal has come to be ours, perhaps by way of a handler that the program has
+    installed since."""
     return number in _taken_on
 
 
 @contextlib.contextmanager
 def waiting():
-    """Within this, a signal raises nothing in the main thread: the wait ends because the nodes stop."""
+    """Within this, a signal raises nothing in the main thread: the wait ends because the nodes
+    stop."""
     global _waiting
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -99,12 +108,15 @@ def waiting():
 
 @contextlib.contextmanager
 def held(limit, is_end=False):
-    """Within this, a signal raises nothing in the main thread, and afterwards what it would have raised.
+    """Within this, a signal raises nothing in the main thread, and afterwards what it would have
+    raised.
 
-    A start or a stop that is torn up half way leaves registrations behind, and the end of the program programs, too.
+    A start or a stop that is torn up half way leaves registrations behind, and the end of the
+    program programs, too.
 
     :param limit: seconds after which a second signal raises all the same
-    :param is_end: whether it is the end of the program, so that there is nothing to raise afterwards
+    :param is_end: whether it is the end of the program, so that there is nothing to raise
+        afterwards
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -115,7 +127,7 @@ def held(limit, is_end=False):
     try:
         yield
     finally:
-        if hold in _held:    # else the process was forked in it
+        if hold in _held:  # else the process was forked in it
             _held.remove(hold)
         if hold.came is not None and not is_end:
             _raise(hold.came)
@@ -130,13 +142,15 @@ def _on_signal(number, frame):
         if not (_held and _held[-1].take(number)):
             raise _exception(number)
         return
-    # Not here, nor in a Thread, whose start takes a lock: the main thread may hold any lock just now.
+    # Not here, nor in a Thread, whose start takes a lock: the main thread may hold any lock just
+    # now.
     _thread.start_new_thread(_end, ())
     _raise(number)
 
 
 def _raise(number):
-    """End what the main thread does, if it does not end by itself, at once or when the hold ends."""
+    """End what the main thread does, if it does not end by itself, at once or when the hold
+    ends."""
     if _held and _held[-1].take(number) or _waiting:
         return
     raise _exception(number)

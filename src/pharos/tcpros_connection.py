@@ -1,7 +1,8 @@
 """A TCPROS connection of our own, with a time limit.
 
-rospy's ServiceProxy has none and asks the environment's master, and nothing in ROS's Python asks a publisher for its
-message definition, so the exchange is ours; the coding of the handshake is rosgraph's.
+rospy's ServiceProxy has none and asks the environment's master, and nothing in ROS's Python asks a
+publisher for its message definition, so the exchange is ours; the coding of the handshake is
+rosgraph's.
 """
 import socket
 import struct
@@ -11,13 +12,16 @@ import rosgraph.network
 
 from pharos.private_rospy.lifetime import Interruption, keep_alive, shut
 
-CALLER_ID = '/pharos_types'    # not a node's: a publisher closes an earlier connection of the same name
-_HEADER_LIMIT = 1 << 22    # bytes of a connection header; it holds a message definition
-_LIMIT = 1 << 30           # bytes of a response; a length beyond is a broken stream
+CALLER_ID = (  # not a node's: a publisher closes an earlier connection of the same name
+    '/pharos_types'
+)
+_HEADER_LIMIT = 1 << 22  # bytes of a connection header; it holds a message definition
+_LIMIT = 1 << 30  # bytes of a response; a length beyond is a broken stream
 
 
 class TcprosConnection:
-    """A connection that is shaken hands on: :attr:`header` is the peer's answer, with 'error' where it refuses.
+    """A connection that is shaken hands on: :attr:`header` is the peer's answer, with 'error' where
+    it refuses.
 
     :param address: (host, port)
     :param header: ours, kept as :attr:`sent`
@@ -32,7 +36,8 @@ class TcprosConnection:
         self._socket = socket.create_connection(address, self._left())
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            keep_alive(self._socket, while_sending=True)    # an answer may take any time, while its host is there
+            # an answer may take any time, while its host is there
+            keep_alive(self._socket, while_sending=True)
             with Interruption(lambda: shut(self._socket)):
                 rosgraph.network.write_ros_handshake_header(self._socket, header)
                 size = self._read(4)
@@ -40,13 +45,14 @@ class TcprosConnection:
             self.header = rosgraph.network.decode_ros_handshake_header(size + answer)
         except (rosgraph.network.ROSHandshakeException, struct.error, UnicodeError) as error:
             self.close()
-            raise ConnectionError('no connection header: %s' % error) from error
+            raise ConnectionError(f'no connection header: {error}') from error
         except BaseException:
             self.close()
             raise
 
     def exchange(self, request, deadline):
-        """Send a serialized request to a service; returns ``(ok, serialized response or error text)``."""
+        """Send a serialized request to a service; returns ``(ok, serialized response or error
+        text)``."""
         self._deadline = deadline
         with Interruption(lambda: shut(self._socket)):
             self._socket.settimeout(self._left())
@@ -55,7 +61,7 @@ class TcprosConnection:
             return ok, self._read_sized(self._read(4), _LIMIT)
 
     def _read_sized(self, size, limit):
-        size, = struct.unpack('<I', size)
+        (size,) = struct.unpack('<I', size)
         if size > limit:
             raise ConnectionError('%d bytes were announced' % size)
         return self._read(size)
@@ -66,9 +72,9 @@ class TcprosConnection:
             try:
                 data = self._socket.recv(min(1 << 20, max(4096, size - len(self._received))))
             except TimeoutError as error:
-                if error.errno is None:    # our time limit
+                if error.errno is None:  # our time limit
                     raise
-                raise ConnectionError('its host has gone: %s' % error.strerror) from error
+                raise ConnectionError(f'its host has gone: {error.strerror}') from error
             if not data:
                 raise ConnectionError('closed after %d of %d bytes' % (len(self._received), size))
             self._received += data
@@ -85,7 +91,7 @@ class TcprosConnection:
             return True
         except OSError:
             pass
-        return False    # closed, or it says something unasked
+        return False  # closed, or it says something unasked
 
     def close(self):
         """Close it."""
@@ -101,13 +107,17 @@ class TcprosConnection:
 
 
 def publisher_header(address, topic, deadline):
-    """The connection header of a publisher, as a subscriber of any type gets it; 'error' is in it where it refuses.
+    """The connection header of a publisher, as a subscriber of any type gets it; 'error' is in it
+    where it refuses.
 
     :param address: (host, port)
     :param deadline: by ``time.monotonic()``
     :raises OSError: if there is no answer
     """
-    connection = TcprosConnection(address, {'topic': topic, 'callerid': CALLER_ID, 'md5sum': '*', 'type': '*',
-                                            'tcp_nodelay': '0'}, deadline)
+    connection = TcprosConnection(
+        address,
+        {'topic': topic, 'callerid': CALLER_ID, 'md5sum': '*', 'type': '*', 'tcp_nodelay': '0'},
+        deadline,
+    )
     connection.close()
     return connection.header

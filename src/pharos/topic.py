@@ -11,15 +11,16 @@ from pharos.life import Life
 from pharos.private_rospy.proxies import MARGIN, time_limit
 from pharos.seconds import check_seconds
 
-POLL = 0.05          # seconds between two looks at the master's types
-QUEUE_SIZE = 1000    # messages kept for a slow receiver, where nothing else is said
+POLL = 0.05  # seconds between two looks at the master's types
+QUEUE_SIZE = 1000  # messages kept for a slow receiver, where nothing else is said
 
 
 class Topic:
     """A topic of one master.
 
-    The report: "When a node asks for information or publishes information, it asks the right instance of PhaROSTopic
-    to give it the correct channel." Topics hold no state: ask :meth:`Master.topic <pharos.Master.topic>` as you like.
+    The report: "When a node asks for information or publishes information, it asks the right
+    instance of PhaROSTopic to give it the correct channel." Topics hold no state: ask
+    :meth:`Master.topic <pharos.Master.topic>` as you like.
     """
 
     def __init__(self, master, name):
@@ -30,18 +31,23 @@ class Topic:
     def type(self):
         """The type name, such as 'turtlesim/Velocity'.
 
-        :raises UnknownTopicError: if the master knows no such topic, or nobody has given its type yet
+        :raises UnknownTopicError: if the master knows no such topic, or nobody has given its type
+            yet
         """
         types = dict(self.master.topic_types())
         name = types.get(self.name, rosgraph.names.ANYTYPE)
         if name != rosgraph.names.ANYTYPE:
             return name
-        if self.publishers or self.subscribers:    # rosmaster does not list these
-            raise UnknownTopicError('the type of %s is not known yet, for only nodes of any type are there: name it '
-                                    'with typed_as=, or start the other node first' % self.name)
-        raise UnknownTopicError('no node of %s publishes or subscribes to %s%s: name its type with typed_as=, or start '
-                                'the other node first'
-                                % (self.master.url, self.name, self.master.near(self.name, types)))
+        if self.publishers or self.subscribers:  # rosmaster does not list these
+            raise UnknownTopicError(
+                f'the type of {self.name} is not known yet, for only nodes of any type are there:'
+                ' name it with typed_as=, or start the other node first'
+            )
+        raise UnknownTopicError(
+            f'no node of {self.master.url} publishes or subscribes to'
+            f' {self.name}{self.master.near(self.name, types)}: name its type with typed_as=, or'
+            ' start the other node first'
+        )
 
     @property
     def publishers(self):
@@ -56,10 +62,24 @@ class Topic:
     @property
     def channels(self):
         """The channels that nodes of this process have open on it."""
-        return [channel for node in self.master.own_nodes() for channel in node.channels if channel.topic == self.name]
+        return [
+            channel
+            for node in self.master.own_nodes()
+            for channel in node.channels
+            if channel.topic == self.name
+        ]
 
-    def input_channel(self, node, typed_as=None, delegate=None, queue_size=QUEUE_SIZE, inline=False, shared=False,
-                      from_=None, wait=0):
+    def input_channel(
+        self,
+        node,
+        typed_as=None,
+        delegate=None,
+        queue_size=QUEUE_SIZE,
+        inline=False,
+        shared=False,
+        from_=None,
+        wait=0,
+    ):
         """A new :class:`~pharos.InputChannel` of ``node``; see :meth:`Node.interested_in`.
 
         :raises TypeError, ValueError: if that is no node of this process, or one of another master
@@ -67,30 +87,46 @@ class Topic:
         self._check_node(node)
         is_first = all(channel.topic != self.name for channel in node.channels)
         message_class = self.message_class(node, typed_as, wait, receives=True)
-        options = dict(delegate=delegate, queue_size=queue_size, inline=inline, shared=shared, from_=from_)
-        if not is_first or message_class is typed_as or not message_types.is_provisional(message_class):
+        options = dict(
+            delegate=delegate, queue_size=queue_size, inline=inline, shared=shared, from_=from_
+        )
+        if (
+            not is_first
+            or message_class is typed_as
+            or not message_types.is_provisional(message_class)
+        ):
             return InputChannel(node, self.name, message_class, **options)
         with node._rospy.refusals.held(self.name) as refusals:
             channel = InputChannel(node, self.name, message_class, **options)
             graph_types.agree_with_publishers(channel, refusals)
         return channel
 
-    def output_channel(self, node, typed_as=None, latch=False, queue_size=QUEUE_SIZE, connect_timeout=None, wait=0):
+    def output_channel(
+        self, node, typed_as=None, latch=False, queue_size=QUEUE_SIZE, connect_timeout=None, wait=0
+    ):
         """A new :class:`~pharos.OutputChannel` of ``node``; see :meth:`Node.output_channel`.
 
         :raises TypeError, ValueError: as :meth:`input_channel`
         """
         self._check_node(node)
-        return OutputChannel(node, self.name, self.message_class(node, typed_as, wait), latch=latch,
-                             queue_size=queue_size, connect_timeout=connect_timeout)
+        return OutputChannel(
+            node,
+            self.name,
+            self.message_class(node, typed_as, wait),
+            latch=latch,
+            queue_size=queue_size,
+            connect_timeout=connect_timeout,
+        )
 
     def message_class(self, node, typed_as=None, wait=0, receives=False):
-        """The message class of the topic for ``node``: ``typed_as``, else what the node knows, else the master's.
+        """The message class of the topic for ``node``: ``typed_as``, else what the node knows, else
+        the master's.
 
-        Where no package here has the type, one who receives takes a live publisher's definition before one that was
-        given at run time or is shipped: another would never connect.
+        Where no package here has the type, one who receives takes a live publisher's definition
+        before one that was given at run time or is shipped: another would never connect.
 
-        :param wait: seconds to wait until somebody has given it a type, and its definition where it is not known here
+        :param wait: seconds to wait until somebody has given it a type, and its definition where it
+            is not known here
         :raises MessageTypeError: if the node uses the topic with another type already
         :raises NodeStoppedError: if the node stops meanwhile
         """
@@ -100,13 +136,19 @@ class Topic:
 
     def _check_node(self, node):
         if not isinstance(node, Life):
-            raise TypeError(f'a channel on {self.name} is given to a node of this process, not to {node!r}')
+            raise TypeError(
+                f'a channel on {self.name} is given to a node of this process, not to {node!r}'
+            )
         if node.master != self.master:
-            raise ValueError(f'{self} is at another master than {node.name}: ask that for its topic')
+            raise ValueError(
+                f'{self} is at another master than {node.name}: ask that for its topic'
+            )
         node._live_rospy()
 
     def _message_class(self, node, typed_as, wait, receives):
-        known = next((channel.message_class for channel in node.channels if channel.topic == self.name), None)
+        known = next(
+            (channel.message_class for channel in node.channels if channel.topic == self.name), None
+        )
         if known and typed_as in (None, known._type):
             return known
         if typed_as is None:
@@ -114,8 +156,10 @@ class Topic:
         asked = self._class_of(typed_as, receives)
         if known and asked._md5sum != known._md5sum:
             raise MessageTypeError(
-                '%s uses %s with the type %s [%s] already and cannot use it as %s [%s] too: close that channel first'
-                % (node.name, self.name, known._type, known._md5sum, asked._type, asked._md5sum))
+                f'{node.name} uses {self.name} with the type {known._type} [{known._md5sum}]'
+                f' already and cannot use it as {asked._type} [{asked._md5sum}] too: close that'
+                ' channel first'
+            )
         return asked
 
     def _class_of(self, type_or_class, receives):
@@ -123,7 +167,9 @@ class Topic:
         try:
             known = message_types.message_class(type_or_class)
         except UnknownTypeError:
-            return graph_types.class_from_publishers(self, type_or_class) or message_types.message_class(type_or_class)
+            return graph_types.class_from_publishers(
+                self, type_or_class
+            ) or message_types.message_class(type_or_class)
         if receives and known is not type_or_class and message_types.is_provisional(known):
             own = graph_types.classes_here(self, known._type)
             return next((cls for cls in own if cls._md5sum == known._md5sum), (own or [known])[0])
@@ -134,17 +180,18 @@ class Topic:
         while True:
             try:
                 return self._class_of(self.type, receives)
-            except (UnknownTopicError, UnknownTypeError):    # only subscribers are there
+            except (UnknownTopicError, UnknownTypeError):  # only subscribers are there
                 if time.monotonic() >= deadline:
                     raise
             except NodeStoppedError as error:
                 raise self._stopped(node) from error
-            if node._rospy.ended.wait(POLL):    # a master tells nobody of new types
+            if node._rospy.ended.wait(POLL):  # a master tells nobody of new types
                 raise self._stopped(node)
 
     def _stopped(self, node):
-        return NodeStoppedError('%s stopped while it waited for the type of %s: start it again first'
-                                % (node.name, self.name))
+        return NodeStoppedError(
+            f'{node.name} stopped while it waited for the type of {self.name}: start it again first'
+        )
 
     def __eq__(self, other):
         return isinstance(other, Topic) and (self.name, self.master) == (other.name, other.master)
@@ -153,4 +200,4 @@ class Topic:
         return hash((self.name, self.master))
 
     def __repr__(self):
-        return '<Topic %s of %s>' % (self.name, self.master.url)
+        return f'<Topic {self.name} of {self.master.url}>'

@@ -7,7 +7,8 @@ from pharos.signals import is_from_signal
 
 
 class _Transcript:
-    """Shows things a line each, from any thread, on standard output or wherever :meth:`on_show` says.
+    """Shows things a line each, from any thread, on standard output or wherever :meth:`on_show`
+    says.
 
     The report (listing 3.3)::
 
@@ -16,16 +17,16 @@ class _Transcript:
     """
 
     def __init__(self):
-        self._lock = threading.RLock()    # an RLock: what receives a line may show something itself
+        self._lock = threading.RLock()  # an RLock: what receives a line may show something itself
         self._receiver = None
-        self._is_failing = False          # whether the receiver has raised something
+        self._is_failing = False  # whether the receiver has raised something
 
     def show(self, *things):
         """Show one line: ``things`` as text, separated by blanks. Raises nothing.
 
-        Where the receiver of :meth:`on_show` raises something, the line goes to standard output, the
-        first one with a word about it. A line that cannot be written there either, to a closed pipe
-        for example, is lost.
+        Where the receiver of :meth:`on_show` raises something, the line goes to standard output,
+        the first one with a word about it. A line that cannot be written there either, to a closed
+        pipe for example, is lost.
         """
         text = ' '.join(map(text_of, things))
         with self._lock:
@@ -43,8 +44,10 @@ class _Transcript:
                 raise
             if not self._is_failing:
                 self._is_failing = True
-                why = (f'the receiver {name_of(receiver)} of the Transcript raised '
-                       f'{type(error).__name__}: {text_of(error)}: what it does not take is shown here')
+                why = (
+                    f'the receiver {name_of(receiver)} of the Transcript raised '
+                    f'{type(error).__name__}: {text_of(error)}: what it does not take is shown here'
+                )
                 attempt(lambda: _print(why))
             return False
 
@@ -60,13 +63,13 @@ class _Transcript:
         return before
 
     def __repr__(self):
-        return '<Transcript to %s>' % ('standard output' if self._receiver is None else self._receiver)
+        return f"<Transcript to {'standard output' if self._receiver is None else self._receiver}>"
 
 
 def _print(text):
     try:
         print(text, flush=True)
-    except UnicodeEncodeError:    # as on a terminal that knows ASCII only
+    except UnicodeEncodeError:  # as on a terminal that knows ASCII only
         encoding = sys.stdout.encoding
         print(text.encode(encoding, 'backslashreplace').decode(encoding), flush=True)
 

@@ -1,9 +1,10 @@
 """The turtles' field: where the turtles are, how they move, and the picture that their pens draw.
 
-There is no ROS in here; `scripts/turtle_simulator` puts a field on topics and services. The figures and the order of
-events are turtlesim's (ros_tutorials, turtlesim/src/turtle.cpp and turtle_frame.cpp), so that a program sees the same
-numbers from either. Lengths are in metres from the lower left corner, y upwards, and angles in radians, as in
-turtlesim/Pose; pixels count from the upper left corner.
+There is no ROS in here; `scripts/turtle_simulator` puts a field on topics and services. The figures
+and the order of events are turtlesim's (ros_tutorials, turtlesim/src/turtle.cpp and
+turtle_frame.cpp), so that a program sees the same numbers from either. Lengths are in metres from
+the lower left corner, y upwards, and angles in radians, as in turtlesim/Pose; pixels count from the
+upper left corner.
 """
 
 import itertools
@@ -11,23 +12,37 @@ import math
 
 from PIL import Image, ImageDraw
 
-METRE = 45    # pixels: the height of turtlesim's picture of a turtle
-PICTURE_SIZE = 500    # pixels
-FIELD_SIZE = (PICTURE_SIZE - 1) / METRE    # 11.088889 m
-COMMAND_HOLDS = 1.0    # seconds
-BACKGROUND = (0x45, 0x56, 0xff)
-PEN_COLOUR = (0xb3, 0xb8, 0xff)
-PEN_WIDTH = 3    # pixels
+METRE = 45  # pixels: the height of turtlesim's picture of a turtle
+PICTURE_SIZE = 500  # pixels
+FIELD_SIZE = (PICTURE_SIZE - 1) / METRE  # 11.088889 m
+COMMAND_HOLDS = 1.0  # seconds
+BACKGROUND = (0x45, 0x56, 0xFF)
+PEN_COLOUR = (0xB3, 0xB8, 0xFF)
+PEN_WIDTH = 3  # pixels
 
 # A turtle seen from above, heading right: discs (forward, left, radius) in metres, the shell last.
-LIMBS = ((0.46, 0, 0.13), (0.28, 0.3, 0.1), (0.28, -0.3, 0.1), (-0.28, 0.3, 0.1), (-0.28, -0.3, 0.1), (-0.42, 0, 0.06))
+LIMBS = (
+    (0.46, 0, 0.13),
+    (0.28, 0.3, 0.1),
+    (0.28, -0.3, 0.1),
+    (-0.28, 0.3, 0.1),
+    (-0.28, -0.3, 0.1),
+    (-0.42, 0, 0.06),
+)
 SHELL = (0, 0, 0.38)
-SHELL_COLOURS = ((0x3c, 0x8f, 0x3c), (0xd9, 0x7b, 0x29), (0x8e, 0x4a, 0xa8), (0xc0, 0x3a, 0x3a), (0x2b, 0x8c, 0x8c))
-LIMB_COLOUR = (0xe4, 0xd3, 0x9a)
+SHELL_COLOURS = (
+    (0x3C, 0x8F, 0x3C),
+    (0xD9, 0x7B, 0x29),
+    (0x8E, 0x4A, 0xA8),
+    (0xC0, 0x3A, 0x3A),
+    (0x2B, 0x8C, 0x8C),
+)
+LIMB_COLOUR = (0xE4, 0xD3, 0x9A)
 
 
 class Turtle:
-    """A turtle on a field. Where it is: `x`, `y`, `theta`; `colour` is what was under it at the last update."""
+    """A turtle on a field. Where it is: `x`, `y`, `theta`; `colour` is what was under it at the
+    last update."""
 
     def __init__(self, field, x, y, theta):
         _check_finite(x=x, y=y, theta=theta)
@@ -39,7 +54,8 @@ class Turtle:
 
     @property
     def linear_velocity(self):
-        """Metres a second: signed along the heading, or the speed of a turtle that also goes sideways."""
+        """Metres a second: signed along the heading, or the speed of a turtle that also goes
+        sideways."""
         return math.hypot(self._forward, self._left) if self._left else self._forward
 
     @property
@@ -48,19 +64,22 @@ class Turtle:
         return self._turning
 
     def drive(self, forward, turning, left=0.0):
-        """Move on with these velocities (metres and radians a second) for a second, unless told anew."""
+        """Move on with these velocities (metres and radians a second) for a second, unless told
+        anew."""
         _check_finite(forward=forward, turning=turning, left=left)
         self._forward, self._left, self._turning = forward, left, turning
         self._command_age = 0.0
 
     def set_pen(self, colour, width, off):
-        """Lift the pen, or put it down with another colour and width (pixels; 0 is the thinnest)."""
+        """Lift the pen, or put it down with another colour and width (pixels; 0 is the
+        thinnest)."""
         self.pen_is_down = not off
         if not off:
             self.pen_colour, self.pen_width = tuple(colour), width or 1
 
     def update(self, seconds):
-        """Move on by so many seconds. Returns where a wall kept the turtle from going, `(x, y)`, or None."""
+        """Move on by so many seconds. Returns where a wall kept the turtle from going, `(x, y)`, or
+        None."""
         if self._command_age > COMMAND_HOLDS:
             self._stop()
         self._command_age += seconds
@@ -68,7 +87,8 @@ class Turtle:
         along, across = math.cos(self.theta), math.sin(self.theta)
         return self._go_to(
             self.x + (along * self._forward - across * self._left) * seconds,
-            self.y + (across * self._forward + along * self._left) * seconds)
+            self.y + (across * self._forward + along * self._left) * seconds,
+        )
 
     def teleport_absolute(self, x, y, theta):
         """Be there, with a line from where the turtle was. Returns as `update` does."""
@@ -80,7 +100,9 @@ class Turtle:
         """Turn by `angular`, then be `linear` ahead, with a line. Returns as `update` does."""
         _check_finite(linear=linear, angular=angular)
         self.theta = _normalised(self.theta + angular)
-        return self._go_to(self.x + math.cos(self.theta) * linear, self.y + math.sin(self.theta) * linear)
+        return self._go_to(
+            self.x + math.cos(self.theta) * linear, self.y + math.sin(self.theta) * linear
+        )
 
     def _stop(self):
         self._forward = self._left = self._turning = 0.0
@@ -104,9 +126,12 @@ class Field:
         self.reset(background)
 
     def spawn(self, name, x, y, theta):
-        """Put a turtle on the field; without a name it gets one. Returns the name; ValueError if it is taken."""
+        """Put a turtle on the field; without a name it gets one. Returns the name; ValueError if it
+        is taken."""
         if not name:
-            name = next(free for free in map('turtle{}'.format, self._numbers) if free not in self.turtles)
+            name = next(
+                free for free in map('turtle{}'.format, self._numbers) if free not in self.turtles
+            )
         if name in self.turtles:
             raise ValueError(f'A turtle named [{name}] already exists')
         self.turtles[name] = Turtle(self, x, y, theta)
@@ -138,7 +163,8 @@ class Field:
         """Draw a line between two points with ends as broad as the line."""
         pixels = [_pixel(*start), _pixel(*end)]
         self._pen.line(pixels, colour, width)
-        # Pillow cuts a wide line off square at its ends: without a dot there, a curve shows a gap at each of its steps.
+        # Pillow cuts a wide line off square at its ends: without a dot there, a curve shows a gap
+        # at each of its steps.
         for x, y in pixels:
             self._pen.ellipse(_box(x, y, (width - 1) / 2), colour)
 
@@ -149,7 +175,10 @@ class Field:
         for turtle, shell_colour in zip(self.turtles.values(), itertools.cycle(SHELL_COLOURS)):
             along, across = math.cos(turtle.theta), math.sin(turtle.theta)
             for forward, left, radius in LIMBS + (SHELL,):
-                x, y = _pixel(turtle.x + along * forward - across * left, turtle.y + across * forward + along * left)
+                x, y = _pixel(
+                    turtle.x + along * forward - across * left,
+                    turtle.y + across * forward + along * left,
+                )
                 colour = shell_colour if radius == SHELL[-1] else LIMB_COLOUR
                 pen.ellipse(_box(x, y, radius * METRE), colour, outline='black')
         return picture

@@ -1,12 +1,14 @@
-"""The callbacks of plain rospy Subscribers at the end of a link between two nodes of this process."""
+"""The callbacks of plain rospy Subscribers at the end of a link between two nodes of this
+process."""
 import collections
 import contextlib
 import threading
 
 from pharos.intraprocess.dispatcher import Dispatcher
 
-UNDER_WAY = 4 << 20    # bytes that wait beside a publisher's queue, as they do in the sockets of TCPROS
-SMALL = 64             # bytes that a message is taken to have whose size is not told
+# bytes that wait beside a publisher's queue, as they do in the sockets of TCPROS
+UNDER_WAY = 4 << 20
+SMALL = 64  # bytes that a message is taken to have whose size is not told
 
 
 def is_of_channel(callback):
@@ -17,26 +19,28 @@ def is_of_channel(callback):
 class CallbackInbox:
     """The messages on their way to the callbacks of a rospy subscription, through one link.
 
-    All is as over a socket. The callbacks run in a thread of the link, so that those of two publishers may wait for
-    each other, and get one message for all of them. What does not fit into the publisher's queue is dropped, the oldest
-    first; a publisher that has no queue waits.
+    All is as over a socket. The callbacks run in a thread of the link, so that those of two
+    publishers may wait for each other, and get one message for all of them. What does not fit into
+    the publisher's queue is dropped, the oldest first; a publisher that has no queue waits.
     """
 
-    inline = shared = False    # see dispatcher.Inbox
+    inline = shared = False  # see dispatcher.Inbox
 
     def __init__(self, link, publisher, subscriber, start_thread):
         """:param publisher: rospy's _PublisherImpl
         :param subscriber: rospy's _SubscriberImpl
         """
-        self.closed = False    # nothing more arrives
-        self.latched = None    # the last message of a publisher that latches
+        self.closed = False  # nothing more arrives
+        self.latched = None  # the last message of a publisher that latches
         self.dispatcher = Dispatcher(start_thread)
         self._link, self._publisher, self._subscriber = link, publisher, subscriber
         self._queue, self._sizes = collections.deque(), collections.deque()
-        self._put_bytes = self._taken_bytes = 0    # of those put and not dropped, and of those taken
+        self._put_bytes = self._taken_bytes = 0  # of those put and not dropped, and of those taken
         self._announced = False
-        self._room = threading.Condition()    # notified when there is some, while a publisher waits for it
-        self._waiting = self._excused = 0     # publishers that wait; and threads for which they are not to wait
+        # notified when there is some, while a publisher waits for it
+        self._room = threading.Condition()
+        # publishers that wait; and threads for which they are not to wait
+        self._waiting = self._excused = 0
         self.dispatcher.need_thread()
 
     def put(self, value, size=0):
@@ -64,22 +68,29 @@ class CallbackInbox:
 
     def _make_room(self):
         """Drop the oldest message; for the thread that puts."""
-        with contextlib.suppress(IndexError):    # it has just been taken
+        with contextlib.suppress(IndexError):  # it has just been taken
             self._queue.popleft()
             self._put_bytes -= self._sizes.popleft()
 
     def _take(self):
         """Take the oldest message; for the thread that runs.
 
-        Each of the two threads has a count of its own: neither may overwrite what the other has just counted.
+        Each of the two threads has a count of its own: neither may overwrite what the other has
+        just counted.
         """
         value = self._queue.popleft()
         self._taken_bytes += self._sizes.popleft()
         return value
 
     def _waits_for_room(self, size):
-        return (self._publisher.queue_size is None and self._queue and self._bytes + size > UNDER_WAY
-                and not self.closed and not self._excused and not self.dispatcher.is_run_here())
+        return (
+            self._publisher.queue_size is None
+            and self._queue
+            and self._bytes + size > UNDER_WAY
+            and not self.closed
+            and not self._excused
+            and not self.dispatcher.is_run_here()
+        )
 
     def _wait_for_room(self, size):
         with self._room:
@@ -89,7 +100,9 @@ class CallbackInbox:
 
     def run_next(self):
         """Run the callbacks for the oldest message, if there is one still."""
-        self._announced = False    # before looking at the queue: what is put from now on announces itself
+        self._announced = (
+            False  # before looking at the queue: what is put from now on announces itself
+        )
         queue, limit = self._queue, self._subscriber.queue_size
         try:
             while limit and len(queue) > limit:
@@ -119,7 +132,8 @@ class CallbackInbox:
 
     @contextlib.contextmanager
     def unbounded(self):
-        """Within this, no publisher waits for room: it holds a lock that the thread needs which would make room."""
+        """Within this, no publisher waits for room: it holds a lock that the thread needs which
+        would make room."""
         with self._room:
             self._excused += 1
             self._room.notify_all()

@@ -1,12 +1,14 @@
 """Copies of ROS messages in two halves: frozen once by the publisher, thawed by each receiver.
 
-What a receiver gets equals, in value and in the Python type of every field, what the wire would have delivered::
+What a receiver gets equals, in value and in the Python type of every field, what the wire would
+have delivered::
 
     copier = copier_for(PointStamped)
     frozen = copier.freeze(message)     # a snapshot: a tuple of immutable values
     message = copier.thaw(frozen)       # a fresh message, as often as there are receivers
 
-The work is done by two functions generated for each class, as genpy generates its serializers (``copier.source``)::
+The work is done by two functions generated for each class, as genpy generates its serializers
+(``copier.source``)::
 
     def freeze_fields(message):
         header_0 = message.header
@@ -26,10 +28,11 @@ The work is done by two functions generated for each class, as genpy generates i
         header_0 = message.header = new(Header_1)
         ...
 
-The copies equal the wire's by three rules. Numbers pass through the struct codes of the wire, which round, convert
-and refuse alike; only what is of the very type that arrives (float, str, bytes) is shared as it is. A message with
-anything else in it is serialized: what is frozen then is bytes, and the errors are the wire's own. So is every message
-of a class that genpy did not make in the usual way (AnyMsg, numpy_msg, one written by hand).
+The copies equal the wire's by three rules. Numbers pass through the struct codes of the wire, which
+round, convert and refuse alike; only what is of the very type that arrives (float, str, bytes) is
+shared as it is. A message with anything else in it is serialized: what is frozen then is bytes, and
+the errors are the wire's own. So is every message of a class that genpy did not make in the usual
+way (AnyMsg, numpy_msg, one written by hand).
 """
 import functools
 import io
@@ -40,24 +43,28 @@ from typing import Callable, NamedTuple, Optional
 
 import genpy
 from genmsg.msgs import parse_type
-from genpy.base import SIMPLE_TYPES_DICT as STRUCT_CODES    # primitive type -> its code on the wire
+from genpy.base import SIMPLE_TYPES_DICT as STRUCT_CODES  # primitive type -> its code on the wire
 
 from pharos.messages.nested_types import nested_class
 
-ARRIVAL_CODES = {**STRUCT_CODES, 'bool': '?'}   # genpy sends a bool as a number: 7 goes out, True arrives
-SMALL = 64     # bytes that a message is taken to have beside its texts and arrays
-FEW = 1024     # bytes; messages that all have one size, of so many, are not worth counting
+# genpy sends a bool as a number: 7 goes out, True arrives
+ARRIVAL_CODES = {**STRUCT_CODES, 'bool': '?'}
+SMALL = 64  # bytes that a message is taken to have beside its texts and arrays
+FEW = 1024  # bytes; messages that all have one size, of so many, are not worth counting
 
 
 class Copier(NamedTuple):
-    """The functions that copy the messages of one class. Where it is always serialized, two of them are missing."""
+    """The functions that copy the messages of one class. Where it is always serialized, two of them
+    are missing."""
 
-    freeze: Callable    # message -> tuple or bytes; raises what message.serialize() raises
-    thaw: Callable      # tuple or bytes -> fresh message
-    size: Optional[Callable]    # message -> about how many bytes it has on the wire; None: always a few
-    freeze_fields: Optional[Callable] = None    # message -> tuple; raises where freeze would serialize
-    thaw_fields: Optional[Callable] = None      # tuple -> message, its times not canonized
-    source: str = ''    # of all but the first two, to be read when debugging
+    freeze: Callable  # message -> tuple or bytes; raises what message.serialize() raises
+    thaw: Callable  # tuple or bytes -> fresh message
+    # message -> about how many bytes it has on the wire; None: always a few
+    size: Optional[Callable]
+    # message -> tuple; raises where freeze would serialize
+    freeze_fields: Optional[Callable] = None
+    thaw_fields: Optional[Callable] = None  # tuple -> message, its times not canonized
+    source: str = ''  # of all but the first two, to be read when debugging
 
 
 def copier_for(cls):
@@ -66,9 +73,10 @@ def copier_for(cls):
     if copier is None:
         try:
             copier = _generate(cls)
-        except Exception:   # a class not understood costs time, never a wrong copy
+        except Exception:  # a class not understood costs time, never a wrong copy
             copier = Copier(serialized, lambda frozen: cls().deserialize(frozen), _estimated_size)
-        # Kept in the class itself: a registry here would keep classes made at run time alive for ever.
+        # Kept in the class itself: a registry here would keep classes made at run time alive for
+        # ever.
         cls._pharos_copier = copier
     return copier
 
@@ -82,13 +90,18 @@ def thawer(publisher_cls, receiver_cls):
     def thaw_as_receiver(frozen):
         data = frozen if type(frozen) is bytes else serialized(copier.thaw_fields(frozen))
         return receiver_cls().deserialize(data)
+
     return thaw_as_receiver
 
 
 def _estimated_size(message):
     """The size of a message of any class, such as rospy's AnyMsg or one with numpy arrays."""
     values = [getattr(message, name, None) for name in message.__slots__]
-    return SMALL + sum(getattr(value, 'nbytes', None) or len(value) for value in values if hasattr(value, '__len__'))
+    return SMALL + sum(
+        getattr(value, 'nbytes', None) or len(value)
+        for value in values
+        if hasattr(value, '__len__')
+    )
 
 
 def serialized(message):
@@ -103,7 +116,8 @@ class Odd(Exception):
 
 
 def text(value):
-    """The value itself, if it is a str that UTF-8 has a form for, as it has none for a lone surrogate."""
+    """The value itself, if it is a str that UTF-8 has a form for, as it has none for a lone
+    surrogate."""
     if type(value) is not str:
         raise Odd
     value.encode('utf-8')
@@ -120,11 +134,16 @@ def sequence(value):
 def octets(value):
     """The bytes that arrive in a uint8[] or char[]."""
     # bytes() itself would take more than the wire does, even an int.
-    return value if type(value) is bytes else bytes(value if type(value) is bytearray else sequence(value))
+    return (
+        value
+        if type(value) is bytes
+        else bytes(value if type(value) is bytearray else sequence(value))
+    )
 
 
 def _numbers_of(base):
-    """The function that turns the value of an array of this primitive type into the tuple that arrives."""
+    """The function that turns the value of an array of this primitive type into the tuple that
+    arrives."""
     sent, arriving = STRUCT_CODES[base], ARRIVAL_CODES[base]
 
     @functools.lru_cache(maxsize=128)
@@ -133,7 +152,8 @@ def _numbers_of(base):
 
     def numbers(value):
         if type(value) in (list, tuple):
-            value = tuple(value)    # a snapshot: a list could change its length between two looks at it
+            # a snapshot: a list could change its length between two looks at it
+            value = tuple(value)
             if sent == 'd' and set(map(type, value)) == {float}:
                 return value
         else:
@@ -142,14 +162,23 @@ def _numbers_of(base):
                 return tuple(value)
         pack, unpack = structs(len(value))
         return unpack(pack(*value))
+
     return numbers
 
 
 def _from_numpy(array):
-    """The list of a numpy array's numbers, which are plain ints or floats then, and the struct code of its type."""
-    numpy = sys.modules.get('numpy')    # not imported here: unless someone did, this is no array of it
-    # Of other kinds, tolist() may give what the wire refuses in the array itself: an int for a datetime64.
-    if numpy is None or type(array) is not numpy.ndarray or array.ndim != 1 or array.dtype.kind not in 'iuf':
+    """The list of a numpy array's numbers, which are plain ints or floats then, and the struct code
+    of its type."""
+    # not imported here: unless someone did, this is no array of it
+    numpy = sys.modules.get('numpy')
+    # Of other kinds, tolist() may give what the wire refuses in the array itself: an int for a
+    # datetime64.
+    if (
+        numpy is None
+        or type(array) is not numpy.ndarray
+        or array.ndim != 1
+        or array.dtype.kind not in 'iuf'
+    ):
         raise Odd
     return array.tolist(), array.dtype.char
 
@@ -157,30 +186,65 @@ def _from_numpy(array):
 # What generated code calls; to convert an array: the function named after the type of its elements.
 _HELPERS = {'Odd': Odd, 'new': object.__new__, 'text': text, 'sequence': sequence}
 _HELPERS.update((base + '_array', _numbers_of(base)) for base in STRUCT_CODES)
-_HELPERS.update(string_array=lambda value: tuple(map(text, sequence(value))), uint8_array=octets, char_array=octets)
+_HELPERS.update(
+    string_array=lambda value: tuple(map(text, sequence(value))),
+    uint8_array=octets,
+    char_array=octets,
+)
 
 
 def _generate(cls):
     """The Copier of a class that genpy made; any exception for another."""
     writer = _Writer()
     writer.add_object(cls, 'message')
-    # The wire canonizes the times that are the message's own, not those of its header or of other messages in it.
-    canon = [f'message.{name}.canon()' for name, type_name in _fields(cls) if type_name in ('time', 'duration')]
+    # The wire canonizes the times that are the message's own, not those of its header or of other
+    # messages in it.
+    canon = [
+        f'message.{name}.canon()'
+        for name, type_name in _fields(cls)
+        if type_name in ('time', 'duration')
+    ]
     freeze, build = list(writer.freeze_lines()), list(writer.thaw_lines(cls))
     size = writer.size()
-    source = '\n'.join([
-        'def freeze_fields(message):', *_indented(freeze), '',
-        'def thaw_fields(frozen):', *_indented(build), '    return message', '',
-        'def size(message):', f'    return {size}', '',
-        # each of these again with all of it in one function: a message that comes alone meets cold caches
-        'def freeze(message):', '    if type(message) is cls:', '        try:', *_indented(_indented(_indented(freeze))),
-        '        except Exception:', '            pass', '    return serialized(message)', '',
-        'def thaw(frozen):', '    if type(frozen) is bytes: return cls().deserialize(frozen)',
-        *_indented([*build, *canon]), '    return message', ''])
+    source = '\n'.join(
+        [
+            'def freeze_fields(message):',
+            *_indented(freeze),
+            '',
+            'def thaw_fields(frozen):',
+            *_indented(build),
+            '    return message',
+            '',
+            'def size(message):',
+            f'    return {size}',
+            '',
+            # each of these again with all of it in one function: a message that comes alone meets
+            # cold caches
+            'def freeze(message):',
+            '    if type(message) is cls:',
+            '        try:',
+            *_indented(_indented(_indented(freeze))),
+            '        except Exception:',
+            '            pass',
+            '    return serialized(message)',
+            '',
+            'def thaw(frozen):',
+            '    if type(frozen) is bytes: return cls().deserialize(frozen)',
+            *_indented([*build, *canon]),
+            '    return message',
+            '',
+        ]
+    )
     scope = {**writer.scope, 'cls': cls, 'serialized': serialized}
-    exec(compile(source, '<copier of %s>' % cls.__name__, 'exec'), scope)
-    return Copier(scope['freeze'], scope['thaw'], size and scope['size'],
-                  scope['freeze_fields'], scope['thaw_fields'], source)
+    exec(compile(source, f'<copier of {cls.__name__}>', 'exec'), scope)
+    return Copier(
+        scope['freeze'],
+        scope['thaw'],
+        size and scope['size'],
+        scope['freeze_fields'],
+        scope['thaw_fields'],
+        source,
+    )
 
 
 def _indented(lines):
@@ -190,11 +254,17 @@ def _indented(lines):
 def _fields(cls):
     """The (name, type) pairs of a class that genpy made, or of Time or Duration."""
     if cls in (genpy.Time, genpy.Duration):
-        number = 'uint32' if cls is genpy.Time else 'int32'     # as genmsg has it; their _slot_types say int32 for both
+        # as genmsg has it; their _slot_types say int32 for both
+        number = 'uint32' if cls is genpy.Time else 'int32'
         return [('secs', number), ('nsecs', number)]
-    # A numpy_msg derives from another message, AnyMsg has no types: neither serializes as its fields would say.
+    # A numpy_msg derives from another message, AnyMsg has no types: neither serializes as its
+    # fields would say.
     made_by_genpy = {'__slots__', '_slot_types', 'serialize', 'serialize_numpy'} <= vars(cls).keys()
-    if not made_by_genpy or cls.__bases__ != (genpy.Message,) or len(cls.__slots__) != len(cls._slot_types):
+    if (
+        not made_by_genpy
+        or cls.__bases__ != (genpy.Message,)
+        or len(cls.__slots__) != len(cls._slot_types)
+    ):
         raise Odd
     return list(zip(cls.__slots__, cls._slot_types))
 
@@ -202,22 +272,24 @@ def _fields(cls):
 class _Writer:
     """Writes the bodies of freeze_fields and thaw_fields, field by field.
 
-    Objects and values are in local variables, named alike in both; in between, the values are the frozen tuple.
+    Objects and values are in local variables, named alike in both; in between, the values are the
+    frozen tuple.
     """
 
     def __init__(self):
-        self.scope = dict(_HELPERS)     # the globals of the generated code
+        self.scope = dict(_HELPERS)  # the globals of the generated code
         self._count = itertools.count()
-        self._reads = []                # lines of freeze_fields
-        self._builds = []               # lines of thaw_fields
-        self._values = []               # the variables in the frozen tuple
-        self._floats = []               # those of them that are float64
-        self._numbers = []              # other numbers: (primitive type, where it is read, variable)
-        self._sizes = []                # expressions of size, where it varies,
-        self._fixed_size = SMALL        # and what does not
+        self._reads = []  # lines of freeze_fields
+        self._builds = []  # lines of thaw_fields
+        self._values = []  # the variables in the frozen tuple
+        self._floats = []  # those of them that are float64
+        self._numbers = []  # other numbers: (primitive type, where it is read, variable)
+        self._sizes = []  # expressions of size, where it varies,
+        self._fixed_size = SMALL  # and what does not
 
     def add_object(self, cls, owner, path='message'):
-        """Add the fields of the object of class cls that is in the variable owner, and at that path in a message."""
+        """Add the fields of the object of class cls that is in the variable owner, and at that path
+        in a message."""
         for name, type_name in _fields(cls):
             base, is_array, length = parse_type(type_name)
             field, local = f'{owner}.{name}', self._unique(name)
@@ -267,15 +339,19 @@ class _Writer:
             self._reads.append(f'{local} = {field}')
             self._floats.append(local)
         elif base == 'string':
-            self._reads += [f'{local} = {field}',
-                            f'if type({local}) is not str or not {local}.isascii(): {local} = text({local})']
+            self._reads += [
+                f'{local} = {field}',
+                f'if type({local}) is not str or not {local}.isascii(): {local} = text({local})',
+            ]
         else:
             self._numbers.append((base, field, local))
 
     def _add_array(self, cls, base, length, field, local):
         if base in STRUCT_CODES or base == 'string':
             self._reads.append(f'{local} = {base}_array({field})')
-            self._add_value(field, local, fresh=f'list({local})' if base in ('bool', 'string') else local)
+            self._add_value(
+                field, local, fresh=f'list({local})' if base in ('bool', 'string') else local
+            )
         else:
             element = copier_for(nested_class(cls, base))
             if element.freeze_fields is None:
@@ -291,7 +367,8 @@ class _Writer:
         self._builds.append(f'{field} = {fresh}')
 
     def _unique(self, name):
-        """A variable named after what is in it. Whatever is not ours in the generated code comes through here."""
+        """A variable named after what is in it. Whatever is not ours in the generated code comes
+        through here."""
         if not name.isidentifier():
             raise Odd
         return f'{name}_{next(self._count)}'
@@ -307,8 +384,12 @@ class _Writer:
         yield from self._reads
         if self._numbers:
             bases, fields, variables = zip(*self._numbers)
-            sent, arriving = (''.join(map(codes.get, bases)) for codes in (STRUCT_CODES, ARRIVAL_CODES))
-            self.scope.update(pack=struct.Struct('<' + sent).pack, unpack=struct.Struct('<' + arriving).unpack)
+            sent, arriving = (
+                ''.join(map(codes.get, bases)) for codes in (STRUCT_CODES, ARRIVAL_CODES)
+            )
+            self.scope.update(
+                pack=struct.Struct('<' + sent).pack, unpack=struct.Struct('<' + arriving).unpack
+            )
             yield f'{", ".join(variables)}, = unpack(pack({", ".join(fields)}))'
         if self._floats:
             floats, variables = struct.Struct(f'<{len(self._floats)}d'), ', '.join(self._floats)

@@ -6,20 +6,37 @@ import time
 from pharos.intraprocess.dispatcher import BURST
 from pharos.intraprocess import copier, sharing
 
-EARLY = 2.0    # seconds after the start in which log lines are kept for listeners that connect later
+EARLY = 2.0  # seconds after the start in which log lines are kept for listeners that connect later
 _clock = time.perf_counter
 
 
 class Fanout:
-    """Where the messages of one node on one topic go, through INTRAPROCESS and TCPROS, and what is latched.
+    """Where the messages of one node on one topic go, through INTRAPROCESS and TCPROS, and what is
+    latched.
 
     :param publisher: rospy's _PublisherImpl
     :param module: the rospy.topics that it is of
     """
 
     # a message that comes alone meets cold caches: all that it needs lies together
-    __slots__ = ('_lock', '_closed', '_seq', '_has_header', '_freeze', '_ways', '_last', '_size', '_mark',
-                 '_publisher', '_module', '_thaw', '_buffer', '_latches', '_early', 'connections')
+    __slots__ = (
+        '_lock',
+        '_closed',
+        '_seq',
+        '_has_header',
+        '_freeze',
+        '_ways',
+        '_last',
+        '_size',
+        '_mark',
+        '_publisher',
+        '_module',
+        '_thaw',
+        '_buffer',
+        '_latches',
+        '_early',
+        'connections',
+    )
 
     def __init__(self, publisher, module):
         self._publisher, self._module = publisher, module
@@ -27,28 +44,29 @@ class Fanout:
         self._has_header = getattr(publisher.data_class, '_has_header', False)
         self._freeze, self._thaw, self._size = copier.copier_for(publisher.data_class)[:3]
         self._buffer = io.BytesIO()
-        self._latches = {}    # channel, None: rospy's Publishers -> its Latch
+        self._latches = {}  # channel, None: rospy's Publishers -> its Latch
         self._early = _EarlyLines() if publisher.resolved_name == '/rosout' else None
-        self._last = 0.0      # when the last message woke a dispatcher
+        self._last = 0.0  # when the last message woke a dispatcher
         self.set_connections(())
 
     def set_connections(self, connections):
         """Sort the connections out, whenever they change: by how a message goes to them."""
         inboxes, remote = _split(connections)
         inline = list({inbox.dispatcher for inbox in inboxes if inbox.inline})
-        mark = None    # of the messages that receivers share
+        mark = None  # of the messages that receivers share
         if any(inbox.shared for inbox in inboxes):
             mark = sharing.Mark(links_of(connections)[0].header)
         self._mark = mark
         # all at once: somebody may be publishing
         self._ways = inboxes, remote, _dispatchers(inboxes), inline, mark
-        self.connections = tuple(connections)    # those through which a message goes that is published from now on
+        # those through which a message goes that is published from now on
+        self.connections = tuple(connections)
 
     def publish(self, message, by=None, to=None, connection=None):
         """Send a message to all; returns whether there is anybody.
 
-        :param by: the channel whose message it is; None: a rospy Publisher's, which calls :meth:`run` when it has
-            released the lock
+        :param by: the channel whose message it is; None: a rospy Publisher's, which calls
+            :meth:`run` when it has released the lock
         :param to: name of the only node that is to get it, None: all
         :param connection: the only connection through which it is to go, None: all
         """
@@ -64,7 +82,7 @@ class Fanout:
             if not (inboxes or remote or latch):
                 return False
             self._seq += 1
-            if self._has_header and message._md5sum != '*':    # AnyMsg has none
+            if self._has_header and message._md5sum != '*':  # AnyMsg has none
                 if sharing.is_held(message.header):
                     message = sharing.with_own_header(message)
                 message.header.seq = self._seq
@@ -123,7 +141,7 @@ class Fanout:
         try:
             self._module.serialize_message(buffer, seq, message)
             return buffer.getvalue()
-        finally:    # what does not serialize must leave nothing that would corrupt the stream
+        finally:  # what does not serialize must leave nothing that would corrupt the stream
             buffer.seek(0)
             buffer.truncate()
 
@@ -132,8 +150,10 @@ class Fanout:
         for connection in connections:
             try:
                 connection.write_data(data)
-            except Exception as error:    # the connection broke
-                self._module.logdebug('publisher connection to [%s] terminated: %s' % (connection.endpoint_id, error))
+            except Exception as error:  # the connection broke
+                self._module.logdebug(
+                    f'publisher connection to [{connection.endpoint_id}] terminated: {error}'
+                )
                 connection.close()
 
     def _latch(self, by, frozen, receiver):
@@ -145,11 +165,12 @@ class Fanout:
 
     def _latched_for(self, receiver):
         """What is latched for the node of that name, frozen."""
-        latches = tuple(self._latches.values())    # a channel may close meanwhile
+        latches = tuple(self._latches.values())  # a channel may close meanwhile
         return self._early or [frozen for latch in latches for frozen in latch.of(receiver)]
 
     def send_latched(self, inboxes, receiver):
-        """Put what is latched into new inboxes; :meth:`run` is to be called when the lock is released.
+        """Put what is latched into new inboxes; :meth:`run` is to be called when the lock is
+        released.
 
         :param receiver: the name of the node whose inboxes they are
         """
@@ -207,12 +228,13 @@ class Fanout:
 class Latch:
     """What one channel sent last, for those who come late; it outlives the run of the node.
 
-    What went to one node alone is for that node alone: for it, the last message is another one than for all others.
+    What went to one node alone is for that node alone: for it, the last message is another one than
+    for all others.
     """
 
     def __init__(self):
-        self._to_all = ()      # the message, frozen, if there is one
-        self._to_one = {}      # node name -> likewise, where that is newer
+        self._to_all = ()  # the message, frozen, if there is one
+        self._to_one = {}  # node name -> likewise, where that is newer
 
     def keep(self, frozen, receiver):
         """Keep a message that was sent to the node of that name, None: to all."""
@@ -228,13 +250,17 @@ class Latch:
 
 def links_of(connections):
     """The links among the connections of a publisher or a subscription, as rospy has them."""
-    return [connection.link for connection in connections if connection.transport_type == 'INTRAPROCESS']
+    return [
+        connection.link for connection in connections if connection.transport_type == 'INTRAPROCESS'
+    ]
 
 
 def _split(connections):
     """The inboxes behind those that are INTRAPROCESS, and the others."""
     inboxes = [inbox for link in links_of(connections) for inbox in link.all_inboxes()]
-    return inboxes, [connection for connection in connections if connection.transport_type != 'INTRAPROCESS']
+    return inboxes, [
+        connection for connection in connections if connection.transport_type != 'INTRAPROCESS'
+    ]
 
 
 def _dispatchers(inboxes):
@@ -243,7 +269,8 @@ def _dispatchers(inboxes):
 
 
 class _EarlyLines:
-    """The first log lines of a node: its listeners connect a tenth of a second later, and would miss them."""
+    """The first log lines of a node: its listeners connect a tenth of a second later, and would
+    miss them."""
 
     def __init__(self):
         self._until = time.monotonic() + EARLY

@@ -1,8 +1,9 @@
-"""INTRAPROCESS: messages between nodes of one process without a socket, as a transport that ROS negotiates.
+"""INTRAPROCESS: messages between nodes of one process without a socket, as a transport that ROS
+negotiates.
 
-A subscriber offers its protocols to the publisher, which picks the first that it supports. This one is named for the
-process and offered before TCPROS: another process does not know the name and falls back to TCPROS. Discovery stays the
-master's, and getBusInfo shows the connections.
+A subscriber offers its protocols to the publisher, which picks the first that it supports. This one
+is named for the process and offered before TCPROS: another process does not know the name and falls
+back to TCPROS. Discovery stays the master's, and getBusInfo shows the connections.
 """
 import contextlib
 import os
@@ -15,7 +16,7 @@ from pharos.intraprocess.callbacks import CallbackInbox, is_of_channel
 from pharos.private_rospy.refusals import suits
 from pharos.intraprocess.statistics import Statistics
 
-PROTOCOL = None    # its name, of this process alone
+PROTOCOL = None  # its name, of this process alone
 
 
 def _name_protocol():
@@ -31,14 +32,21 @@ class Link:
     """A connection between a publisher and a subscription of two nodes of this process."""
 
     def __init__(self, publisher, subscriber, instance, other):
-        self._publisher, self._subscriber = publisher, subscriber    # rospy's _PublisherImpl and _SubscriberImpl
-        self._instance, self._other = instance, other                # the subscriber's and the publisher's PrivateRospy
+        # rospy's _PublisherImpl and _SubscriberImpl
+        self._publisher, self._subscriber = (publisher, subscriber)
+        # the subscriber's and the publisher's PrivateRospy
+        self._instance, self._other = (instance, other)
         self.header = other.connection_header(publisher)
         self.publisher_name = other.name
         self.thaw = copier.thawer(publisher.data_class, subscriber.data_class)
-        self.inboxes = {}    # receiver -> its inbox: channels, CallbackInbox for plain callbacks, and Statistics
-        self.sending = _End(self, rospy.impl.transport.OUTBOUND, publisher.resolved_name, instance.name)
-        self.receiving = _End(self, rospy.impl.transport.INBOUND, subscriber.resolved_name, other.uri)
+        # receiver -> its inbox: channels, CallbackInbox for plain callbacks, and Statistics
+        self.inboxes = {}
+        self.sending = _End(
+            self, rospy.impl.transport.OUTBOUND, publisher.resolved_name, instance.name
+        )
+        self.receiving = _End(
+            self, rospy.impl.transport.INBOUND, subscriber.resolved_name, other.uri
+        )
         self.receiving.callerid_pub = other.name
 
     def open(self):
@@ -46,29 +54,43 @@ class Link:
 
         The publisher matches the receivers. Those that come between the two know the link already.
         """
-        return self._subscriber.add_connection(self.receiving) and self._publisher.add_connection(self.sending)
+        return self._subscriber.add_connection(self.receiving) and self._publisher.add_connection(
+            self.sending
+        )
 
     def match_receivers(self):
         """Have an inbox for each receiver that the subscription has; returns the new ones.
 
         The publisher calls this with its lock.
         """
-        subscriber, before, start_thread = self._subscriber, self.inboxes, self._instance.start_thread
-        channels = [channel for channel in self._instance.wiring.channels_on(subscriber.resolved_name)
-                    if channel.from_ in (None, self.publisher_name) and self._suits(channel)]
-        inboxes = {channel: before.get(channel) or self._channel_inbox(channel) for channel in channels}
+        subscriber, before, start_thread = (
+            self._subscriber,
+            self.inboxes,
+            self._instance.start_thread,
+        )
+        channels = [
+            channel
+            for channel in self._instance.wiring.channels_on(subscriber.resolved_name)
+            if channel.from_ in (None, self.publisher_name) and self._suits(channel)
+        ]
+        inboxes = {
+            channel: before.get(channel) or self._channel_inbox(channel) for channel in channels
+        }
         if subscriber.has_plain_callbacks():
-            inboxes[CallbackInbox] = (self._open_callback_inbox()
-                                      or CallbackInbox(self, self._publisher, subscriber, start_thread))
+            inboxes[CallbackInbox] = self._open_callback_inbox() or CallbackInbox(
+                self, self._publisher, subscriber, start_thread
+            )
         if subscriber.statistics_logger is not None:
-            inboxes[Statistics] = (before.get(Statistics)
-                                   or Statistics(subscriber, self.publisher_name, self.thaw, start_thread))
+            inboxes[Statistics] = before.get(Statistics) or Statistics(
+                subscriber, self.publisher_name, self.thaw, start_thread
+            )
         self.inboxes = inboxes
         plain = before.get(CallbackInbox)
         if plain is not None and inboxes.get(CallbackInbox) is not plain:
-            plain.close()    # or its thread would stay: who removes the last callback may come later
+            plain.close()  # or its thread would stay: who removes the last callback may come later
         if self.sending.done or self.receiving.done:
-            self._close_inboxes()    # the link was closed meanwhile, and does not see those opened since
+            # the link was closed meanwhile, and does not see those opened since
+            self._close_inboxes()
         return [inbox for receiver, inbox in inboxes.items() if before.get(receiver) is not inbox]
 
     def all_inboxes(self):
@@ -76,13 +98,17 @@ class Link:
         return list(self.inboxes.values())
 
     def _suits(self, channel):
-        """Whether a channel can hear the publisher; the subscription that it shares with others may take any type."""
+        """Whether a channel can hear the publisher; the subscription that it shares with others may
+        take any type."""
         if suits(channel.message_class, self.header['md5sum']):
             return True
         refuse = self._instance.refusals.header_refused
         # the publisher's lock may be held, and those who are told may publish
-        self._instance.start_thread(refuse, (self._subscriber, self._other.uri, channel.message_class, self.header),
-                                    'refusal')
+        self._instance.start_thread(
+            refuse,
+            (self._subscriber, self._other.uri, channel.message_class, self.header),
+            'refusal',
+        )
         return False
 
     def _close_inboxes(self):
@@ -114,17 +140,21 @@ class Link:
         self._publisher.channels_changed(self)
 
     def unbounded(self):
-        """Within this, no publisher waits for the callbacks of the subscription; see :class:`CallbackInbox`."""
+        """Within this, no publisher waits for the callbacks of the subscription; see
+        :class:`CallbackInbox`."""
         inbox = self._open_callback_inbox()
         return inbox.unbounded() if inbox else contextlib.nullcontext()
 
     def close(self, end):
         """One end was closed: the other goes too.
 
-        In a thread of its own, for rospy closes ends under the lock of their topic, and the other's topic has its own.
+        In a thread of its own, for rospy closes ends under the lock of their topic, and the other's
+        topic has its own.
         """
         self._close_inboxes()
-        other, instance = ((self.receiving, self._instance) if end is self.sending else (self.sending, self._other))
+        other, instance = (
+            (self.receiving, self._instance) if end is self.sending else (self.sending, self._other)
+        )
         if not other.done:
             instance.start_thread(other.close, name='closing')
 
@@ -133,18 +163,18 @@ class _End(rospy.impl.transport.Transport):
     """One end of a link, as rospy's topics keep it among their connections."""
 
     transport_type = 'INTRAPROCESS'
-    latch = None    # those who come late get latched messages from the link
+    latch = None  # those who come late get latched messages from the link
 
     def __init__(self, link, direction, topic, peer):
         super().__init__(direction, topic)
         self.link, self.endpoint_id, self.header = link, peer, link.header
 
     def get_transport_info(self):
-        return 'INTRAPROCESS connection to [%s]' % self.endpoint_id
+        return f'INTRAPROCESS connection to [{self.endpoint_id}]'
 
     def close(self):
         if not self.done:
-            self.done = True    # before any lock is taken: nothing more is sent through it
+            self.done = True  # before any lock is taken: nothing more is sent through it
             super().close()
             self.link.close(self)
 
@@ -167,20 +197,21 @@ def protocol_handler(instance):
             publisher = other and other.publisher(topic)
             subscriber = instance.subscriber(topic)
             if publisher is None or subscriber is None:
-                return 0, '%s has gone from %s' % (topic, uri), 0
+                return 0, f'{topic} has gone from {uri}', 0
             refusal = _refusal(publisher, subscriber, other, instance)
             if refusal:
                 other.refusals.subscriber_refused(publisher, instance.name, refusal, refusal)
-                instance.refusals.publisher_refused(subscriber, uri, refusal,
-                                                    lambda: other.connection_header(publisher))
+                instance.refusals.publisher_refused(
+                    subscriber, uri, refusal, lambda: other.connection_header(publisher)
+                )
                 return 0, refusal, 0
             instance.refusals.publisher_connected(topic, uri)
             other.refusals.subscriber_connected(topic, instance.name)
             link = Link(publisher, subscriber, instance, other)
             if link.open():
-                return 1, 'connected to %s' % other.name, 0
+                return 1, f'connected to {other.name}', 0
             link.receiving.close()
-            return 0, '%s was closed meanwhile' % topic, 0
+            return 0, f'{topic} was closed meanwhile', 0
 
     return Handler()
 
@@ -190,5 +221,7 @@ def _refusal(publisher, subscriber, other, instance):
     offered, asked = publisher.data_class, subscriber.data_class
     if asked._md5sum in ('*', offered._md5sum):
         return None
-    return '%s wants %s as %s [%s], but %s publishes %s [%s]: not connected' % (
-        instance.name, publisher.resolved_name, asked._type, asked._md5sum, other.name, offered._type, offered._md5sum)
+    return (
+        f'{instance.name} wants {publisher.resolved_name} as {asked._type} [{asked._md5sum}], but'
+        f' {other.name} publishes {offered._type} [{offered._md5sum}]: not connected'
+    )

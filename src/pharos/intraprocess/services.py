@@ -14,10 +14,11 @@ from pharos.intraprocess.sharing import numbered
 from pharos.private_rospy.wiring import running_here
 from pharos.signals import is_from_signal
 
-NESTED = 64     # service calls of one thread within one another: a cycle, which would only end with the stack
-IDLE = 1.0      # seconds that a thread with nothing to do is kept
+# service calls of one thread within one another: a cycle, which would only end with the stack
+NESTED = 64
+IDLE = 1.0  # seconds that a thread with nothing to do is kept
 
-_nested = threading.local()    # .depth: of the calls that run in this thread
+_nested = threading.local()  # .depth: of the calls that run in this thread
 
 
 class Failed(Exception):
@@ -25,7 +26,8 @@ class Failed(Exception):
 
 
 def find(name, uri, service_class):
-    """The :class:`LocalService` of that name and URI, if its provider is of this process; else None."""
+    """The :class:`LocalService` of that name and URI, if its provider is of this process; else
+    None."""
     instance, service = _offered_here(name, uri)
     return service and LocalService(instance, service, service_class)
 
@@ -50,14 +52,17 @@ def offer(instance, name, service_class, answer):
 
     :raises MasterUnreachableError: if it cannot be registered
     """
-    return registered(lambda: instance.rospy.Service(Resolved(name), service_class, answer),
-                      lambda service: service.shutdown('it is not registered'))
+    return registered(
+        lambda: instance.rospy.Service(Resolved(name), service_class, answer),
+        lambda service: service.shutdown('it is not registered'),
+    )
 
 
 class LocalService:
     """A rospy Service of this process, called without a socket.
 
-    :param service_class: whose requests and responses the caller has; that of the service may be another one
+    :param service_class: whose requests and responses the caller has; that of the service may be
+        another one
     """
 
     def __init__(self, instance, service, service_class):
@@ -65,8 +70,12 @@ class LocalService:
         self._offered, self._as_response = instance.services, instance.as_response
         self._name, self._uri = service.resolved_name, service.uri
         self.md5sum = service.service_class._md5sum
-        self._header = {'service': self._name, 'type': service.service_class._type, 'md5sum': self.md5sum,
-                        'callerid': instance.name}
+        self._header = {
+            'service': self._name,
+            'type': service.service_class._type,
+            'md5sum': self.md5sum,
+            'callerid': instance.name,
+        }
         #: the first half of copying a request; raises what ``request.serialize()`` raises
         self.freeze = copier.copier_for(service_class._request_class).freeze
         self._freeze_response = copier.copier_for(service.response_class).freeze
@@ -81,15 +90,18 @@ class LocalService:
         """Call it with a request that :attr:`freeze` made; returns the response.
 
         :param header: the request's ``_connection_header``
-        :param deadline: by ``time.monotonic()``; None: no limit, and the service runs in this thread
+        :param deadline: by ``time.monotonic()``; None: no limit, and the service runs in this
+            thread
         :raises Failed: if the service fails
         :raises ConnectionError: if its node stops meanwhile
         :raises socket.timeout: if it does not answer in time; it goes on in a thread of its node
         """
         depth = getattr(_nested, 'depth', 0) + 1
         if depth > NESTED:
-            raise Failed('%d service calls are under way within one another: do the services call each other in a '
-                         'circle?' % NESTED)
+            raise Failed(
+                '%d service calls are under way within one another: do the services call each other'
+                ' in a circle?' % NESTED
+            )
         request = self._thaw(frozen)
         request._connection_header = header
         if deadline is None:
@@ -101,21 +113,23 @@ class LocalService:
         return response
 
     def _answer(self, request, depth):
-        """What rospy's ServiceImpl._handle_request does, but for the writing: the response, frozen."""
+        """What rospy's ServiceImpl._handle_request does, but for the writing: the response,
+        frozen."""
         service = self._service
         before, _nested.depth = getattr(_nested, 'depth', 0), depth
         try:
             response = self._as_response(service.handler(request), service.response_class)
             service.seq += 1
             return self._freeze_response(numbered(response, service.seq))
-        # the caller gets the text alone, as from elsewhere: the reason's traceback is its node's to report
+        # the caller gets the text alone, as from elsewhere: the reason's traceback is its node's to
+        # report
         except rospy.ServiceException as error:
-            raise Failed('service cannot process request: %s' % error) from None
+            raise Failed(f'service cannot process request: {error}') from None
         except BaseException as error:
             if is_from_signal(error):
                 raise
             self._tell_handler(error)
-            raise Failed('error processing request: %s' % error) from None
+            raise Failed(f'error processing request: {error}') from None
         finally:
             _nested.depth = before
 
@@ -125,7 +139,7 @@ class LocalService:
         except BaseException as another:
             if is_from_signal(another):
                 raise
-            self._instance.warn('the error handler of %s raised %r' % (self._name, another))
+            self._instance.warn(f'the error handler of {self._name} raised {another!r}')
 
 
 def serialize(request):
@@ -134,17 +148,19 @@ def serialize(request):
 
 
 def checker(cls):
-    """The function that raises what ``serialize()`` of a message of that class would raise; cheaper than that."""
+    """The function that raises what ``serialize()`` of a message of that class would raise; cheaper
+    than that."""
     return copier.copier_for(cls).freeze
 
 
 class Workers:
-    """Threads of a node that answer calls with a time limit; one that is stuck is not waited for."""
+    """Threads of a node that answer calls with a time limit; one that is stuck is not waited
+    for."""
 
     def __init__(self, start_thread):
         self._start_thread = start_thread
-        self._idle = []          # a queue of each thread that has nothing to do
-        self._waited_for = set()    # the queues in which callers expect an outcome
+        self._idle = []  # a queue of each thread that has nothing to do
+        self._waited_for = set()  # the queues in which callers expect an outcome
         self._closed = False
 
     def run(self, job, deadline):
@@ -186,11 +202,12 @@ class Workers:
                 result = job()
             except Failed as failure:
                 result = failure
-            except BaseException as error:    # of what makes the answer; this thread and its caller go on
-                result = Failed('error processing request: %s' % type(error).__name__)
-            self._idle.append(jobs)    # before the caller goes on, who may call again at once
+            except BaseException as error:
+                # of what makes the answer; this thread and its caller go on
+                result = Failed(f'error processing request: {type(error).__name__}')
+            self._idle.append(jobs)  # before the caller goes on, who may call again at once
             outcome.put(result)
-            job = outcome = result = None    # they are not this thread's to keep alive
+            job = outcome = result = None  # they are not this thread's to keep alive
 
     def _next(self, jobs):
         try:
@@ -200,7 +217,7 @@ class Workers:
                 self._idle.remove(jobs)
                 return None, None
             except ValueError:
-                return jobs.get()    # somebody has just taken it, to put a job in
+                return jobs.get()  # somebody has just taken it, to put a job in
 
     def close(self):
         """End the threads and the waits; nothing is run any more."""

@@ -1,7 +1,8 @@
 """Messages that several nodes hold at once: nothing may be written into them any more.
 
-A channel with ``shared=True`` gets the published message itself. Whoever publishes it again, or another message with
-its header, would write the next ``header.seq`` and ``_connection_header`` into what the others hold.
+A channel with ``shared=True`` gets the published message itself. Whoever publishes it again, or
+another message with its header, would write the next ``header.seq`` and ``_connection_header`` into
+what the others hold.
 """
 import copy
 
@@ -9,10 +10,12 @@ import genpy
 
 
 class Mark(dict):
-    """The ``_connection_header`` of the messages that one publisher hands over, and of their headers."""
+    """The ``_connection_header`` of the messages that one publisher hands over, and of their
+    headers."""
 
     def put_on(self, message):
-        """Mark a message that is handed over; returns it, or a copy if it is held as another publisher's already."""
+        """Mark a message that is handed over; returns it, or a copy if it is held as another
+        publisher's already."""
         if is_held(message) and message._connection_header != self:
             message = _copied(message)
         message._connection_header = self
@@ -27,7 +30,8 @@ def is_held(message):
 
 
 def with_own_header(message):
-    """The message, whose header others hold, with a header of its own; a copy of it if they hold the message, too."""
+    """The message, whose header others hold, with a header of its own; a copy of it if they hold
+    the message, too."""
     if is_held(message):
         message = _copied(message)
     message.header = _copied(message.header)
@@ -37,7 +41,8 @@ def with_own_header(message):
 def _copied(message):
     """A copy with the same fields, and no mark.
 
-    Whoever publishes one message again and again has two made each time, and ``copy`` takes five times as long.
+    Whoever publishes one message again and again has two made each time, and ``copy`` takes five
+    times as long.
     """
     if not isinstance(message, genpy.Message):
         return copy.copy(message)
@@ -48,7 +53,8 @@ def _copied(message):
 
 
 def numbered(message, seq):
-    """The message with that ``header.seq``, as rospy.msg.serialize_message numbers messages, services' among them.
+    """The message with that ``header.seq``, as rospy.msg.serialize_message numbers messages,
+    services' among them.
 
     A copy if others hold it.
     """

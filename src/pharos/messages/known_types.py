@@ -1,4 +1,5 @@
-"""Where the types of messages and services are known: found before, installed, in files, or shipped for turtlesim."""
+"""Where the types of messages and services are known: found before, installed, in files, or shipped
+for turtlesim."""
 
 import importlib.util
 import os
@@ -14,19 +15,22 @@ from pharos.messages.turtlesim_types import DEFINITIONS
 
 MAX_TEXT = 1 << 20  # characters of a definition with those nested in it
 NAME = re.compile('[A-Za-z][A-Za-z0-9_]{0,127}')
-_TYPE = re.compile('%s/%s' % (NAME.pattern, NAME.pattern))
+_TYPE = re.compile(f'{NAME.pattern}/{NAME.pattern}')
 _KINDS = {'msg': 'message', 'srv': 'service'}
 
 found = {}  # (kind, type): class answered before or defined, so that two asks give the same one
-provisional = set()  # keys of found that no package here has: to a subscriber, a live publisher knows better
+# keys of found that no package here has: to a subscriber, a live publisher knows better
+provisional = set()
 
 
 def check_name(kind, type_):
     """Raise UnknownTypeError unless it can be the name of a type, such as 'std_msgs/String'."""
     if not isinstance(type_, str) or not _TYPE.fullmatch(type_):
         hint = _near_types(kind, str(type_)[:99])
-        raise UnknownTypeError(f"malformed {_KINDS[kind]} type {reprlib.repr(type_)}{hint}: give 'package/Type', in "
-                               'ASCII letters, digits and _, or a class')
+        raise UnknownTypeError(
+            f"malformed {_KINDS[kind]} type {reprlib.repr(type_)}{hint}: give 'package/Type', in "
+            "ASCII letters, digits and _, or a class"
+        )
 
 
 def seek(kind, type_, must=True):
@@ -42,9 +46,11 @@ def seek(kind, type_, must=True):
     package, _, name = type_.partition('/')
     define = 'define_message' if kind == 'msg' else 'define_service'
     raise UnknownTypeError(
-        f'unknown {_KINDS[kind]} type {type_!r}{_near_types(kind, type_)}: Python has no {package}.{kind}.{name}, '
-        f'there is no {package}/{kind}/{name}.{kind} on ROS_PACKAGE_PATH ({os.pathsep.join(rospkg.get_ros_paths())}), '
-        f'and no definition was given; install the package {package} or call {define}({type_!r}, text)')
+        f'unknown {_KINDS[kind]} type {type_!r}{_near_types(kind, type_)}: Python has no'
+        f' {package}.{kind}.{name}, there is no {package}/{kind}/{name}.{kind} on ROS_PACKAGE_PATH'
+        f' ({os.pathsep.join(rospkg.get_ros_paths())}), and no definition was given; install the'
+        f' package {package} or call {define}({type_!r}, text)'
+    )
 
 
 def everywhere(kind, type_):
@@ -77,7 +83,9 @@ def installed(kind, type_):
     try:
         return get(type_)
     except Exception as error:
-        raise UnknownTypeError(f'{type_}: importing {package}.{kind} failed ({error}): reinstall it') from error
+        raise UnknownTypeError(
+            f'{type_}: importing {package}.{kind} failed ({error}): reinstall it'
+        ) from error
 
 
 def file_text(kind, type_):
@@ -87,7 +95,8 @@ def file_text(kind, type_):
         path = os.path.join(rospkg.RosPack().get_path(package), kind, f'{name}.{kind}')
         with open(path, encoding='utf-8', errors='replace') as file:
             return file.read(MAX_TEXT + 1)
-    except Exception:  # a package.xml that rospkg cannot parse must not hide the types given at run time
+    except Exception:
+        # a package.xml that rospkg cannot parse must not hide the types given at run time
         return None
 
 
@@ -101,22 +110,32 @@ _LOOKS = _found_before, installed, file_text, _shipped
 def _near_types(kind, type_):
     """Return a hint at types with the same last name or one that differs by a slip."""
     import glob  # rospy does not load it, and most programs never come here
+
     rospack = rospkg.RosPack()
     folders = [os.path.join(glob.escape(folder), '*', kind, '_[A-Za-z]*.py') for folder in sys.path]
     try:
-        folders += [os.path.join(glob.escape(rospack.get_path(name)), kind, '*.' + kind) for name in rospack.list()]
+        folders += [
+            os.path.join(glob.escape(rospack.get_path(name)), kind, '*.' + kind)
+            for name in rospack.list()
+        ]
     except Exception:  # as in file_text
         pass
-    paths = [os.path.splitext(path)[0].split(os.sep) for folder in folders for path in glob.iglob(folder)]
-    names = {'%s/%s' % (path[-3], path[-1].lstrip('_')) for path in paths}
-    names.update(DEFINITIONS[kind], (known for known_kind, known in list(found) if known_kind == kind))
+    paths = [
+        os.path.splitext(path)[0].split(os.sep) for folder in folders for path in glob.iglob(folder)
+    ]
+    names = {f"{path[-3]}/{path[-1].lstrip('_')}" for path in paths}
+    names.update(
+        DEFINITIONS[kind], (known for known_kind, known in list(found) if known_kind == kind)
+    )
     last = '/' + type_.rpartition('/')[2]
     return _hint(sorted(name for name in names if name.endswith(last))[:3]) or near(type_, names)
 
 
 def near(name, names):
-    """Return ' (did you mean ...?)' where ``name`` may be a slip for one of ``names``, else nothing."""
+    """Return ' (did you mean ...?)' where ``name`` may be a slip for one of ``names``, else
+    nothing."""
     import difflib  # rospy does not load it either
+
     return _hint(difflib.get_close_matches(name, names, 2, 0.8))
 
 

@@ -15,19 +15,24 @@ from pharos.messages.nested_types import nested_class
 
 
 # Raises where the value of a field of this type would not serialize, and is quick.
-_WRITERS = {'string': str.encode, **{base: struct.Struct('<' + code).pack for base, code in SIMPLE_TYPES_DICT.items()}}
+_WRITERS = {
+    'string': str.encode,
+    **{base: struct.Struct('<' + code).pack for base, code in SIMPLE_TYPES_DICT.items()},
+}
 
 
 def describe_fields(cls):
-    """Return the fields of a message class as a text, for example ``'linear: float32, angular: float32'``."""
+    """Return the fields of a message class as a text, for example ``'linear: float32, angular:
+    float32'``."""
     return ', '.join('%s: %s' % field for field in _fields(cls)) or 'no fields'
 
 
 def build(cls, block, fields):
-    """Return a new message that ``block(message)``, if there is one, and then ``fields`` by name have filled.
+    """Return a new message that ``block(message)``, if there is one, and then ``fields`` by name
+    have filled.
 
-    Raises `MessageTypeError` for a field that does not exist, for a value in ``fields`` that does not fit, and for a
-    block that returns a message of its own.
+    Raises `MessageTypeError` for a field that does not exist, for a value in ``fields`` that does
+    not fit, and for a block that returns a message of its own.
     """
     message = cls()
     if block is not None:
@@ -37,33 +42,43 @@ def build(cls, block, fields):
             explain(error, message)
             raise
         if isinstance(made, genpy.Message) and made is not message and made._type == message._type:
-            raise MessageTypeError(f'the block returned another {message._type} than it was given, which is the one '
-                                   'that is sent: fill the fields of that')
+            raise MessageTypeError(
+                f'the block returned another {message._type} than it was given, which is the one '
+                'that is sent: fill the fields of that'
+            )
     return fill(message, fields) if fields else message
 
 
 def fill(message, fields):
     """Set fields of a message by name and return the message.
 
-    A nested message may be given as a dict of those of its fields to be set. Raises `MessageTypeError` for a field
-    that does not exist or a value that would not serialize; fields before it are set by then.
+    A nested message may be given as a dict of those of its fields to be set. Raises
+    `MessageTypeError` for a field that does not exist or a value that would not serialize; fields
+    before it are set by then.
     """
     return _fill(message, fields, message._type)
 
 
 def check_fits(message):
-    """Raise `MessageTypeError`, naming field, value and what fits, if a message does not serialize. Slow."""
+    """Raise `MessageTypeError`, naming field, value and what fits, if a message does not serialize.
+    Slow."""
     try:
         message.serialize(io.BytesIO())
-    except Exception as error:  # genpy lets AttributeError, OverflowError and UnicodeEncodeError escape too
+    except Exception as error:
+        # genpy lets AttributeError, OverflowError and UnicodeEncodeError escape too
         for name, field_type in _fields(type(message)):
-            _check_value(type(message), field_type, getattr(message, name, None), f'{message._type}.{name}')
-        raise MessageTypeError(f'{message._type} does not serialize: {error}; '
-                               f'its fields are {describe_fields(type(message))}') from error
+            _check_value(
+                type(message), field_type, getattr(message, name, None), f'{message._type}.{name}'
+            )
+        raise MessageTypeError(
+            f'{message._type} does not serialize: {error}; '
+            f'its fields are {describe_fields(type(message))}'
+        ) from error
 
 
 def explain(error, message):
-    """Raise `MessageTypeError` if an `AttributeError` names a field that the message, or one nested in it, has not."""
+    """Raise `MessageTypeError` if an `AttributeError` names a field that the message, or one nested
+    in it, has not."""
     wrong = re.match(r"'(\w+)' object has no attribute '(\w+)'", str(error))
     pending = [type(message)]
     while wrong and pending:
@@ -75,7 +90,10 @@ def explain(error, message):
 
 def _fields(cls):
     if issubclass(cls, genpy.TVal):
-        return [(name, 'uint32' if issubclass(cls, genpy.Time) else 'int32') for name in ('secs', 'nsecs')]
+        return [
+            (name, 'uint32' if issubclass(cls, genpy.Time) else 'int32')
+            for name in ('secs', 'nsecs')
+        ]
     return zip(cls.__slots__, getattr(cls, '_slot_types', ()))  # rospy.AnyMsg has no _slot_types
 
 
@@ -88,8 +106,10 @@ def nested_classes(cls):
 
 def _no_field(cls, path, name):
     names = [field for field, _ in _fields(cls)]
-    return MessageTypeError(f'{path} has no field {name!r}{near(str(name), names)}; '
-                            f'its fields are {describe_fields(cls)}')
+    return MessageTypeError(
+        f'{path} has no field {name!r}{near(str(name), names)}; '
+        f'its fields are {describe_fields(cls)}'
+    )
 
 
 def _fill(message, fields, path):
@@ -102,19 +122,24 @@ def _fill(message, fields, path):
             _WRITERS[field_type](value)
         except Exception:  # it is no single number or string, or does not fit
             field_path = f'{path}.{name}'
-            value = _from_dicts(type(message), field_type, value, field_path, getattr(message, name))
+            value = _from_dicts(
+                type(message), field_type, value, field_path, getattr(message, name)
+            )
             _check_value(type(message), field_type, value, field_path)
         setattr(message, name, value)
     return message
 
 
 def _from_dicts(cls, field_type, value, path, present=None):
-    """Return a field's value with the dicts in it made messages; one for a single message goes into the ``present``."""
+    """Return a field's value with the dicts in it made messages; one for a single message goes into
+    the ``present``."""
     base, is_array, _ = parse_type(field_type)
     if base in SIMPLE_TYPES_DICT or base == 'string':
         return value
     if is_array and isinstance(value, (list, tuple)):
-        return [_from_dicts(cls, base, item, f'{path}[{index}]') for index, item in enumerate(value)]
+        return [
+            _from_dicts(cls, base, item, f'{path}[{index}]') for index, item in enumerate(value)
+        ]
     if not is_array and isinstance(value, dict):
         nested = nested_class(cls, base) or type(present)
         return _fill(present if isinstance(present, nested) else nested(), value, path)
@@ -122,7 +147,8 @@ def _from_dicts(cls, field_type, value, path, present=None):
 
 
 def _check_value(cls, field_type, value, path):
-    """Raise MessageTypeError unless genpy would serialize the value: the same struct and str calls decide."""
+    """Raise MessageTypeError unless genpy would serialize the value: the same struct and str calls
+    decide."""
     base, is_array, length = parse_type(field_type)
     code = SIMPLE_TYPES_DICT.get(base)
     try:
@@ -151,8 +177,10 @@ def _check_value(cls, field_type, value, path):
         if code and isinstance(value, (list, tuple)):
             for index, item in enumerate(value):
                 _check_value(cls, base, item, f'{path}[{index}]')
-        raise MessageTypeError(f'{path} = {reprlib.repr(value)} does not fit {field_type}: '
-                               f'give {_what_fits(cls, field_type)}') from error
+        raise MessageTypeError(
+            f'{path} = {reprlib.repr(value)} does not fit {field_type}: '
+            f'give {_what_fits(cls, field_type)}'
+        ) from error
 
 
 def _what_fits(cls, field_type):
@@ -162,7 +190,9 @@ def _what_fits(cls, field_type):
         items = base if length is None else f'{length} {base}'
         return f'a list of {items}' + (' or bytes' if base in ('uint8', 'char') else '')
     if base in ('bool', 'string', 'float32', 'float64'):
-        return {'bool': 'True or False', 'string': 'a str', 'float32': 'a number up to 3.4e38'}.get(base, 'a number')
+        return {'bool': 'True or False', 'string': 'a str', 'float32': 'a number up to 3.4e38'}.get(
+            base, 'a number'
+        )
     if code:
         bits = 8 * struct.calcsize(code) - code.islower()
         return f'an integer from {-2 ** bits if code.islower() else 0} to {2 ** bits - 1}'

@@ -1,7 +1,7 @@
 """Message and service classes by type name, made at run time where no generated code is installed.
 
-A class made here works with rospy's topics and services like an installed one. Every function may be called from any
-thread.
+A class made here works with rospy's topics and services like an installed one. Every function may
+be called from any thread.
 """
 
 import threading
@@ -12,19 +12,33 @@ from pharos.messages import known_types, message_definition
 from pharos.errors import MessageTypeError, UnknownTypeError
 from pharos.messages.message_fields import build, check_fits, describe_fields, explain, fill
 
-__all__ = ['message_class', 'service_class', 'define_message', 'define_service', 'class_from_definition',
-           'known_service_classes', 'is_provisional', 'describe_fields', 'describe_service', 'build', 'fill',
-           'check_fits', 'explain']
+__all__ = [
+    'message_class',
+    'service_class',
+    'define_message',
+    'define_service',
+    'class_from_definition',
+    'known_service_classes',
+    'is_provisional',
+    'describe_fields',
+    'describe_service',
+    'build',
+    'fill',
+    'check_fits',
+    'explain',
+]
 
 _lock = threading.RLock()
 _given = {}  # (kind, type): class from define_message or define_service
 
 
 def message_class(type_or_class):
-    """Return the class of a message type, ``'package/Type'`` or ``'Header'``; a message class is returned as it is.
+    """Return the class of a message type, ``'package/Type'`` or ``'Header'``; a message class is
+    returned as it is.
 
-    Sought in this order: installed Python packages, ``.msg`` files on ROS_PACKAGE_PATH, what :func:`define_message` was
-    given, and what this package ships for turtlesim. A subscriber asks the live publishers of its topic before it takes
+    Sought in this order: installed Python packages, ``.msg`` files on ROS_PACKAGE_PATH, what
+    :func:`define_message` was given, and what this package ships for turtlesim. A subscriber asks
+        the live publishers of its topic before it takes
     one of the last two. Raises `UnknownTypeError`.
     """
     if isinstance(type_or_class, type) and issubclass(type_or_class, genpy.Message):
@@ -33,40 +47,50 @@ def message_class(type_or_class):
 
 
 def is_provisional(cls):
-    """Whether the class is that of its type here, but of no package: given at run time, or shipped for turtlesim."""
+    """Whether the class is that of its type here, but of no package: given at run time, or shipped
+    for turtlesim."""
     key = 'msg', cls._type
     return key in known_types.provisional and known_types.found.get(key) is cls
 
 
 def service_class(type_or_class):
-    """Return the class of a service type, ``'package/Type'``, as :func:`message_class` does with ``.srv`` files."""
+    """Return the class of a service type, ``'package/Type'``, as :func:`message_class` does with
+    ``.srv`` files."""
     if isinstance(type_or_class, type) and hasattr(type_or_class, '_request_class'):
         return type_or_class
     return _class('srv', type_or_class)
 
 
 def define_message(type_, text):
-    """Define the message type ``'package/Type'`` by the text of a ``.msg`` file and return its class.
+    """Define the message type ``'package/Type'`` by the text of a ``.msg`` file and return its
+    class.
 
-    Types that it nests may follow, each after a line of ``=`` and a line ``MSG: package/Type``, as ``gendeps --cat``
-    prints them; those that are not known yet are thereby defined too. Raises `UnknownTypeError` for a text that cannot
-    be read or refers to an unknown type, and `MessageTypeError` if the type is known with other fields.
+    Types that it nests may follow, each after a line of ``=`` and a line ``MSG: package/Type``, as
+    ``gendeps --cat`` prints them; those that are not known yet are thereby defined too. Raises
+    `UnknownTypeError` for a text that cannot be read or refers to an unknown type, and
+    `MessageTypeError` if the type is known with other fields.
     """
     return _define('msg', type_, text)
 
 
 def define_service(type_, text):
-    """Define the service type ``'package/Type'`` by the text of a ``.srv`` file, as :func:`define_message` does."""
+    """Define the service type ``'package/Type'`` by the text of a ``.srv`` file, as
+    :func:`define_message` does."""
     return _define('srv', type_, text)
 
 
 def known_service_classes(type_):
-    """Return the classes of all definitions of a service type that are here, whichever :func:`service_class` gives."""
+    """Return the classes of all definitions of a service type that are here, whichever
+    :func:`service_class` gives."""
     classes = []
     with _lock:
         for known in known_types.everywhere('srv', type_):
             try:
-                cls = message_definition.make('srv', type_, known) if isinstance(known, str) else known
+                cls = (
+                    message_definition.make('srv', type_, known)
+                    if isinstance(known, str)
+                    else known
+                )
             except UnknownTypeError:  # a text that cannot be read tells nobody anything
                 continue
             classes.append(cls)
@@ -74,23 +98,28 @@ def known_service_classes(type_):
 
 
 def describe_service(cls):
-    """Return the fields of a service class as a text: ``'request: data: bool; response: no fields'``."""
+    """Return the fields of a service class as a text: ``'request: data: bool; response: no
+    fields'``."""
     request, response = map(describe_fields, (cls._request_class, cls._response_class))
     return f'request: {request}; response: {response}'
 
 
 def class_from_definition(type_, full_text, md5sum=None):
-    """Return the class for a message type as a peer describes it in its connection header, nested types included.
+    """Return the class for a message type as a peer describes it in its connection header, nested
+    types included.
 
-    The installed class is returned if it is the same. Nothing is defined for later. Raises `UnknownTypeError`
-    for a text that cannot be read, and `MessageTypeError` if the text has not the ``md5sum`` given.
+    The installed class is returned if it is the same. Nothing is defined for later. Raises
+    `UnknownTypeError` for a text that cannot be read, and `MessageTypeError` if the text has not
+    the ``md5sum`` given.
     """
     known_types.check_name('msg', type_)
     with _lock:
         cls = message_definition.make('msg', type_, full_text)
         if md5sum not in (None, '*', cls._md5sum):
-            raise MessageTypeError(f'{type_} was announced with md5sum {md5sum}, but its definition has {cls._md5sum} '
-                                   f'({describe_fields(cls)}): build the peer anew, its message code is inconsistent')
+            raise MessageTypeError(
+                f'{type_} was announced with md5sum {md5sum}, but its definition has {cls._md5sum} '
+                f'({describe_fields(cls)}): build the peer anew, its message code is inconsistent'
+            )
         return cls
 
 
@@ -109,14 +138,20 @@ def _define(kind, type_, text):
     with _lock:
         cls = message_definition.make(kind, type_, text)
         key = kind, type_
-        before = _given.get(key) or known_types.installed(kind, type_) or known_types.file_text(kind, type_)
+        before = (
+            _given.get(key)
+            or known_types.installed(kind, type_)
+            or known_types.file_text(kind, type_)
+        )
         if before is None:
             known_types.provisional.add(key)
         if isinstance(before, str):
             before = message_definition.make(kind, type_, before)
         if before not in (None, cls):
-            raise MessageTypeError(f'{type_} is known already, with md5sum {before._md5sum} and other fields or '
-                                   'constants than in the text now given: give the same text, or define another type')
+            raise MessageTypeError(
+                f'{type_} is known already, with md5sum {before._md5sum} and other fields or '
+                'constants than in the text now given: give the same text, or define another type'
+            )
         _given[key] = known_types.found[key] = cls
         classes = getattr(getattr(cls, '_request_class', cls), '_classes', {})
         for nested in classes.keys() & message_definition.split(type_, text).keys() - {type_}:

@@ -1,7 +1,7 @@
 """Definitions of turtlesim's types, for machines without that package: Debian 12 has none.
 
-The messages are those of ROS Fuerte, which the PhaROS report uses: velocities are sent as turtlesim/Velocity; later
-releases send geometry_msgs/Twist, and the rest is unchanged.
+The messages are those of ROS Fuerte, which the PhaROS report uses: velocities are sent as
+turtlesim/Velocity; later releases send geometry_msgs/Twist, and the rest is unchanged.
 """
 
 _COLOUR = 'uint8 r\nuint8 g\nuint8 b\n'
@@ -18,7 +18,9 @@ DEFINITIONS = {
     'srv': {
         'turtlesim/Kill': 'string name\n---\n',
         'turtlesim/SetPen': _COLOUR + 'uint8 width\nuint8 off\n---\n',
-        'turtlesim/Spawn': _PLACE + 'string name  # may be empty: turtlesim finds one\n---\nstring name\n',
+        'turtlesim/Spawn': (
+            _PLACE + 'string name  # may be empty: turtlesim finds one\n---\nstring name\n'
+        ),
         'turtlesim/TeleportAbsolute': _PLACE + '---\n',
         'turtlesim/TeleportRelative': _VELOCITY + '---\n',
     },

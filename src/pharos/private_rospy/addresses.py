@@ -9,34 +9,42 @@ import urllib.parse
 import rosgraph.network
 from rosgraph.rosenv import ROS_HOSTNAME, ROS_IP
 
-_HOST = re.compile(r'\w([\w.-]*\w)?\.?', re.ASCII)    # Docker's names have underscores
-_NOBODYS = ipaddress.ip_network('0.0.0.0/8')          # '5' is one of these
+_HOST = re.compile(r'\w([\w.-]*\w)?\.?', re.ASCII)  # Docker's names have underscores
+_NOBODYS = ipaddress.ip_network('0.0.0.0/8')  # '5' is one of these
 _BROADCAST = ipaddress.ip_address('255.255.255.255')
 
 
 def check_port(what, port):
     """``port`` if it is one, else ValueError."""
     if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port <= 65535:
-        raise ValueError('%s must be a port number, 0 (any free one) to 65535, not %r' % (what, port))
+        raise ValueError(f'{what} must be a port number, 0 (any free one) to 65535, not {port!r}')
     return port
 
 
 def check_url(url, source=''):
-    """``url`` if it can be a master's, else ValueError; written as URLs should be, with a closing slash.
+    """``url`` if it can be a master's, else ValueError; written as URLs should be, with a closing
+    slash.
 
     :param source: the variable of the environment that it comes from, if it does
     """
     try:
         parts = urllib.parse.urlsplit(url) if isinstance(url, str) else None
-        if parts and parts.scheme == 'http' and parts.path in ('', '/') and not parts.query + parts.fragment:
+        if (
+            parts
+            and parts.scheme == 'http'
+            and parts.path in ('', '/')
+            and not parts.query + parts.fragment
+        ):
             host, port = parts.hostname, parts.port
             is_host = host and _HOST.fullmatch(host) or _is_ipv6(host)
             if is_host and port and '@' not in parts.netloc:
                 return f'http://[{host}]:{port}/' if ':' in host else f'http://{host}:{port}/'
     except ValueError:
-        pass    # the port is no number, for example
+        pass  # the port is no number, for example
     where = f'{source} is {url!r}, which' if source else repr(url)
-    raise ValueError(f'{where} is not the URL of a ROS master: it looks like http://127.0.0.1:11311/')
+    raise ValueError(
+        f'{where} is not the URL of a ROS master: it looks like http://127.0.0.1:11311/'
+    )
 
 
 def check_domain(what, domain):
@@ -46,18 +54,30 @@ def check_domain(what, domain):
     """
     advice = 'give a host name or an IPv4 address of this host, such as robot1 or 192.168.1.5'
     if _is_ipv6(domain):
-        raise ValueError(f'{what} cannot be {domain!r}, for ROS puts no IPv6 address into a URL: {advice}; with '
-                         'ROS_IPV6=on the name may be one of an IPv6 address')
+        raise ValueError(
+            f'{what} cannot be {domain!r}, for ROS puts no IPv6 address into a URL: {advice}; with '
+            'ROS_IPV6=on the name may be one of an IPv6 address'
+        )
     if not isinstance(domain, str) or not _HOST.fullmatch(domain):
         raise ValueError(f'{what} cannot be {domain!r}: {advice}, without http:// and port')
     try:
-        found = _look_up(domain, socket.AF_UNSPEC if rosgraph.network.use_ipv6() else socket.AF_INET)
+        found = _look_up(
+            domain, socket.AF_UNSPEC if rosgraph.network.use_ipv6() else socket.AF_INET
+        )
     except (OSError, UnicodeError) as error:
-        raise ValueError(f'{what} {domain!r} does not resolve ({error}), so that nobody would reach the node: '
-                         f'{advice}') from error
+        raise ValueError(
+            f'{what} {domain!r} does not resolve ({error}), so that nobody would reach the node: '
+            f'{advice}'
+        ) from error
     for address in found:
-        if address in _NOBODYS or address.is_multicast or address in (_BROADCAST, ipaddress.ip_address('::')):
-            raise ValueError(f'{what} {domain!r} means {address}, at which nobody would reach the node: {advice}')
+        if (
+            address in _NOBODYS
+            or address.is_multicast
+            or address in (_BROADCAST, ipaddress.ip_address('::'))
+        ):
+            raise ValueError(
+                f'{what} {domain!r} means {address}, at which nobody would reach the node: {advice}'
+            )
     return domain
 
 
@@ -76,7 +96,8 @@ def check_environment(environ):
 
 
 def default_domain():
-    """What a node says where nothing else is said: the host's name, or its address where the name does not resolve.
+    """What a node says where nothing else is said: the host's name, or its address where the name
+    does not resolve.
 
     rosgraph says the name, and nobody reaches the node.
     """
@@ -87,7 +108,8 @@ def default_domain():
 
 
 def is_same_master(url, other):
-    """Whether two URLs as of :func:`check_url` mean one address; looks host names up, once, but never connects."""
+    """Whether two URLs as of :func:`check_url` mean one address; looks host names up, once, but
+    never connects."""
     if url == other:
         return True
     one, two = urllib.parse.urlsplit(url), urllib.parse.urlsplit(other)
@@ -95,7 +117,8 @@ def is_same_master(url, other):
         return False
     try:
         return not _of_master(one.hostname).isdisjoint(_of_master(two.hostname))
-    except (OSError, UnicodeError):    # what cannot be looked up is the same only where it is spelt so
+    except (OSError, UnicodeError):
+        # what cannot be looked up is the same only where it is spelt so
         return False
 
 
@@ -104,7 +127,7 @@ def _of_master(host):
     """The addresses of a host; this one has a master at all of its own."""
     found = _look_up(host, socket.AF_UNSPEC)
     here = {_address(own) for own in rosgraph.network.get_local_addresses()}
-    here |= {_address('0.0.0.0'), _address('::')}    # to which a client connects here
+    here |= {_address('0.0.0.0'), _address('::')}  # to which a client connects here
     for own in 'localhost', socket.gethostname():
         with contextlib.suppress(OSError, UnicodeError):
             here |= _look_up(own, socket.AF_UNSPEC)
@@ -113,7 +136,10 @@ def _of_master(host):
 
 def _look_up(host, family):
     """The IP addresses of a host."""
-    return {_address(found[0]) for *_, found in socket.getaddrinfo(host, None, family, socket.SOCK_STREAM)}
+    return {
+        _address(found[0])
+        for *_, found in socket.getaddrinfo(host, None, family, socket.SOCK_STREAM)
+    }
 
 
 def _address(text):

@@ -1,8 +1,9 @@
-"""The arguments that rosrun and roslaunch give to one node, shared out among the nodes of a process.
+"""The arguments that rosrun and roslaunch give to one node, shared out among the nodes of a
+process.
 
-``__name:=``, ``__ns:=``, remappings and private parameters are for the node that is the whole program. Here the first
-node created with them takes the name, and all else is for all. What is for one alone says so as in ROS 2:
-``detector:image:=/camera/image``.
+``__name:=``, ``__ns:=``, remappings and private parameters are for the node that is the whole
+program. Here the first node created with them takes the name, and all else is for all. What is for
+one alone says so as in ROS 2: ``detector:image:=/camera/image``.
 """
 import re
 import threading
@@ -12,12 +13,14 @@ import rosgraph.names
 from pharos.private_rospy.addresses import is_same_master
 
 _FOR_ONE = re.compile(r'([A-Za-z]\w*):(?!=)(.*)', re.ASCII | re.DOTALL)
-_takers = []    # (master URL, arguments, node that takes the __name in them): for good, since nodes start again
-_lock = threading.Lock()    # guards it
+# (master URL, arguments, node that takes the __name in them): for good, since nodes start again
+_takers = []
+_lock = threading.Lock()  # guards it
 
 
 def mappings_for(arguments, node):
-    """``({left: right} for all nodes, {left: right} for that one alone)`` of the ``left:=right`` among the arguments.
+    """``({left: right} for all nodes, {left: right} for that one alone)`` of the ``left:=right``
+    among the arguments.
 
     What is no such mapping is ignored, as by rosgraph.
 
@@ -25,9 +28,12 @@ def mappings_for(arguments, node):
     :raises TypeError: if the arguments are no list of strings
     :raises ValueError: if a mapping has several right sides
     """
-    is_list = isinstance(arguments, (list, tuple))    # an iterator is empty when the next one looks at it
+    # an iterator is empty when the next one looks at it
+    is_list = isinstance(arguments, (list, tuple))
     if not is_list or not all(isinstance(argument, str) for argument in arguments):
-        raise TypeError(f"argv is a list of strings, such as sys.argv or ['__name:=eye'], not {arguments!r}")
+        raise TypeError(
+            f"argv is a list of strings, such as sys.argv or ['__name:=eye'], not {arguments!r}"
+        )
     for_all, for_one = {}, {}
     for argument in arguments:
         mappings = for_all
@@ -40,14 +46,17 @@ def mappings_for(arguments, node):
             continue
         left, right, *more = (side.strip() for side in argument.split(rosgraph.names.REMAP))
         if more:
-            raise ValueError(f'{argument!r} in argv maps to several names or values: there is to be one :=')
+            raise ValueError(
+                f'{argument!r} in argv maps to several names or values: there is to be one :='
+            )
         if left and right:
             mappings[left] = right
     return for_all, for_one
 
 
 def takes_name(master_url, arguments, node):
-    """Whether the ``__name`` in the arguments is for the node: it is for the first that asks, now and later.
+    """Whether the ``__name`` in the arguments is for the node: it is for the first that asks, now
+    and later.
 
     :param node: the full name that the node has without it
     """

@@ -1,4 +1,5 @@
-"""How the clients of a server come in: none is waited for, and none is trusted to say what it ought to."""
+"""How the clients of a server come in: none is waited for, and none is trusted to say what it ought
+to."""
 import collections
 import errno
 import threading
@@ -6,13 +7,16 @@ import time
 
 from pharos.private_rospy.lifetime import shut
 
-BACKLOG = 1024     # connections waiting to be accepted; of a rush, those beyond would try again a second later
-CLIENTS = 128      # of one server, that have something to say before they are served
-GRACE = 0.25       # seconds that each of them has in any case
-PAUSE = 0.05       # seconds until the next attempt to accept a client where there are no descriptors left
-COMPLAINTS = 100   # lines of the log within
-COMPLAINT_PERIOD = 10.0    # seconds, about the clients of one server; the rest is counted
-TEXT_LIMIT = 300   # characters of a client's in a line of the log
+# connections waiting to be accepted; of a rush, those beyond would try again a second later
+BACKLOG = 1024
+CLIENTS = 128  # of one server, that have something to say before they are served
+GRACE = 0.25  # seconds that each of them has in any case
+PAUSE = (
+    0.05  # seconds until the next attempt to accept a client where there are no descriptors left
+)
+COMPLAINTS = 100  # lines of the log within
+COMPLAINT_PERIOD = 10.0  # seconds, about the clients of one server; the rest is counted
+TEXT_LIMIT = 300  # characters of a client's in a line of the log
 _EXHAUSTED = errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM
 _SHUT = errno.EINVAL, errno.EBADF
 
@@ -20,9 +24,9 @@ _SHUT = errno.EINVAL, errno.EBADF
 class Door:
     """Lets the clients of one server in, each into a thread of its own.
 
-    A client that is to say something before it is served, a handshake or a request, is *expected*. Where too many
-    are, the one expected longest is closed: silent clients keep nobody from coming in, and are told from those that
-    come in a rush by their age.
+    A client that is to say something before it is served, a handshake or a request, is *expected*.
+    Where too many are, the one expected longest is closed: silent clients keep nobody from coming
+    in, and are told from those that come in a rush by their age.
 
     :param kind: of the clients, for the log and the names of threads
     :param warn: ``warn(text)`` logs that a client was refused
@@ -30,19 +34,20 @@ class Door:
 
     def __init__(self, kind, lifetime, warn):
         self._kind, self._lifetime, self._warn = kind, lifetime, warn
-        self._changed = threading.Condition()    # guards all below; notified when fewer are expected
-        self._expected = {}    # socket -> since when; those expected longest first
-        self._inside = 0       # threads
+        self._changed = threading.Condition()  # guards all below; notified when fewer are expected
+        self._expected = {}  # socket -> since when; those expected longest first
+        self._inside = 0  # threads
         self._crowded = False  # and the log says so
-        self._complaints = collections.deque(maxlen=COMPLAINTS)    # when the last were logged
-        self._not_logged = 0   # since then
+        self._complaints = collections.deque(maxlen=COMPLAINTS)  # when the last were logged
+        self._not_logged = 0  # since then
 
     def accept(self, listener, serve):
         """Accept clients until the listener is shut; ``serve(socket, address)`` runs for each.
 
         Whatever it raises closes the client, and is logged as the reason.
 
-        :param listener: a socket that listens already: one that is shut before this runs would listen again
+        :param listener: a socket that listens already: one that is shut before this runs would
+            listen again
         """
         while True:
             self._make_room(wait=True)
@@ -54,7 +59,7 @@ class Door:
                 if error.errno in _EXHAUSTED:
                     self._close_longest(error.strerror)
                     self._lifetime.ended.wait(PAUSE)
-                continue    # else the client went before it was let in
+                continue  # else the client went before it was let in
             self._lifetime.hold(sock)
             self.expect(sock)
             self._let_in(sock, address, serve)
@@ -62,12 +67,13 @@ class Door:
     def _let_in(self, sock, address, serve):
         with self._changed:
             self._inside += 1
-            full = self._inside > 2 * CLIENTS    # those that are served, or are closed and do not know it yet
+            # those that are served, or are closed and do not know it yet
+            full = self._inside > 2 * CLIENTS
         try:
             if full:
                 raise RuntimeError('%d %s clients are being served' % (2 * CLIENTS, self._kind))
             self._lifetime.start_thread(self._serve, (sock, address, serve), self._kind)
-        except RuntimeError as error:    # Python's own, where the system gives no more threads
+        except RuntimeError as error:  # Python's own, where the system gives no more threads
             self._leave(sock)
             self._say_crowded(error)
             sock.close()
@@ -102,12 +108,14 @@ class Door:
             return since is not None
 
     def refuse(self, sock, address, why):
-        """Log why a client that was expected is not served; what happens to it later is its own affair."""
+        """Log why a client that was expected is not served; what happens to it later is its own
+        affair."""
         if self.heard(sock):
             self.complain(address, why)
 
     def complain(self, address, why):
-        """Log what is wrong with a client, unless so many others are wrong that it would fill the log."""
+        """Log what is wrong with a client, unless so many others are wrong that it would fill the
+        log."""
         if self._lifetime.ended.is_set():
             return
         now = time.monotonic()
@@ -139,18 +147,19 @@ class Door:
             longest = next(iter(self._expected), None)
             if longest is not None:
                 del self._expected[longest]
-                shut(longest)    # its thread wakes
+                shut(longest)  # its thread wakes
         self._say_crowded(why)
 
     def _say_crowded(self, why):
         with self._changed:
             said, self._crowded = self._crowded, True
         if not said and not self._lifetime.ended.is_set():
-            self._warn('%s: those that said nothing for longest are closed, to let others in' % why)
+            self._warn(f'{why}: those that said nothing for longest are closed, to let others in')
 
 
 def brief(text, limit=TEXT_LIMIT):
-    """What came from elsewhere, fit for one line of the log: not too long, control characters as escapes."""
+    """What came from elsewhere, fit for one line of the log: not too long, control characters as
+    escapes."""
     text = str(text)
     shown = ''.join(char if char.isprintable() else repr(char)[1:-1] for char in text[:limit])
     return shown + ('...' if len(text) > limit else '')

@@ -17,7 +17,16 @@ import _thread
 import rosgraph
 
 from pharos.errors import MasterUnreachableError, NodeStoppedError, PortInUseError
-from pharos.private_rospy import (host, logs, names, publishing, pubsub, refusals, registration, servers)
+from pharos.private_rospy import (
+    host,
+    logs,
+    names,
+    publishing,
+    pubsub,
+    refusals,
+    registration,
+    servers,
+)
 from pharos.private_rospy.lifetime import Lifetime
 from pharos.private_rospy.loader import PrivateImports, Substitute
 from pharos.private_rospy.parameters import WatchedParameters
@@ -25,15 +34,15 @@ from pharos.private_rospy.proxies import ServerProxy, is_time_up, master_api, ti
 from pharos.intraprocess.services import Workers
 from pharos.private_rospy.wiring import Wiring
 
-POLL = 0.001    # seconds between rospy's own looks at whether it is registered; it takes 0.1 s
+POLL = 0.001  # seconds between rospy's own looks at whether it is registered; it takes 0.1 s
 
 
 class PrivateRospy:
     """A rospy of one node, for one run of it: a stopped one is thrown away.
 
     :param settings: the :class:`~.settings.Settings` of the node
-    :param on_stop_request: called as ``on_stop_request(reason)``, in a thread of its own, when ROS or a user of
-        ``rospy.signal_shutdown`` asks the node to stop
+    :param on_stop_request: called as ``on_stop_request(reason)``, in a thread of its own, when ROS
+        or a user of ``rospy.signal_shutdown`` asks the node to stop
     :param allows_remote_shutdown: ``allows_remote_shutdown()``: whether any host may ask for that
     """
 
@@ -45,8 +54,9 @@ class PrivateRospy:
         self._stopping = threading.Lock()
         # whether a newer node has it: what registers this one again would end that one
         self.has_lost_name = False
-        self.on_failure = lambda error: None    # called with what a hook of rospy.on_shutdown raised
-        self.on_received = lambda: None    # called after the callbacks of a batch of messages, in its thread
+        self.on_failure = lambda error: None  # called with what a hook of rospy.on_shutdown raised
+        # called after the callbacks of a batch of messages, in its thread
+        self.on_received = lambda: None
         self.uri = None
         self.wiring = Wiring(self)
         self.refusals = refusals.Refusals(self)
@@ -60,41 +70,58 @@ class PrivateRospy:
         proxies = Substitute(xmlrpc.client, ServerProxy=ServerProxy)
         private_os = Substitute(os, environ=self.settings.environ)
         hooks = collections.defaultdict(list)
-        for part in ({'rospy.service': _share_service_exception, 'rospy.impl.init': self._poll_quickly,
-                      'rospy.core': self._shut_down_early},
-                     names.hooks(), logs.hooks(), servers.hooks(lifetime, self.warn, self.debug),
-                     registration.hooks(self), pubsub.hooks(self), refusals.hooks(self),
-                     self.parameters.hooks()):
+        for part in (
+            {
+                'rospy.service': _share_service_exception,
+                'rospy.impl.init': self._poll_quickly,
+                'rospy.core': self._shut_down_early,
+            },
+            names.hooks(),
+            logs.hooks(),
+            servers.hooks(lifetime, self.warn, self.debug),
+            registration.hooks(self),
+            pubsub.hooks(self),
+            refusals.hooks(self),
+            self.parameters.hooks(),
+        ):
             for name, hook in part.items():
                 hooks[name].append(hook)
-        modules = PrivateImports(hooks=hooks, substitutes={
-            'os': private_os,
-            'sys': Substitute(sys, argv=self.settings.argv),
-            'logging': logging_module,
-            # running.py stops the node at the end of the program
-            'atexit': Substitute(atexit, register=lambda function, *args, **kwargs: function),
-            'threading': Substitute(threading, Thread=lifetime.Thread),
-            '_thread': Substitute(_thread, start_new_thread=lifetime.start_thread),
-            'time': Substitute(time, sleep=lifetime.sleep),
-            'socket': Substitute(socket, setdefaulttimeout=lambda timeout: None),    # rospy sets the whole process's
-            'xmlrpc': Substitute(xmlrpc, client=proxies),
-            'xmlrpc.client': proxies})
-        logging_module.os = private_os    # the configuration file is evaluated with this
+        modules = PrivateImports(
+            hooks=hooks,
+            substitutes={
+                'os': private_os,
+                'sys': Substitute(sys, argv=self.settings.argv),
+                'logging': logging_module,
+                # running.py stops the node at the end of the program
+                'atexit': Substitute(atexit, register=lambda function, *args, **kwargs: function),
+                'threading': Substitute(threading, Thread=lifetime.Thread),
+                '_thread': Substitute(_thread, start_new_thread=lifetime.start_thread),
+                'time': Substitute(time, sleep=lifetime.sleep),
+                # rospy sets the whole process's
+                'socket': Substitute(socket, setdefaulttimeout=lambda timeout: None),
+                'xmlrpc': Substitute(xmlrpc, client=proxies),
+                'xmlrpc.client': proxies,
+            },
+        )
+        logging_module.os = private_os  # the configuration file is evaluated with this
         logging_module.config = modules.load_apart('logging.config', logging.__path__)
         self._logging = logging_module
         return modules
 
     def _poll_quickly(self, module):
         """rospy.impl.init: waits in steps of 0.1 s, for as long as the master takes."""
+
         def sleep(seconds):
             self._check_not_ended()
             if time.monotonic() > self._deadline:
                 raise self._stopped_answering()
             time.sleep(min(seconds, POLL))
+
         module.time = Substitute(time, sleep=sleep)
 
     def _shut_down_early(self, module):
-        """rospy.core: is_shutdown() holds from the beginning of the stop, so that what loops until then ends first.
+        """rospy.core: is_shutdown() holds from the beginning of the stop, so that what loops until
+        then ends first.
 
         rospy.topics keeps the real one: the last messages of a soul that is ending are still sent.
         """
@@ -102,13 +129,15 @@ class PrivateRospy:
         module.is_shutdown = lambda: is_shutdown() or self._lifetime.ended.is_set()
         self.is_shut_down = is_shutdown
         # of hooks of on_shutdown; where that cannot be printed, rospy would stop half way
-        module.traceback = Substitute(traceback, print_exc=lambda: self.on_failure(sys.exc_info()[1]))
+        module.traceback = Substitute(
+            traceback, print_exc=lambda: self.on_failure(sys.exc_info()[1])
+        )
 
     def import_library(self, name):
         """A library written on rospy, such as 'actionlib', bound to this node."""
         return self._modules.load(name)
 
-    # -- life ---------------------------------------------------------------------------------------------------------
+    # -- life
 
     def start(self, timeout):
         """Open the ports, claim the name, register. On an error, nothing is left behind.
@@ -124,26 +153,37 @@ class PrivateRospy:
                 master_api(settings.master_url, self.name, timeout).getPid()
             except registration.COMMUNICATION_ERRORS as error:
                 raise MasterUnreachableError(
-                    'no ROS master answers at %s (%s): start one with roscore or Master.embedded(), or set '
-                    'ROS_MASTER_URI' % (settings.master_url, error)) from error
+                    f'no ROS master answers at {settings.master_url} ({error}): start one with'
+                    ' roscore or Master.embedded(), or set ROS_MASTER_URI'
+                ) from error
             with self._reached():
                 registration.claim_name(settings.master_url, self.name, timeout)
         core = self._modules.load('rospy.core')
-        core._shutdown_hooks.insert(0, self._wake)    # the first, so that the threads that rospy waits for end at once
+        # the first, so that the threads that rospy waits for end at once
+        core._shutdown_hooks.insert(0, self._wake)
         try:
             with _ports_checked('tcp_port', settings.tcp_port):
-                self.tcp_port = servers.listen(self._modules.load('rospy.impl.tcpros_base'), settings.tcp_port)
+                self.tcp_port = servers.listen(
+                    self._modules.load('rospy.impl.tcpros_base'), settings.tcp_port
+                )
             with _ports_checked('xmlrpc_port', settings.xmlrpc_port):
-                with time_limit(2 * timeout), self._reached():    # half of it until rospy is registered
-                    self.rospy.init_node(settings.base_name, argv=settings.argv, disable_signals=True,
-                                         xmlrpc_port=settings.xmlrpc_port, tcpros_port=settings.tcp_port)
+                # half of it until rospy is registered
+                with time_limit(2 * timeout), self._reached():
+                    self.rospy.init_node(
+                        settings.base_name,
+                        argv=settings.argv,
+                        disable_signals=True,
+                        xmlrpc_port=settings.xmlrpc_port,
+                        tcpros_port=settings.tcp_port,
+                    )
             self._check_not_ended()
         except BaseException:
             self.stop(0)
             raise
         self.xmlrpc_port = self._lifetime.xmlrpc.port
         self.domain = self._modules.load('rosgraph.network').get_host_name()
-        core.add_preshutdown_hook(self.request_stop)    # rospy.signal_shutdown called by the node's own code
+        # rospy.signal_shutdown called by the node's own code
+        core.add_preshutdown_hook(self.request_stop)
 
     @contextlib.contextmanager
     def _reached(self):
@@ -156,31 +196,36 @@ class PrivateRospy:
             raise self._stopped_answering() from error
 
     def _stopped_answering(self):
-        return MasterUnreachableError('the ROS master %s stopped answering while %s registered: is its host busy, or '
-                                      'gone?' % (self.settings.master_url, self.name))
+        return MasterUnreachableError(
+            f'the ROS master {self.settings.master_url} stopped answering while'
+            f' {self.name} registered: is its host busy, or gone?'
+        )
 
     def _check_not_ended(self):
         if self.ended.is_set():
-            raise NodeStoppedError('%s was stopped while it started' % self.name)
+            raise NodeStoppedError(f'{self.name} was stopped while it started')
 
     def request_stop(self, reason):
         """Have the node stopped, from a thread that the stop need not wait for."""
         if not self._stopping.locked():
-            threading.Thread(target=self._on_stop_request, args=(reason,), name=self.name + ' stop',
-                             daemon=True).start()
+            threading.Thread(
+                target=self._on_stop_request, args=(reason,), name=self.name + ' stop', daemon=True
+            ).start()
 
     def end(self):
-        """Begin the stop: all that waits ends, ``is_shutdown()`` holds, and nothing more is received."""
+        """Begin the stop: all that waits ends, ``is_shutdown()`` holds, and nothing more is
+        received."""
         self._lifetime.begin_end()
         changed = self._modules.load('rospy.rostime').get_rostime_cond()
         with changed:
-            changed.notify_all()    # simulated time may stand still
+            changed.notify_all()  # simulated time may stand still
 
     def stop(self, flush_timeout, given_up=()):
-        """Send what is under way (for up to ``flush_timeout`` seconds), unregister, close the ports, end the threads.
+        """Send what is under way (for up to ``flush_timeout`` seconds), unregister, close the
+        ports, end the threads.
 
-        Returns the names of threads that did not end in time, but for those ``given_up`` already. Harmless when done
-        twice.
+        Returns the names of threads that did not end in time, but for those ``given_up`` already.
+        Harmless when done twice.
         """
         if not self._stopping.acquire(blocking=False):
             return []
@@ -191,8 +236,8 @@ class PrivateRospy:
         pubsub.flush(self._topic_manager(), flush_timeout)
         core.signal_shutdown('stop')
         with core._shutdown_lock:
-            pass    # where the node's own code called that, it returned at once
-        for proxy in list(core._xmlrpc_cache.values()):    # a thread that is left may add one
+            pass  # where the node's own code called that, it returned at once
+        for proxy in list(core._xmlrpc_cache.values()):  # a thread that is left may add one
             proxy('close')()
         left = self._lifetime.end(given_up)
         logs.close_handlers(self._logging)
@@ -206,27 +251,34 @@ class PrivateRospy:
                 changed.notify_all()
 
     def repair(self, state, was_away):
-        """Register with the master what it has forgotten; see :func:`.registration.repair`. Raises nothing."""
+        """Register with the master what it has forgotten; see :func:`.registration.repair`. Raises
+        nothing."""
         handler = self._lifetime.xmlrpc.handler
         if handler is None or self.ended.is_set():
             return
         try:
             services = self._modules.load('rospy.impl.registration').get_service_manager()
             if registration.repair(self, handler, self._topic_manager(), services, state, was_away):
-                self.rospy.logwarn('the master %s had forgotten %s: registered again',
-                                   self.settings.master_url, self.name)
+                self.rospy.logwarn(
+                    'the master %s had forgotten %s: registered again',
+                    self.settings.master_url,
+                    self.name,
+                )
                 self.parameters.put_back()
         except (rosgraph.MasterException, *registration.COMMUNICATION_ERRORS) as error:
-            self.rospy.logdebug('cannot register with the master %s: %s', self.settings.master_url, error)
+            self.rospy.logdebug(
+                'cannot register with the master %s: %s', self.settings.master_url, error
+            )
 
     def _topic_manager(self):
         return self._modules.load('rospy.impl.registration').get_topic_manager()
 
-    # -- what the facade needs of rospy's inside -----------------------------------------------------------------------
+    # -- what the facade needs of rospy's inside
 
     @property
     def log(self):
-        """rospy's ``_base_logger``: it reports the caller of its caller, so ``node.log`` must call it itself."""
+        """rospy's ``_base_logger``: it reports the caller of its caller, so ``node.log`` must call
+        it itself."""
         return self._modules.load('rospy.core')._base_logger
 
     @property
@@ -240,18 +292,21 @@ class PrivateRospy:
 
     @property
     def here(self):
-        """``with here():`` what waits in this thread does so on behalf of the node, and ends with it."""
+        """``with here():`` what waits in this thread does so on behalf of the node, and ends with
+        it."""
         return self._lifetime.here
 
     def wait_until(self, predicate, timeout):
-        """Wait until ``predicate()``, which speaks of connections in this process, holds, or the node stops.
+        """Wait until ``predicate()``, which speaks of connections in this process, holds, or the
+        node stops.
 
         :param timeout: seconds, None: no limit
         """
         publishing.wait_until(predicate, timeout, self._lifetime)
 
     def wait_until_silent(self, timeout):
-        """Wait until the node is unregistered, and nobody can ask it anything, for up to ``timeout`` seconds."""
+        """Wait until the node is unregistered, and nobody can ask it anything, for up to
+        ``timeout`` seconds."""
         self._lifetime.silent.wait(timeout)
 
     @property
@@ -291,18 +346,25 @@ class PrivateRospy:
 
     @property
     def as_response(self):
-        """``as_response(value, response_class)``: what the handler of a rospy Service returned, as a response."""
+        """``as_response(value, response_class)``: what the handler of a rospy Service returned, as
+        a response."""
         return self._modules.load('rospy.impl.tcpros_service').convert_return_to_response
 
     def connection_header(self, publisher):
-        """What a subscriber of rospy's _PublisherImpl gets as its messages' ``_connection_header``."""
-        return self._modules.load('rospy.impl.tcpros_pubsub').TCPROSPub(
-            publisher.resolved_name, publisher.data_class, publisher.is_latch, publisher.headers).get_header_fields()
+        """What a subscriber of rospy's _PublisherImpl gets as its messages'
+        ``_connection_header``."""
+        return (
+            self._modules.load('rospy.impl.tcpros_pubsub')
+            .TCPROSPub(
+                publisher.resolved_name, publisher.data_class, publisher.is_latch, publisher.headers
+            )
+            .get_header_fields()
+        )
 
     def connect(self, topic, uri):
         """Connect the subscription to the publisher at that URI, unless it is connected."""
         handler = self._lifetime.xmlrpc.handler
-        if handler is not None:    # None: it is stopping
+        if handler is not None:  # None: it is stopping
             handler._connect_topic(topic, uri)
 
 
@@ -317,10 +379,13 @@ class _ports_checked:
 
     def __exit__(self, kind, error, traceback):
         if isinstance(error, OSError) and error.errno in (errno.EADDRINUSE, errno.EACCES):
-            raise PortInUseError('%s %d cannot be bound (%s): choose another port, or 0 for any free one'
-                                 % (self._what, self._port, error.strerror)) from error
+            raise PortInUseError(
+                '%s %d cannot be bound (%s): choose another port, or 0 for any free one'
+                % (self._what, self._port, error.strerror)
+            ) from error
 
 
 def _share_service_exception(module):
-    """rospy.service: one ServiceException for all nodes, so that ``except rospy.ServiceException`` catches it."""
+    """rospy.service: one ServiceException for all nodes, so that ``except rospy.ServiceException``
+    catches it."""
     module.ServiceException = host.rospy.ServiceException

@@ -1,38 +1,44 @@
-"""What a node's rospy holds while it runs, so that its stop leaves nothing behind: threads and sockets."""
+"""What a node's rospy holds while it runs, so that its stop leaves nothing behind: threads and
+sockets."""
 import contextlib
 import socket
 import threading
 import time
 import weakref
 
-# A signal that the kernel gives to another thread does not end the main thread's wait, in which Python would handle it.
+# A signal that the kernel gives to another thread does not end the main thread's wait, in which
+# Python would handle it.
 SIGNAL_LATENCY = 0.2  # seconds that such a wait lasts at the most
-JOIN_TIMEOUT = 2.0    # seconds that a thread is waited for
-# A peer that vanishes says nothing: TCP notices that it is gone where it is asked to, here within half a minute.
-KEEPALIVE_IDLE = 10       # seconds of silence after which the peer's host is asked whether it is there
-KEEPALIVE_INTERVAL = 5    # seconds between two such questions
-KEEPALIVE_COUNT = 4       # of them without an answer, and the connection is broken
+JOIN_TIMEOUT = 2.0  # seconds that a thread is waited for
+# A peer that vanishes says nothing: TCP notices that it is gone where it is asked to, here within
+# half a minute.
+KEEPALIVE_IDLE = 10  # seconds of silence after which the peer's host is asked whether it is there
+KEEPALIVE_INTERVAL = 5  # seconds between two such questions
+KEEPALIVE_COUNT = 4  # of them without an answer, and the connection is broken
 
-_thread = threading.local()    # .lifetime: of the node on whose behalf the thread runs, if it does
+_thread = threading.local()  # .lifetime: of the node on whose behalf the thread runs, if it does
 
 
 class Lifetime:
     """The threads and accepted sockets of one run of a node, and the event that ends it.
 
-    :attr:`ended` is set when the node stops: sleeps inside rospy end with it, as do waits in an :class:`Interruption`.
+    :attr:`ended` is set when the node stops: sleeps inside rospy end with it, as do waits in an
+        :class:`Interruption`.
     """
 
     def __init__(self, name):
         self.ended = threading.Event()
-        self.silent = threading.Event()    # set when the node is unregistered, and its XML-RPC server closed
-        self._interruptions = set()    # of waits under way
+        # set when the node is unregistered, and its XML-RPC server closed
+        self.silent = threading.Event()
+        self._interruptions = set()  # of waits under way
         self.threads = weakref.WeakSet()
-        self.xmlrpc = None    # the node's XML-RPC server, once it is bound
+        self.xmlrpc = None  # the node's XML-RPC server, once it is bound
         self._sockets = weakref.WeakSet()
         lifetime = self
 
         class Thread(threading.Thread):
-            """A thread that is named after its node, ends with the process, and can be waited for."""
+            """A thread that is named after its node, ends with the process, and can be waited
+            for."""
 
             def run(self):
                 with lifetime.here():
@@ -40,7 +46,7 @@ class Lifetime:
 
             def start(self):
                 self.daemon = True
-                self.name = '%s %s' % (name, self.name)
+                self.name = f'{name} {self.name}'
                 lifetime.threads.add(self)
                 super().start()
 
@@ -54,7 +60,8 @@ class Lifetime:
 
     @contextlib.contextmanager
     def here(self):
-        """Within this, what waits in this thread does so on behalf of the node, and ends with it."""
+        """Within this, what waits in this thread does so on behalf of the node, and ends with
+        it."""
         before, _thread.lifetime = getattr(_thread, 'lifetime', None), self
         try:
             yield
@@ -68,7 +75,8 @@ class Lifetime:
             interruption.wake()
 
     def sleep(self, seconds):
-        """``time.sleep`` that ends with the node; ``sleep(0)`` yields, as rospy's publishers mean it to."""
+        """``time.sleep`` that ends with the node; ``sleep(0)`` yields, as rospy's publishers mean
+        it to."""
         if seconds <= 0:
             time.sleep(0)
         elif threading.current_thread() is not threading.main_thread():
@@ -80,11 +88,13 @@ class Lifetime:
 
     def hold(self, sock):
         """Shut this accepted socket down at the end, at the latest."""
-        keep_alive(sock)    # rospy waits for ever for a service's client, or in vain for a subscriber's leaving
+        # rospy waits for ever for a service's client, or in vain for a subscriber's leaving
+        keep_alive(sock)
         self.shut_at_end(sock)
 
     def shut_at_end(self, sock):
-        """Shut this socket down at the end: a thread that waits for what comes through it then ends."""
+        """Shut this socket down at the end: a thread that waits for what comes through it then
+        ends."""
         self._sockets.add(sock)
 
     def spare(self, sock):
@@ -92,32 +102,42 @@ class Lifetime:
         self._sockets.discard(sock)
 
     def end(self, given_up=()):
-        """Shut the sockets, wait for the threads but those given up; returns those that did not end in time."""
+        """Shut the sockets, wait for the threads but those given up; returns those that did not end
+        in time."""
         self.begin_end()
         for sock in list(self._sockets):
             shut(sock)
         me = threading.current_thread()
-        threads = [thread for thread in list(self.threads) if thread is not me and thread not in given_up]
+        threads = [
+            thread for thread in list(self.threads) if thread is not me and thread not in given_up
+        ]
         deadline = time.monotonic() + JOIN_TIMEOUT
         for thread in threads:
-            if thread.is_alive():    # else it has ended, or is only just being started, and will see that all has
+            # else it has ended, or is only just being started, and will see that all has
+            if thread.is_alive():
                 thread.join(max(0.0, deadline - time.monotonic()))
         return [thread for thread in threads if thread.is_alive()]
 
 
 class Interruption:
-    """Within this, a wait ends when a node stops: the one on whose behalf this thread runs, or another one given.
+    """Within this, a wait ends when a node stops: the one on whose behalf this thread runs, or
+    another one given.
 
-    A wait that begins only when the node stops already is for its last words, and is not ended, unless it is part of
-    one that began before.
+    A wait that begins only when the node stops already is for its last words, and is not ended,
+    unless it is part of one that began before.
 
-    :param wake: ``wake()`` makes the wait end, in whatever thread; None where :attr:`came` is all that is wanted
+    :param wake: ``wake()`` makes the wait end, in whatever thread; None where :attr:`came` is all
+        that is wanted
     """
 
     def __init__(self, wake=None, lifetime=None):
         self.wake = wake
-        here, self._outer = getattr(_thread, 'lifetime', None), getattr(_thread, 'interruption', None)
-        self._lifetimes = {each for each in (lifetime, here) if each is not None and not each.ended.is_set()}
+        here, self._outer = getattr(_thread, 'lifetime', None), getattr(
+            _thread, 'interruption', None
+        )
+        self._lifetimes = {
+            each for each in (lifetime, here) if each is not None and not each.ended.is_set()
+        }
         if self._outer is not None:
             self._lifetimes |= self._outer._lifetimes
 
@@ -143,8 +163,9 @@ class Interruption:
 def keep_alive(sock, while_sending=False):
     """Have the connection break when its peer has silently gone, as with a cable pulled out.
 
-    :param while_sending: also where something is under way to the peer, which TCP else goes on sending for a quarter of
-        an hour; not for publishers, since a peer that stops reading is then taken for one that has gone
+    :param while_sending: also where something is under way to the peer, which TCP else goes on
+        sending for a quarter of an hour; not for publishers, since a peer that stops reading is
+        then taken for one that has gone
     """
     try:
         if while_sending:
@@ -155,7 +176,7 @@ def keep_alive(sock, while_sending=False):
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, KEEPALIVE_INTERVAL)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, KEEPALIVE_COUNT)
     except OSError:
-        pass    # closed already
+        pass  # closed already
 
 
 def shut(sock):
@@ -163,4 +184,4 @@ def shut(sock):
     try:
         sock.shutdown(socket.SHUT_RDWR)
     except OSError:
-        pass    # not connected, or closed already
+        pass  # not connected, or closed already

@@ -1,8 +1,8 @@
 """Loads rospy's modules once more, with globals of their own.
 
 ``sys.modules`` stays untouched and no other thread notices: every module of the private set gets a
-``__builtins__`` whose ``__import__`` resolves the private packages to the set and everything else as usual, also
-for imports that rospy does inside functions later on.
+``__builtins__`` whose ``__import__`` resolves the private packages to the set and everything else
+as usual, also for imports that rospy does inside functions later on.
 """
 import builtins
 import functools
@@ -14,9 +14,10 @@ from importlib.machinery import PathFinder
 
 from pharos.private_rospy.host import rospy
 
-_SHARED = {'rospy.exceptions': rospy.exceptions}    # so that ``except rospy.ROSException`` catches every node's
+# so that ``except rospy.ROSException`` catches every node's
+_SHARED = {'rospy.exceptions': rospy.exceptions}
 _IMPORTS_ROSPY = re.compile(rb'^\s*(import|from)\s+rospy\b', re.MULTILINE)
-_found = {}    # module name -> (spec, code), the same for all sets
+_found = {}  # module name -> (spec, code), the same for all sets
 
 
 class Substitute:
@@ -34,22 +35,27 @@ def _find(name, path):
     if name not in _found:
         spec = PathFinder.find_spec(name, path)
         if spec is None:
-            raise ModuleNotFoundError('No module named %r' % name, name=name)
+            raise ModuleNotFoundError(f'No module named {name!r}', name=name)
         _found[name] = spec, spec.loader.get_code(name)
     return _found[name]
 
 
 @functools.lru_cache(maxsize=None)
 def _is_written_on_rospy(package):
-    """Whether a package imports rospy in one of its files: its copy for a node must then be that node's own too."""
+    """Whether a package imports rospy in one of its files: its copy for a node must then be that
+    node's own too."""
     if package in sys.stdlib_module_names:
         return False
     spec = PathFinder.find_spec(package)
     if spec is None:
         return False
     if spec.submodule_search_locations:
-        files = [entry.path for folder in spec.submodule_search_locations if os.path.isdir(folder)
-                 for entry in os.scandir(folder)]
+        files = [
+            entry.path
+            for folder in spec.submodule_search_locations
+            if os.path.isdir(folder)
+            for entry in os.scandir(folder)
+        ]
     else:
         files = [spec.origin or '']
     return any(_IMPORTS_ROSPY.search(_read(path)) for path in files if path.endswith('.py'))
@@ -61,11 +67,13 @@ def _read(path):
 
 
 class PrivateImports:
-    """A set of private modules: rospy, rosgraph, and whatever they or :meth:`load` import that is written on rospy.
+    """A set of private modules: rospy, rosgraph, and whatever they or :meth:`load` import that is
+    written on rospy.
 
-    :param substitutes: ``{module name: object}`` that private modules get when they import that name
-    :param hooks: ``{module name: [function(module)]}`` run right after a private module's code, before any other
-        module can import names from it
+    :param substitutes: ``{module name: object}`` that private modules get when they import that
+        name
+    :param hooks: ``{module name: [function(module)]}`` run right after a private module's code,
+        before any other module can import names from it
     """
 
     def __init__(self, substitutes, hooks):
@@ -90,7 +98,7 @@ class PrivateImports:
             return self.modules[name]
         parent_name, _, leaf = name.rpartition('.')
         parent = self._load(parent_name) if parent_name else None
-        if name in self.modules:    # the parent's code imported it
+        if name in self.modules:  # the parent's code imported it
             return self.modules[name]
         if name in _SHARED:
             module = self.modules[name] = _SHARED[name]
@@ -106,7 +114,8 @@ class PrivateImports:
         module = importlib.util.module_from_spec(spec)
         vars(module)['__builtins__'] = self._builtins
         if into is not None:
-            into[spec.name] = module    # before its code runs: rospy's modules import each other in circles
+            # before its code runs: rospy's modules import each other in circles
+            into[spec.name] = module
         try:
             exec(code, vars(module))
         except BaseException:
@@ -116,7 +125,11 @@ class PrivateImports:
         return module
 
     def _import(self, name, globals=None, locals=None, fromlist=(), level=0):
-        absolute = importlib.util.resolve_name('.' * level + name, globals['__package__']) if level else name
+        absolute = (
+            importlib.util.resolve_name('.' * level + name, globals['__package__'])
+            if level
+            else name
+        )
         top = absolute.partition('.')[0]
         if top in self._substitutes:
             real = builtins.__import__(name, globals, locals, fromlist, level)
@@ -130,7 +143,7 @@ class PrivateImports:
             for item in fromlist:
                 if item != '*' and not hasattr(module, item):
                     try:
-                        self._load('%s.%s' % (absolute, item))
+                        self._load(f'{absolute}.{item}')
                     except ModuleNotFoundError:
-                        pass    # the import statement itself says what is missing
+                        pass  # the import statement itself says what is missing
         return module

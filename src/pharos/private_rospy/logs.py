@@ -1,9 +1,10 @@
 """Logging of a node's own.
 
-rospy logs to the process-wide loggers 'rosout' and 'rospy', and ``init_node`` runs ``fileConfig``, which strips earlier
-handlers: with plain copies, a line of one node appears under another's name, twice, or not at all. A private logging
-module (own root, own manager, own list of handlers) lets rospy configure it unchanged. It is not a reload of the
-module: that would register exit and fork hooks.
+rospy logs to the process-wide loggers 'rosout' and 'rospy', and ``init_node`` runs ``fileConfig``,
+which strips earlier handlers: with plain copies, a line of one node appears under another's name,
+twice, or not at all. A private logging module (own root, own manager, own list of handlers) lets
+rospy configure it unchanged. It is not a reload of the module: that would register exit and fork
+hooks.
 """
 import contextlib
 import logging
@@ -13,13 +14,16 @@ import weakref
 
 from pharos.private_rospy.loader import Substitute
 
-_MESSAGE = '\0'    # where the message goes in a line of the screen
+_MESSAGE = '\0'  # where the message goes in a line of the screen
 
 
 def private_logging():
-    """A module that looks like ``logging`` and shares nothing with it but its classes and functions."""
+    """A module that looks like ``logging`` and shares nothing with it but its classes and
+    functions."""
     module = types.ModuleType('logging')
-    vars(module).update({name: value for name, value in vars(logging).items() if not name.startswith('__')})
+    vars(module).update(
+        {name: value for name, value in vars(logging).items() if not name.startswith('__')}
+    )
     module.__path__ = logging.__path__
 
     class Logger(logging.Logger):
@@ -35,7 +39,9 @@ def private_logging():
         manager.loggerClass = logger_class
 
     module.root, module.Logger = root, Logger
-    module.getLogger = lambda name=None: manager.getLogger(name) if name and name != 'root' else root
+    module.getLogger = lambda name=None: (
+        manager.getLogger(name) if name and name != 'root' else root
+    )
     module.setLoggerClass = set_logger_class
     module.getLoggerClass = lambda: manager.loggerClass
     # fileConfig clears these two lists, the process's own if they were shared
@@ -47,7 +53,8 @@ def hooks():
     """The load hooks of this module."""
 
     def mend_screen(module):
-        """rosgraph.roslogging: '${time:' in a message is an error, as is a closed screen, of whoever logs."""
+        """rosgraph.roslogging: '${time:' in a message is an error, as is a closed screen, of
+        whoever logs."""
         handler, formatter = module.RosStreamHandler, module._defaultFormatter
         module._defaultFormatter = Substitute(formatter, format=lambda record: _MESSAGE)
         emit, write = handler.emit, handler._write
@@ -57,22 +64,25 @@ def hooks():
             try:
                 emit(self, record)
             except (OSError, ValueError):
-                pass    # nobody is there to read it
+                pass  # nobody is there to read it
+
         handler.emit = emit_what_can_be
 
         def write_message(self, file, line, color):
-            if file is None:    # the program was started without that one
+            if file is None:  # the program was started without that one
                 return
             write(self, file, line.replace(_MESSAGE, self._message), color)
+
         handler._write = write_message
 
     return {'rosgraph.roslogging': mend_screen}
 
 
 def close_handlers(module):
-    """Flush and close every handler of a private logging module, as far as the disk takes what they hold."""
+    """Flush and close every handler of a private logging module, as far as the disk takes what they
+    hold."""
     for logger in [module.root, *module.root.manager.loggerDict.values()]:
-        for handler in list(getattr(logger, 'handlers', ())):    # a PlaceHolder has none
+        for handler in list(getattr(logger, 'handlers', ())):  # a PlaceHolder has none
             logger.removeHandler(handler)
             with contextlib.suppress(OSError):
                 handler.close()

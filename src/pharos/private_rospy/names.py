@@ -1,20 +1,23 @@
-"""ROS names: what can be one, and how a name that is resolved already passes through rospy as it is."""
+"""ROS names: what can be one, and how a name that is resolved already passes through rospy as it
+is."""
 import re
 import reprlib
 
 import rosgraph.names
 
-# rosgraph.names.is_legal_name, which tells no position; a name also begins with a letter, as rosgraph's comment has it
+# rosgraph.names.is_legal_name, which tells no position; a name also begins with a letter, as
+# rosgraph's comment has it
 _LEGAL = re.compile(r'(?:~/?|/)?(?:(?:[A-Za-z]|(?<=[~/])_)\w*(?:/\w+)*)?', re.ASCII)
 _EMPTY = '', '/', '~', '~/'
-NAME_LIMIT = 1000     # characters of a name, also in what other nodes send
-NODE_LIMIT = 250      # of that of a node of ours: its log file is named after it
+NAME_LIMIT = 1000  # characters of a name, also in what other nodes send
+NODE_LIMIT = 250  # of that of a node of ours: its log file is named after it
 
 
 def check_name(name, what, private=False, base=False, limit=NAME_LIMIT):
     """``name`` if it can be one, else ValueError with a caret under the first bad character.
 
-    :param what: the name is for, 'topic' for example; that of a 'node' ends in a part that begins with a letter
+    :param what: the name is for, 'topic' for example; that of a 'node' ends in a part that begins
+        with a letter
     :param private: whether '~name' is one, since a node is there that it is private to
     :param base: whether it is one part only, without a namespace
     :param limit: how many characters it has at the most
@@ -22,13 +25,21 @@ def check_name(name, what, private=False, base=False, limit=NAME_LIMIT):
     if not isinstance(name, str):
         raise ValueError(f'a {what} name is a string, not {name!r}')
     if name in _EMPTY:
-        raise ValueError(f"a {what} needs a name, such as '{'driver' if base else '/robot1/driver'}', not {name!r}")
+        raise ValueError(
+            f"a {what} needs a name, such as '{'driver' if base else '/robot1/driver'}', not"
+            f" {name!r}"
+        )
     if len(name) > limit:
-        raise ValueError(f'a {what} name has {limit} characters at the most, and {reprlib.repr(name)} has {len(name)}')
+        raise ValueError(
+            f'a {what} name has {limit} characters at the most, and {reprlib.repr(name)} has'
+            f' {len(name)}'
+        )
     at = _bad_character(name, what == 'node', private, base)
     if at is None:
         return name
-    allowed = 'letters, digits and _, beginning with a letter' + ('' if base else '; parts are joined by /')
+    allowed = 'letters, digits and _, beginning with a letter' + (
+        '' if base else '; parts are joined by /'
+    )
     if name.startswith('~') and not private:
         allowed += '; a name with ~ is private to a node, and can be given to a node alone'
     raise ValueError(f'{name!r} cannot be a {what} name ({allowed}):\n  {name}\n  {" " * at}^')
@@ -42,7 +53,7 @@ def _bad_character(name, is_node, private, base):
     rest = name[end:]
     if base and '/' in name[:end]:
         return name.index('/')
-    if rest == '/' and not is_node and name[:end].strip('~/'):    # rospy takes it away
+    if rest == '/' and not is_node and name[:end].strip('~/'):  # rospy takes it away
         return None
     if rest:
         return end + 1 if rest[0] == '/' and len(rest) > 1 else end
@@ -56,7 +67,8 @@ def global_name(name, what):
 
 
 class Resolved(str):
-    """A name that rospy is to take as it is: it is resolved and remapped, and would be remapped once more."""
+    """A name that rospy is to take as it is: it is resolved and remapped, and would be remapped
+    once more."""
 
 
 def hooks():
@@ -68,15 +80,18 @@ def hooks():
 
         def resolve_name(name, caller_id=None):
             return str(name) if isinstance(name, Resolved) else resolve(name, caller_id)
+
         module.resolve_name = resolve_name
 
     def name_as_resolved(module):
-        """rospy.topics: resolves what is resolved already, so that Topic and _TopicImpl differ where names swap."""
+        """rospy.topics: resolves what is resolved already, so that Topic and _TopicImpl differ
+        where names swap."""
         topic = module._TopicImpl
         init = topic.__init__
 
         def __init__(self, name, data_class):
             init(self, Resolved(name), data_class)
+
         topic.__init__ = __init__
 
     return {'rospy.names': resolve_once, 'rospy.topics': name_as_resolved}

@@ -10,20 +10,23 @@ from pharos.private_rospy.proxies import master_api
 
 
 class WatchedParameters:
-    """The parameters that one :class:`~.instance.PrivateRospy` watches, or has given a first value."""
+    """The parameters that one :class:`~.instance.PrivateRospy` watches, or has given a first
+    value."""
 
     def __init__(self, instance):
         self._instance = instance
-        self._listeners = {}      # global name -> [function(value)]
-        self._initialized = {}    # global name -> its first value
-        self._subscribed = set()  # of those listened to, the outermost: of what is in them, the master tells for each
-        self._cached = set()      # global names of which rospy itself has the master tell
+        self._listeners = {}  # global name -> [function(value)]
+        self._initialized = {}  # global name -> its first value
+        # of those listened to, the outermost: of what is in them, the master tells for each
+        self._subscribed = set()
+        self._cached = set()  # global names of which rospy itself has the master tell
         self._closed = False
-        self._lock = threading.Lock()           # guards _listeners
-        self._subscribing = threading.Lock()    # guards _subscribed
+        self._lock = threading.Lock()  # guards _listeners
+        self._subscribing = threading.Lock()  # guards _subscribed
 
     def hooks(self):
         """The load hooks."""
+
         def tell_listeners(module):
             """rospy.impl.masterslave: only its own cache is told of a parameter that changed."""
             handler = module.ROSHandler
@@ -33,29 +36,38 @@ class WatchedParameters:
             def paramUpdate(self_, caller_id, key, value):
                 answer = update(self_, caller_id, key, value)
                 return (1, '', 0) if self._tell(key, value) else answer
+
             handler.paramUpdate = paramUpdate
 
         def note_subscriptions(module):
-            """rospy.impl.paramserver: what get_param_cached subscribed to, as a log line does, is never let go."""
+            """rospy.impl.paramserver: what get_param_cached subscribed to, as a log line does, is
+            never let go."""
             set_ = module.ParamServerCache.set
 
             def set(self_, key, value):
                 self._cached.add(key)
                 set_(self_, key, value)
+
             module.ParamServerCache.set = set
             self._cache = module.get_param_server_cache
 
         def subscribe_while_running(module):
-            """rospy.msproxy: a line of the log subscribes to a parameter, which registers the node anew."""
+            """rospy.msproxy: a line of the log subscribes to a parameter, which registers the node
+            anew."""
             get_cached = module.MasterProxy.get_param_cached
 
             def get_param_cached(self_, key):
                 if self._may_subscribe():
                     return get_cached(self_, key)
                 return self_[key]
+
             module.MasterProxy.get_param_cached = get_param_cached
-        return {'rospy.impl.masterslave': tell_listeners, 'rospy.impl.paramserver': note_subscriptions,
-                'rospy.msproxy': subscribe_while_running}
+
+        return {
+            'rospy.impl.masterslave': tell_listeners,
+            'rospy.impl.paramserver': note_subscriptions,
+            'rospy.msproxy': subscribe_while_running,
+        }
 
     def _may_subscribe(self):
         return not (self._closed or self._instance.has_lost_name)
@@ -75,12 +87,13 @@ class WatchedParameters:
         for name, value in dict(self._initialized).items():
             self._set_where_missing(name, value)
         with self._lock:
-            watched = sorted(self._listeners)    # namespaces before what is in them
+            watched = sorted(self._listeners)  # namespaces before what is in them
         for name in watched:
             self._subscribe(name)
 
     def watch(self, name, listener):
-        """Call ``listener(value)`` whenever the parameter is set; once more for the same listener is no more."""
+        """Call ``listener(value)`` whenever the parameter is set; once more for the same listener
+        is no more."""
         with self._lock:
             listeners = self._listeners.setdefault(name, [])
             is_new = listener not in listeners
@@ -123,13 +136,16 @@ class WatchedParameters:
         return master_api(self._instance.settings.master_url, self._instance.name)
 
     def put_back(self):
-        """A restarted master has no parameters: set the node's private ones and first values, and watch again."""
+        """A restarted master has no parameters: set the node's private ones and first values, and
+        watch again."""
         client = self._instance.rospy.client
-        for name, value in client.load_command_line_node_params(self._instance.settings.argv).items():
+        for name, value in client.load_command_line_node_params(
+            self._instance.settings.argv
+        ).items():
             self._instance.rospy.set_param('~' + name, value)
         for name in list(self._cached):
             with contextlib.suppress(KeyError):
-                self._cache().delete(name)    # rospy subscribes anew when it is asked for it
+                self._cache().delete(name)  # rospy subscribes anew when it is asked for it
         with self._subscribing:
             self._subscribed.clear()
         self.renew()
@@ -137,15 +153,22 @@ class WatchedParameters:
     def tell_of_own(self, key, value):
         """The node itself has set a parameter, of which a master tells all but the one who sets."""
         with self._subscribing:
-            told_by_master = isinstance(value, dict) and not any(_holds(name, key) for name in self._subscribed)
-        self._tell(key, value, not told_by_master)    # those subscribed to a part of a dict are told, whoever sets it
+            told_by_master = isinstance(value, dict) and not any(
+                _holds(name, key) for name in self._subscribed
+            )
+        # those subscribed to a part of a dict are told, whoever sets it
+        self._tell(key, value, not told_by_master)
 
     def _tell(self, key, value, within=True):
-        """Tell the listeners of a parameter, and of what is around and ``within`` it; returns whether there are any."""
+        """Tell the listeners of a parameter, and of what is around and ``within`` it; returns
+        whether there are any."""
         key = '/' + key.strip('/')
         with self._lock:
-            told = [(name, list(listeners)) for name, listeners in self._listeners.items()
-                    if _holds(name, key) or within and _holds(key, name)]
+            told = [
+                (name, list(listeners))
+                for name, listeners in self._listeners.items()
+                if _holds(name, key) or within and _holds(key, name)
+            ]
         for name, listeners in told:
             new = value if name == key else self._value(name)
             for listener in listeners:
@@ -157,13 +180,14 @@ class WatchedParameters:
         self._closed = True
 
     def unsubscribe(self, calls):
-        """Add to the calls those that end the watch: a master keeps the name of a node that does not."""
+        """Add to the calls those that end the watch: a master keeps the name of a node that does
+        not."""
         for name in self._subscribed | self._cached:
             calls.unsubscribeParam(self._instance.name, self._instance.uri, name)
 
     def _value(self, name):
         try:
-            return self._master().getParam(name)    # rospy would remap the name once more
+            return self._master().getParam(name)  # rospy would remap the name once more
         except rosgraph.MasterError:
             return None
 
@@ -175,9 +199,11 @@ def carried(name, value):
     """
     try:
         return xmlrpc.client.loads(xmlrpc.client.dumps((value,)))[0][0]
-    except Exception as error:    # of several kinds; text with characters that XML has not, for one
-        raise ValueError(f'{name} cannot be {reprlib.repr(value)}: the parameter server holds booleans, numbers '
-                         f'(integers of 32 bits), strings, and lists and dicts of them ({error})') from error
+    except Exception as error:  # of several kinds; text with characters that XML has not, for one
+        raise ValueError(
+            f'{name} cannot be {reprlib.repr(value)}: the parameter server holds booleans, numbers '
+            f'(integers of 32 bits), strings, and lists and dicts of them ({error})'
+        ) from error
 
 
 def _holds(namespace, name):

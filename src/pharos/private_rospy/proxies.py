@@ -1,4 +1,5 @@
-"""XML-RPC proxies with a time limit: the standard library's wait for ever for a peer that does not answer."""
+"""XML-RPC proxies with a time limit: the standard library's wait for ever for a peer that does not
+answer."""
 import contextlib
 import http.client
 import socket
@@ -10,9 +11,11 @@ import rosgraph
 
 from pharos.private_rospy.lifetime import Interruption, shut
 
-TIMEOUT = 10.0    # seconds for one call, where nothing else is said
-MARGIN = 0.5      # seconds beyond a time limit, to tell a master that does not answer from what did not come
-_limits = threading.local()    # .deadline: by which all calls of this thread are to end
+TIMEOUT = 10.0  # seconds for one call, where nothing else is said
+MARGIN = (
+    0.5  # seconds beyond a time limit, to tell a master that does not answer from what did not come
+)
+_limits = threading.local()  # .deadline: by which all calls of this thread are to end
 
 
 @contextlib.contextmanager
@@ -31,7 +34,8 @@ def time_limit(seconds):
 
 
 def deadline_in(seconds):
-    """The time, by ``time.monotonic()``, in so many seconds, or when the :func:`time_limit` of this thread is over."""
+    """The time, by ``time.monotonic()``, in so many seconds, or when the :func:`time_limit` of this
+    thread is over."""
     deadline, limit = time.monotonic() + seconds, getattr(_limits, 'deadline', None)
     return deadline if limit is None else min(deadline, limit)
 
@@ -45,12 +49,12 @@ def is_time_up():
 class _Limits:
     """When the calls of a proxy are to end.
 
-    Its transport and what that holds share them: if they knew each other, their sockets would stay open until Python's
-    collector of cycles comes by.
+    Its transport and what that holds share them: if they knew each other, their sockets would stay
+    open until Python's collector of cycles comes by.
     """
 
-    deadline = 0.0     # of the present call, by time.monotonic()
-    is_shut = False    # whether none is to go on
+    deadline = 0.0  # of the present call, by time.monotonic()
+    is_shut = False  # whether none is to go on
 
     def left(self):
         """The seconds left for the present call."""
@@ -103,7 +107,7 @@ class _Connection(http.client.HTTPConnection):
         super().connect()
         self.sock = _Socket(fileno=self.sock.detach())
         self.sock.limits = self._limits
-        self._limits.check()    # shut() may have come before there was a socket
+        self._limits.check()  # shut() may have come before there was a socket
 
 
 class _Socket(socket.socket):
@@ -134,7 +138,8 @@ def interruption(proxy):
 
 
 def master_api(url, caller_id='/pharos', timeout=TIMEOUT):
-    """rosgraph's own API of the master at ``url``, with a time limit of ``timeout`` seconds a call."""
+    """rosgraph's own API of the master at ``url``, with a time limit of ``timeout`` seconds a
+    call."""
     api = rosgraph.Master(caller_id, master_uri=url)
     api.handle = ServerProxy(url, timeout)
     return api

@@ -1,4 +1,5 @@
-"""Connections refused because the types of the two ends differ: found out about once, and told once."""
+"""Connections refused because the types of the two ends differ: found out about once, and told
+once."""
 import contextlib
 import threading
 import time
@@ -11,24 +12,26 @@ from pharos.private_rospy.door import brief
 from pharos.private_rospy.host import rospy
 from pharos.tcpros_connection import CALLER_ID, publisher_header
 
-TIMEOUT = 1.0        # seconds in which a publisher that refused says what it publishes
-REMEMBERED = 1000    # refusals of a node on each side; beyond, the oldest is told again when it is repeated
+TIMEOUT = 1.0  # seconds in which a publisher that refused says what it publishes
+REMEMBERED = (
+    1000  # refusals of a node on each side; beyond, the oldest is told again when it is repeated
+)
 
 
 class Refusal(NamedTuple):
     """A publisher that a subscription cannot hear."""
 
     topic: str
-    publisher: str      # its node's name, or its URI where it does not tell
-    wanted: type        # the message class of the subscription
-    offered: dict       # the publisher's connection header: type, md5sum, message_definition
+    publisher: str  # its node's name, or its URI where it does not tell
+    wanted: type  # the message class of the subscription
+    offered: dict  # the publisher's connection header: type, md5sum, message_definition
 
 
 class Refusals:
     """What the node of one :class:`~.instance.PrivateRospy` cannot hear, and who cannot hear it.
 
-    Peers try again whenever the master names them a publisher, so that each refusal is remembered, for as long as the
-    subscription or the publisher is there, or until the two do connect.
+    Peers try again whenever the master names them a publisher, so that each refusal is remembered,
+    for as long as the subscription or the publisher is there, or until the two do connect.
 
     :attr:`on_refused` is called with each :class:`Refusal` that is new.
     """
@@ -36,18 +39,20 @@ class Refusals:
     def __init__(self, instance):
         self._instance = instance
         self._lock = threading.Lock()
-        self._publishers = {}     # (topic, URI) -> (rospy's subscription, what was said, the Refusal once it is known)
-        self._subscribers = {}    # (topic, node name) -> (rospy's publisher, what was said)
-        self._held = {}           # topic -> the refusals of which is not told yet
+        # (topic, URI) -> (rospy's subscription, what was said, the Refusal once it is known)
+        self._publishers = {}
+        self._subscribers = {}  # (topic, node name) -> (rospy's publisher, what was said)
+        self._held = {}  # topic -> the refusals of which is not told yet
         self.on_refused = lambda refusal: None
 
-    # -- who cannot be heard -------------------------------------------------------------------------------------------
+    # -- who cannot be heard
 
     def publisher_refused(self, subscription, uri, said, ask, wanted=None):
         """A connection to the publisher at that URI has failed with what it said.
 
         :param subscription: rospy's _SubscriberImpl
-        :param ask: ``ask()`` returns the publisher's connection header, or None if the reason is no type
+        :param ask: ``ask()`` returns the publisher's connection header, or None if the reason is no
+            type
         :param wanted: the message class, where it is not the subscription's
         """
         wanted = wanted or subscription.data_class
@@ -58,7 +63,7 @@ class Refusals:
             _remember(self._publishers, key, (subscription, said, None))
         header = ask()
         if header is None or header.get('md5sum') == wanted._md5sum:
-            self.publisher_connected(*key)    # it has gone, or changed its mind
+            self.publisher_connected(*key)  # it has gone, or changed its mind
             return
         refusal = Refusal(key[0], header.get('callerid', uri), wanted, header)
         with self._lock:
@@ -72,7 +77,8 @@ class Refusals:
 
     @contextlib.contextmanager
     def held(self, topic):
-        """Tell of the refusals of a topic only afterwards, and of those that are left then in the list that it gives."""
+        """Tell of the refusals of a topic only afterwards, and of those that are left then in the
+        list that it gives."""
         held = []
         with self._lock:
             self._held[topic] = held
@@ -86,17 +92,26 @@ class Refusals:
                 self.on_refused(refusal)
 
     def message_refused(self, subscription, wanted, header):
-        """A message came from a publisher that suits the subscription, which takes any type, but not a channel of it.
+        """A message came from a publisher that suits the subscription, which takes any type, but
+        not a channel of it.
 
         :param header: the message's ``_connection_header``
         """
-        uri = next((connection.endpoint_id for connection in subscription.connections or ()
-                    if getattr(connection, 'callerid_pub', None) == header['callerid']), header['callerid'])
+        uri = next(
+            (
+                connection.endpoint_id
+                for connection in subscription.connections or ()
+                if getattr(connection, 'callerid_pub', None) == header['callerid']
+            ),
+            header['callerid'],
+        )
         self.header_refused(subscription, uri, wanted, header)
 
     def header_refused(self, subscription, uri, wanted, header):
         """A publisher's connection header is of another type than a channel of the subscription."""
-        self.publisher_refused(subscription, uri, 'its md5sum is %s' % header['md5sum'], lambda: header, wanted)
+        self.publisher_refused(
+            subscription, uri, f"its md5sum is {header['md5sum']}", lambda: header, wanted
+        )
 
     def publisher_connected(self, topic, uri):
         """Nothing is wrong with it now."""
@@ -121,9 +136,13 @@ class Refusals:
             return False
         neighbour = self._instance.wiring.neighbour(uri)
         # the master's word of a publisher of this process takes its time
-        return uri in subscription.publishers or neighbour is not None and neighbour.publisher(topic) is not None
+        return (
+            uri in subscription.publishers
+            or neighbour is not None
+            and neighbour.publisher(topic) is not None
+        )
 
-    # -- who cannot hear -----------------------------------------------------------------------------------------------
+    # -- who cannot hear
 
     def subscriber_refused(self, publisher, name, said, line):
         """A subscriber was refused; ``line`` is the warning.
@@ -147,12 +166,15 @@ class Refusals:
         """Names of the nodes that cannot hear what this one publishes on the topic."""
         publisher = self._instance.publisher(topic)
         with self._lock:
-            return [key[1] for key, (refusing, _) in self._subscribers.items()
-                    if key[0] == topic and refusing is publisher]
+            return [
+                key[1]
+                for key, (refusing, _) in self._subscribers.items()
+                if key[0] == topic and refusing is publisher
+            ]
 
 
 def _remember(entries, key, entry):
-    entries.pop(key, None)    # the newest are the last
+    entries.pop(key, None)  # the newest are the last
     entries[key] = entry
     if len(entries) > REMEMBERED:
         del entries[next(iter(entries))]
@@ -162,15 +184,19 @@ def hooks(instance):
     """The load hooks of this module, for the :class:`~.instance.PrivateRospy` given."""
 
     def tell_of_types(module):
-        """rospy.impl.tcpros_pubsub: tells the log of the subscriber, or nobody, and does not always name the topic."""
+        """rospy.impl.tcpros_pubsub: tells the log of the subscriber, or nobody, and does not always
+        name the topic."""
         handler = module.TCPROSHandler
         handle = handler.topic_connection_handler
 
         def topic_connection_handler(self, sock, address, header):
             topic, name = header['topic'], header.get('callerid')
             asked_for = instance.publisher(topic) if name == CALLER_ID else None
-            if asked_for is not None:    # who only asks for the definition is no subscriber, and misses no message
-                rosgraph.network.write_ros_handshake_header(sock, instance.connection_header(asked_for))
+            # who only asks for the definition is no subscriber, and misses no message
+            if asked_for is not None:
+                rosgraph.network.write_ros_handshake_header(
+                    sock, instance.connection_header(asked_for)
+                )
                 sock.close()
                 return None
             said = handle(self, sock, address, header)
@@ -178,7 +204,11 @@ def hooks(instance):
                 instance.refusals.subscriber_connected(topic, name)
                 return said
             publisher = instance.publisher(topic)
-            if publisher is None or header.get('md5sum') in (None, publisher.data_class._md5sum) or name is None:
+            if (
+                publisher is None
+                or header.get('md5sum') in (None, publisher.data_class._md5sum)
+                or name is None
+            ):
                 return said
             if topic not in said:
                 said = f'{topic}: {said} ({name})'
@@ -187,6 +217,7 @@ def hooks(instance):
             line = f'TCPROS client {address[0]}:{address[1]} refused: {brief(said)}'
             instance.refusals.subscriber_refused(publisher, name, said, line)
             return None
+
         handler.topic_connection_handler = topic_connection_handler
 
     return {'rospy.impl.tcpros_pubsub': tell_of_types}
@@ -198,7 +229,8 @@ def suits(wanted, md5sum):
 
 
 def check_md5sum(connection, wanted):
-    """Raise TransportInitError if the publisher that rospy's connection has shaken hands with is of another type.
+    """Raise TransportInitError if the publisher that rospy's connection has shaken hands with is of
+    another type.
 
     rospy takes messages of another md5sum from a publisher that does not check.
 
@@ -207,17 +239,23 @@ def check_md5sum(connection, wanted):
     header = connection.header
     if not suits(wanted, header['md5sum']):
         # as if it had said so itself: it is not to be tried again and again
-        connection.header = {**header, 'error': 'its md5sum is %s' % header['md5sum']}
+        connection.header = {**header, 'error': f"its md5sum is {header['md5sum']}"}
         raise rospy.exceptions.TransportInitError(connection.header['error'])
 
 
 def examine(instance, connection, topic, uri):
     """Find out why rospy's connection to the publisher at that URI failed."""
-    header, subscription, address = connection.header, instance.subscriber(topic), connection.dest_address
+    header, subscription, address = (
+        connection.header,
+        instance.subscriber(topic),
+        connection.dest_address,
+    )
     if subscription is None or 'error' not in (header or ()) or instance.ended.is_set():
         return
     known = header if 'md5sum' in header else None
-    instance.refusals.publisher_refused(subscription, uri, header['error'], lambda: known or _ask(address, topic))
+    instance.refusals.publisher_refused(
+        subscription, uri, header['error'], lambda: known or _ask(address, topic)
+    )
 
 
 def _ask(address, topic):

@@ -5,14 +5,17 @@ import socket
 import threading
 import time
 
-AT_ONCE = 1 << 16    # bytes; copying more into the socket would hold the publisher up longer than waking a thread
+# bytes; copying more into the socket would hold the publisher up longer than waking a thread
+AT_ONCE = 1 << 16
 
 
 class Sender:
-    """A bounded queue in front of a rospy transport, and the thread that writes what does not fit into the socket.
+    """A bounded queue in front of a rospy transport, and the thread that writes what does not fit
+    into the socket.
 
-    Instead of rospy's QueuedConnection, which has its thread write everything: waking it takes longer than writing. And
-    which takes all that is queued out at once, so that it can neither drop nor count it any more.
+    Instead of rospy's QueuedConnection, which has its thread write everything: waking it takes
+    longer than writing. And which takes all that is queued out at once, so that it can neither drop
+    nor count it any more.
     """
 
     def __init__(self, connection, queue_size, start_thread, queue_bytes=math.inf):
@@ -22,9 +25,9 @@ class Sender:
         self._connection = connection
         self._queue, self._bytes = collections.deque(), 0
         self._limit, self._byte_limit = queue_size or math.inf, queue_bytes
-        self._begun = b''         # the rest of a message whose beginning the socket has
-        self._is_idle = True      # nothing is on its way but what the socket has
-        self._error = None        # of the thread, for the next who publishes, as in rospy
+        self._begun = b''  # the rest of a message whose beginning the socket has
+        self._is_idle = True  # nothing is on its way but what the socket has
+        self._error = None  # of the thread, for the next who publishes, as in rospy
         self._changed = threading.Condition(threading.Lock())
         connection.set_cleanup_callback(self._closed)
         start_thread(self._run, name='sender')
@@ -48,7 +51,7 @@ class Sender:
                 self._enqueue(data)
             self._is_idle = False
             self._changed.notify_all()
-        time.sleep(0)    # else the thread gets the interpreter 5 ms later from a busy publisher
+        time.sleep(0)  # else the thread gets the interpreter 5 ms later from a busy publisher
 
     def _enqueue(self, data):
         queue = self._queue
@@ -62,7 +65,8 @@ class Sender:
         connection = self._connection
         try:
             sent = connection.socket.send(data, socket.MSG_DONTWAIT)
-        except (OSError, AttributeError):    # it is full; or broken, or closed, as the thread will see
+        except (OSError, AttributeError):
+            # it is full; or broken, or closed, as the thread will see
             return 0
         connection.stat_bytes += sent
         return sent
@@ -94,4 +98,6 @@ class Sender:
     def flush(self, timeout):
         """Wait until everything published is with the socket, up to ``timeout`` seconds."""
         with self._changed:
-            self._changed.wait_for(lambda: self._is_idle or self._connection.done, max(0.0, timeout))
+            self._changed.wait_for(
+                lambda: self._is_idle or self._connection.done, max(0.0, timeout)
+            )

@@ -1,4 +1,5 @@
-"""A node's two servers, XML-RPC and TCPROS: bound where errors can be raised, safe from bad clients, really closed."""
+"""A node's two servers, XML-RPC and TCPROS: bound where errors can be raised, safe from bad
+clients, really closed."""
 import io
 import socket
 import struct
@@ -12,20 +13,22 @@ from pharos.private_rospy.lifetime import shut
 from pharos.private_rospy.names import NAME_LIMIT
 from pharos.intraprocess.sharing import numbered
 
-HANDSHAKE_TIMEOUT = 5.0       # seconds for the whole handshake, however slowly it comes
-HANDSHAKE_LIMIT = 1 << 20     # bytes of a connection header; real ones hold a message definition
-MESSAGE_LIMIT = 1000000000    # bytes of a message; roscpp's limit
+HANDSHAKE_TIMEOUT = 5.0  # seconds for the whole handshake, however slowly it comes
+HANDSHAKE_LIMIT = 1 << 20  # bytes of a connection header; real ones hold a message definition
+MESSAGE_LIMIT = 1000000000  # bytes of a message; roscpp's limit
 
-_NAMES = {'callerid', 'topic', 'service', 'type', 'md5sum'}    # the fields of a header that are shown to others
+# the fields of a header that are shown to others
+_NAMES = {'callerid', 'topic', 'service', 'type', 'md5sum'}
 _CLIENT_GONE = rospy.exceptions.TransportTerminated, ConnectionResetError
 
 
 def hooks(lifetime, warn, debug):
-    """The load hooks of the two servers, for a node of that lifetime; ``warn(text)``, ``debug(text)`` write to its log.
-    """
+    """The load hooks of the two servers, for a node of that lifetime; ``warn(text)``,
+    ``debug(text)`` write to its log."""
 
     def limit_handshake(module):
-        """rosgraph.network: a peer that is silent, slow or announces 4 GiB is listened to for ever."""
+        """rosgraph.network: a peer that is silent, slow or announces 4 GiB is listened to for
+        ever."""
 
         def read_ros_handshake_header(sock, buffer, size):
             deadline = time.monotonic() + HANDSHAKE_TIMEOUT
@@ -33,7 +36,9 @@ def hooks(lifetime, warn, debug):
                 while True:
                     left = deadline - time.monotonic()
                     if left <= 0:
-                        raise module.ROSHandshakeException('no handshake within %g s' % HANDSHAKE_TIMEOUT)
+                        raise module.ROSHandshakeException(
+                            f'no handshake within {HANDSHAKE_TIMEOUT:g} s'
+                        )
                     sock.settimeout(left)
                     received = sock.recv(size)
                     if not received:
@@ -43,26 +48,32 @@ def hooks(lifetime, warn, debug):
                         continue
                     length = 4 + struct.unpack_from('<I', buffer.getbuffer())[0]
                     if length > HANDSHAKE_LIMIT:
-                        raise module.ROSHandshakeException('a handshake of %d bytes; the limit is %d'
-                                                           % (length, HANDSHAKE_LIMIT))
+                        raise module.ROSHandshakeException(
+                            'a handshake of %d bytes; the limit is %d' % (length, HANDSHAKE_LIMIT)
+                        )
                     if buffer.tell() >= length:
                         break
             except socket.timeout:
-                raise module.ROSHandshakeException('no handshake within %g s' % HANDSHAKE_TIMEOUT) from None
+                raise module.ROSHandshakeException(
+                    f'no handshake within {HANDSHAKE_TIMEOUT:g} s'
+                ) from None
             finally:
                 try:
                     sock.settimeout(None)
                 except OSError:
-                    pass    # closed meanwhile
+                    pass  # closed meanwhile
             data = buffer.getvalue()
             buffer.seek(0)
             buffer.truncate()
-            buffer.write(data[length:])    # the first message may have come along
+            buffer.write(data[length:])  # the first message may have come along
             header = module.decode_ros_handshake_header(data[:length])
             for field in _NAMES & header.keys():
                 if len(header[field]) > NAME_LIMIT or not header[field].isprintable():
-                    raise module.ROSHandshakeException('%s can be no %s' % (brief(header[field], 60), field))
+                    raise module.ROSHandshakeException(
+                        f'{brief(header[field], 60)} can be no {field}'
+                    )
             return header
+
         module.read_ros_handshake_header = read_ros_handshake_header
 
     def mend_connections(module):
@@ -73,42 +84,53 @@ def hooks(lifetime, warn, debug):
         module.rospyerr = module.rospydebug
 
     def mend_messages(module):
-        """rospy.msg: it writes a traceback for each message that it cannot read, whoever sent it."""
+        """rospy.msg: it writes a traceback for each message that it cannot read, whoever sent
+        it."""
         module.logging.getLogger('rospy.msg').setLevel(module.logging.CRITICAL)
         serialize = module.serialize_message
         # it would number what others hold
-        module.serialize_message = lambda buffer, seq, message: serialize(buffer, seq, numbered(message, seq))
+        module.serialize_message = lambda buffer, seq, message: serialize(
+            buffer, seq, numbered(message, seq)
+        )
 
     def expect_requests(module):
-        """rospy.impl.tcpros_service: a client that asks nothing is waited for, and one that asks nonsense kept."""
+        """rospy.impl.tcpros_service: a client that asks nothing is waited for, and one that asks
+        nonsense kept."""
         door, service = Door('service', lifetime, warn), module.ServiceImpl
         tell = service.error_handler
 
         def error_handler(self, error, *information):
-            if not isinstance(error, _CLIENT_GONE):    # that it did not wait for its answer is no error of ours
+            # that it did not wait for its answer is no error of ours
+            if not isinstance(error, _CLIENT_GONE):
                 tell(self, error, *information)
+
         service.error_handler = error_handler
 
         handle_request = service._handle_request
 
         def _handle_request(self, transport, request):
-            """rospy leaves a caller without an answer where the handler raises what is no Exception."""
+            """rospy leaves a caller without an answer where the handler raises what is no
+            Exception."""
             try:
                 handle_request(self, transport, request)
             except Exception:
                 raise
             except BaseException as error:
                 self.error_handler(error, *sys.exc_info())
-                self._write_service_error(transport, 'error processing request: %s' % error)
+                self._write_service_error(transport, f'error processing request: {error}')
+
         service._handle_request = _handle_request
 
         def handle(self, transport, header):
-            sock, persistent = transport.socket, header.get('persistent', '').lower() in ('1', 'true')
+            sock, persistent = transport.socket, header.get('persistent', '').lower() in (
+                '1',
+                'true',
+            )
             try:
                 address = sock.getpeername()
                 again = header.get('probe') != '1'
                 while again:
-                    if not persistent:    # a client that is may say nothing for long
+                    if not persistent:  # a client that is may say nothing for long
                         door.expect(sock)
                     received = transport.receive_once()
                     door.heard(sock)
@@ -118,21 +140,27 @@ def hooks(lifetime, warn, debug):
             except _Unreadable as error:
                 door.complain(address, error)
             except rospy.exceptions.TransportTerminated as error:
-                door.refuse(sock, address, error)    # a persistent one is not expected, and may go
+                door.refuse(sock, address, error)  # a persistent one is not expected, and may go
             except (OSError, rospy.exceptions.TransportInitError):
-                pass    # it has gone; what would tell it of that finds the transport closed
+                pass  # it has gone; what would tell it of that finds the transport closed
             finally:
                 door.heard(sock)
                 transport.close()
+
         service.handle = handle
 
-    return {'rosgraph.network': limit_handshake, 'rospy.impl.tcpros_base': mend_connections,
-            'rospy.msg': mend_messages, 'rospy.impl.tcpros_service': expect_requests,
-            **xmlrpc_server.hooks(lifetime, warn, debug)}
+    return {
+        'rosgraph.network': limit_handshake,
+        'rospy.impl.tcpros_base': mend_connections,
+        'rospy.msg': mend_messages,
+        'rospy.impl.tcpros_service': expect_requests,
+        **xmlrpc_server.hooks(lifetime, warn, debug),
+    }
 
 
 def _accept_at_a_door(module, door):
-    """rospy.impl.tcpros_base: one silent client keeps all others from connecting (ros_comm PR #1918)."""
+    """rospy.impl.tcpros_base: one silent client keeps all others from connecting (ros_comm PR
+    #1918)."""
     server, tcp = module.TCPROSServer, module.TCPServer
     tcp.run = lambda self: door.accept(self.server_sock, self.inbound_handler)
 
@@ -142,6 +170,7 @@ def _accept_at_a_door(module, door):
             self.is_shutdown = True
             shut(self.server_sock)
             self.server_sock.close()
+
     tcp.shutdown = shutdown
 
     def shake_hands(self, sock, address):
@@ -157,35 +186,43 @@ def _accept_at_a_door(module, door):
             if module.is_shutdown():
                 refusal = 'node shutting down'
             module.write_ros_handshake_header(sock, {'error': str(refusal)})
-            raise module.TransportInitError('%s (%s)' % (refusal, header.get('callerid', 'no caller id')))
+            raise module.TransportInitError(f"{refusal} ({header.get('callerid', 'no caller id')})")
+
     server._tcp_server_callback = shake_hands
 
 
 def _end_bad_connections(module, warn):
-    """rospy.impl.tcpros_base: a stream that cannot be read is read on, and announcements of 4 GiB are believed."""
+    """rospy.impl.tcpros_base: a stream that cannot be read is read on, and announcements of 4 GiB
+    are believed."""
     transport, protocol = module.TCPROSTransport, module.TCPROSTransportProtocol
     receive, read = transport.receive_once, protocol.read_messages
 
     def read_messages(self, buffer, queue, sock):
-        size, = struct.unpack_from('<I', buffer.getbuffer())
+        (size,) = struct.unpack_from('<I', buffer.getbuffer())
         if size > MESSAGE_LIMIT:
-            raise module.TransportException('a message of %d bytes; the limit is %d' % (size, MESSAGE_LIMIT))
+            raise module.TransportException(
+                'a message of %d bytes; the limit is %d' % (size, MESSAGE_LIMIT)
+            )
         read(self, buffer, queue, sock)
+
     protocol.read_messages = read_messages
 
     def receive_once(self):
-        """A connection ends with the node, too: rospy's loop of a persistent service connection never does."""
+        """A connection ends with the node, too: rospy's loop of a persistent service connection
+        never does."""
         try:
             messages = receive(self)
         except module.TransportTerminated:
             raise
         except module.TransportException as error:
-            if self.dest_address and not self.done and not module.is_shutdown():    # we are the client
-                warn('connection with %s for %s closed: %s' % (self.endpoint_id, self.name, brief(error)))
+            # we are the client
+            if self.dest_address and not self.done and not module.is_shutdown():
+                warn(f'connection with {self.endpoint_id} for {self.name} closed: {brief(error)}')
             raise _Unreadable(str(error)) from None
         if not messages and module.is_shutdown():
             raise module.TransportTerminated('the node stops')
         return messages
+
     transport.receive_once = receive_once
 
 
@@ -194,7 +231,8 @@ class _Unreadable(rospy.exceptions.TransportTerminated):
 
 
 def listen(tcpros_base, port):
-    """Open a node's TCPROS server now, in this thread; rospy does so at the first connection and prints errors."""
+    """Open a node's TCPROS server now, in this thread; rospy does so at the first connection and
+    prints errors."""
     server = tcpros_base.init_tcpros_server(port)
     server.tcp_ros_server = tcpros_base.TCPServer(server._tcp_server_callback, port)
     server.tcp_ros_server.server_sock.listen(BACKLOG)

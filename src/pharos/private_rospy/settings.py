@@ -1,14 +1,19 @@
 """What one node is to be: name, master, address, ports and remappings, as rospy reads them.
 
-rospy takes them from ``os.environ`` and ``sys.argv``; a node gets private ones, so that no rospy function need be
-overridden and the process's own stay untouched.
+rospy takes them from ``os.environ`` and ``sys.argv``; a node gets private ones, so that no rospy
+function need be overridden and the process's own stay untouched.
 """
 import os
 
 import rosgraph.names
 from rosgraph.rosenv import ROS_HOSTNAME, ROS_IP, ROS_MASTER_URI, ROS_NAMESPACE
 
-from pharos.private_rospy.addresses import (check_domain, check_environment, check_port, default_domain)
+from pharos.private_rospy.addresses import (
+    check_domain,
+    check_environment,
+    check_port,
+    default_domain,
+)
 from pharos.private_rospy.arguments import mappings_for, takes_name
 from pharos.private_rospy.host import rospy
 from pharos.private_rospy.names import NODE_LIMIT, check_name
@@ -18,15 +23,18 @@ from pharos.private_rospy.parameters import carried
 class Settings:
     """The settings of one node.
 
-    :param name: node name; '/robot1/driver' carries a namespace, 'driver' is in ROS_NAMESPACE or '/'
+    :param name: node name; '/robot1/driver' carries a namespace, 'driver' is in ROS_NAMESPACE or
+        '/'
     :param master_url: URL of the ROS master
-    :param domain: address to advertise and, if it is loopback, the only one to listen on; None: what
-        ROS_HOSTNAME, ROS_IP or the host's name say
+    :param domain: address to advertise and, if it is loopback, the only one to listen on; None:
+        what ROS_HOSTNAME, ROS_IP or the host's name say
     :param tcp_port: TCPROS port, 0 for any free one
     :param xmlrpc_port: XML-RPC port, 0 for any free one
-    :param argv: ROS remappings and private parameters, see :mod:`.arguments`; what is no remapping is ignored
+    :param argv: ROS remappings and private parameters, see :mod:`.arguments`; what is no remapping
+        is ignored
     :raises TypeError: if ``argv`` is no list of strings
-    :raises ValueError: if a name, port or address cannot be one, or the value of a private parameter
+    :raises ValueError: if a name, port or address cannot be one, or the value of a private
+        parameter
     """
 
     def __init__(self, name, master_url, domain=None, tcp_port=0, xmlrpc_port=0, argv=None):
@@ -41,22 +49,26 @@ class Settings:
         self._set_domain(domain, mappings)
         is_named_there = self._set_name(name, arguments, for_all, for_one)
         self.environ[ROS_NAMESPACE] = self.namespace.rstrip('/') or '/'
-        for left in '__master', '__ns', '__name':    # the settings say this
+        for left in '__master', '__ns', '__name':  # the settings say this
             mappings.pop(left, None)
         if '__name' in for_all and not is_named_there:
-            mappings.pop('__log', None)    # roslaunch has named this file after the other node
+            mappings.pop('__log', None)  # roslaunch has named this file after the other node
         self.argv = [self.base_name, *map(rosgraph.names.REMAP.join, mappings.items())]
         check_private_parameters(self.argv)
 
     def _set_name(self, name, arguments, for_all, for_one):
         """Find the node's name; returns whether it is the ``__name`` that is given for all."""
         given = {**for_all, **for_one}.get('__ns')
-        if given is None and '__log' in for_all:    # roslaunch, which knows the node by its own idea of the namespace
+        # roslaunch, which knows the node by its own idea of the namespace
+        if given is None and '__log' in for_all:
             given = self.environ.get(ROS_NAMESPACE, '/')
         self.namespace = _namespace(name, given)
         base = for_one.get('__name', name.rpartition('/')[2])
-        is_named_there = '__name' in for_all and '__name' not in for_one and takes_name(
-            self.master_url, arguments, self.namespace + base)
+        is_named_there = (
+            '__name' in for_all
+            and '__name' not in for_one
+            and takes_name(self.master_url, arguments, self.namespace + base)
+        )
         if is_named_there:
             base = for_all['__name']
             if given is not None:
@@ -70,12 +82,12 @@ class Settings:
         if domain is not None:
             self.environ.pop(ROS_IP, None)
             self.environ[ROS_HOSTNAME] = check_domain('domain', domain)
-        for argument in '__hostname', '__ip':    # before all others
+        for argument in '__hostname', '__ip':  # before all others
             if argument in mappings:
                 check_domain(argument, mappings[argument])
                 return
         if check_environment(self.environ) is None:
-            self.environ[ROS_HOSTNAME] = default_domain()    # rosgraph complains of a name in ROS_IP
+            self.environ[ROS_HOSTNAME] = default_domain()  # rosgraph complains of a name in ROS_IP
 
 
 def _namespace(name, given):
@@ -85,11 +97,14 @@ def _namespace(name, given):
     given = given if given.strip('/') else '/'
     if given != '/':
         check_name(given, 'namespace')
-    return rosgraph.names.make_global_ns(rosgraph.names.ns_join(given, name.lstrip('/').rpartition('/')[0]))
+    return rosgraph.names.make_global_ns(
+        rosgraph.names.ns_join(given, name.lstrip('/').rpartition('/')[0])
+    )
 
 
 def check_private_parameters(arguments):
-    """Raise ValueError for the value of a private parameter that the server cannot hold, or that is no YAML.
+    """Raise ValueError for the value of a private parameter that the server cannot hold, or that is
+    no YAML.
 
     rospy sets them when the node has registered, one after the other.
     """
@@ -97,7 +112,9 @@ def check_private_parameters(arguments):
         try:
             parameters = rospy.client.load_command_line_node_params([argument])
         except rospy.ROSInitException as error:
-            raise ValueError(f'{argument!r} sets no private parameter, for its value is no YAML: put text with special '
-                             f'characters in quotes ({error})') from error
+            raise ValueError(
+                f'{argument!r} sets no private parameter, for its value is no YAML: put text with'
+                f' special characters in quotes ({error})'
+            ) from error
         for name, value in parameters.items():
             carried('~' + name, value)

@@ -8,7 +8,7 @@ from pharos.private_rospy.names import Resolved
 from pharos.private_rospy.proxies import time_limit
 from pharos.private_rospy.registration import REGISTER_TIMEOUT, UNREGISTER_TIMEOUT, registered
 
-_running = {}    # URI -> the PrivateRospy that runs there, in this process
+_running = {}  # URI -> the PrivateRospy that runs there, in this process
 
 
 def running_here():
@@ -19,15 +19,18 @@ def running_here():
 class Wiring:
     """The channels of one :class:`~.instance.PrivateRospy`."""
 
-    takes_plain_callbacks = False    # whether subscriptions without any channel connect in process, too
+    takes_plain_callbacks = (
+        False  # whether subscriptions without any channel connect in process, too
+    )
 
     def __init__(self, instance):
         self._instance = instance
-        self._channels = {}                    # topic -> the channels that receive from it
-        self._lock = threading.Lock()          # held to change that
-        self.told_subscribers = {}             # topic -> URIs, of which the master told a new publisher
-        self.told_late = set()                 # topics of which the log says that subscribers did not connect in time
-        self.connecting = threading.local()    # .topic: of the connection that this thread negotiates
+        self._channels = {}  # topic -> the channels that receive from it
+        self._lock = threading.Lock()  # held to change that
+        self.told_subscribers = {}  # topic -> URIs, of which the master told a new publisher
+        # topics of which the log says that subscribers did not connect in time
+        self.told_late = set()
+        self.connecting = threading.local()  # .topic: of the connection that this thread negotiates
 
     def open(self):
         """The node runs: its neighbours may connect to it."""
@@ -38,7 +41,7 @@ class Wiring:
         if _running.get(self._instance.uri) is self._instance:
             del _running[self._instance.uri]
 
-    # -- channels -----------------------------------------------------------------------------------------------------
+    # -- channels
 
     def subscribe(self, channel, **options):
         """rospy's Subscriber for an InputChannel, connected to the publishers in this process.
@@ -53,8 +56,12 @@ class Wiring:
         endpoint = None
         try:
             with time_limit(max(REGISTER_TIMEOUT, channel.node.connect_timeout)):
-                endpoint = registered(lambda: self._instance.rospy.Subscriber(
-                    Resolved(topic), channel.message_class, channel._offer, **options), _unregister)
+                endpoint = registered(
+                    lambda: self._instance.rospy.Subscriber(
+                        Resolved(topic), channel.message_class, channel._offer, **options
+                    ),
+                    _unregister,
+                )
             self._connect(channel)
         except BaseException:
             self._forget(channel)
@@ -70,8 +77,12 @@ class Wiring:
             self._instance.connect(topic, other.uri)
         name, refuses = self._instance.name, self._instance.refusals.refuses
         self._instance.wait_until(
-            lambda: all(other.wiring.sends_to(name, topic) or refuses(topic, other.uri) for other in publishers),
-            channel.node.connect_timeout)
+            lambda: all(
+                other.wiring.sends_to(name, topic) or refuses(topic, other.uri)
+                for other in publishers
+            ),
+            channel.node.connect_timeout,
+        )
 
     def unsubscribe(self, channel, endpoint):
         """End what :meth:`subscribe` began."""
@@ -84,7 +95,8 @@ class Wiring:
             self._channels[topic] = tuple(c for c in self.channels_on(topic) if c is not channel)
 
     def advertise(self, channel, timeout, **options):
-        """rospy's Publisher for an OutputChannel, and its way; subscribers in this process are told at once.
+        """rospy's Publisher for an OutputChannel, and its way; subscribers in this process are told
+        at once.
 
         rosmaster tells them in steps of 0.1 s.
 
@@ -92,8 +104,12 @@ class Wiring:
         :raises MasterUnreachableError: if it cannot be registered
         """
         with time_limit(max(REGISTER_TIMEOUT, timeout)):
-            endpoint = registered(lambda: self._instance.rospy.Publisher(
-                Resolved(channel.topic), channel.message_class, latch=channel.latch, **options), _unregister)
+            endpoint = registered(
+                lambda: self._instance.rospy.Publisher(
+                    Resolved(channel.topic), channel.message_class, latch=channel.latch, **options
+                ),
+                _unregister,
+            )
         endpoint.impl.queue_bytes = channel.queue_bytes
         if channel.latch:
             endpoint.impl.fanout.resume(channel)
@@ -104,9 +120,11 @@ class Wiring:
         return endpoint, endpoint.impl.fanout.publish
 
     def known_subscribers(self, topic):
-        """Names of the nodes that the master knew to be interested when this one registered as a publisher.
+        """Names of the nodes that the master knew to be interested when this one registered as a
+        publisher.
 
-        None where the master must be asked: of others it told the URI alone, and of a second channel nothing.
+        None where the master must be asked: of others it told the URI alone, and of a second
+        channel nothing.
         """
         nodes = [_running.get(uri) for uri in self.told_subscribers.pop(topic, [None])]
         return None if None in nodes else {node.name for node in nodes}
@@ -120,7 +138,8 @@ class Wiring:
     def connections(endpoint):
         """``[(peer node name, transport)]`` of a rospy Publisher or Subscriber.
 
-        rospy looks twice a second for subscribers that have left; until then they count as connected (ros_comm #927).
+        rospy looks twice a second for subscribers that have left; until then they count as
+        connected (ros_comm #927).
         """
         topic = endpoint.impl
         if topic is None:
@@ -128,9 +147,13 @@ class Wiring:
         if endpoint.reg_type == 'pub':
             connections, ended = topic.fanout.connections, _has_left
         else:
-            connections, ended = topic.connections, _is_done    # a subscriber's thread sees the end by itself
-        return [(_peer(connection), connection.transport_type)
-                for connection in connections if not ended(connection)]
+            # a subscriber's thread sees the end by itself
+            connections, ended = (topic.connections, _is_done)
+        return [
+            (_peer(connection), connection.transport_type)
+            for connection in connections
+            if not ended(connection)
+        ]
 
     @staticmethod
     def reaches(endpoint, name):
@@ -142,7 +165,7 @@ class Wiring:
         """Whether rospy has closed a Publisher or Subscriber, as it does when the node stops."""
         return endpoint.impl is None or endpoint.impl.closed
 
-    # -- links --------------------------------------------------------------------------------------------------------
+    # -- links
 
     def channels_on(self, topic):
         """The channels of the node that receive from the topic."""
@@ -151,27 +174,38 @@ class Wiring:
     def connects_in_process(self):
         """Whether the connection that this thread negotiates may be INTRAPROCESS.
 
-        Not where nobody but plain rospy callbacks listens: actionlib, for one, does not stand answers that come so
-        quickly, and waits for ever.
+        Not where nobody but plain rospy callbacks listens: actionlib, for one, does not stand
+        answers that come so quickly, and waits for ever.
         """
         return self.takes_plain_callbacks or bool(self.channels_on(self.connecting.topic))
 
     def sends_to(self, name, topic):
-        """Whether the node, if it publishes on the topic at all, is connected to the subscriber of that name."""
+        """Whether the node, if it publishes on the topic at all, is connected to the subscriber of
+        that name."""
         publisher = self._instance.publisher(topic)
-        return publisher is None or any(connection.endpoint_id == name for connection in publisher.fanout.connections)
+        return publisher is None or any(
+            connection.endpoint_id == name for connection in publisher.fanout.connections
+        )
 
     def hears(self, topic):
         """Whether the node is connected to a publisher that suits it."""
         subscriber = self._instance.subscriber(topic)
-        return any(connection.transport_type == 'INTRAPROCESS' or hasattr(connection, 'is_heard')
-                   for connection in (subscriber and subscriber.connections or ()))
+        return any(
+            connection.transport_type == 'INTRAPROCESS' or hasattr(connection, 'is_heard')
+            for connection in (subscriber and subscriber.connections or ())
+        )
 
     def has_heard_from_publishers(self, topic):
         """Whether it is, or none of those that the master has named will suit it."""
         subscriber, refuses = self._instance.subscriber(topic), self._instance.refusals.refuses
-        return subscriber is None or self.hears(topic) or all(
-            uri in subscriber.out_of_reach or refuses(topic, uri) for uri in subscriber.publishers)
+        return (
+            subscriber is None
+            or self.hears(topic)
+            or all(
+                uri in subscriber.out_of_reach or refuses(topic, uri)
+                for uri in subscriber.publishers
+            )
+        )
 
     @staticmethod
     def neighbour(uri):
@@ -181,7 +215,9 @@ class Wiring:
     def _neighbours(self):
         """The nodes of this process at the same master, this one among them."""
         master = self._instance.settings.master_url
-        return [other for other in running_here() if is_same_master(other.settings.master_url, master)]
+        return [
+            other for other in running_here() if is_same_master(other.settings.master_url, master)
+        ]
 
 
 # a process that was forked has none of these nodes, whose sockets are its parent's
@@ -204,14 +240,14 @@ def _has_left(connection):
     poll = select.poll()
     try:
         poll.register(connection.socket, select.POLLRDHUP)
-    except (TypeError, ValueError):    # it is just being closed
+    except (TypeError, ValueError):  # it is just being closed
         return True
     return bool(poll.poll(0))
 
 
 def _peer(connection):
-    # a publisher's end is called after the subscriber's node; a subscriber's after the publisher's URI, and it
-    # knows the name once the handshake is through
+    # a publisher's end is called after the subscriber's node; a subscriber's after the publisher's
+    # URI, and it knows the name once the handshake is through
     name = getattr(connection, 'callerid_pub', 'unknown')
     if name == 'unknown':
         other = _running.get(connection.endpoint_id)

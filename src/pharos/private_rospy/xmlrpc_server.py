@@ -12,35 +12,40 @@ from pharos.private_rospy.door import BACKLOG, Door, brief
 from pharos.private_rospy.lifetime import shut
 from pharos.private_rospy.loader import Substitute
 
-REQUEST_TIMEOUT = 30.0    # seconds from one answer until the next request has come, however slowly
-REQUEST_LIMIT = 8 << 20   # bytes of a request
-LARGE_REQUEST = 1 << 16   # bytes; of requests beyond, only so many are held at a time:
+REQUEST_TIMEOUT = 30.0  # seconds from one answer until the next request has come, however slowly
+REQUEST_LIMIT = 8 << 20  # bytes of a request
+LARGE_REQUEST = 1 << 16  # bytes; of requests beyond, only so many are held at a time:
 LARGE_REQUESTS = 8
 
-REFUSED = 'refused: '     # how an answer begins by which a node defends itself
-_call = threading.local()    # .client: the address of the client whose call this thread answers; .here: ours
+REFUSED = 'refused: '  # how an answer begins by which a node defends itself
+# .client: the address of the client whose call this thread answers; .here: ours
+_call = threading.local()
 
 
 def hooks(lifetime, warn, debug):
-    """The load hooks of this module, for a node of that lifetime; ``warn(text)``, ``debug(text)`` write to its log."""
+    """The load hooks of this module, for a node of that lifetime; ``warn(text)``, ``debug(text)``
+    write to its log."""
 
     def limit_requests(module):
-        """rosgraph.xmlrpc: a request may be silent or huge for ever, and runs in a thread that nobody knows."""
+        """rosgraph.xmlrpc: a request may be silent or huge for ever, and runs in a thread that
+        nobody knows."""
         door = Door('XML-RPC', lifetime, warn)
         module.SilenceableXMLRPCRequestHandler = _request_handler(
-            module.SilenceableXMLRPCRequestHandler, door, lifetime)
+            module.SilenceableXMLRPCRequestHandler, door, lifetime
+        )
         server, node = module.ThreadingXMLRPCServer, module.XmlRpcNode
         dispatch = server._dispatch
 
         def _dispatch(self, method, parameters):
             """Nothing in rospy says whose the calls were that it refused.
 
-            A call that ROS's slave API answers with an error is the caller's affair: peers come too late, or try.
+            A call that ROS's slave API answers with an error is the caller's affair: peers come too
+            late, or try.
             """
             try:
                 answer = dispatch(self, method, parameters)
             except Exception as error:
-                door.complain(_call.client, 'call of %s: %s' % (brief(method), error))
+                door.complain(_call.client, f'call of {brief(method)}: {error}')
                 raise
             if type(answer) is tuple and answer[0] < 1:
                 if answer[1].startswith(REFUSED):
@@ -49,6 +54,7 @@ def hooks(lifetime, warn, debug):
                     client = '%s:%s' % _call.client[:2]
                     debug(f'XML-RPC client {client}: call of {method}: {brief(answer[1])}')
             return answer
+
         server._dispatch = _dispatch
 
         def serve(self, sock, address):
@@ -56,36 +62,44 @@ def hooks(lifetime, warn, debug):
                 self.finish_request(sock, address)
             finally:
                 self.shutdown_request(sock)
+
         server.serve = serve
 
         def start(self):
-            """Bind here, in the caller's thread, where an error can be raised; rosgraph prints it in another."""
+            """Bind here, in the caller's thread, where an error can be raised; rosgraph prints it
+            in another."""
             lifetime.xmlrpc = self
             self._run_init()
             self.server.socket.listen(BACKLOG)
             ways_in = self.server.socket, self.server.serve
             self.accepting = lifetime.start_thread(door.accept, ways_in, 'xmlrpc-accept')
+
         node.start = start
 
         def shutdown(self, reason):
             """rosgraph only closes the socket, on which its thread then spins (ros_comm #2238)."""
             self.is_shutdown = True
             server, handler = self.server, self.handler
-            self.server = self.handler = None    # first, for others take that for stopped
+            self.server = self.handler = None  # first, for others take that for stopped
             if handler:
                 handler._shutdown(reason)
             if server:
                 shut(server.socket)
-                self.accepting.join()    # closed any earlier, the socket could not wake it any more
+                self.accepting.join()  # closed any earlier, the socket could not wake it any more
                 server.server_close()
             lifetime.silent.set()
+
         node.shutdown = shutdown
 
     def leave_complaints_to_the_server(module):
-        """rospy.impl.masterslave: writes tracebacks of calls with wrong arguments, and not whose they were."""
+        """rospy.impl.masterslave: writes tracebacks of calls with wrong arguments, and not whose
+        they were."""
         module._logger = Substitute(module._logger, error=module._logger.debug)
 
-    return {'rosgraph.xmlrpc': limit_requests, 'rospy.impl.masterslave': leave_complaints_to_the_server}
+    return {
+        'rosgraph.xmlrpc': limit_requests,
+        'rospy.impl.masterslave': leave_complaints_to_the_server,
+    }
 
 
 class _Reader(io.RawIOBase):
@@ -123,7 +137,9 @@ def _request_handler(base, door, lifetime):
             self.connection, self.answered = self.request, False
             # one segment per answer, and no waiting for its acknowledgement: 40 ms a call otherwise
             self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self.rfile, self.wfile = io.BufferedReader(_Reader(self.connection)), self.connection.makefile('wb')
+            self.rfile, self.wfile = io.BufferedReader(
+                _Reader(self.connection)
+            ), self.connection.makefile('wb')
 
         def handle(self):
             self.close_connection = False
@@ -137,7 +153,8 @@ def _request_handler(base, door, lifetime):
                 self.log_error('%s', error)
 
         def log_error(self, format, *args):
-            if self.rfile.raw.received or not self.answered:    # else it went, having nothing more to ask
+            # else it went, having nothing more to ask
+            if self.rfile.raw.received or not self.answered:
                 door.refuse(self.connection, self.client_address, format % args)
 
         def handle_expect_100(self):
@@ -152,8 +169,10 @@ def _request_handler(base, door, lifetime):
             elif not length.isdecimal() or 'transfer-encoding' in headers:
                 self.send_error(411)
             elif len(length) > 10 or int(length) > REQUEST_LIMIT:
-                self.send_error(413, 'a request of %.20s bytes; the limit is %d' % (length, REQUEST_LIMIT))
-            elif 'content-encoding' in headers:    # what is small may become huge
+                self.send_error(
+                    413, 'a request of %.20s bytes; the limit is %d' % (length, REQUEST_LIMIT)
+                )
+            elif 'content-encoding' in headers:  # what is small may become huge
                 self.send_error(415)
             elif int(length) <= LARGE_REQUEST:
                 self._answer(int(length))
@@ -175,8 +194,10 @@ def _request_handler(base, door, lifetime):
                     raise ValueError('closed after %d of %d bytes' % (len(body), length))
                 _refuse_entities(body)
                 parameters, method = xmlrpc.client.loads(body)
-            except Exception as error:    # xmlrpc raises whatever it is that it trips over
-                self.send_error(400, 'no XML-RPC call: ' + brief(error).encode('ascii', 'replace').decode())
+            except Exception as error:  # xmlrpc raises whatever it is that it trips over
+                self.send_error(
+                    400, 'no XML-RPC call: ' + brief(error).encode('ascii', 'replace').decode()
+                )
                 return
             if not door.heard(self.connection):
                 self.close_connection = True
@@ -186,9 +207,13 @@ def _request_handler(base, door, lifetime):
                 self.close_connection = True
             _call.client, _call.here = self.client_address, self.connection.getsockname()
             try:
-                answer = xmlrpc.client.dumps((self.server._dispatch(method, parameters),), methodresponse=True)
+                answer = xmlrpc.client.dumps(
+                    (self.server._dispatch(method, parameters),), methodresponse=True
+                )
             except Exception as error:
-                answer = xmlrpc.client.dumps(xmlrpc.client.Fault(1, '%s: %s' % (type(error).__name__, brief(error))))
+                answer = xmlrpc.client.dumps(
+                    xmlrpc.client.Fault(1, f'{type(error).__name__}: {brief(error)}')
+                )
             answer = answer.encode()
             self.connection.settimeout(REQUEST_TIMEOUT)
             self.send_response(200)
@@ -202,19 +227,26 @@ def _request_handler(base, door, lifetime):
 
 
 def _refuse_entities(body):
-    """Raise an error where the body is no XML, or defines entities, by which a little of it becomes a lot."""
+    """Raise an error where the body is no XML, or defines entities, by which a little of it becomes
+    a lot."""
+
     def refuse(*doctype):
         raise ValueError('it has a document type')
+
     parser = xml.parsers.expat.ParserCreate()
     parser.StartDoctypeDeclHandler = refuse
     parser.Parse(body, True)
 
 
 def ends_of_call():
-    """The IP addresses, the client's and ours, of the call that this thread answers; None if it answers none."""
+    """The IP addresses, the client's and ours, of the call that this thread answers; None if it
+    answers none."""
     if not hasattr(_call, 'client'):
         return None
-    return [address[0].partition('%')[0].removeprefix('::ffff:') for address in (_call.client, _call.here)]
+    return [
+        address[0].partition('%')[0].removeprefix('::ffff:')
+        for address in (_call.client, _call.here)
+    ]
 
 
 def is_call_from_nearby(master_url):
@@ -224,6 +256,6 @@ def is_call_from_nearby(master_url):
         return True
     try:
         found = socket.getaddrinfo(urllib.parse.urlsplit(master_url).hostname, None)
-    except OSError:    # the name has no address, or none that can be found now
+    except OSError:  # the name has no address, or none that can be found now
         return False
     return ends[0] in {address[0] for *_, address in found}
