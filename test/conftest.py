@@ -58,7 +58,7 @@ class Mailbox:
 
 def speak_tcpros_only(node):
     """Have the node connect by sockets alone, as those of other processes do; returns it."""
-    handlers = node._rospy._lifetime.xmlrpc.handler.protocol_handlers
+    handlers = node._rospy.lifetime.xmlrpc.handler.protocol_handlers
     handlers[:] = [handler for handler in handlers if not handler.supports(PROTOCOL)]
     return node
 

@@ -257,7 +257,7 @@ def test_a_client_for_whom_there_is_no_thread_is_closed(node, warnings, monkeypa
         raise RuntimeError("can't start new thread")
 
     with monkeypatch.context() as patch:
-        patch.setattr(node._rospy._lifetime.Thread, 'start', start)
+        patch.setattr(node._rospy.lifetime.Thread, 'start', start)
         for port in node.tcp_port, node.xmlrpc_port:
             with connect(port) as client:
                 assert is_closed(client)

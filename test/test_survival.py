@@ -175,7 +175,7 @@ def test_a_node_stops_while_it_publishes_receives_and_calls(master):
 def test_a_publisher_that_once_answers_nonsense_is_asked_again(master):
     node = create(master, '/node')
     node.interested_in('/survival/nonsense', 'std_msgs/String', delegate=Mailbox())
-    handler = node._rospy._lifetime.xmlrpc.handler
+    handler = node._rospy.lifetime.xmlrpc.handler
     asked, proceed = threading.Semaphore(0), threading.Event()
 
     def request_topic(caller_id, topic, protocols):

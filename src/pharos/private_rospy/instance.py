@@ -20,7 +20,7 @@ from pharos.errors import MasterUnreachableError, NodeStoppedError, PortInUseErr
 from pharos.private_rospy import (
     host,
     logs,
-    names,
+    patches,
     publishing,
     pubsub,
     refusals,
@@ -50,7 +50,7 @@ class PrivateRospy:
         self.settings = settings
         self.name = settings.name
         self._on_stop_request, self.allows_remote_shutdown = on_stop_request, allows_remote_shutdown
-        self._lifetime = Lifetime(self.name)
+        self.lifetime = Lifetime(self.name)
         self._stopping = threading.Lock()
         # whether a newer node has it: what registers this one again would end that one
         self.has_lost_name = False
@@ -61,12 +61,13 @@ class PrivateRospy:
         self.wiring = Wiring(self)
         self.refusals = refusals.Refusals(self)
         self.parameters = WatchedParameters(self)
-        self.workers = Workers(self._lifetime.start_thread)
+        self.workers = Workers(self.lifetime.start_thread)
         self._modules = self._load()
         self.rospy = self._modules.load('rospy')
+        patches.check_applied(self._modules.modules)
 
     def _load(self):
-        lifetime, logging_module = self._lifetime, logs.private_logging()
+        lifetime, logging_module = self.lifetime, logs.private_logging()
         proxies = Substitute(xmlrpc.client, ServerProxy=ServerProxy)
         private_os = Substitute(os, environ=self.settings.environ)
         hooks = collections.defaultdict(list)
@@ -76,7 +77,6 @@ class PrivateRospy:
                 'rospy.impl.init': self._poll_quickly,
                 'rospy.core': self._shut_down_early,
             },
-            names.hooks(),
             logs.hooks(),
             servers.hooks(lifetime, self.warn, self.debug),
             registration.hooks(self),
@@ -88,6 +88,7 @@ class PrivateRospy:
                 hooks[name].append(hook)
         modules = PrivateImports(
             hooks=hooks,
+            patch=lambda module: patches.apply(module, self),
             substitutes={
                 'os': private_os,
                 'sys': Substitute(sys, argv=self.settings.argv),
@@ -126,7 +127,7 @@ class PrivateRospy:
         rospy.topics keeps the real one: the last messages of a soul that is ending are still sent.
         """
         is_shutdown = module.is_shutdown
-        module.is_shutdown = lambda: is_shutdown() or self._lifetime.ended.is_set()
+        module.is_shutdown = lambda: is_shutdown() or self.lifetime.ended.is_set()
         self.is_shut_down = is_shutdown
         # of hooks of on_shutdown; where that cannot be printed, rospy would stop half way
         module.traceback = Substitute(
@@ -180,7 +181,7 @@ class PrivateRospy:
         except BaseException:
             self.stop(0)
             raise
-        self.xmlrpc_port = self._lifetime.xmlrpc.port
+        self.xmlrpc_port = self.lifetime.xmlrpc.port
         self.domain = self._modules.load('rosgraph.network').get_host_name()
         # rospy.signal_shutdown called by the node's own code
         core.add_preshutdown_hook(self.request_stop)
@@ -215,7 +216,7 @@ class PrivateRospy:
     def end(self):
         """Begin the stop: all that waits ends, ``is_shutdown()`` holds, and nothing more is
         received."""
-        self._lifetime.begin_end()
+        self.lifetime.begin_end()
         changed = self._modules.load('rospy.rostime').get_rostime_cond()
         with changed:
             changed.notify_all()  # simulated time may stand still
@@ -239,21 +240,21 @@ class PrivateRospy:
             pass  # where the node's own code called that, it returned at once
         for proxy in list(core._xmlrpc_cache.values()):  # a thread that is left may add one
             proxy('close')()
-        left = self._lifetime.end(given_up)
+        left = self.lifetime.end(given_up)
         logs.close_handlers(self._logging)
         return [thread.name for thread in left]
 
     def _wake(self, reason):
-        self._lifetime.begin_end()
-        if self._lifetime.xmlrpc and self._lifetime.xmlrpc.handler:
-            changed = self._lifetime.xmlrpc.handler.reg_man.cond
+        self.lifetime.begin_end()
+        if self.lifetime.xmlrpc and self.lifetime.xmlrpc.handler:
+            changed = self.lifetime.xmlrpc.handler.reg_man.cond
             with changed:
                 changed.notify_all()
 
     def repair(self, state, was_away):
         """Register with the master what it has forgotten; see :func:`.registration.repair`. Raises
         nothing."""
-        handler = self._lifetime.xmlrpc.handler
+        handler = self.lifetime.xmlrpc.handler
         if handler is None or self.ended.is_set():
             return
         try:
@@ -284,17 +285,17 @@ class PrivateRospy:
     @property
     def start_thread(self):
         """``start_thread(target, args=(), name=None)``: a thread that the stop waits for."""
-        return self._lifetime.start_thread
+        return self.lifetime.start_thread
 
     def shut_at_end(self, sock):
         """Shut the socket down when the node stops, at the latest."""
-        self._lifetime.shut_at_end(sock)
+        self.lifetime.shut_at_end(sock)
 
     @property
     def here(self):
         """``with here():`` what waits in this thread does so on behalf of the node, and ends with
         it."""
-        return self._lifetime.here
+        return self.lifetime.here
 
     def wait_until(self, predicate, timeout):
         """Wait until ``predicate()``, which speaks of connections in this process, holds, or the
@@ -302,17 +303,17 @@ class PrivateRospy:
 
         :param timeout: seconds, None: no limit
         """
-        publishing.wait_until(predicate, timeout, self._lifetime)
+        publishing.wait_until(predicate, timeout, self.lifetime)
 
     def wait_until_silent(self, timeout):
         """Wait until the node is unregistered, and nobody can ask it anything, for up to
         ``timeout`` seconds."""
-        self._lifetime.silent.wait(timeout)
+        self.lifetime.silent.wait(timeout)
 
     @property
     def ended(self):
         """The event set when the stop begins."""
-        return self._lifetime.ended
+        return self.lifetime.ended
 
     def warn(self, text):
         """A warning in the node's log."""
@@ -325,11 +326,11 @@ class PrivateRospy:
     @property
     def thread_count(self):
         """How many threads the node has."""
-        return sum(thread.is_alive() for thread in list(self._lifetime.threads))
+        return sum(thread.is_alive() for thread in list(self.lifetime.threads))
 
     def owns(self, thread):
         """Whether the thread is one of this node's."""
-        return thread in self._lifetime.threads
+        return thread in self.lifetime.threads
 
     def publisher(self, topic):
         """rospy's _PublisherImpl of the topic, None if there is none."""
@@ -363,7 +364,7 @@ class PrivateRospy:
 
     def connect(self, topic, uri):
         """Connect the subscription to the publisher at that URI, unless it is connected."""
-        handler = self._lifetime.xmlrpc.handler
+        handler = self.lifetime.xmlrpc.handler
         if handler is not None:  # None: it is stopping
             handler._connect_topic(topic, uri)
 

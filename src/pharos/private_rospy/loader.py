@@ -74,13 +74,15 @@ class PrivateImports:
         name
     :param hooks: ``{module name: [function(module)]}`` run right after a private module's code,
         before any other module can import names from it
+    :param patch: ``patch(module)``, called likewise with every private module
     """
 
-    def __init__(self, substitutes, hooks):
+    def __init__(self, substitutes, hooks, patch):
         self.modules = {}
         self._private = {'rospy', 'rosgraph'}
         self._substitutes = substitutes
         self._hooks = hooks
+        self._patch = patch
         self._builtins = dict(vars(builtins), __import__=self._import)
 
     def load(self, name):
@@ -106,6 +108,7 @@ class PrivateImports:
             module = self._run(*_find(name, parent.__path__ if parent else None), into=self.modules)
             for hook in self._hooks.get(name, ()):
                 hook(module)
+            self._patch(module)
         if parent:
             setattr(parent, leaf, module)
         return module

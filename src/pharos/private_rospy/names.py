@@ -69,29 +69,3 @@ def global_name(name, what):
 class Resolved(str):
     """A name that rospy is to take as it is: it is resolved and remapped, and would be remapped
     once more."""
-
-
-def hooks():
-    """The load hooks of this module."""
-
-    def resolve_once(module):
-        """rospy.names."""
-        resolve = module.resolve_name
-
-        def resolve_name(name, caller_id=None):
-            return str(name) if isinstance(name, Resolved) else resolve(name, caller_id)
-
-        module.resolve_name = resolve_name
-
-    def name_as_resolved(module):
-        """rospy.topics: resolves what is resolved already, so that Topic and _TopicImpl differ
-        where names swap."""
-        topic = module._TopicImpl
-        init = topic.__init__
-
-        def __init__(self, name, data_class):
-            init(self, Resolved(name), data_class)
-
-        topic.__init__ = __init__
-
-    return {'rospy.names': resolve_once, 'rospy.topics': name_as_resolved}
