@@ -257,7 +257,19 @@ class Pharos(Player):
             )
             if not channel.wait_for_subscribers(receivers, PATIENCE):
                 raise SystemExit(f'not connected: {channel!r}')
-            return channel.publish
+            return self._sending_to(topic) if self.options.send_to else channel.publish
+
+    def _sending_to(self, topic):
+        send_to = self._publisher.send_to
+
+        def publish(message):
+            def fill(fresh):
+                for name in message.__slots__:
+                    setattr(fresh, name, getattr(message, name))
+
+            send_to(topic, fill)
+
+        return publish
 
 
 class Rospy(Player):
@@ -314,6 +326,9 @@ def main():
     )
     parser.add_argument(
         '--shared', action='store_true', help='pharos: the receiver gets the published instance'
+    )
+    parser.add_argument(
+        '--send-to', action='store_true', help='pharos: node.send_to(topic, block), not publish'
     )
     parser.add_argument(
         '--tuned', action='store_true', help='rospy: tcp_nodelay, and a large buff_size'

@@ -32,6 +32,7 @@ PYTHON_ROWS = {
     'direct call': ['direct'],
     'SimpleQueue, 2 threads': ['queue'],
     'pharos inline': ['pharos', '--inline'],
+    'pharos inline, send_to': ['pharos', '--inline', '--send-to'],
     'pharos inline, shared': ['pharos', '--inline', '--shared'],
     'pharos default': ['pharos'],
     'rospy, 1 process': ['rospy'],

@@ -16,9 +16,8 @@ from pharos.private_rospy.proxies import time_limit
 from pharos.seconds import check_limit
 from pharos.private_rospy.registration import REGISTER_TIMEOUT
 
-ANSWER_TIMEOUT = (
-    0.5  # seconds in which the master has told a live subscriber; then it is asked whether it lives
-)
+# seconds in which the master has told a live subscriber; then it is asked whether it lives
+ANSWER_TIMEOUT = 0.5
 # bytes read from a socket at once; rospy's 64 KiB let subscribers of images fall behind
 BUFFER_SIZE = 1 << 20
 
@@ -258,6 +257,8 @@ class OutputChannel(_Channel):
         self.latched = Latch()
         self.sent = 0
         self._uninterested = set()  # names of nodes of which the log says so
+        self._freeze = copier.copier_for(message_class).freeze
+        self._fanout = _ClosedFanout
         self._begin(connect_timeout)
 
     def _open(self, connect_timeout=None):
@@ -265,7 +266,7 @@ class OutputChannel(_Channel):
         deadline = time.monotonic() + timeout
         self._opener, self._connected = threading.current_thread(), threading.Event()
         try:
-            endpoint, self._send = self.node._rospy.wiring.advertise(
+            endpoint, self._fanout = self.node._rospy.wiring.advertise(
                 self, timeout, tcp_nodelay=True, queue_size=self.queue_size
             )
             self._opened(endpoint)
@@ -296,7 +297,7 @@ class OutputChannel(_Channel):
             to = str(self.node._name_of(to))
             self._check_is_there(to)
         try:
-            is_sent = self._send(message, self, to)
+            is_sent = self._fanout.publish(message, self, to)
         except Exception as error:
             self._explain(error, message)
         if is_sent or to is None:
@@ -313,10 +314,8 @@ class OutputChannel(_Channel):
         if name not in self._uninterested and not self.latch:
             self._uninterested.add(name)
             self.node.log(
-                (
-                    f'{name} is not interested in {self.topic}, or not connected yet: what'
-                    f' {self.node.name} sends to it alone goes nowhere'
-                ),
+                f'{name} is not interested in {self.topic}, or not connected yet: what'
+                f' {self.node.name} sends to it alone goes nowhere',
                 level='warning',
             )
 
@@ -342,19 +341,25 @@ class OutputChannel(_Channel):
         raise MessageTypeError(f'{self.type} cannot be sent on {self.topic}: {error}') from error
 
     def _unregister(self, endpoint):
-        self._send = _closed
+        self._fanout = _ClosedFanout
         self.node._rospy.wiring.unadvertise(self, endpoint)
 
     def send(self, block=None, *, to=None, **fields):
         """Fill a fresh message with ``block(message)`` and by keywords, publish it, and return
         it."""
         if block is not None:
-            if not callable(block):
-                check_block(block, 'block', ('message',))  # says how it is called
             check_runs(block, 'a block')
-        message = message_types.build(self.message_class, block, fields)
-        if not self.connections:
-            message_types.check_fits(message)  # with nobody interested, rospy does not look at it
+        try:
+            message = message_types.build(self.message_class, block, fields)
+        except TypeError:
+            check_block(block, 'block', ('message',))  # says how it is called
+            raise
+        if not self._fanout.connections:  # with nobody interested, nobody else looks at it
+            try:
+                self._freeze(message)
+            except Exception:
+                message_types.check_fits(message)
+                raise
         self.publish(message, to)
         return message
 
@@ -411,20 +416,23 @@ class OutputChannel(_Channel):
         if self.topic not in told:
             told.add(self.topic)
             self.node.log(
-                (
-                    f'{self.topic}: {", ".join(sorted(names))} did not connect within'
-                    f' {timeout:g} s, though the master has them as subscribers, and may miss the'
-                    f' first messages of {self.node.name}: can they reach this host, and are they'
-                    ' of the same type? A longer connect_timeout waits longer'
-                ),
+                f'{self.topic}: {", ".join(sorted(names))} did not connect within'
+                f' {timeout:g} s, though the master has them as subscribers, and may miss the'
+                f' first messages of {self.node.name}: can they reach this host, and are they'
+                ' of the same type? A longer connect_timeout waits longer',
                 level='warning',
             )
 
     def _stopped(self):
         super()._stopped()
-        self._send = _closed
+        self._fanout = _ClosedFanout
 
 
-def _closed(*arguments):
-    """Instead of a closed channel's way."""
-    raise NodeStoppedError('closed')
+class _ClosedFanout:
+    """What a closed channel has instead of a fan-out."""
+
+    connections = ()
+
+    @staticmethod
+    def publish(*arguments):
+        raise NodeStoppedError('closed')

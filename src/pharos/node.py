@@ -54,6 +54,7 @@ class Node(Life):
         self.soul, self.delegate = soul, delegate
         self._opening = threading.Lock()  # held to change _channels
         self._first_sends = {}  # topic name -> the lock of the thread that opens its channel
+        self._senders = {}  # topic name, as given to send_to -> the channel that it went through
         self._failures = Failures(self._tell_failure)
 
     # -- blocks
@@ -229,8 +230,6 @@ class Node(Life):
         :raises MessageTypeError: if a field does not exist or does not fit
         :raises UnknownTopicError, UnknownTypeError: if there is no type
         """
-        if block is not None:
-            check_block(block, 'block', ('message',))
         if to is not None:
             to = self._name_of(to)
         if connect_timeout is None:
@@ -239,25 +238,23 @@ class Node(Life):
             connect_timeout = check_seconds('connect_timeout', connect_timeout)
         if wait != 0:
             wait = check_seconds('wait', wait)
-        topic = self._topic(topic)
-        channel = self._sending_channel(topic)
-        if channel is None:
-            channel = self._open_sending_channel(topic, typed_as, connect_timeout, wait)
-        elif typed_as is not None:
-            topic.message_class(self, typed_as)  # refuses another type
+        channel = self._senders.get(topic) if isinstance(topic, str) else None
+        if channel is None or not channel.is_open:
+            check_block(block, 'block', ('message',))
+            bus = self._topic(topic)
+            channel = self._sending_channel(bus) or self._open_sending_channel(
+                bus, typed_as, connect_timeout, wait
+            )
+            self._senders[topic] = channel
+        if typed_as not in (None, channel.message_class, channel.type):
+            self._topic(topic).message_class(self, typed_as)  # refuses another type
         # another thread may be opening it just now
         channel.wait_until_connected(connect_timeout)
         return channel.send(block, to=to, **fields)
 
     def _sending_channel(self, topic):
-        return next(
-            (
-                channel
-                for channel in self.channels
-                if channel.topic == topic.name and hasattr(channel, 'publish')
-            ),
-            None,
-        )
+        channels = [channel for channel in self.channels if channel.topic == topic.name]
+        return next((channel for channel in channels if hasattr(channel, 'publish')), None)
 
     def _open_sending_channel(self, topic, typed_as, connect_timeout, wait):
         """Open a channel for :meth:`send_to`; of several threads that come at once, one does, and
@@ -316,6 +313,7 @@ class Node(Life):
     def _forget_channel(self, channel):
         with self._opening:
             self._channels = [other for other in self._channels if other is not channel]
+            self._senders.clear()
 
     # -- services, parameters, log
 

@@ -95,8 +95,8 @@ class Wiring:
             self._channels[topic] = tuple(c for c in self.channels_on(topic) if c is not channel)
 
     def advertise(self, channel, timeout, **options):
-        """rospy's Publisher for an OutputChannel, and its way; subscribers in this process are told
-        at once.
+        """rospy's Publisher for an OutputChannel, and its fan-out; subscribers in this process are
+        told at once.
 
         rosmaster tells them in steps of 0.1 s.
 
@@ -117,7 +117,7 @@ class Wiring:
         for other in self._neighbours():
             if other.subscriber(channel.topic):
                 other.connect(channel.topic, self._instance.uri)
-        return endpoint, endpoint.impl.fanout.publish
+        return endpoint, endpoint.impl.fanout
 
     def known_subscribers(self, topic):
         """Names of the nodes that the master knew to be interested when this one registered as a
