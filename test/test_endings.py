@@ -394,7 +394,7 @@ def waiting(master, monkeypatch):
     peer.serve('/sleep', 'std_srvs/Empty', sleep)
     peer.serve('/sleep_elsewhere', 'std_srvs/Empty', sleep)
     monkeypatch.setattr(
-        'pharos.private_rospy.wiring.Wiring.sends_to', lambda self, name, topic: False
+        'pharos.private_rospy.connections.Connections.sends_to', lambda self, name, topic: False
     )
     monkeypatch.setattr('pharos.channel.OutputChannel.connections', [])
     monkeypatch.setattr(

@@ -313,7 +313,7 @@ def test_a_channel_that_is_opened_while_its_node_connects_hears_the_publisher(
 ):
     """The subscription is connected already, but the link was made without the channel."""
     node, sender, mailbox = create(master, '/near'), create(master, '/far'), Mailbox()
-    node._rospy.wiring.takes_plain_callbacks = True
+    node._rospy.connections.takes_plain_callbacks = True
     match, opened = Link.match_receivers, []
 
     def match_and_open(self):

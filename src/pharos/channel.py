@@ -57,7 +57,7 @@ class _Channel:
     @property
     def connections(self):
         """``[(peer node name, transport)]``, transport being 'INTRAPROCESS' or 'TCPROS'."""
-        return self.node._rospy.wiring.connections(self._endpoint) if self.is_open else []
+        return self.node._rospy.connections.of(self._endpoint) if self.is_open else []
 
     @property
     def is_open(self):
@@ -141,12 +141,12 @@ class InputChannel(_Channel):
         )
         # rospy's queue_size would drop without counting; the inbox has ours
         self._opened(
-            self.node._rospy.wiring.subscribe(self, tcp_nodelay=True, buff_size=BUFFER_SIZE)
+            self.node._rospy.connections.subscribe(self, tcp_nodelay=True, buff_size=BUFFER_SIZE)
         )
         dispatcher.run()  # what came latched
 
     def _unregister(self, endpoint):
-        self.node._rospy.wiring.unsubscribe(self, endpoint)
+        self.node._rospy.connections.unsubscribe(self, endpoint)
         self.node._dispatcher.wait_for_delegate(self.node.stop_timeout)
 
     def _subscribe_as(self, message_class):
@@ -266,7 +266,7 @@ class OutputChannel(_Channel):
         deadline = time.monotonic() + timeout
         self._opener, self._connected = threading.current_thread(), threading.Event()
         try:
-            endpoint, self._fanout = self.node._rospy.wiring.advertise(
+            endpoint, self._fanout = self.node._rospy.connections.advertise(
                 self, timeout, tcp_nodelay=True, queue_size=self.queue_size
             )
             self._opened(endpoint)
@@ -307,7 +307,7 @@ class OutputChannel(_Channel):
         """Raise UnknownNodeError if a message for that node alone has nowhere to go, since there is
         no such node."""
         endpoint = self._endpoint
-        if endpoint is None or self.node._rospy.wiring.reaches(endpoint, name):
+        if endpoint is None or self.node._rospy.connections.reaches(endpoint, name):
             return
         with time_limit(self.node.connect_timeout):
             self.node.master._find(name)
@@ -332,7 +332,7 @@ class OutputChannel(_Channel):
 
     def _explain(self, error, message):
         """Raise our error for one that publishing raised."""
-        if not self.is_open or self.node._rospy.wiring.is_closed(self._endpoint):
+        if not self.is_open or self.node._rospy.connections.is_closed(self._endpoint):
             raise NodeStoppedError(
                 f'the channel of {self.node.name} on {self.topic} is closed: open another with'
                 ' output_channel()'
@@ -342,7 +342,7 @@ class OutputChannel(_Channel):
 
     def _unregister(self, endpoint):
         self._fanout = _ClosedFanout
-        self.node._rospy.wiring.unadvertise(self, endpoint)
+        self.node._rospy.connections.unadvertise(self, endpoint)
 
     def send(self, block=None, *, to=None, **fields):
         """Fill a fresh message with ``block(message)`` and by keywords, publish it, and return
@@ -384,7 +384,7 @@ class OutputChannel(_Channel):
 
         rospy loses what is published before (ros_comm #176, #286).
         """
-        missing = self.node._rospy.wiring.known_subscribers(self.topic)
+        missing = self.node._rospy.connections.known_subscribers(self.topic)
         if missing is None:  # not always: a large graph's state takes long to read
             try:
                 with time_limit(max(REGISTER_TIMEOUT, deadline - time.monotonic())):
@@ -412,7 +412,7 @@ class OutputChannel(_Channel):
 
     def _tell_who_is_late(self, names, timeout):
         """Say in the log, once for each topic, which subscribers may miss the first message."""
-        told = self.node._rospy.wiring.told_late
+        told = self.node._rospy.connections.told_late
         if self.topic not in told:
             told.add(self.topic)
             self.node.log(

@@ -74,9 +74,9 @@ def agree_with_publishers(channel, refusals):
     """
     instance, topic = channel.node._rospy, channel.topic
     instance.wait_until(
-        lambda: instance.wiring.has_heard_from_publishers(topic), channel.node.connect_timeout
+        lambda: instance.connections.has_heard_from_publishers(topic), channel.node.connect_timeout
     )
-    if instance.wiring.hears(topic):
+    if instance.connections.hears(topic):
         return
     for refusal in list(refusals):
         offered = refusal.offered

@@ -70,7 +70,7 @@ class Link:
         )
         channels = [
             channel
-            for channel in self._instance.wiring.channels_on(subscriber.resolved_name)
+            for channel in self._instance.connections.channels_on(subscriber.resolved_name)
             if channel.from_ in (None, self.publisher_name) and self._suits(channel)
         ]
         inboxes = {
@@ -187,13 +187,13 @@ def protocol_handler(instance):
             return protocol == PROTOCOL
 
         def get_supported(self):
-            return [[PROTOCOL]] if instance.wiring.connects_in_process() else []
+            return [[PROTOCOL]] if instance.connections.connects_in_process() else []
 
         def init_publisher(self, topic, protocol):
             return 1, 'ready', [PROTOCOL]
 
         def create_transport(self, topic, uri, parameters):
-            other = instance.wiring.neighbour(uri)
+            other = instance.connections.local_node_at(uri)
             publisher = other and other.publisher(topic)
             subscriber = instance.subscriber(topic)
             if publisher is None or subscriber is None:

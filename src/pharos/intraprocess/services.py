@@ -11,7 +11,7 @@ from pharos.private_rospy.lifetime import Interruption
 from pharos.private_rospy.names import Resolved
 from pharos.private_rospy.registration import registered
 from pharos.intraprocess.sharing import numbered
-from pharos.private_rospy.wiring import running_here
+from pharos.private_rospy.connections import local_nodes
 from pharos.signals import is_from_signal
 
 # service calls of one thread within one another: a cycle, which would only end with the stack
@@ -40,7 +40,7 @@ def class_of(name, uri):
 
 def _offered_here(name, uri):
     """The PrivateRospy and the rospy Service of that name and URI, or twice None."""
-    for instance in running_here():
+    for instance in local_nodes():
         service = instance.services.get(name)
         if service is not None and service.uri == uri:
             return instance, service

@@ -32,7 +32,7 @@ from pharos.private_rospy.loader import PrivateImports, Substitute
 from pharos.private_rospy.parameters import WatchedParameters
 from pharos.private_rospy.proxies import ServerProxy, is_time_up, master_api, time_limit
 from pharos.intraprocess.services import Workers
-from pharos.private_rospy.wiring import Wiring
+from pharos.private_rospy.connections import Connections
 
 POLL = 0.001  # seconds between rospy's own looks at whether it is registered; it takes 0.1 s
 
@@ -58,7 +58,7 @@ class PrivateRospy:
         # called after the callbacks of a batch of messages, in its thread
         self.on_received = lambda: None
         self.uri = None
-        self.wiring = Wiring(self)
+        self.connections = Connections(self)
         self.refusals = refusals.Refusals(self)
         self.parameters = WatchedParameters(self)
         self.workers = Workers(self.lifetime.start_thread)
@@ -230,7 +230,7 @@ class PrivateRospy:
         """
         if not self._stopping.acquire(blocking=False):
             return []
-        self.wiring.close()
+        self.connections.close()
         self.workers.close()
         self.parameters.close()
         core = self._modules.load('rospy.core')

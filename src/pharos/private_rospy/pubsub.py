@@ -40,7 +40,7 @@ def hooks(instance):
             """Who hears of the node from the master, as soon as it registers, is to find it
             here."""
             instance.uri = uri
-            instance.wiring.open()
+            instance.connections.open()
             ready(self, uri)
 
         ready, handler._ready = handler._ready, _ready

@@ -134,7 +134,7 @@ class Refusals:
         """Whether both ends are there still."""
         if self._instance.subscriber(topic) is not subscription:
             return False
-        neighbour = self._instance.wiring.neighbour(uri)
+        neighbour = self._instance.connections.local_node_at(uri)
         # the master's word of a publisher of this process takes its time
         return (
             uri in subscription.publishers

@@ -42,7 +42,7 @@ def hooks(instance):
         handler = module.ROSHandler
         connect, lock = handler._connect_topic, threading.Lock()
         connecting = {}  # (topic, URI) -> whether it was asked for again meanwhile
-        attempt = instance.wiring.connecting
+        attempt = instance.connections.connecting
 
         def note_attempt(topic, uri, has_reached):
             subscriber = instance.subscriber(topic)
@@ -168,7 +168,7 @@ def hooks(instance):
             elif kind == 'sub':
                 self.publisher_update(name, value)
             elif kind == 'pub':
-                instance.wiring.told_subscribers[name] = value
+                instance.connections.subscribers_at_registration[name] = value
 
         manager.reg_added = reg_added
 

@@ -1,4 +1,4 @@
-"""How the channels of a node are wired to its rospy, and to the nodes of this process."""
+"""How the channels of a node are connected through its rospy, and to the nodes of this process."""
 import os
 import select
 import threading
@@ -11,12 +11,12 @@ from pharos.private_rospy.registration import REGISTER_TIMEOUT, UNREGISTER_TIMEO
 _running = {}  # URI -> the PrivateRospy that runs there, in this process
 
 
-def running_here():
+def local_nodes():
     """The PrivateRospys of the running nodes of this process."""
     return list(_running.values())
 
 
-class Wiring:
+class Connections:
     """The channels of one :class:`~.instance.PrivateRospy`."""
 
     takes_plain_callbacks = (
@@ -27,7 +27,9 @@ class Wiring:
         self._instance = instance
         self._channels = {}  # topic -> the channels that receive from it
         self._lock = threading.Lock()  # held to change that
-        self.told_subscribers = {}  # topic -> URIs, of which the master told a new publisher
+        self.subscribers_at_registration = (
+            {}
+        )  # topic -> URIs, of which the master told a new publisher
         # topics of which the log says that subscribers did not connect in time
         self.told_late = set()
         self.connecting = threading.local()  # .topic: of the connection that this thread negotiates
@@ -78,7 +80,7 @@ class Wiring:
         name, refuses = self._instance.name, self._instance.refusals.refuses
         self._instance.wait_until(
             lambda: all(
-                other.wiring.sends_to(name, topic) or refuses(topic, other.uri)
+                other.connections.sends_to(name, topic) or refuses(topic, other.uri)
                 for other in publishers
             ),
             channel.node.connect_timeout,
@@ -126,7 +128,7 @@ class Wiring:
         None where the master must be asked: of others it told the URI alone, and of a second
         channel nothing.
         """
-        nodes = [_running.get(uri) for uri in self.told_subscribers.pop(topic, [None])]
+        nodes = [_running.get(uri) for uri in self.subscribers_at_registration.pop(topic, [None])]
         return None if None in nodes else {node.name for node in nodes}
 
     def unadvertise(self, channel, endpoint):
@@ -135,7 +137,7 @@ class Wiring:
         _unregister(endpoint)
 
     @staticmethod
-    def connections(endpoint):
+    def of(endpoint):
         """``[(peer node name, transport)]`` of a rospy Publisher or Subscriber.
 
         rospy looks twice a second for subscribers that have left; until then they count as
@@ -208,7 +210,7 @@ class Wiring:
         )
 
     @staticmethod
-    def neighbour(uri):
+    def local_node_at(uri):
         """The PrivateRospy of this process at that URI, None if there is none."""
         return _running.get(uri)
 
@@ -216,7 +218,7 @@ class Wiring:
         """The nodes of this process at the same master, this one among them."""
         master = self._instance.settings.master_url
         return [
-            other for other in running_here() if is_same_master(other.settings.master_url, master)
+            other for other in local_nodes() if is_same_master(other.settings.master_url, master)
         ]
 
 
