@@ -163,8 +163,8 @@ from std_msgs.msg import String
 from std_srvs.srv import Empty
 rospy.init_node('peer')
 rospy.Subscriber('/soak/to_peer', String, lambda message: None)
-rospy.Service('/soak/stuck', Empty, lambda request: print('called', flush=True) or
-rospy.sleep(3600)) publisher = rospy.Publisher('/soak/from_peer', String, latch=True, queue_size=1)
+rospy.Service('/soak/stuck', Empty, lambda request: print('called', flush=True) or rospy.sleep(3600))
+publisher = rospy.Publisher('/soak/from_peer', String, latch=True, queue_size=1)
 publisher.publish('hello')
 rospy.spin()
 ''',
@@ -173,9 +173,9 @@ import threading
 from pharos import BlockNode, Master, spin
 node = Master().create(BlockNode, named='/peer')
 node.interested_in('/soak/to_peer', 'std_msgs/String')
-node.serve('/soak/stuck', 'std_srvs/Empty', lambda request: print('called', flush=True) or
-node.sleep(3600)) node.output_channel('/soak/from_peer', 'std_msgs/String',
-latch=True).send(data='hello') spin()
+node.serve('/soak/stuck', 'std_srvs/Empty', lambda request: print('called', flush=True) or node.sleep(3600))
+node.output_channel('/soak/from_peer', 'std_msgs/String', latch=True).send(data='hello')
+spin()
 ''',
 ]
 

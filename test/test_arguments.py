@@ -250,8 +250,7 @@ def launch(master, tmp_path, monkeypatch):
 def test_under_roslaunch_the_first_has_the_name_that_roslaunch_knows(launch):
     seen, registered = launch(
         """<launch><group ns="robot">
-      <node pkg="two_in_one" type="program" name="vision" output="screen" args="_threshold:=3
-      eye:_threshold:=4">
+      <node pkg="two_in_one" type="program" name="vision" output="screen" args="_threshold:=3 eye:_threshold:=4">
         <remap from="image" to="/camera/image"/>
         <param name="given" value="7"/>
       </node>

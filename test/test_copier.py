@@ -54,16 +54,15 @@ DEFINITION = SEPARATOR.join(
 EVERYTHING = genpy.dynamic.generate_dynamic('made_up/Everything', DEFINITION)['made_up/Everything']
 
 TYPES = """
-    std_msgs/Empty std_msgs/String std_msgs/Bool std_msgs/Byte std_msgs/Char std_msgs/Int64
-    std_msgs/Float32 std_msgs/Time std_msgs/Duration std_msgs/Header std_msgs/ColorRGBA
-    std_msgs/Float64MultiArray std_msgs/UInt8MultiArray
+    std_msgs/Empty std_msgs/String std_msgs/Bool std_msgs/Byte std_msgs/Char std_msgs/Int64 std_msgs/Float32
+    std_msgs/Time std_msgs/Duration std_msgs/Header std_msgs/ColorRGBA std_msgs/Float64MultiArray
+    std_msgs/UInt8MultiArray
     geometry_msgs/Twist geometry_msgs/PoseStamped geometry_msgs/PoseWithCovarianceStamped
     geometry_msgs/PolygonStamped
-    sensor_msgs/Image sensor_msgs/PointCloud2 sensor_msgs/LaserScan sensor_msgs/JointState
-    sensor_msgs/CameraInfo sensor_msgs/BatteryState sensor_msgs/MultiDOFJointState nav_msgs/Odometry
-    nav_msgs/OccupancyGrid nav_msgs/Path nav_msgs/MapMetaData diagnostic_msgs/DiagnosticArray
-    tf2_msgs/TFMessage rosgraph_msgs/Log rosgraph_msgs/Clock rosgraph_msgs/TopicStatistics
-    actionlib_msgs/GoalStatusArray actionlib_msgs/GoalID
+    sensor_msgs/Image sensor_msgs/PointCloud2 sensor_msgs/LaserScan sensor_msgs/JointState sensor_msgs/CameraInfo
+    sensor_msgs/BatteryState sensor_msgs/MultiDOFJointState nav_msgs/Odometry nav_msgs/OccupancyGrid nav_msgs/Path
+    nav_msgs/MapMetaData diagnostic_msgs/DiagnosticArray tf2_msgs/TFMessage rosgraph_msgs/Log rosgraph_msgs/Clock
+    rosgraph_msgs/TopicStatistics actionlib_msgs/GoalStatusArray actionlib_msgs/GoalID
 """.split()
 CLASSES = [genpy.message.get_message_class(name) for name in TYPES] + [EVERYTHING]
 

@@ -37,7 +37,8 @@ def child():
 heard.wait()
 {fork}
 print('still', me.lifecycle.value, other.health().registered, started.poll(),
-embedded.is_reachable(), flush=True) back.send(data='back')
+      embedded.is_reachable(), flush=True)
+back.send(data='back')
 
 def tell_of_the_wait():
     while not pharos.signals._waiting:
@@ -73,8 +74,8 @@ CHILDREN = {
     'nodes of its own': '''
     mine = Master().create(BlockNode, named='/program_child', domain='127.0.0.1')
     got = threading.Event()
-    mine.interested_in('/forks_said', 'std_msgs/String', delegate=lambda message, channel:
-    got.set()) mine.send_to('/forks_back', data='from the child')
+    mine.interested_in('/forks_said', 'std_msgs/String', delegate=lambda message, channel: got.set())
+    mine.send_to('/forks_back', data='from the child')
     assert got.wait(60)
     assert mine.master.nodes() and mine.health().registered
     def live(me):

@@ -166,8 +166,8 @@ import sys, pharos
 def hear(message, channel):
     print(message, flush=True)
     print('heard', channel.type, message.OK, flush=True)
-pharos.Master().create(pharos.BlockNode, named='/hearing_peer',
-delegate=hear).interested_in(sys.argv[1], wait=60) pharos.spin()
+pharos.Master().create(pharos.BlockNode, named='/hearing_peer', delegate=hear).interested_in(sys.argv[1], wait=60)
+pharos.spin()
 '''
 
 

@@ -74,9 +74,9 @@ from pharos import BlockNode, Master, Transcript, spin
 
 node = Master().wait(20).create(BlockNode, named='/pharos')
 answers = node.output_channel('/pharos/answer', 'std_msgs/String')
-node.interested_in('/pharos/question', answers.type, lambda message, channel:
-answers.publish(message)) node.serve('/pharos/who', 'std_srvs/Trigger', lambda request: {'success':
-True, 'message': 'a pharos node'}) Transcript.show('ready')
+node.interested_in('/pharos/question', answers.type, lambda message, channel: answers.publish(message))
+node.serve('/pharos/who', 'std_srvs/Trigger', lambda request: {'success': True, 'message': 'a pharos node'})
+Transcript.show('ready')
 spin()
 '''
 
@@ -101,8 +101,8 @@ from pharos import BlockNode, Master, Transcript
 master, peer = Master().wait(20), sys.argv[1]
 with master.create(BlockNode, named='/asking') as node:
     answers = queue.SimpleQueue()
-    heard = node.interested_in('/%s/answer' % peer, 'std_msgs/String', lambda message, channel:
-    answers.put(message)) asked = node.output_channel('/%s/question' % peer, 'std_msgs/String')
+    heard = node.interested_in('/%s/answer' % peer, 'std_msgs/String', lambda message, channel: answers.put(message))
+    asked = node.output_channel('/%s/question' % peer, 'std_msgs/String')
     while answers.empty():    # relay advertises only with its first message, which so is lost
         asked.wait_for_subscribers(1, 20)
         asked.send(data='hello')

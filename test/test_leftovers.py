@@ -32,11 +32,9 @@ def count():
     gc.collect()
     for thread in threading.enumerate():
         if thread.name.startswith('watcher') and not pharos.running.nodes():
-            thread.join(20)    # it watches the master while there are nodes, and ends once it sees
-            that there are none
+            thread.join(20)    # it watches the master while there are nodes, and ends once it sees that there are none
     deadline = time.monotonic() + 20
-    while len(os.listdir('/proc/self/task')) > threading.active_count() and time.monotonic() <
-    deadline:
+    while len(os.listdir('/proc/self/task')) > threading.active_count() and time.monotonic() < deadline:
         threading.Event().wait(0.001)    # a thread that was joined has still to leave the kernel
     open_files = []
     for descriptor in os.listdir('/proc/self/fd'):
@@ -48,8 +46,7 @@ def count():
             'descriptors': len(open_files), 'registrations': registrations()}
 
 def registrations():
-    return sum(nodes.count(name) for kind in master.system_state() for nodes in kind.values() for
-    name in ours)
+    return sum(nodes.count(name) for kind in master.system_state() for nodes in kind.values() for name in ours)
 
 def cpu_share():
     """The share of a core that is used while nothing happens."""
@@ -101,24 +98,24 @@ stopped_cpu = cpu_share()
 node.start()
 running_cpu = cpu_share()
 node.stop()
-print(json.dumps({'counts': counts, 'stops': stops, 'memory': memory, 'cpu': [stopped_cpu,
-running_cpu]})) '''
+print(json.dumps({'counts': counts, 'stops': stops, 'memory': memory, 'cpu': [stopped_cpu, running_cpu]}))
+'''
 )
 
 HUNDRED = (
     COUNTED
     + r'''
 ours = ['/many/n%d' % number for number in range(100)]
-master.create(BlockNode, named='/first', domain='127.0.0.1').stop()    # what is loaded once per
-process before = count()
+master.create(BlockNode, named='/first', domain='127.0.0.1').stop()    # what is loaded once per process
+before = count()
 nodes = []
-started = timed(lambda: nodes.extend(master.create(BlockNode, named=name, domain='127.0.0.1') for
-name in ours)) running = count()
+started = timed(lambda: nodes.extend(master.create(BlockNode, named=name, domain='127.0.0.1') for name in ours))
+running = count()
 stopped = timed(lambda: [node.stop() for node in nodes])
 nodes.clear()
 after = count()
-print(json.dumps({'before': before, 'running': running, 'after': after, 'started': started,
-'stopped': stopped})) '''
+print(json.dumps({'before': before, 'running': running, 'after': after, 'started': started, 'stopped': stopped}))
+'''
 )
 
 

@@ -43,8 +43,7 @@ from load import Image, Int32, image
 rospy.init_node('camera')
 images = rospy.Publisher('/load/images', Image, queue_size=%d)
 def publish(message):
-    while not images.get_num_connections():    # a subscriber knows of a connection before its
-    publisher does
+    while not images.get_num_connections():    # a subscriber knows of a connection before its publisher does
         rospy.sleep(0.01)
     for number in range(message.data):
         images.publish(image(number))

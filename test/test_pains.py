@@ -214,8 +214,7 @@ busy = socket.create_server(('127.0.0.1', 0))
 port = busy.getsockname()[1]
 try:
     rospy.init_node('bare', anonymous=True, %s=port)
-    show('no error; the TCPROS server is at %%s:%%s' %%
-    rospy.impl.tcpros_base.get_tcpros_server_address())
+    show('no error; the TCPROS server is at %%s:%%s' %% rospy.impl.tcpros_base.get_tcpros_server_address())
 except Exception as error:
     show(str(error).replace(str(port), 'the port'))
 '''
@@ -238,8 +237,8 @@ def test_bare_rospy_is_not_shut_down_for_an_earlier_owner_of_its_uri(bare):
     assert (
         bare(
             '''
-xmlrpc.client.ServerProxy(rospy.get_node_uri()).shutdown('/master', '[/old] Reason: new node
-registered with same name') show(rospy.is_shutdown())
+xmlrpc.client.ServerProxy(rospy.get_node_uri()).shutdown('/master', '[/old] Reason: new node registered with same name')
+show(rospy.is_shutdown())
 '''
         )
         is False
@@ -392,9 +391,9 @@ def callback(message):
         found.put('two at a time')
     except threading.BrokenBarrierError:
         found.put('one at a time')
-subscribers = [rospy.Subscriber(topic, String, callback) for topic in ('/pains/left',
-'/pains/right')] publishers = [rospy.Publisher(topic, String, queue_size=1, latch=True) for topic in
-('/pains/left', '/pains/right')] for publisher in publishers:
+subscribers = [rospy.Subscriber(topic, String, callback) for topic in ('/pains/left', '/pains/right')]
+publishers = [rospy.Publisher(topic, String, queue_size=1, latch=True) for topic in ('/pains/left', '/pains/right')]
+for publisher in publishers:
     publisher.publish('go')
 show(found.get(timeout=40))
 '''
@@ -441,8 +440,8 @@ def test_bare_rospy_tells_of_an_exception_in_a_callback(bare):
     assert bare(
         '''
 told, done = [], threading.Event()
-sys.excepthook = threading.excepthook = lambda *arguments: 'bad' in str(arguments) and
-told.append(arguments) def callback(message):
+sys.excepthook = threading.excepthook = lambda *arguments: 'bad' in str(arguments) and told.append(arguments)
+def callback(message):
     if message.data == 'good':
         done.set()
     raise ValueError(message.data)

@@ -15,9 +15,8 @@ from pharos import BlockNode, ExternalNode, RosProcess, UnknownNodeError
 from programs import Program
 from sockets import wait_for_end
 
-MANIFEST = """<package
-format="2"><name>%s</name><version>0.0.0</version><description>d</description> <maintainer
-email="a@b.org">m</maintainer><license>BSD</license></package>"""
+MANIFEST = """<package format="2"><name>%s</name><version>0.0.0</version><description>d</description>
+<maintainer email="a@b.org">m</maintainer><license>BSD</license></package>"""
 
 TALKER = """#!/usr/bin/python3
 import rospy, std_msgs.msg
@@ -368,7 +367,8 @@ from pharos import BlockNode, Master
 Master().create(BlockNode, named='/n')
 lines = queue.SimpleQueue()
 process = Master().run('fake_robot', {program(package, 'parent', 'sleep 1000 & echo $!; wait')!r},
-on_line=lines.put) print('PIDS', process.pid, lines.get(), flush=True)
+                       on_line=lines.put)
+print('PIDS', process.pid, lines.get(), flush=True)
 {end}
 """
     with Program(master.url, sys.executable, '-c', code) as started:
@@ -423,9 +423,8 @@ def test_a_program_that_ended_long_ago_is_not_signalled_again(master, package, m
 
 LAUNCH = """<launch>
   <arg name="who" /><arg name="text" default="hello" />
-  <node name="$(arg who)" pkg="fake_robot" type="talker" output="screen"><param name="text"
-  value="$(arg text)" /></node> <node name="second" pkg="fake_robot" type="talker"><remap
-  from="talk" to="talk2" /></node>
+  <node name="$(arg who)" pkg="fake_robot" type="talker" output="screen"><param name="text" value="$(arg text)" /></node>
+  <node name="second" pkg="fake_robot" type="talker"><remap from="talk" to="talk2" /></node>
 </launch>"""
 
 

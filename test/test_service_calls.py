@@ -58,8 +58,8 @@ def fail(request):
     raise RuntimeError('no room for %s' % request.load_namespace)
 
 def wait(request):
-    sys.stdout.write('called by %s\n' % request.load_namespace)    # at once: print writes the end
-    apart sys.stdout.flush()
+    sys.stdout.write('called by %s\n' % request.load_namespace)    # at once: print writes the end apart
+    sys.stdout.flush()
     gate.wait()
     return echo(request)
 
@@ -237,8 +237,8 @@ def pose():
     """The first pose of turtle2 that has been told since."""
     with master.create(pharos.BlockNode, named='/looks_on', domain='127.0.0.1') as node:
         poses = queue.SimpleQueue()
-        node.interested_in('/turtle2/pose', delegate=lambda pose, channel: poses.put((pose.x,
-        pose.y, pose.theta))) return poses.get(timeout=20)
+        node.interested_in('/turtle2/pose', delegate=lambda pose, channel: poses.put((pose.x, pose.y, pose.theta)))
+        return poses.get(timeout=20)
 '''
 
 ALL_SERVICES = (
@@ -799,8 +799,7 @@ def count():
     gc.collect()
     return {'descriptors': len(os.listdir('/proc/self/fd')), 'threads': threading.active_count(),
             'allocated': tracemalloc.get_traced_memory()[0] / 1e6, 'resident': resident('self'),
-            "provider's descriptors": len(os.listdir('/proc/%s/fd' % pid)), "provider's memory":
-            resident(pid)}
+            "provider's descriptors": len(os.listdir('/proc/%s/fd' % pid)), "provider's memory": resident(pid)}
 
 tracemalloc.start()
 call(500)    # what is made once is there then

@@ -30,8 +30,7 @@ def wait_for(event):
         pass
 
 def ready_in_wait():
-    """Tell when the main thread waits in something of ours; before that, it runs code of its
-    own."""
+    """Tell when the main thread waits in something of ours; before that, it runs code of its own."""
     def tell():
         while not pharos.signals._waiting:
             threading.Event().wait(0.001)
@@ -264,8 +263,7 @@ def test_sighup_is_ignored_as_nohup_has_it(program):
     running = program(
         """
 import os
-os.execv(sys.executable, [sys.executable, '-c', 'import signal; signal.signal(signal.SIGHUP,
-signal.SIG_IGN); '
+os.execv(sys.executable, [sys.executable, '-c', 'import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN); '
     'import pharos; me = pharos.Master().create(pharos.BlockNode, "/program"); '
     'print("ready", flush=True); pharos.spin()'])
 """
@@ -306,8 +304,8 @@ CAREFUL = """
 import os
 class Careful(pharos.Node):
     def stop(self):
-        os.write(1, b'\\nbegun\\n')    # at once, and on a line of its own, beside a traceback of
-        the main thread super().stop()
+        os.write(1, b'\\nbegun\\n')    # at once, and on a line of its own, beside a traceback of the main thread
+        super().stop()
         threading.Event().wait(0.3)    # other threads go on meanwhile
         os.write(1, b'\\nended\\n')
 me = Master().create(Careful, named='/program', domain='127.0.0.1')
@@ -362,8 +360,8 @@ def test_a_second_ctrl_c_while_the_nodes_stop_does_no_harm(program):
 me = node(soul=lambda me: threading.Event().wait(60))
 me.stop_timeout = 0.5
 me.fork()
-threading.Thread(target=lambda: (me._rospy.ended.wait(), print('stopping', flush=True)),
-daemon=True).start() ready_in_wait()
+threading.Thread(target=lambda: (me._rospy.ended.wait(), print('stopping', flush=True)), daemon=True).start()
+ready_in_wait()
 pharos.spin()
 """
     )

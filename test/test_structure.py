@@ -19,11 +19,10 @@ LINE_LIMIT = 440
 ROOMS_BELOW = 'pharos.private_rospy', 'pharos.intraprocess'
 
 EXPORTS = """
-    Master Node BlockNode Lifecycle ExternalNode Topic InputChannel OutputChannel Service Parameter
-    Transcript RosProcess Failure message_class service_class define_message define_service spin
-    __version__ PharosError MasterUnreachableError NodeNameInUseError PortInUseError
-    UnknownNodeError UnknownTopicError UnknownTypeError MessageTypeError UnknownServiceError
-    ServiceTypeError ServiceCallError NodeStoppedError
+    Master Node BlockNode Lifecycle ExternalNode Topic InputChannel OutputChannel Service Parameter Transcript RosProcess
+    Failure message_class service_class define_message define_service spin __version__
+    PharosError MasterUnreachableError NodeNameInUseError PortInUseError UnknownNodeError UnknownTopicError
+    UnknownTypeError MessageTypeError UnknownServiceError ServiceTypeError ServiceCallError NodeStoppedError
 """.split()
 
 

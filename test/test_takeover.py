@@ -12,8 +12,8 @@ from programs import Program, forget_parameters, until
 ROSPY_NODE = """
 import rospy, std_msgs.msg
 rospy.init_node('contested', disable_signals=False)
-sub = rospy.Subscriber('/newer_hears', std_msgs.msg.String, lambda message: print('heard',
-message.data, flush=True)) print('ready', flush=True)
+sub = rospy.Subscriber('/newer_hears', std_msgs.msg.String, lambda message: print('heard', message.data, flush=True))
+print('ready', flush=True)
 rospy.spin()
 print('ended', flush=True)
 """
