@@ -23,7 +23,7 @@ from rosgraph.network import encode_ros_handshake_header
 from conftest import TIMEOUT, Mailbox, speak_tcpros_only
 from fuzz import Fuzz
 from pharos import BlockNode
-from pharos.private_rospy import door, registration, servers, xmlrpc_server
+from pharos.private_rospy import acceptor, registration, servers, xmlrpc_server
 from programs import Program, until
 
 FUZZ_COUNT = int(os.environ.get('PHAROS_FUZZ_COUNT', 2500))  # bad clients; tools/soak makes it more
@@ -145,11 +145,11 @@ def test_hundreds_of_silent_clients_keep_nobody_out(master, mailbox, node, warni
         assert answers(node) and rosnode.rosnode_ping('/node', max_count=1)
         assert master.lookup_service('/clients/set').call(data=True, timeout=TIMEOUT).success
         for kind in 'TCPROS', 'XML-RPC':
-            until(lambda: len(threads(node, kind)) <= door.CLIENTS)
+            until(lambda: len(threads(node, kind)) <= acceptor.CLIENTS)
             assert len(threads(node, kind)) > 1  # some do hang there
         assert {warnings.get(), warnings.get()} == {
             '%d %s clients say nothing: those that said nothing for longest are closed, to let others in'
-            % (door.CLIENTS, kind)
+            % (acceptor.CLIENTS, kind)
             for kind in ('TCPROS', 'XML-RPC')
         }
         assert warnings.empty()
@@ -172,7 +172,7 @@ def test_of_hundreds_of_good_clients_none_is_taken_for_a_silent_one(
     master, node, warnings, monkeypatch
 ):
     """Those that come in a rush wait for their turn; it is 0.25 s otherwise until one is silent."""
-    monkeypatch.setattr(door, 'GRACE', TIMEOUT)
+    monkeypatch.setattr(acceptor, 'GRACE', TIMEOUT)
     request = post(call('getPid', '/test'), more='Connection: close\r\n')
     for port, said in (node.tcp_port, shake()), (node.xmlrpc_port, request):
         with Program(master.url, sys.executable, '-c', RUSH, str(port), said.hex()) as rush:
@@ -437,9 +437,11 @@ def test_service_clients_that_ask_nothing_keep_nobody_out(master, node, warnings
             return not warnings.empty()
 
     with contextlib.ExitStack() as clients:
-        longest, *_ = [clients.enter_context(call_service(node)) for _ in range(door.CLIENTS + 20)]
+        longest, *_ = [
+            clients.enter_context(call_service(node)) for _ in range(acceptor.CLIENTS + 20)
+        ]
         until(ask)
-        assert '%d service clients say nothing' % door.CLIENTS in warnings.get()
+        assert '%d service clients say nothing' % acceptor.CLIENTS in warnings.get()
         assert is_closed(longest)
 
 
@@ -619,20 +621,20 @@ def test_a_parameter_update_for_no_parameter_is_told_to_nobody(node):
 
 
 def test_a_flood_of_bad_clients_does_not_fill_the_log(node, warnings, monkeypatch):
-    monkeypatch.setattr(door, 'COMPLAINT_PERIOD', 3600)
+    monkeypatch.setattr(acceptor, 'REJECTION_PERIOD', 3600)
     with xmlrpc.client.ServerProxy(node.uri) as proxy:
 
         def refused():
             with contextlib.suppress(xmlrpc.client.Fault):
                 proxy.nothing()
 
-        for _ in range(door.COMPLAINTS + 5):
+        for _ in range(acceptor.REJECTION_LINES + 5):
             refused()
         assert (
-            all('call of nothing' in line for line in warnings.take(door.COMPLAINTS))
+            all('call of nothing' in line for line in warnings.take(acceptor.REJECTION_LINES))
             and warnings.empty()
         )
-        monkeypatch.setattr(door, 'COMPLAINT_PERIOD', 0)
+        monkeypatch.setattr(acceptor, 'REJECTION_PERIOD', 0)
         refused()
     assert 'and 5 more' in warnings.get()
 

@@ -18,7 +18,7 @@ from pharos import (
     running,
 )
 from pharos import message_class, stopping
-from pharos.private_rospy import door, lifetime, proxies, xmlrpc_server
+from pharos.private_rospy import acceptor, lifetime, proxies, xmlrpc_server
 from pharos.intraprocess import services
 from programs import until
 from sockets import refused_url, silent_peer
@@ -309,22 +309,22 @@ def test_stops_at_any_time_of_the_start_leave_nothing(master):
 
 def test_a_node_stopped_before_it_accepts_anybody_ends_its_threads(master, monkeypatch):
     """A socket that is shut and then told to listen would listen for ever."""
-    late, accept = threading.Event(), door.Door.accept
+    late, accept = threading.Event(), acceptor.Acceptor.accept
 
     def accept_late(self, listener, serve):
         late.wait(TIMEOUT)
         accept(self, listener, serve)
 
-    monkeypatch.setattr(door.Door, 'accept', accept_late)
+    monkeypatch.setattr(acceptor.Acceptor, 'accept', accept_late)
     node = master.create(BlockNode, named='/late', domain='127.0.0.1')
     accepting = [thread for thread in threading.enumerate() if thread.name.startswith('/late')]
 
-    def shut_and_tell(sock):
-        shut(sock)
+    def shutdown_and_tell(sock):
+        shutdown_socket(sock)
         late.set()
 
-    shut = xmlrpc_server.shut
-    monkeypatch.setattr(xmlrpc_server, 'shut', shut_and_tell)
+    shutdown_socket = xmlrpc_server.shutdown_socket
+    monkeypatch.setattr(xmlrpc_server, 'shutdown_socket', shutdown_and_tell)
     stopping = threading.Thread(target=node.stop, daemon=True)
     stopping.start()
     stopping.join(TIMEOUT)
@@ -482,11 +482,11 @@ def test_a_thread_that_is_only_just_beginning_is_not_waited_for():
 
 def test_a_part_of_a_wait_that_begins_after_the_stop_began_ends_too():
     life, woken, parts = lifetime.Lifetime('/node'), threading.Event(), threading.Event()
-    with life.here(), lifetime.Interruption(woken.set):
-        life.begin_end()
+    with life.interrupts_waits(), lifetime.Interruption(woken.set):
+        life.begin_shutdown()
         with lifetime.Interruption(parts.set) as part:
             assert woken.is_set() and parts.is_set() and part.came
-    with life.here(), lifetime.Interruption(parts.set) as last_words:
+    with life.interrupts_waits(), lifetime.Interruption(parts.set) as last_words:
         assert not last_words.came
 
 

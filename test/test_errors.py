@@ -7,7 +7,7 @@ import pytest
 
 import pharos
 from pharos import BlockNode, Master
-from pharos.private_rospy.host import rospy
+from pharos.private_rospy.process_rospy import rospy
 
 
 def create(master, name='/node', node_class=BlockNode, **kwargs):

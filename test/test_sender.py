@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings, strategies
 
 from conftest import TIMEOUT
-from pharos.private_rospy.host import rospy
+from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.sender import AT_ONCE, Sender
 from programs import until
 

@@ -12,7 +12,7 @@ import std_srvs.srv
 import pharos
 from conftest import TIMEOUT
 from pharos import BlockNode
-from pharos.private_rospy.host import rospy
+from pharos.private_rospy.process_rospy import rospy
 from programs import run
 
 SPAWN = 'turtlesim/Spawn'  # x, y, theta, name -> name

@@ -108,7 +108,7 @@ class Souls:
         """
         self._here.depth = self._depth() + 1
         try:
-            with self._node._live_rospy().here():
+            with self._node._live_rospy().interrupts_waits():
                 return block(self._node)
         except BaseException as error:
             self._node._report(

@@ -1,5 +1,5 @@
 """The errors of this package: each says what failed, on what name, and what to do next."""
-from pharos.private_rospy.host import rospy
+from pharos.private_rospy.process_rospy import rospy
 
 
 class PharosError(rospy.ROSException):

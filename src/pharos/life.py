@@ -7,7 +7,7 @@ from pharos import running, signals, stopping
 from pharos.blocks import Souls, attempt, check_runs, name_of
 from pharos.intraprocess.dispatcher import Dispatcher
 from pharos.errors import NodeStoppedError, PharosError
-from pharos.private_rospy.host import rospy
+from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.instance import PrivateRospy
 from pharos.seconds import check_seconds
 from pharos.transcript import Transcript

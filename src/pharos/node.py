@@ -10,7 +10,7 @@ from pharos.health import health_of
 from pharos.life import Life
 from pharos.offered_service import OfferedService
 from pharos.parameter import Parameter
-from pharos.private_rospy.host import rospy
+from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.names import Resolved, check_name
 from pharos.private_rospy.settings import Settings
 from pharos.seconds import check_seconds

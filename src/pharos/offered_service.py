@@ -7,7 +7,7 @@ from pharos.messages import message_types
 from pharos.blocks import check_block, text_of
 from pharos.errors import MessageTypeError, PharosError
 from pharos.intraprocess import services
-from pharos.private_rospy.host import rospy
+from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.proxies import time_limit
 from pharos.private_rospy.registration import REGISTER_TIMEOUT, UNREGISTER_TIMEOUT
 

@@ -9,7 +9,7 @@ import time
 
 from pharos import signals, stopping
 from pharos.errors import NodeNameInUseError
-from pharos.private_rospy import host
+from pharos.private_rospy import process_rospy
 from pharos.private_rospy.lifetime import SIGNAL_LATENCY
 
 # A stopped node's rospy is a web of cycles of 0.7 MB, which only the collector frees. It looks at
@@ -159,6 +159,6 @@ def _forget():
 
 
 signals.serve(lambda: bool(_nodes or _others or stopping.is_under_way()), stop_all)
-host.on_signal(_rospy_ended_by)
+process_rospy.on_signal(_rospy_ended_by)
 atexit.register(_end)
 os.register_at_fork(after_in_child=_forget)

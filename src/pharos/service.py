@@ -10,7 +10,7 @@ from pharos.messages import message_types
 from pharos.blocks import check_block
 from pharos.errors import NodeStoppedError, ServiceCallError, ServiceTypeError, UnknownServiceError
 from pharos.intraprocess import services
-from pharos.private_rospy.host import rospy
+from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.proxies import time_limit
 from pharos.private_rospy.lifetime import Interruption
 from pharos.seconds import check_limit

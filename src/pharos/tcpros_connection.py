@@ -10,7 +10,7 @@ import time
 
 import rosgraph.network
 
-from pharos.private_rospy.lifetime import Interruption, keep_alive, shut
+from pharos.private_rospy.lifetime import Interruption, keep_alive, shutdown_socket
 
 CALLER_ID = (  # not a node's: a publisher closes an earlier connection of the same name
     '/pharos_types'
@@ -38,7 +38,7 @@ class TcprosConnection:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             # an answer may take any time, while its host is there
             keep_alive(self._socket, while_sending=True)
-            with Interruption(lambda: shut(self._socket)):
+            with Interruption(lambda: shutdown_socket(self._socket)):
                 rosgraph.network.write_ros_handshake_header(self._socket, header)
                 size = self._read(4)
                 answer = self._read_sized(size, _HEADER_LIMIT)
@@ -54,7 +54,7 @@ class TcprosConnection:
         """Send a serialized request to a service; returns ``(ok, serialized response or error
         text)``."""
         self._deadline = deadline
-        with Interruption(lambda: shut(self._socket)):
+        with Interruption(lambda: shutdown_socket(self._socket)):
             self._socket.settimeout(self._left())
             self._socket.sendall(struct.pack('<I', len(request)) + request)
             ok = self._read(1) != b'\0'

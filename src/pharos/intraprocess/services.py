@@ -6,7 +6,7 @@ import threading
 import time
 
 from pharos.intraprocess import copier
-from pharos.private_rospy.host import rospy
+from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.lifetime import Interruption
 from pharos.private_rospy.names import Resolved
 from pharos.private_rospy.registration import registered

@@ -18,7 +18,7 @@ import rosgraph
 
 from pharos.errors import MasterUnreachableError, NodeStoppedError, PortInUseError
 from pharos.private_rospy import (
-    host,
+    process_rospy,
     logs,
     patches,
     publishing,
@@ -191,7 +191,7 @@ class PrivateRospy:
         """Turns what rospy raises where the time is up into an error that names the master."""
         try:
             yield
-        except (*registration.COMMUNICATION_ERRORS, host.rospy.ROSInitException) as error:
+        except (*registration.COMMUNICATION_ERRORS, process_rospy.rospy.ROSInitException) as error:
             if not is_time_up():
                 raise
             raise self._stopped_answering() from error
@@ -216,16 +216,16 @@ class PrivateRospy:
     def end(self):
         """Begin the stop: all that waits ends, ``is_shutdown()`` holds, and nothing more is
         received."""
-        self.lifetime.begin_end()
+        self.lifetime.begin_shutdown()
         changed = self._modules.load('rospy.rostime').get_rostime_cond()
         with changed:
             changed.notify_all()  # simulated time may stand still
 
-    def stop(self, flush_timeout, given_up=()):
+    def stop(self, flush_timeout, abandoned=()):
         """Send what is under way (for up to ``flush_timeout`` seconds), unregister, close the
         ports, end the threads.
 
-        Returns the names of threads that did not end in time, but for those ``given_up`` already.
+        Returns the names of threads that did not end in time, but for those ``abandoned`` already.
         Harmless when done twice.
         """
         if not self._stopping.acquire(blocking=False):
@@ -240,12 +240,12 @@ class PrivateRospy:
             pass  # where the node's own code called that, it returned at once
         for proxy in list(core._xmlrpc_cache.values()):  # a thread that is left may add one
             proxy('close')()
-        left = self.lifetime.end(given_up)
+        left = self.lifetime.end(abandoned)
         logs.close_handlers(self._logging)
         return [thread.name for thread in left]
 
     def _wake(self, reason):
-        self.lifetime.begin_end()
+        self.lifetime.begin_shutdown()
         if self.lifetime.xmlrpc and self.lifetime.xmlrpc.handler:
             changed = self.lifetime.xmlrpc.handler.reg_man.cond
             with changed:
@@ -287,15 +287,15 @@ class PrivateRospy:
         """``start_thread(target, args=(), name=None)``: a thread that the stop waits for."""
         return self.lifetime.start_thread
 
-    def shut_at_end(self, sock):
+    def track_socket(self, sock):
         """Shut the socket down when the node stops, at the latest."""
-        self.lifetime.shut_at_end(sock)
+        self.lifetime.track_socket(sock)
 
     @property
-    def here(self):
-        """``with here():`` what waits in this thread does so on behalf of the node, and ends with
-        it."""
-        return self.lifetime.here
+    def interrupts_waits(self):
+        """``with interrupts_waits():`` what waits in this thread does so on behalf of the node, and
+        ends with it."""
+        return self.lifetime.interrupts_waits
 
     def wait_until(self, predicate, timeout):
         """Wait until ``predicate()``, which speaks of connections in this process, holds, or the
@@ -389,4 +389,4 @@ class _ports_checked:
 def _share_service_exception(module):
     """rospy.service: one ServiceException for all nodes, so that ``except rospy.ServiceException``
     catches it."""
-    module.ServiceException = host.rospy.ServiceException
+    module.ServiceException = process_rospy.rospy.ServiceException

@@ -41,7 +41,7 @@ class Lifetime:
             for."""
 
             def run(self):
-                with lifetime.here():
+                with lifetime.interrupts_waits():
                     super().run()
 
             def start(self):
@@ -59,7 +59,7 @@ class Lifetime:
         return thread
 
     @contextlib.contextmanager
-    def here(self):
+    def interrupts_waits(self):
         """Within this, what waits in this thread does so on behalf of the node, and ends with
         it."""
         before, _thread.lifetime = getattr(_thread, 'lifetime', None), self
@@ -68,7 +68,7 @@ class Lifetime:
         finally:
             _thread.lifetime = before
 
-    def begin_end(self):
+    def begin_shutdown(self):
         """Begin the end: all that waits on behalf of the node ends."""
         self.ended.set()
         for interruption in tuple(self._interruptions):
@@ -86,30 +86,24 @@ class Lifetime:
             while seconds > 0 and not self.ended.wait(min(seconds, SIGNAL_LATENCY)):
                 seconds = until - time.monotonic()
 
-    def hold(self, sock):
-        """Shut this accepted socket down at the end, at the latest."""
-        # rospy waits for ever for a service's client, or in vain for a subscriber's leaving
-        keep_alive(sock)
-        self.shut_at_end(sock)
-
-    def shut_at_end(self, sock):
+    def track_socket(self, sock):
         """Shut this socket down at the end: a thread that waits for what comes through it then
         ends."""
         self._sockets.add(sock)
 
-    def spare(self, sock):
+    def untrack_socket(self, sock):
         """Do not shut this socket: its client is to hear that the node has stopped."""
         self._sockets.discard(sock)
 
-    def end(self, given_up=()):
+    def end(self, abandoned=()):
         """Shut the sockets, wait for the threads but those given up; returns those that did not end
         in time."""
-        self.begin_end()
+        self.begin_shutdown()
         for sock in list(self._sockets):
-            shut(sock)
+            shutdown_socket(sock)
         me = threading.current_thread()
         threads = [
-            thread for thread in list(self.threads) if thread is not me and thread not in given_up
+            thread for thread in list(self.threads) if thread is not me and thread not in abandoned
         ]
         deadline = time.monotonic() + JOIN_TIMEOUT
         for thread in threads:
@@ -179,7 +173,7 @@ def keep_alive(sock, while_sending=False):
         pass  # closed already
 
 
-def shut(sock):
+def shutdown_socket(sock):
     """Shut a socket down: unlike ``close`` alone, this wakes a thread that waits on it."""
     try:
         sock.shutdown(socket.SHUT_RDWR)

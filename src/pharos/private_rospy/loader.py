@@ -12,7 +12,7 @@ import re
 import sys
 from importlib.machinery import PathFinder
 
-from pharos.private_rospy.host import rospy
+from pharos.private_rospy.process_rospy import rospy
 
 # so that ``except rospy.ROSException`` catches every node's
 _SHARED = {'rospy.exceptions': rospy.exceptions}

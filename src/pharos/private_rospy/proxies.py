@@ -9,7 +9,7 @@ import xmlrpc.client
 
 import rosgraph
 
-from pharos.private_rospy.lifetime import Interruption, shut
+from pharos.private_rospy.lifetime import Interruption, shutdown_socket
 
 TIMEOUT = 10.0  # seconds for one call, where nothing else is said
 MARGIN = (
@@ -94,7 +94,7 @@ class _Transport(xmlrpc.client.Transport):
         connection = self._connection[1]
         sock = connection.sock if connection else None
         if sock is not None:
-            shut(sock)
+            shutdown_socket(sock)
 
 
 class _Connection(http.client.HTTPConnection):

@@ -64,7 +64,7 @@ def hooks(instance):
             sock = self.socket
             if sock is None:  # closed meanwhile
                 return
-            instance.shut_at_end(sock)  # a call of a service waits for its answer for ever
+            instance.track_socket(sock)  # a call of a service waits for its answer for ever
             if is_keepalive_wanted():
                 keep_alive(sock)
 

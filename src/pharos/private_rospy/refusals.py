@@ -8,8 +8,8 @@ from typing import NamedTuple
 import rosgraph
 
 from pharos.private_rospy import publishing
-from pharos.private_rospy.door import brief
-from pharos.private_rospy.host import rospy
+from pharos.private_rospy.acceptor import brief
+from pharos.private_rospy.process_rospy import rospy
 from pharos.tcpros_connection import CALLER_ID, publisher_header
 
 TIMEOUT = 1.0  # seconds in which a publisher that refused says what it publishes

@@ -7,9 +7,9 @@ import sys
 import time
 
 from pharos.private_rospy import xmlrpc_server
-from pharos.private_rospy.door import BACKLOG, Door, brief
-from pharos.private_rospy.host import rospy
-from pharos.private_rospy.lifetime import shut
+from pharos.private_rospy.acceptor import BACKLOG, Acceptor, brief
+from pharos.private_rospy.process_rospy import rospy
+from pharos.private_rospy.lifetime import shutdown_socket
 from pharos.private_rospy.names import NAME_LIMIT
 from pharos.intraprocess.sharing import numbered
 
@@ -78,7 +78,7 @@ def hooks(lifetime, warn, debug):
 
     def mend_connections(module):
         """rospy.impl.tcpros_base."""
-        _accept_at_a_door(module, Door('TCPROS', lifetime, warn))
+        _accept_in_threads(module, Acceptor('TCPROS', lifetime, warn))
         _end_bad_connections(module, warn)
         # where it writes tracebacks, a line of the log says what is wrong
         module.rospyerr = module.rospydebug
@@ -96,7 +96,7 @@ def hooks(lifetime, warn, debug):
     def expect_requests(module):
         """rospy.impl.tcpros_service: a client that asks nothing is waited for, and one that asks
         nonsense kept."""
-        door, service = Door('service', lifetime, warn), module.ServiceImpl
+        acceptor, service = Acceptor('service', lifetime, warn), module.ServiceImpl
         tell = service.error_handler
 
         def error_handler(self, error, *information):
@@ -131,20 +131,22 @@ def hooks(lifetime, warn, debug):
                 again = header.get('probe') != '1'
                 while again:
                     if not persistent:  # a client that is may say nothing for long
-                        door.expect(sock)
+                        acceptor.start_handshake(sock)
                     received = transport.receive_once()
-                    door.heard(sock)
+                    acceptor.finish_handshake(sock)
                     for request in received:
                         self._handle_request(transport, request)
                     again = persistent
             except _Unreadable as error:
-                door.complain(address, error)
+                acceptor.log_rejection(address, error)
             except rospy.exceptions.TransportTerminated as error:
-                door.refuse(sock, address, error)  # a persistent one is not expected, and may go
+                acceptor.reject(
+                    sock, address, error
+                )  # a persistent one is not expected, and may go
             except (OSError, rospy.exceptions.TransportInitError):
                 pass  # it has gone; what would tell it of that finds the transport closed
             finally:
-                door.heard(sock)
+                acceptor.finish_handshake(sock)
                 transport.close()
 
         service.handle = handle
@@ -158,17 +160,17 @@ def hooks(lifetime, warn, debug):
     }
 
 
-def _accept_at_a_door(module, door):
+def _accept_in_threads(module, acceptor):
     """rospy.impl.tcpros_base: one silent client keeps all others from connecting (ros_comm PR
     #1918)."""
     server, tcp = module.TCPROSServer, module.TCPServer
-    tcp.run = lambda self: door.accept(self.server_sock, self.inbound_handler)
+    tcp.run = lambda self: acceptor.accept(self.server_sock, self.inbound_handler)
 
     def shutdown(self):
         """close() alone does not wake accept(), and the port stays taken."""
         if not self.is_shutdown:
             self.is_shutdown = True
-            shut(self.server_sock)
+            shutdown_socket(self.server_sock)
             self.server_sock.close()
 
     tcp.shutdown = shutdown

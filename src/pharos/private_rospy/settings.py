@@ -15,7 +15,7 @@ from pharos.private_rospy.addresses import (
     default_domain,
 )
 from pharos.private_rospy.arguments import mappings_for, takes_name
-from pharos.private_rospy.host import rospy
+from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.names import NODE_LIMIT, check_name
 from pharos.private_rospy.parameters import carried
 

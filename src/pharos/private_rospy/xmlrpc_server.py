@@ -8,8 +8,8 @@ import urllib.parse
 import xml.parsers.expat
 import xmlrpc.client
 
-from pharos.private_rospy.door import BACKLOG, Door, brief
-from pharos.private_rospy.lifetime import shut
+from pharos.private_rospy.acceptor import BACKLOG, Acceptor, brief
+from pharos.private_rospy.lifetime import shutdown_socket
 from pharos.private_rospy.loader import Substitute
 
 REQUEST_TIMEOUT = 30.0  # seconds from one answer until the next request has come, however slowly
@@ -29,9 +29,9 @@ def hooks(lifetime, warn, debug):
     def limit_requests(module):
         """rosgraph.xmlrpc: a request may be silent or huge for ever, and runs in a thread that
         nobody knows."""
-        door = Door('XML-RPC', lifetime, warn)
+        acceptor = Acceptor('XML-RPC', lifetime, warn)
         module.SilenceableXMLRPCRequestHandler = _request_handler(
-            module.SilenceableXMLRPCRequestHandler, door, lifetime
+            module.SilenceableXMLRPCRequestHandler, acceptor, lifetime
         )
         server, node = module.ThreadingXMLRPCServer, module.XmlRpcNode
         dispatch = server._dispatch
@@ -45,11 +45,13 @@ def hooks(lifetime, warn, debug):
             try:
                 answer = dispatch(self, method, parameters)
             except Exception as error:
-                door.complain(_call.client, f'call of {brief(method)}: {error}')
+                acceptor.log_rejection(_call.client, f'call of {brief(method)}: {error}')
                 raise
             if type(answer) is tuple and answer[0] < 1:
                 if answer[1].startswith(REFUSED):
-                    door.complain(_call.client, f'call of {method}: {answer[1][len(REFUSED):]}')
+                    acceptor.log_rejection(
+                        _call.client, f'call of {method}: {answer[1][len(REFUSED):]}'
+                    )
                 else:
                     client = '%s:%s' % _call.client[:2]
                     debug(f'XML-RPC client {client}: call of {method}: {brief(answer[1])}')
@@ -72,7 +74,7 @@ def hooks(lifetime, warn, debug):
             self._run_init()
             self.server.socket.listen(BACKLOG)
             ways_in = self.server.socket, self.server.serve
-            self.accepting = lifetime.start_thread(door.accept, ways_in, 'xmlrpc-accept')
+            self.accepting = lifetime.start_thread(acceptor.accept, ways_in, 'xmlrpc-accept')
 
         node.start = start
 
@@ -84,21 +86,21 @@ def hooks(lifetime, warn, debug):
             if handler:
                 handler._shutdown(reason)
             if server:
-                shut(server.socket)
+                shutdown_socket(server.socket)
                 self.accepting.join()  # closed any earlier, the socket could not wake it any more
                 server.server_close()
             lifetime.silent.set()
 
         node.shutdown = shutdown
 
-    def leave_complaints_to_the_server(module):
+    def leave_logged_to_the_server(module):
         """rospy.impl.masterslave: writes tracebacks of calls with wrong arguments, and not whose
         they were."""
         module._logger = Substitute(module._logger, error=module._logger.debug)
 
     return {
         'rosgraph.xmlrpc': limit_requests,
-        'rospy.impl.masterslave': leave_complaints_to_the_server,
+        'rospy.impl.masterslave': leave_logged_to_the_server,
     }
 
 
@@ -126,7 +128,7 @@ class _Reader(io.RawIOBase):
         return count
 
 
-def _request_handler(base, door, lifetime):
+def _request_handler(base, acceptor, lifetime):
     """The class that serves one client, derived from rosgraph's."""
     large = threading.BoundedSemaphore(LARGE_REQUESTS)
 
@@ -145,7 +147,7 @@ def _request_handler(base, door, lifetime):
             self.close_connection = False
             try:
                 while not self.close_connection:
-                    door.expect(self.connection)
+                    acceptor.start_handshake(self.connection)
                     self.rfile.raw.begin()
                     self.waits_for_us = False
                     self.handle_one_request()
@@ -155,7 +157,7 @@ def _request_handler(base, door, lifetime):
         def log_error(self, format, *args):
             # else it went, having nothing more to ask
             if self.rfile.raw.received or not self.answered:
-                door.refuse(self.connection, self.client_address, format % args)
+                acceptor.reject(self.connection, self.client_address, format % args)
 
         def handle_expect_100(self):
             """The client is told to go on when its request is accepted."""
@@ -199,11 +201,11 @@ def _request_handler(base, door, lifetime):
                     400, 'no XML-RPC call: ' + brief(error).encode('ascii', 'replace').decode()
                 )
                 return
-            if not door.heard(self.connection):
+            if not acceptor.finish_handshake(self.connection):
                 self.close_connection = True
                 return
             if method == 'shutdown':
-                lifetime.spare(self.connection)
+                lifetime.untrack_socket(self.connection)
                 self.close_connection = True
             _call.client, _call.here = self.client_address, self.connection.getsockname()
             try:

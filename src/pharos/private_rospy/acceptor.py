@@ -5,23 +5,24 @@ import errno
 import threading
 import time
 
-from pharos.private_rospy.lifetime import shut
+from pharos.private_rospy.lifetime import keep_alive, shutdown_socket
 
 # connections waiting to be accepted; of a rush, those beyond would try again a second later
 BACKLOG = 1024
 CLIENTS = 128  # of one server, that have something to say before they are served
 GRACE = 0.25  # seconds that each of them has in any case
-PAUSE = (
-    0.05  # seconds until the next attempt to accept a client where there are no descriptors left
-)
-COMPLAINTS = 100  # lines of the log within
-COMPLAINT_PERIOD = 10.0  # seconds, about the clients of one server; the rest is counted
+# seconds until the next attempt to accept a client where there are no descriptors left
+PAUSE = 0.05
+# lines about the clients of one server that the log takes in a period of so many seconds; the rest
+# is counted
+REJECTION_LINES = 100
+REJECTION_PERIOD = 10.0
 TEXT_LIMIT = 300  # characters of a client's in a line of the log
 _EXHAUSTED = errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM
 _SHUT = errno.EINVAL, errno.EBADF
 
 
-class Door:
+class Acceptor:
     """Lets the clients of one server in, each into a thread of its own.
 
     A client that is to say something before it is served, a handshake or a request, is *expected*.
@@ -38,7 +39,7 @@ class Door:
         self._expected = {}  # socket -> since when; those expected longest first
         self._inside = 0  # threads
         self._crowded = False  # and the log says so
-        self._complaints = collections.deque(maxlen=COMPLAINTS)  # when the last were logged
+        self._logged = collections.deque(maxlen=REJECTION_LINES)  # when the last were logged
         self._not_logged = 0  # since then
 
     def accept(self, listener, serve):
@@ -60,8 +61,10 @@ class Door:
                     self._close_longest(error.strerror)
                     self._lifetime.ended.wait(PAUSE)
                 continue  # else the client went before it was let in
-            self._lifetime.hold(sock)
-            self.expect(sock)
+            # rospy waits for ever for a service's client, or in vain for a subscriber's leaving
+            keep_alive(sock)
+            self._lifetime.track_socket(sock)
+            self.start_handshake(sock)
             self._let_in(sock, address, serve)
 
     def _let_in(self, sock, address, serve):
@@ -83,22 +86,22 @@ class Door:
             serve(sock, address)
         except Exception as error:
             sock.close()
-            self.refuse(sock, address, error)
+            self.reject(sock, address, error)
         finally:
             self._leave(sock)
 
     def _leave(self, sock):
-        self.heard(sock)
+        self.finish_handshake(sock)
         with self._changed:
             self._inside -= 1
 
-    def expect(self, sock):
+    def start_handshake(self, sock):
         """The client is to say something now."""
         with self._changed:
             self._expected[sock] = time.monotonic()
         self._make_room()
 
-    def heard(self, sock):
+    def finish_handshake(self, sock):
         """It has said it; returns whether it was expected, and not closed for others meanwhile."""
         with self._changed:
             since = self._expected.pop(sock, None)
@@ -107,21 +110,21 @@ class Door:
             self._changed.notify_all()
             return since is not None
 
-    def refuse(self, sock, address, why):
+    def reject(self, sock, address, why):
         """Log why a client that was expected is not served; what happens to it later is its own
         affair."""
-        if self.heard(sock):
-            self.complain(address, why)
+        if self.finish_handshake(sock):
+            self.log_rejection(address, why)
 
-    def complain(self, address, why):
+    def log_rejection(self, address, why):
         """Log what is wrong with a client, unless so many others are wrong that it would fill the
         log."""
         if self._lifetime.ended.is_set():
             return
         now = time.monotonic()
         with self._changed:
-            told = self._complaints
-            if len(told) == COMPLAINTS and now - told[0] < COMPLAINT_PERIOD:
+            told = self._logged
+            if len(told) == REJECTION_LINES and now - told[0] < REJECTION_PERIOD:
                 self._not_logged += 1
                 return
             told.append(now)
@@ -147,7 +150,7 @@ class Door:
             longest = next(iter(self._expected), None)
             if longest is not None:
                 del self._expected[longest]
-                shut(longest)  # its thread wakes
+                shutdown_socket(longest)  # its thread wakes
         self._say_crowded(why)
 
     def _say_crowded(self, why):
