@@ -30,7 +30,7 @@ from pharos.private_rospy import (
 from pharos.private_rospy.lifetime import Lifetime
 from pharos.private_rospy.loader import PrivateImports, Substitute
 from pharos.private_rospy.parameters import WatchedParameters
-from pharos.private_rospy.proxies import ServerProxy, is_time_up, master_api, time_limit
+from pharos.private_rospy.proxies import ServerProxy, is_time_up, time_limit
 from pharos.intraprocess.services import Workers
 from pharos.private_rospy.connections import Connections
 
@@ -149,16 +149,8 @@ class PrivateRospy:
         """
         settings = self.settings
         self._deadline = time.monotonic() + timeout
-        with time_limit(timeout):
-            try:
-                master_api(settings.master_url, self.name, timeout).getPid()
-            except registration.COMMUNICATION_ERRORS as error:
-                raise MasterUnreachableError(
-                    f'no ROS master answers at {settings.master_url} ({error}): start one with'
-                    ' roscore or Master.embedded(), or set ROS_MASTER_URI'
-                ) from error
-            with self._reached():
-                registration.claim_name(settings.master_url, self.name, timeout)
+        with time_limit(timeout), self._reached():
+            registration.claim_name(settings.master_url, self.name, timeout)
         core = self._modules.load('rospy.core')
         # the first, so that the threads that rospy waits for end at once
         core._shutdown_hooks.insert(0, self._wake)

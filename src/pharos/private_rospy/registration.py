@@ -277,6 +277,7 @@ def _name_is_anothers(handler):
 def claim_name(master_url, name, timeout):
     """Make sure that no running node has ``name``; what a dead one left with the master goes.
 
+    :raises MasterUnreachableError: if no master answers
     :raises NodeNameInUseError: if a running node has the name, or one that cannot be told from it
     """
     master = master_api(master_url, name, timeout)
@@ -284,6 +285,11 @@ def claim_name(master_url, name, timeout):
         uri = master.lookupNode(name)
     except rosgraph.MasterError:  # unknown to the master, as it should be
         return
+    except COMMUNICATION_ERRORS as error:
+        raise MasterUnreachableError(
+            f'no ROS master answers at {master_url} ({error}): start one with roscore or'
+            ' Master.embedded(), or set ROS_MASTER_URI'
+        ) from error
     try:
         ServerProxy(uri, PING_TIMEOUT).getPid(name)
     except ConnectionRefusedError:
