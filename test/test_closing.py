@@ -7,7 +7,7 @@ import pytest
 import pharos
 from conftest import TIMEOUT, Mailbox
 from pharos import BlockNode
-from pharos.messages.message_types import define_service
+from pharos.messages import define_service
 
 STRING = 'std_msgs/String'
 

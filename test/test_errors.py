@@ -49,7 +49,7 @@ def test_a_taken_name(master):
         pharos.NodeNameInUseError, match='/taken is taken by a running node of this process: .*stop'
     ):
         create(master, '/taken')
-    assert owner.is_running and master.answers('/taken')
+    assert owner.is_running and master.is_node_alive('/taken')
 
 
 def test_a_name_left_by_a_dead_node_is_free(master):
@@ -147,7 +147,7 @@ def test_an_unknown_topic(master):
     ):
         node.send_to('/untyped_yet', data=1)
     node.output_channel('/posing_turtle/pose', 'turtlesim/Pose')
-    with pytest.raises(pharos.UnknownTopicError, match='did you mean /posing_turtle/pose'):
+    with pytest.raises(pharos.UnknownTopicError, match='did you mean ./posing_turtle/pose'):
         create(master, '/other').interested_in('/posing_turtle/poes')
 
 

@@ -102,7 +102,7 @@ def test_near_names_are_offered(master):
         ('/clear', lambda: master.lookup_service('/claer')),
         ('/background_r', lambda: master.parameters['/backgruond_r']),
     ):
-        with pytest.raises((pharos.PharosError, KeyError), match=f'did you mean {name}'):
+        with pytest.raises((pharos.PharosError, KeyError), match=f'did you mean .{name}'):
             ask()
 
 

@@ -36,8 +36,8 @@ from pharos import (
     graph_types,
     message_class,
 )
-from pharos.messages.message_types import class_from_definition
-from pharos.tcpros_connection import publisher_header
+from pharos.messages import class_from_definition
+from pharos.private_rospy.tcpros_connection import publisher_header
 from programs import Program, run, until
 from sockets import refused_url
 

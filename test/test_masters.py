@@ -45,7 +45,7 @@ def test_nodes_of_one_name_live_on_two_masters(masters):
         assert (
             master.nodes() == [node]
             and master.node('/same') is node
-            and master.own_nodes() == [node]
+            and master.local_nodes() == [node]
         )
         assert run(master.url, 'rosnode', 'list').stdout == '/same\n'
         assert node.uri in run(master.url, 'rosnode', 'info', '/same').stdout
@@ -138,7 +138,7 @@ def test_masters_of_one_address_are_one(spellings):
     node = create(given, '/own')
     assert (
         other.node('/own') is node
-        and other.own_nodes() == [node]
+        and other.local_nodes() == [node]
         and other.wait_for_node('/own', TIMEOUT) is node
     )
     assert other.nodes() == [node]

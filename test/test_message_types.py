@@ -19,9 +19,9 @@ import std_msgs.msg
 import std_srvs.srv
 from hypothesis import given, settings, strategies as st
 
-from pharos.messages import known_types, message_definition, message_types
+from pharos.messages import classes, definition, lookup
 from pharos.errors import MessageTypeError, UnknownTypeError
-from pharos.messages.message_types import (
+from pharos.messages import (
     check_fits,
     class_from_definition,
     define_message,
@@ -57,9 +57,9 @@ PRIMITIVES = [
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch):
     """Each test begins with nothing defined, made or found."""
-    monkeypatch.setattr(message_definition, '_made', {})
-    monkeypatch.setattr(message_types, '_given', {})
-    monkeypatch.setattr(known_types, 'found', {})
+    monkeypatch.setattr(definition, '_made', {})
+    monkeypatch.setattr(classes, '_given', {})
+    monkeypatch.setattr(lookup, 'found', {})
 
 
 @pytest.fixture
@@ -491,7 +491,7 @@ import os, sys
 sys.modules['std_srvs'] = None  # as if not installed
 import rosmaster.master
 import rospy
-from pharos.messages.message_types import define_service, fill
+from pharos.messages import define_service, fill
 master = rosmaster.master.Master(port=0)
 master.start()
 os.environ['ROS_MASTER_URI'] = master.uri

@@ -303,7 +303,7 @@ def test_to_a_node_that_is_not_there_is_an_error_and_not_counted(master, node, m
     channel = node.output_channel('/orders', STRING)
     for send in channel.send, lambda **kwargs: node.send_to('/orders', **kwargs):
         with pytest.raises(
-            pharos.UnknownNodeError, match='no node /lisener at .*did you mean /listener'
+            pharos.UnknownNodeError, match='no node /lisener at .*did you mean ./listener'
         ):
             send(data='lost', to=to)
     channel.send(data='found', to='listener')

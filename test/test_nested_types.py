@@ -14,8 +14,8 @@ from rospy.numpy_msg import numpy_msg
 
 from conftest import TIMEOUT, serializes_numpy
 from pharos import BlockNode, MessageTypeError
-from pharos.messages.message_types import build, check_fits, class_from_definition, explain
-from pharos.messages.nested_types import nested_class
+from pharos.messages import build, check_fits, class_from_definition, explain
+from pharos.messages import nested_class
 from pharos.intraprocess.copier import copier_for
 from test_copier import told, wire
 from test_message_types import PRIMITIVES, VALUES

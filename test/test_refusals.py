@@ -12,7 +12,7 @@ import std_msgs.msg
 import pharos
 from conftest import TIMEOUT, Mailbox
 from pharos import BlockNode, MessageTypeError
-from pharos.messages import message_types
+from pharos import messages
 from pharos.private_rospy import refusals
 from pharos.intraprocess.link import Link
 from programs import Program, until
@@ -25,9 +25,9 @@ FIELD = {STRING: 'data: string', INT32: 'data: int32'}
 
 PEER = r'''
 import sys, rospy
-from pharos.messages import message_types
+from pharos import messages
 kind, name, topic, type_, text = sys.argv[1:]
-cls = message_types.class_from_definition(type_, text)
+cls = messages.class_from_definition(type_, text)
 rospy.init_node(name)
 if kind == 'publisher':
     end = rospy.Publisher(topic, cls, latch=True, queue_size=1)
@@ -85,7 +85,7 @@ def publisher_here(url, topic, type_, text):
     sender = create(pharos.Master(url), '/far')
     in_time(
         lambda: sender.output_channel(
-            topic, message_types.class_from_definition(type_, text), latch=True
+            topic, messages.class_from_definition(type_, text), latch=True
         )
     )
     yield '/far'
@@ -95,7 +95,7 @@ def publisher_here(url, topic, type_, text):
 @contextlib.contextmanager
 def careless_publisher(url, topic, type_, text):
     """One that does not check."""
-    cls = message_types.class_from_definition(type_, text)
+    cls = messages.class_from_definition(type_, text)
     with Publisher(pharos.Master(url), topic, type_, text, cls._md5sum, name='/far'):
         yield '/far'
 

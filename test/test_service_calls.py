@@ -19,7 +19,7 @@ import rosnode
 import pharos
 from conftest import TIMEOUT, InProcessMaster
 from pharos import BlockNode
-from pharos.messages import message_types
+from pharos import messages
 from programs import Program, environment, forget_parameters, run, script, until
 from sockets import wait_for_end
 
@@ -224,7 +224,8 @@ def threads():
 TURTLES = r'''
 import importlib.util, sys
 import pharos
-from pharos.messages import message_types, turtlesim_types
+from pharos import messages
+from pharos.messages import turtlesim
 
 assert importlib.util.find_spec('turtlesim') is None
 master, called = pharos.Master(), {}
@@ -273,7 +274,7 @@ print('called', *sorted(service.type for service in called.values()))
 UNKNOWN_TYPE = (
     TURTLES
     + r'''
-text = turtlesim_types.DEFINITIONS['srv'].pop('turtlesim/TeleportAbsolute')
+text = turtlesim.DEFINITIONS['srv'].pop('turtlesim/TeleportAbsolute')
 service = master.lookup_service('/turtle1/teleport_absolute')
 print(service.type, service.md5sum)
 try:
@@ -452,7 +453,7 @@ def test_a_provider_that_came_back_with_another_type(master, moves):
 
 def test_a_slip_in_the_name_of_a_service_elsewhere(master, there):
     with pytest.raises(
-        pharos.UnknownServiceError, match='the service /there/ecko, did you mean /there/echo'
+        pharos.UnknownServiceError, match='the service /there/ecko .did you mean ./there/echo'
     ):
         master.lookup_service('/there/ecko')
 
@@ -606,7 +607,7 @@ class Refuser:
         told = {
             'callerid': '/refuser',
             'type': ECHO,
-            'md5sum': message_types.service_class(ECHO)._md5sum,
+            'md5sum': messages.service_class(ECHO)._md5sum,
         }
         with contextlib.ExitStack() as taken:
             for header in told, {'error': 'not today'}, None:

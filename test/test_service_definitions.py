@@ -7,7 +7,7 @@ import pytest
 
 import pharos
 from pharos import BlockNode, ServiceTypeError
-from pharos.messages import message_types
+from pharos import messages
 from programs import Program, script
 
 TYPE = 'layout_srvs/Spawn'
@@ -39,7 +39,7 @@ persistent_or_not = pytest.mark.parametrize(
 
 def class_of(text):
     """The class of that text, with nothing defined for later."""
-    return message_types.message_definition.make('srv', TYPE, text)
+    return messages.definition.make('srv', TYPE, text)
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def defined(monkeypatch):
     """``defined(text)``: that is what the type is here, until the test ends."""
 
     def define(text):
-        monkeypatch.setitem(message_types.known_types.found, ('srv', TYPE), class_of(text))
+        monkeypatch.setitem(messages.lookup.found, ('srv', TYPE), class_of(text))
 
     return define
 

@@ -301,7 +301,7 @@ def test_an_unknown_service_names_the_near_ones(master):
     with pytest.raises(
         pharos.UnknownServiceError,
         match='offers the service /turtle1/telport.*did you mean '
-        '/turtle1/teleport: see rosservice list',
+        './turtle1/teleport.*: see rosservice list',
     ):
         master.lookup_service('/turtle1/telport')
 

@@ -3,7 +3,7 @@ import pytest
 
 from conftest import Mailbox
 from pharos import BlockNode
-from pharos.messages.message_types import define_service
+from pharos.messages import define_service
 from programs import until
 
 POINT, STRING, HEADER = 'geometry_msgs/PointStamped', 'std_msgs/String', 'std_msgs/Header'

@@ -18,7 +18,7 @@ from pharos.external_node import ExternalNode
 from pharos.failures import Failure
 from pharos.life import Lifecycle
 from pharos.master import Master
-from pharos.messages.message_types import (
+from pharos.messages import (
     define_message,
     define_service,
     message_class,

@@ -5,7 +5,7 @@ import time
 
 import genpy
 
-from pharos.messages import message_types
+from pharos import messages
 from pharos.blocks import check_block, check_delegate, check_runs
 from pharos.intraprocess.dispatcher import Inbox, SocketInbox
 from pharos.errors import MasterUnreachableError, MessageTypeError, NodeStoppedError, PharosError
@@ -326,7 +326,7 @@ class OutputChannel(_Channel):
         ):
             raise MessageTypeError(
                 f"{self.topic} carries"
-                f" {self.type} ({message_types.describe_fields(self.message_class)}), not"
+                f" {self.type} ({messages.describe_fields(self.message_class)}), not"
                 f" {getattr(message, '_type', None) or repr(message)}"
             )
 
@@ -337,7 +337,7 @@ class OutputChannel(_Channel):
                 f'the channel of {self.node.name} on {self.topic} is closed: open another with'
                 ' output_channel()'
             ) from error
-        message_types.check_fits(message)
+        messages.check_fits(message)
         raise MessageTypeError(f'{self.type} cannot be sent on {self.topic}: {error}') from error
 
     def _unregister(self, endpoint):
@@ -350,7 +350,7 @@ class OutputChannel(_Channel):
         if block is not None:
             check_runs(block, 'a block')
         try:
-            message = message_types.build(self.message_class, block, fields)
+            message = messages.build(self.message_class, block, fields)
         except TypeError:
             check_block(block, 'block', ('message',))  # says how it is called
             raise
@@ -358,7 +358,7 @@ class OutputChannel(_Channel):
             try:
                 self._freeze(message)
             except Exception:
-                message_types.check_fits(message)
+                messages.check_fits(message)
                 raise
         self.publish(message, to)
         return message
@@ -395,7 +395,7 @@ class OutputChannel(_Channel):
         def connected():
             missing.difference_update(name for name, _ in self.connections)
             missing.difference_update(
-                node.name for node in self.node.master.own_nodes() if node._is_ending()
+                node.name for node in self.node.master.local_nodes() if node._is_ending()
             )
             missing.difference_update(self.node._rospy.refusals.subscribers(self.topic))
             return not missing or not self.is_open
@@ -405,7 +405,7 @@ class OutputChannel(_Channel):
         if not connected() and self.node.is_running:
             # those that do not answer any more, killed for example, are not worth the wait
             with time_limit(deadline - time.monotonic()):
-                missing.intersection_update(filter(self.node.master.answers, tuple(missing)))
+                missing.intersection_update(filter(self.node.master.is_node_alive, tuple(missing)))
             wait_until(connected, deadline - time.monotonic())
             if timeout and not connected() and self.node.is_running:
                 self._tell_who_is_late(missing, timeout)

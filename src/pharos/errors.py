@@ -1,4 +1,7 @@
 """The errors of this package: each says what failed, on what name, and what to do next."""
+import difflib
+from typing import Iterable, List, Optional
+
 from pharos.private_rospy.process_rospy import rospy
 
 
@@ -48,3 +51,14 @@ class ServiceCallError(PharosError):
 
 class NodeStoppedError(PharosError):
     """The node is not running."""
+
+
+def suggest(name: str, names: Iterable[str], meant: Optional[List[str]] = None) -> str:
+    """The hint that ends a complaint about a wrong name: ``" (did you mean 'x' or 'y'?)"``.
+
+    :param names: those that there are; of them, the ones that differ by a slip are suggested
+    :param meant: what is suggested instead, if that is anything
+    :returns: nothing where there is nothing to suggest
+    """
+    meant = meant or difflib.get_close_matches(name, list(names), 3, 0.7)
+    return f" (did you mean {' or '.join(map(repr, meant))}?)" if meant else ''

@@ -31,7 +31,7 @@ class ExternalNode:
 
     def is_alive(self):
         """Whether it answers."""
-        return self.master.answers(self.name)
+        return self.master.is_node_alive(self.name)
 
     @property
     def publications(self):

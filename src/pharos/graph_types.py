@@ -2,11 +2,11 @@
 them."""
 import rosgraph
 
-from pharos.messages import message_types
+from pharos import messages
 from pharos.errors import PharosError
 from pharos.private_rospy.proxies import ServerProxy, deadline_in
 from pharos.private_rospy.registration import COMMUNICATION_ERRORS
-from pharos.tcpros_connection import CALLER_ID, publisher_header
+from pharos.private_rospy.tcpros_connection import CALLER_ID, publisher_header
 
 TIMEOUT = 2.0  # seconds that one publisher may take
 
@@ -37,7 +37,7 @@ def class_from_publishers(topic, type_):
             continue  # the next one may answer, and as agreed
         if header.get('message_definition') and header.get('type') == type_:
             try:
-                return message_types.class_from_definition(
+                return messages.class_from_definition(
                     type_, header['message_definition'], header.get('md5sum')
                 )
             except PharosError as error:
@@ -53,7 +53,7 @@ def class_from_publishers(topic, type_):
 def classes_here(topic, type_):
     """The classes with which nodes of this process publish that type on the topic."""
     # None: it is just being started
-    instances = [node._rospy for node in topic.master.own_nodes() if node._rospy]
+    instances = [node._rospy for node in topic.master.local_nodes() if node._rospy]
     publishers = [
         publisher
         for publisher in (instance.publisher(topic.name) for instance in instances)
@@ -82,7 +82,7 @@ def agree_with_publishers(channel, refusals):
         offered = refusal.offered
         if offered.get('type') == channel.type:
             try:
-                cls = message_types.class_from_definition(
+                cls = messages.class_from_definition(
                     channel.type, offered.get('message_definition'), offered.get('md5sum')
                 )
             except PharosError:
@@ -123,7 +123,7 @@ def explain(name, refusal):
         )
     return (
         f'{name} wants {refusal.topic} as {wanted._type} [{wanted._md5sum}]'
-        f' ({message_types.describe_fields(wanted)}), but {refusal.publisher} publishes {theirs},'
+        f' ({messages.describe_fields(wanted)}), but {refusal.publisher} publishes {theirs},'
         f' and is not heard: {advice}'
     )
 
@@ -131,8 +131,8 @@ def explain(name, refusal):
 def _fields_in(header):
     """What a publisher's connection header says of the fields of its messages."""
     try:
-        return message_types.describe_fields(
-            message_types.class_from_definition(
+        return messages.describe_fields(
+            messages.class_from_definition(
                 header.get('type'), header.get('message_definition'), header.get('md5sum')
             )
         )

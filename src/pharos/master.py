@@ -1,5 +1,4 @@
 """The proxy of a ROS master."""
-import difflib
 import threading
 import time
 import urllib.parse
@@ -10,7 +9,13 @@ from rosgraph.rosenv import ROS_MASTER_URI
 from pharos import node as nodes_of_ours
 from pharos import ros_process, running
 from pharos.blocks import check_block
-from pharos.errors import MasterUnreachableError, NodeStoppedError, PharosError, UnknownNodeError
+from pharos.errors import (
+    MasterUnreachableError,
+    NodeStoppedError,
+    PharosError,
+    UnknownNodeError,
+    suggest,
+)
 from pharos.external_node import ExternalNode
 from pharos.life import Lifecycle
 from pharos.parameters import Parameters
@@ -81,7 +86,7 @@ class Master:
                 f'{self} is not embedded in this program: stop it where it was started'
             )
         running.not_at_end(self.stop)
-        for node in self.own_nodes():
+        for node in self.local_nodes():
             node._stop_for_others()
         if self._child.returncode is None:
             embedded_master.end(self._child)
@@ -189,7 +194,7 @@ class Master:
 
     def nodes(self):
         """All nodes: a Node where it runs in this process, an ExternalNode elsewhere."""
-        own = {node.name: node for node in self.own_nodes()}
+        own = {node.name: node for node in self.local_nodes()}
         names = sorted(
             {name for kind in self.system_state() for users in kind.values() for name in users}
         )
@@ -220,7 +225,7 @@ class Master:
 
     def _unknown(self, name, known):
         return UnknownNodeError(
-            f'no node {name} at {self.url}{self.near(name, known)}: see rosnode list'
+            f'no node {name} at {self.url}{suggest(name, known)}: see rosnode list'
         )
 
     def wait_for_node(self, name, timeout=None):
@@ -247,7 +252,7 @@ class Master:
     def live_node(self, name):
         """The node of that name, if it is there; one that only starts, has died or is unknown is
         not: None."""
-        own = next((node for node in self.own_nodes() if node.name == name), None)
+        own = next((node for node in self.local_nodes() if node.name == name), None)
         if own is not None:
             return own if own.is_running else None
         try:
@@ -280,7 +285,7 @@ class Master:
         """The parameter server as a mapping: ``master.parameters['/rosdistro']``."""
         return Parameters(self)
 
-    def own_nodes(self):
+    def local_nodes(self):
         """The nodes of this process at this master."""
         return [node for node in running.nodes() if node.master == self]
 
@@ -359,7 +364,7 @@ class Master:
                 if stop.came:
                     raise NodeStoppedError(f'the node that waited for the master {self.url} stops')
 
-    def answers(self, name):
+    def is_node_alive(self, name):
         """Whether the node of that name is registered and its XML-RPC server answers."""
         try:
             node = ServerProxy(self._api().lookupNode(name), PING_TIMEOUT)
@@ -368,11 +373,6 @@ class Master:
         except (rosgraph.MasterException, *COMMUNICATION_ERRORS):
             return False
         return True
-
-    def near(self, name, names):
-        """', did you mean ...' where ``name`` may be a slip for one of ``names``, else nothing."""
-        close = difflib.get_close_matches(name, list(names), 3)
-        return f", did you mean {' or '.join(close)}" if close else ''
 
     def _api(self, caller_id='/pharos', timeout=TIMEOUT):
         return master_api(self.url, caller_id, timeout)

@@ -3,7 +3,7 @@ import contextlib
 
 import genpy
 
-from pharos.messages import message_types
+from pharos import messages
 from pharos.blocks import check_block, text_of
 from pharos.errors import MessageTypeError, PharosError
 from pharos.intraprocess import services
@@ -17,7 +17,7 @@ class OfferedService:
 
     def __init__(self, node, name, typed_as, block):
         self.node, self.name = node, name
-        self.service_class = message_types.service_class(typed_as)
+        self.service_class = messages.service_class(typed_as)
         self._check = services.checker(self.service_class._response_class)
         self.block = block
         if any(other.name == name for other in node._services):
@@ -72,29 +72,29 @@ class OfferedService:
             if value._md5sum != response._md5sum:  # the caller would read its bytes as other fields
                 raise MessageTypeError(
                     f'{self.name} answers with a {response._type} of'
-                    f' {message_types.describe_fields(response)} [{response._md5sum}]; its block'
+                    f' {messages.describe_fields(response)} [{response._md5sum}]; its block'
                     ' returned one of'
-                    f' {message_types.describe_fields(type(value))} [{value._md5sum}]: make it of'
+                    f' {messages.describe_fields(type(value))} [{value._md5sum}]: make it of'
                     ' the class that the service was offered with'
                 )
             try:
                 self._check(value)
             except Exception:
-                message_types.check_fits(value)  # tells what of it does not fit
+                messages.check_fits(value)  # tells what of it does not fit
             return value
         if isinstance(value, dict):
-            return message_types.fill(response(), value)
+            return messages.fill(response(), value)
         names = response.__slots__
         if not names:
             return response()
         has_values = isinstance(value, (list, tuple)) and len(value) == len(names)
         if has_values and (len(names) > 1 or not response._slot_types[0].endswith(']')):
-            return message_types.fill(response(), dict(zip(names, value)))
+            return messages.fill(response(), dict(zip(names, value)))
         if len(names) == 1 and value is not None:
-            return message_types.fill(response(), {names[0]: value})
+            return messages.fill(response(), {names[0]: value})
         raise TypeError(
             f"the block of {self.name} must return a response, a dict, tuple or list of its fields"
-            f" ({message_types.describe_fields(response)}){' or its only field' if len(response.__slots__) == 1 else ''};"
+            f" ({messages.describe_fields(response)}){' or its only field' if len(response.__slots__) == 1 else ''};"
             f" it returned {value!r}"
         )
 

@@ -3,6 +3,7 @@ import collections.abc
 
 import rosgraph
 
+from pharos.errors import suggest
 from pharos.private_rospy.names import global_name
 from pharos.private_rospy.parameters import carried
 
@@ -53,7 +54,7 @@ class Parameters(collections.abc.MutableMapping):
                 return getattr(self._master._api(), method)(name, *args)
             except rosgraph.MasterError:
                 raise KeyError(
-                    f'no parameter {name} at {self._master.url}{self._master.near(name, self)}'
+                    f'no parameter {name} at {self._master.url}{suggest(name, self)}'
                 ) from None
 
     def __repr__(self):

@@ -6,15 +6,21 @@ import time
 import genpy
 import rosgraph
 
-from pharos.messages import message_types
+from pharos import messages
 from pharos.blocks import check_block
-from pharos.errors import NodeStoppedError, ServiceCallError, ServiceTypeError, UnknownServiceError
+from pharos.errors import (
+    NodeStoppedError,
+    ServiceCallError,
+    ServiceTypeError,
+    UnknownServiceError,
+    suggest,
+)
 from pharos.intraprocess import services
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.proxies import time_limit
 from pharos.private_rospy.lifetime import Interruption
 from pharos.seconds import check_limit
-from pharos.tcpros_connection import TcprosConnection
+from pharos.private_rospy.tcpros_connection import TcprosConnection
 
 TIMEOUT = 5.0  # seconds in which the master, and a provider asked for its type, must answer
 
@@ -60,7 +66,7 @@ class Service:
             except rosgraph.MasterError:
                 raise UnknownServiceError(
                     f'no node of {self.master.url} offers the service'
-                    f' {self.name}{self.master.near(self.name, self.master.services())}: see'
+                    f' {self.name}{suggest(self.name, self.master.services())}: see'
                     ' rosservice list'
                 ) from None
         return self.uri
@@ -113,7 +119,7 @@ class Service:
         :raises UnknownTypeError: if there is no definition of it here
         """
         if self._class is None:
-            self._class = message_types.service_class(self.type)
+            self._class = messages.service_class(self.type)
         return self._class
 
     def call(self, block=None, *, timeout=None, **fields):
@@ -137,7 +143,7 @@ class Service:
         if block is not None:
             check_block(block, 'block', ('request',))
         self._check_definition(deadline)
-        request = message_types.build(self.service_class._request_class, block, fields)
+        request = messages.build(self.service_class._request_class, block, fields)
         self._calls += 1
         request = services.numbered(request, self._calls)
         waiting = Interruption()
@@ -209,7 +215,7 @@ class Service:
         try:
             data = here.freeze(request) if here else services.serialize(request)
         except Exception:
-            message_types.check_fits(request)  # tells what of it does not
+            messages.check_fits(request)  # tells what of it does not
             raise
         if here:
             return here.call(data, self._header(self._md5sum_sent), deadline)
@@ -295,7 +301,7 @@ class Service:
         self._class = self._here = None  # the right definition may come, and is sought then
         return ServiceTypeError(
             f'{self.name} is of type {theirs}, but {type_} is defined here with md5sum'
-            f' {ours._md5sum} ({message_types.describe_service(ours)}), so nothing was sent: have'
+            f' {ours._md5sum} ({messages.describe_service(ours)}), so nothing was sent: have'
             f' both sides use the same {type_.rpartition("/")[2]}.srv'
         )
 
@@ -303,9 +309,9 @@ class Service:
         """What can be said of the fields of a provider's type; a provider elsewhere tells its
         md5sum alone."""
         here = services.class_of(self.name, self.uri)
-        for known in (here, *message_types.known_service_classes(type_)):
+        for known in (here, *messages.known_service_classes(type_)):
             if known is not None and known._md5sum == md5sum:
-                return message_types.describe_service(known)
+                return messages.describe_service(known)
         return 'its fields are not known here'
 
     def close(self):

@@ -4,9 +4,15 @@ import time
 import rosgraph
 
 from pharos import graph_types
-from pharos.messages import message_types
+from pharos import messages
 from pharos.channel import InputChannel, OutputChannel
-from pharos.errors import MessageTypeError, NodeStoppedError, UnknownTopicError, UnknownTypeError
+from pharos.errors import (
+    MessageTypeError,
+    NodeStoppedError,
+    UnknownTopicError,
+    UnknownTypeError,
+    suggest,
+)
 from pharos.life import Life
 from pharos.private_rospy.proxies import MARGIN, time_limit
 from pharos.seconds import check_seconds
@@ -45,7 +51,7 @@ class Topic:
             )
         raise UnknownTopicError(
             f'no node of {self.master.url} publishes or subscribes to'
-            f' {self.name}{self.master.near(self.name, types)}: name its type with typed_as=, or'
+            f' {self.name}{suggest(self.name, types)}: name its type with typed_as=, or'
             ' start the other node first'
         )
 
@@ -64,7 +70,7 @@ class Topic:
         """The channels that nodes of this process have open on it."""
         return [
             channel
-            for node in self.master.own_nodes()
+            for node in self.master.local_nodes()
             for channel in node.channels
             if channel.topic == self.name
         ]
@@ -90,11 +96,7 @@ class Topic:
         options = dict(
             delegate=delegate, queue_size=queue_size, inline=inline, shared=shared, from_=from_
         )
-        if (
-            not is_first
-            or message_class is typed_as
-            or not message_types.is_provisional(message_class)
-        ):
+        if not is_first or message_class is typed_as or not messages.is_provisional(message_class):
             return InputChannel(node, self.name, message_class, **options)
         with node._rospy.refusals.held(self.name) as refusals:
             channel = InputChannel(node, self.name, message_class, **options)
@@ -165,12 +167,12 @@ class Topic:
     def _class_of(self, type_or_class, receives):
         """The class of a type: known here, or as the topic's publishers define it."""
         try:
-            known = message_types.message_class(type_or_class)
+            known = messages.message_class(type_or_class)
         except UnknownTypeError:
-            return graph_types.class_from_publishers(
-                self, type_or_class
-            ) or message_types.message_class(type_or_class)
-        if receives and known is not type_or_class and message_types.is_provisional(known):
+            return graph_types.class_from_publishers(self, type_or_class) or messages.message_class(
+                type_or_class
+            )
+        if receives and known is not type_or_class and messages.is_provisional(known):
             own = graph_types.classes_here(self, known._type)
             return next((cls for cls in own if cls._md5sum == known._md5sum), (own or [known])[0])
         return known

@@ -50,7 +50,7 @@ class Watcher:
         with self._changed:
             needed = self._is_needed()
             if needed and self._thread is None:
-                if self._master.own_nodes():
+                if self._master.local_nodes():
                     self.reachable_since = time.time()  # one has just registered
                 self._thread = threading.Thread(
                     target=self._run, name=f'watcher of {self._master.url}', daemon=True
@@ -124,7 +124,7 @@ class Watcher:
             self._changed.notify_all()
 
     def _is_needed(self):
-        return bool(self._listeners or self._waiting or self._master.own_nodes())
+        return bool(self._listeners or self._waiting or self._master.local_nodes())
 
     def _run(self):
         # who waits wants to know what is there now; nodes have only just registered
@@ -153,7 +153,7 @@ class Watcher:
         """The graph as a set of (kind, name), None if the master does not answer; and repairs
         registrations."""
         # asked for first: the state may lack one that starts meanwhile
-        nodes = [node for node in self._master.own_nodes() if node.is_running]
+        nodes = [node for node in self._master.local_nodes() if node.is_running]
         try:
             state = self._master.system_state()
         except MasterUnreachableError:

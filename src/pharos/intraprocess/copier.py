@@ -45,7 +45,7 @@ import genpy
 from genmsg.msgs import parse_type
 from genpy.base import SIMPLE_TYPES_DICT as STRUCT_CODES  # primitive type -> its code on the wire
 
-from pharos.messages.nested_types import nested_class
+from pharos.messages import nested_class
 
 # genpy sends a bool as a number: 7 goes out, True arrives
 ARRIVAL_CODES = {**STRUCT_CODES, 'bool': '?'}

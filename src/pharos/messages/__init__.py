@@ -1,1 +1,42 @@
-"""Message and service types by their names: looked up, defined, filled, checked."""
+"""Message and service types by their names: looked up, defined, filled, checked.
+
+- classes: the class of a type, by name or from a definition that is given
+- lookup: where types are sought: installed packages, files, those that turtlesim has
+- definition: a class made from the text of a definition
+- fields: what a message holds: described, filled by name, checked
+"""
+from pharos.messages.classes import (
+    class_from_definition,
+    define_message,
+    define_service,
+    describe_service,
+    is_provisional,
+    known_service_classes,
+    message_class,
+    service_class,
+)
+from pharos.messages.fields import (
+    build,
+    check_fits,
+    describe_fields,
+    explain,
+    fill,
+    nested_class,
+)
+
+__all__ = [
+    'build',
+    'check_fits',
+    'class_from_definition',
+    'define_message',
+    'define_service',
+    'describe_fields',
+    'describe_service',
+    'explain',
+    'fill',
+    'is_provisional',
+    'known_service_classes',
+    'message_class',
+    'nested_class',
+    'service_class',
+]

@@ -10,7 +10,7 @@ import rosgraph
 from pharos.private_rospy import publishing
 from pharos.private_rospy.acceptor import brief
 from pharos.private_rospy.process_rospy import rospy
-from pharos.tcpros_connection import CALLER_ID, publisher_header
+from pharos.private_rospy.tcpros_connection import CALLER_ID, publisher_header
 
 TIMEOUT = 1.0  # seconds in which a publisher that refused says what it publishes
 REMEMBERED = (

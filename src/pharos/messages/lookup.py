@@ -10,8 +10,8 @@ import sys
 import genpy
 import rospkg
 
-from pharos.errors import UnknownTypeError
-from pharos.messages.turtlesim_types import DEFINITIONS
+from pharos.errors import UnknownTypeError, suggest
+from pharos.messages.turtlesim import DEFINITIONS
 
 MAX_TEXT = 1 << 20  # characters of a definition with those nested in it
 NAME = re.compile('[A-Za-z][A-Za-z0-9_]{0,127}')
@@ -33,7 +33,7 @@ def check_name(kind, type_):
         )
 
 
-def seek(kind, type_, must=True):
+def find(kind, type_, must=True):
     """Return the class of a type or, where it has none yet, the text of its definition."""
     for look in _LOOKS:
         known = look(kind, type_)
@@ -128,16 +128,4 @@ def _near_types(kind, type_):
         DEFINITIONS[kind], (known for known_kind, known in list(found) if known_kind == kind)
     )
     last = '/' + type_.rpartition('/')[2]
-    return _hint(sorted(name for name in names if name.endswith(last))[:3]) or near(type_, names)
-
-
-def near(name, names):
-    """Return ' (did you mean ...?)' where ``name`` may be a slip for one of ``names``, else
-    nothing."""
-    import difflib  # rospy does not load it either
-
-    return _hint(difflib.get_close_matches(name, names, 2, 0.8))
-
-
-def _hint(names):
-    return names and f" (did you mean {' or '.join(map(repr, names))}?)" or ''
+    return suggest(type_, names, sorted(name for name in names if name.endswith(last))[:3])

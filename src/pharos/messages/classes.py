@@ -8,25 +8,9 @@ import threading
 
 import genpy
 
-from pharos.messages import known_types, message_definition
+from pharos.messages import definition, lookup
 from pharos.errors import MessageTypeError, UnknownTypeError
-from pharos.messages.message_fields import build, check_fits, describe_fields, explain, fill
-
-__all__ = [
-    'message_class',
-    'service_class',
-    'define_message',
-    'define_service',
-    'class_from_definition',
-    'known_service_classes',
-    'is_provisional',
-    'describe_fields',
-    'describe_service',
-    'build',
-    'fill',
-    'check_fits',
-    'explain',
-]
+from pharos.messages.fields import describe_fields
 
 _lock = threading.RLock()
 _given = {}  # (kind, type): class from define_message or define_service
@@ -50,7 +34,7 @@ def is_provisional(cls):
     """Whether the class is that of its type here, but of no package: given at run time, or shipped
     for turtlesim."""
     key = 'msg', cls._type
-    return key in known_types.provisional and known_types.found.get(key) is cls
+    return key in lookup.provisional and lookup.found.get(key) is cls
 
 
 def service_class(type_or_class):
@@ -84,13 +68,9 @@ def known_service_classes(type_):
     :func:`service_class` gives."""
     classes = []
     with _lock:
-        for known in known_types.everywhere('srv', type_):
+        for known in lookup.everywhere('srv', type_):
             try:
-                cls = (
-                    message_definition.make('srv', type_, known)
-                    if isinstance(known, str)
-                    else known
-                )
+                cls = definition.make('srv', type_, known) if isinstance(known, str) else known
             except UnknownTypeError:  # a text that cannot be read tells nobody anything
                 continue
             classes.append(cls)
@@ -112,9 +92,9 @@ def class_from_definition(type_, full_text, md5sum=None):
     `UnknownTypeError` for a text that cannot be read, and `MessageTypeError` if the text has not
     the ``md5sum`` given.
     """
-    known_types.check_name('msg', type_)
+    lookup.check_name('msg', type_)
     with _lock:
-        cls = message_definition.make('msg', type_, full_text)
+        cls = definition.make('msg', type_, full_text)
         if md5sum not in (None, '*', cls._md5sum):
             raise MessageTypeError(
                 f'{type_} was announced with md5sum {md5sum}, but its definition has {cls._md5sum} '
@@ -124,38 +104,34 @@ def class_from_definition(type_, full_text, md5sum=None):
 
 
 def _class(kind, type_):
-    known_types.check_name(kind, type_)
+    lookup.check_name(kind, type_)
     with _lock:
-        cls = known_types.seek(kind, type_)
+        cls = lookup.find(kind, type_)
         if isinstance(cls, str):
-            cls = message_definition.make(kind, type_, cls)
-        known_types.found[kind, type_] = cls
+            cls = definition.make(kind, type_, cls)
+        lookup.found[kind, type_] = cls
         return cls
 
 
 def _define(kind, type_, text):
-    known_types.check_name(kind, type_)
+    lookup.check_name(kind, type_)
     with _lock:
-        cls = message_definition.make(kind, type_, text)
+        cls = definition.make(kind, type_, text)
         key = kind, type_
-        before = (
-            _given.get(key)
-            or known_types.installed(kind, type_)
-            or known_types.file_text(kind, type_)
-        )
+        before = _given.get(key) or lookup.installed(kind, type_) or lookup.file_text(kind, type_)
         if before is None:
-            known_types.provisional.add(key)
+            lookup.provisional.add(key)
         if isinstance(before, str):
-            before = message_definition.make(kind, type_, before)
+            before = definition.make(kind, type_, before)
         if before not in (None, cls):
             raise MessageTypeError(
                 f'{type_} is known already, with md5sum {before._md5sum} and other fields or '
                 'constants than in the text now given: give the same text, or define another type'
             )
-        _given[key] = known_types.found[key] = cls
+        _given[key] = lookup.found[key] = cls
         classes = getattr(getattr(cls, '_request_class', cls), '_classes', {})
-        for nested in classes.keys() & message_definition.split(type_, text).keys() - {type_}:
-            if known_types.seek('msg', nested, must=False) is None:
-                _given['msg', nested] = known_types.found['msg', nested] = classes[nested]
-                known_types.provisional.add(('msg', nested))
+        for nested in classes.keys() & definition.split(type_, text).keys() - {type_}:
+            if lookup.find('msg', nested, must=False) is None:
+                _given['msg', nested] = lookup.found['msg', nested] = classes[nested]
+                lookup.provisional.add(('msg', nested))
         return cls

@@ -12,10 +12,10 @@ import types
 import genmsg
 from genmsg.msgs import bare_msg_type, is_builtin
 
-from pharos.messages import known_types
+from pharos.messages import lookup
 from pharos.errors import UnknownTypeError
-from pharos.messages.known_types import MAX_TEXT, NAME
-from pharos.messages.message_fields import nested_classes
+from pharos.messages.lookup import MAX_TEXT, NAME
+from pharos.messages.fields import nested_classes
 
 MAX_DEPTH = 64  # types nested in one another
 # of a type and those it nests, counted wherever they occur: genpy writes code for each, 4 s for all
@@ -42,7 +42,7 @@ def make(kind, type_, text):
             f'{type_} has more than {MAX_FIELDS} fields or {MAX_ELEMENTS} elements in all: use '
             'fewer, or arrays of variable length'
         )
-    installed = known_types.installed(kind, type_)
+    installed = lookup.installed(kind, type_)
     request_and_response = getattr(installed, '_request_class', None), getattr(
         installed, '_response_class', None
     )
@@ -84,7 +84,7 @@ def _read(kind, type_, text):
             continue
         if nested not in texts:
             try:
-                known = known_types.seek('msg', nested)
+                known = lookup.find('msg', nested)
             except UnknownTypeError as error:
                 raise UnknownTypeError(f'{user} has a field of an {error}') from error
             texts = {
@@ -110,7 +110,7 @@ def split(type_, text):
     )
     texts = {name.strip(): nested_text[1:] for name, nested_text in zip(nested[::2], nested[1::2])}
     for name in texts:
-        known_types.check_name('msg', name)
+        lookup.check_name('msg', name)
     return {**texts, type_: own}
 
 
@@ -189,7 +189,7 @@ def _generate(context, types_, installed):
         # The md5sum alone does not tell T from T[], as ROS computes it.
         nested = [classes[t] for t in map(bare_msg_type, spec.types) if t in classes]
         key = type_, md5sum, *spec.types, *nested
-        cls = _made.get(key) or installed.get(type_) or known_types.installed('msg', type_)
+        cls = _made.get(key) or installed.get(type_) or lookup.installed('msg', type_)
         if cls is None or key != (type_, cls._md5sum, *cls._slot_types, *nested_classes(cls)):
             cls = _made[key] = _write(spec, plain, alias, namespace)
             cls._type, cls._md5sum, cls._slot_types = type_, md5sum, spec.types

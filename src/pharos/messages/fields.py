@@ -9,11 +9,9 @@ import genpy
 from genmsg.msgs import bare_msg_type, is_builtin, parse_type
 from genpy.base import SIMPLE_TYPES_DICT
 
-from pharos.errors import MessageTypeError
-from pharos.messages.known_types import near
-from pharos.messages.nested_types import nested_class
+from pharos.errors import MessageTypeError, suggest
 
-
+_TIMES = {'time': genpy.Time, 'duration': genpy.Duration}
 # Raises where the value of a field of this type would not serialize, and is quick.
 _WRITERS = {
     'string': str.encode,
@@ -97,6 +95,29 @@ def _fields(cls):
     return zip(cls.__slots__, getattr(cls, '_slot_types', ()))  # rospy.AnyMsg has no _slot_types
 
 
+def nested_class(cls, type_name):
+    """Return the class that a message class's own code means by the name of a type among its
+    fields.
+
+    It is not always the installed class of that name: a class made at run time nests others made
+    with it. None for a class written by hand that nests what is not installed.
+    """
+    if type_name in _TIMES:
+        return _TIMES[type_name]
+    if type_name == 'Header':
+        type_name = 'std_msgs/Header'
+    package, _, name = type_name.rpartition('/')
+    package = package or cls._type.partition('/')[0]
+    # of pharos.messages.definition
+    made_together = getattr(cls, '_classes', {}).get(f'{package}/{name}')
+    # a numpy_msg has its serialize from rospy, and these from the class that it derives from
+    names = getattr(getattr(cls, 'serialize_numpy', None), '__globals__', {})
+    # of genpy.dynamic, all in one module
+    made_together = made_together or names.get(f'_{package}__{name}')
+    imported = getattr(getattr(names.get(package), 'msg', None), name, None)
+    return made_together or imported or genpy.message.get_message_class(f'{package}/{name}')
+
+
 def nested_classes(cls):
     """Return the class of each field that holds messages, in a message class."""
     types = [bare_msg_type(field_type) for _, field_type in _fields(cls)]
@@ -107,7 +128,7 @@ def nested_classes(cls):
 def _no_field(cls, path, name):
     names = [field for field, _ in _fields(cls)]
     return MessageTypeError(
-        f'{path} has no field {name!r}{near(str(name), names)}; '
+        f'{path} has no field {name!r}{suggest(str(name), names)}; '
         f'its fields are {describe_fields(cls)}'
     )
 
