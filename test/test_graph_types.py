@@ -33,10 +33,10 @@ from pharos import (
     UnknownTopicError,
     UnknownTypeError,
     define_message,
-    graph_types,
     message_class,
 )
 from pharos.messages import class_from_definition
+from pharos.private_rospy import tcpros_connection
 from pharos.private_rospy.tcpros_connection import publisher_header
 from programs import Program, run, until
 from sockets import refused_url
@@ -640,7 +640,7 @@ def lie(master, tmp_path, monkeypatch):
     """``lie(type, definition, …)``: the error by which a node refuses a topic with such a
     publisher."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(graph_types, 'TIMEOUT', 0.5)
+    monkeypatch.setattr(tcpros_connection, 'TIMEOUT', 0.5)
 
     def refusal(type_, *args, **kwargs):
         topic = '/types/lie_%d' % next(topic_numbers)

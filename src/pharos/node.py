@@ -1,7 +1,7 @@
 """Nodes: real ROS nodes of this process, written with blocks."""
 import threading
 
-from pharos import graph_types
+from pharos import messages
 from pharos.blocks import attempt, check_block, check_delegate, check_soul, name_of
 from pharos.errors import MessageTypeError, NodeStoppedError, PharosError
 from pharos.external_node import ExternalNode
@@ -145,7 +145,11 @@ class Node(Life):
     def _report_refusal(self, refusal):
         """Keep and tell, once, that a publisher's messages do not come, for they are of another
         type."""
-        error = MessageTypeError(graph_types.explain(self.name, refusal))
+        error = MessageTypeError(
+            messages.explain_refusal(
+                self.name, refusal.topic, refusal.wanted, refusal.publisher, refusal.offered
+            )
+        )
         self._failures.report(
             error, None, f'connection of {self.name} to {refusal.publisher} for {refusal.topic}'
         )

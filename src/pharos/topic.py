@@ -3,18 +3,20 @@ import time
 
 import rosgraph
 
-from pharos import graph_types
 from pharos import messages
 from pharos.channel import InputChannel, OutputChannel
 from pharos.errors import (
     MessageTypeError,
     NodeStoppedError,
+    PharosError,
     UnknownTopicError,
     UnknownTypeError,
     suggest,
 )
 from pharos.life import Life
 from pharos.private_rospy.proxies import MARGIN, time_limit
+from pharos.private_rospy.registration import COMMUNICATION_ERRORS
+from pharos.private_rospy.tcpros_connection import ask_publisher
 from pharos.seconds import check_seconds
 
 POLL = 0.05  # seconds between two looks at the master's types
@@ -100,7 +102,7 @@ class Topic:
             return InputChannel(node, self.name, message_class, **options)
         with node._rospy.refusals.held(self.name) as refusals:
             channel = InputChannel(node, self.name, message_class, **options)
-            graph_types.agree_with_publishers(channel, refusals)
+            self._agree_with_publishers(channel, refusals)
         return channel
 
     def output_channel(
@@ -169,13 +171,62 @@ class Topic:
         try:
             known = messages.message_class(type_or_class)
         except UnknownTypeError:
-            return graph_types.class_from_publishers(self, type_or_class) or messages.message_class(
-                type_or_class
-            )
+            own = self._local_classes(type_or_class)
+            if own:
+                return own[0]
+            known = messages.class_from_publishers(self.name, type_or_class, self._headers())
+            if known is None:
+                raise
+            return known
         if receives and known is not type_or_class and messages.is_provisional(known):
-            own = graph_types.classes_here(self, known._type)
+            own = self._local_classes(known._type)
             return next((cls for cls in own if cls._md5sum == known._md5sum), (own or [known])[0])
         return known
+
+    def _headers(self):
+        """``(node name, connection header)`` of each publisher that answers, one by one."""
+        for name in self.publishers:
+            try:
+                uri = self.master._api().lookupNode(name)
+            except (rosgraph.MasterException, *COMMUNICATION_ERRORS):
+                continue
+            yield name, ask_publisher(uri, self.name)
+
+    def _local_classes(self, type_):
+        """The classes with which nodes of this process publish that type on the topic."""
+        # None: it is just being started
+        instances = [node._rospy for node in self.master.local_nodes() if node._rospy]
+        publishers = filter(None, (instance.publisher(self.name) for instance in instances))
+        classes = [publisher.data_class for publisher in publishers]
+        return [cls for cls in classes if cls._type == type_]
+
+    def _agree_with_publishers(self, channel, refusals):
+        """Have an input channel take the definition of a publisher elsewhere, where none suits it
+        as it is.
+
+        A publisher that is only asked for its definition takes that for a subscriber, and sends to
+        nobody. So the channel subscribes with the definition that is known here, and one who
+        refuses is believed.
+
+        :param refusals: a list that grows with each that comes; of those in it afterwards is to be
+            told
+        """
+        instance = channel.node._rospy
+        instance.wait_until(
+            lambda: instance.connections.has_heard_from_publishers(self.name),
+            channel.node.connect_timeout,
+        )
+        if instance.connections.hears(self.name):
+            return
+        for refusal in list(refusals):
+            if refusal.offered.get('type') == channel.type:
+                try:
+                    cls = messages.class_of_header(refusal.offered)
+                except PharosError:
+                    continue  # it is told as one that cannot be heard
+                refusals.clear()  # those whom this does not suit either refuse again
+                channel._subscribe_as(cls)
+                return
 
     def _class_in_time(self, node, deadline, receives):
         """The class of the master's type, which may come until the deadline."""

@@ -4,6 +4,8 @@
 - lookup: where types are sought: installed packages, files, those that turtlesim has
 - definition: a class made from the text of a definition
 - fields: what a message holds: described, filled by name, checked
+- from_publishers: the class of a topic's messages as its publishers define it
+- turtlesim: the definitions of turtlesim's types
 """
 from pharos.messages.classes import (
     class_from_definition,
@@ -23,16 +25,24 @@ from pharos.messages.fields import (
     fill,
     nested_class,
 )
+from pharos.messages.from_publishers import (
+    class_from_publishers,
+    class_of_header,
+    explain_refusal,
+)
 
 __all__ = [
     'build',
     'check_fits',
     'class_from_definition',
+    'class_from_publishers',
+    'class_of_header',
     'define_message',
     'define_service',
     'describe_fields',
     'describe_service',
     'explain',
+    'explain_refusal',
     'fill',
     'is_provisional',
     'known_service_classes',

@@ -11,10 +11,12 @@ import time
 import rosgraph.network
 
 from pharos.private_rospy.lifetime import Interruption, keep_alive, shutdown_socket
+from pharos.private_rospy.proxies import ServerProxy, deadline_in
+from pharos.private_rospy.registration import COMMUNICATION_ERRORS
 
-CALLER_ID = (  # not a node's: a publisher closes an earlier connection of the same name
-    '/pharos_types'
-)
+TIMEOUT = 2.0  # seconds that one publisher may take to say what it publishes
+# No node's name: a publisher closes an earlier connection of the same name.
+CALLER_ID = '/pharos_types'
 _HEADER_LIMIT = 1 << 22  # bytes of a connection header; it holds a message definition
 _LIMIT = 1 << 30  # bytes of a response; a length beyond is a broken stream
 
@@ -104,6 +106,20 @@ class TcprosConnection:
         if left <= 0:
             raise socket.timeout('time is up')
         return left
+
+
+def ask_publisher(uri, topic):
+    """The connection header of the publisher at that URI; an empty one where it does not answer as
+    agreed."""
+    deadline = deadline_in(TIMEOUT)
+    try:
+        code, _, protocol = ServerProxy(uri, TIMEOUT).requestTopic(CALLER_ID, topic, [['TCPROS']])
+        if code != 1:
+            return {}
+        _, host, port = protocol
+        return publisher_header((host, port), topic, deadline)
+    except (*COMMUNICATION_ERRORS, TypeError, ValueError, OverflowError):
+        return {}
 
 
 def publisher_header(address, topic, deadline):
