@@ -91,7 +91,7 @@ def test_a_node_that_was_not_told_notices(master, monkeypatch):
     """It finds its registrations gone, and does not take the name back."""
     monkeypatch.setattr(watcher, 'PERIOD', 0.05)
     # it does not obey
-    monkeypatch.setattr(registration, '_name_is_anothers', lambda handler: False)
+    monkeypatch.setattr(registration, 'name_is_anothers', lambda node: False)
     ours = create(master)
     ours.output_channel('/ours', 'std_msgs/String')
     with rospy_node(master) as newer:

@@ -187,7 +187,7 @@ def protocol_handler(instance):
             return protocol == PROTOCOL
 
         def get_supported(self):
-            return [[PROTOCOL]] if instance.connections.connects_in_process() else []
+            return [[PROTOCOL]]
 
         def init_publisher(self, topic, protocol):
             return 1, 'ready', [PROTOCOL]

@@ -5,7 +5,8 @@ import threading
 
 from pharos.private_rospy.addresses import is_same_master
 from pharos.private_rospy.names import Resolved
-from pharos.private_rospy.proxies import time_limit
+from pharos.private_rospy import publishing, registration
+from pharos.private_rospy.proxies import ServerProxy, time_limit
 from pharos.private_rospy.registration import REGISTER_TIMEOUT, UNREGISTER_TIMEOUT, registered
 
 _running = {}  # URI -> the PrivateRospy that runs there, in this process
@@ -32,7 +33,8 @@ class Connections:
         )  # topic -> URIs, of which the master told a new publisher
         # topics of which the log says that subscribers did not connect in time
         self.told_late = set()
-        self.connecting = threading.local()  # .topic: of the connection that this thread negotiates
+        # (topic, URI) of each publisher just being connected to -> whether somebody asked again
+        self._connecting = {}
 
     def open(self):
         """The node runs: its neighbours may connect to it."""
@@ -76,7 +78,7 @@ class Connections:
         topic = channel.topic
         publishers = [other for other in self._neighbours() if other.publisher(topic)]
         for other in publishers:
-            self._instance.connect(topic, other.uri)
+            self.connect(topic, other.uri)
         name, refuses = self._instance.name, self._instance.refusals.refuses
         self._instance.wait_until(
             lambda: all(
@@ -118,7 +120,7 @@ class Connections:
             endpoint.impl.fanout.run()
         for other in self._neighbours():
             if other.subscriber(channel.topic):
-                other.connect(channel.topic, self._instance.uri)
+                other.connections.connect(channel.topic, self._instance.uri)
         return endpoint, endpoint.impl.fanout
 
     def known_subscribers(self, topic):
@@ -173,13 +175,83 @@ class Connections:
         """The channels of the node that receive from the topic."""
         return self._channels.get(topic, ())
 
-    def connects_in_process(self):
-        """Whether the connection that this thread negotiates may be INTRAPROCESS.
+    def _may_be_in_process(self, topic):
+        """Whether a connection on the topic may be INTRAPROCESS.
 
         Not where nobody but plain rospy callbacks listens: actionlib, for one, does not stand
         answers that come so quickly, and waits for ever.
         """
-        return self.takes_plain_callbacks or bool(self.channels_on(self.connecting.topic))
+        return self.takes_plain_callbacks or bool(self.channels_on(topic))
+
+    def connect(self, topic, uri):
+        """Connect the subscription to the publisher at that URI, unless it is connected.
+
+        Who asks while that is under way need not wait: where it fails, it is tried once more, for
+        what was no publisher a moment ago may be one now.
+
+        :returns: as all calls of ROS's slave API: a code (1: done), a text, 0
+        """
+        key = topic, uri
+        with self._lock:
+            if key in self._connecting:
+                self._connecting[key] = True
+                return 1, f'connecting to {uri} already', 0
+            self._connecting[key] = False
+        again = True
+        while again:
+            try:
+                answer = self._negotiate(topic, uri)
+            except BaseException:  # else nobody would ever connect to it again
+                with self._lock:
+                    del self._connecting[key]
+                raise
+            with self._lock:
+                again = self._connecting.pop(key) and answer[0] != 1
+                if again:
+                    self._connecting[key] = False
+        subscriber = self._instance.subscriber(topic)
+        if subscriber is not None:
+            if answer[0] == 1:
+                subscriber.out_of_reach.discard(uri)
+            else:
+                subscriber.out_of_reach.add(uri)
+            publishing.notify()
+        return answer
+
+    def _negotiate(self, topic, uri):
+        """What rospy's ROSHandler._connect_topic does, for as long as the node is interested."""
+        while True:
+            handler, subscriber = self._instance.handler, self._instance.subscriber(topic)
+            if handler is None or subscriber is None or self._instance.ended.is_set():
+                return 0, f'{self._instance.name} or its interest in {topic} ends', 0
+            if subscriber.has_connection(uri):
+                return 1, f'connected to {uri} already', 0
+            transports = [
+                transport
+                for transport in handler.protocol_handlers or ()
+                if transport.supports('TCPROS') or self._may_be_in_process(topic)
+            ]
+            offered = [each for transport in transports for each in transport.get_supported()]
+            try:
+                code, text, chosen = ServerProxy(uri).requestTopic(
+                    self._instance.name, topic, offered
+                )
+                break
+            except ConnectionRefusedError as error:
+                return 0, str(error), 0
+            except Exception:  # whatever it answered
+                self._instance.ended.wait(registration.RETRY_DELAY)
+            if uri not in subscriber.publishers:
+                return 0, f'the master knows no publisher of {topic} at {uri}', 0
+        if code <= 0:
+            return code, text, 0
+        for transport in transports:
+            if chosen and transport.supports(chosen[0]):
+                try:
+                    return transport.create_transport(topic, uri, chosen)
+                except AttributeError:  # rospy's, where there is no subscription any more
+                    return 0, f'the interest of {self._instance.name} in {topic} ends', 0
+        return 0, f'{uri} chose {chosen}, which was not offered', 0
 
     def sends_to(self, name, topic):
         """Whether the node, if it publishes on the topic at all, is connected to the subscriber of

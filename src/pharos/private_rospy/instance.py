@@ -9,7 +9,6 @@ import socket
 import sys
 import threading
 import time
-import traceback
 import xmlrpc
 import xmlrpc.client
 import _thread
@@ -22,7 +21,6 @@ from pharos.private_rospy import (
     logs,
     patches,
     publishing,
-    pubsub,
     refusals,
     registration,
     servers,
@@ -72,17 +70,8 @@ class PrivateRospy:
         private_os = Substitute(os, environ=self.settings.environ)
         hooks = collections.defaultdict(list)
         for part in (
-            {
-                'rospy.service': _share_service_exception,
-                'rospy.impl.init': self._poll_quickly,
-                'rospy.core': self._shut_down_early,
-            },
             logs.hooks(),
             servers.hooks(lifetime, self.warn, self.debug),
-            registration.hooks(self),
-            pubsub.hooks(self),
-            refusals.hooks(self),
-            self.parameters.hooks(),
         ):
             for name, hook in part.items():
                 hooks[name].append(hook)
@@ -109,30 +98,16 @@ class PrivateRospy:
         self._logging = logging_module
         return modules
 
-    def _poll_quickly(self, module):
-        """rospy.impl.init: waits in steps of 0.1 s, for as long as the master takes."""
+    def wait_for_registration(self, seconds):
+        """What rospy waits with until it is registered, in steps of 0.1 s and for ever."""
+        self._check_not_ended()
+        if time.monotonic() > self._deadline:
+            raise self._stopped_answering()
+        time.sleep(min(seconds, POLL))
 
-        def sleep(seconds):
-            self._check_not_ended()
-            if time.monotonic() > self._deadline:
-                raise self._stopped_answering()
-            time.sleep(min(seconds, POLL))
-
-        module.time = Substitute(time, sleep=sleep)
-
-    def _shut_down_early(self, module):
-        """rospy.core: is_shutdown() holds from the beginning of the stop, so that what loops until
-        then ends first.
-
-        rospy.topics keeps the real one: the last messages of a soul that is ending are still sent.
-        """
-        is_shutdown = module.is_shutdown
-        module.is_shutdown = lambda: is_shutdown() or self.lifetime.ended.is_set()
-        self.is_shut_down = is_shutdown
-        # of hooks of on_shutdown; where that cannot be printed, rospy would stop half way
-        module.traceback = Substitute(
-            traceback, print_exc=lambda: self.on_failure(sys.exc_info()[1])
-        )
+    def module(self, name):
+        """A module of the node's rospy, such as 'rospy.core'."""
+        return self._modules.load(name)
 
     def import_library(self, name):
         """A library written on rospy, such as 'actionlib', bound to this node."""
@@ -226,7 +201,7 @@ class PrivateRospy:
         self.workers.close()
         self.parameters.close()
         core = self._modules.load('rospy.core')
-        pubsub.flush(self._topic_manager(), flush_timeout)
+        self._flush(flush_timeout)
         core.signal_shutdown('stop')
         with core._shutdown_lock:
             pass  # where the node's own code called that, it returned at once
@@ -235,6 +210,14 @@ class PrivateRospy:
         left = self.lifetime.end(abandoned)
         logs.close_handlers(self._logging)
         return [thread.name for thread in left]
+
+    def _flush(self, timeout):
+        """Wait until what the node published is with the sockets, up to ``timeout`` seconds."""
+        deadline = time.monotonic() + timeout
+        for publisher in list(self._topic_manager().pubs.values()):
+            for connection in list(publisher.connections):
+                if hasattr(connection, 'flush'):
+                    connection.flush(deadline - time.monotonic())
 
     def _wake(self, reason):
         self.lifetime.begin_shutdown()
@@ -354,11 +337,15 @@ class PrivateRospy:
             .get_header_fields()
         )
 
-    def connect(self, topic, uri):
-        """Connect the subscription to the publisher at that URI, unless it is connected."""
-        handler = self.lifetime.xmlrpc.handler
-        if handler is not None:  # None: it is stopping
-            handler._connect_topic(topic, uri)
+    @property
+    def parameter_cache(self):
+        """rospy's own cache of parameters."""
+        return self._modules.load('rospy.impl.paramserver').get_param_server_cache()
+
+    @property
+    def handler(self):
+        """rospy's ROSHandler; None when it is stopping."""
+        return self.lifetime.xmlrpc.handler
 
 
 class _ports_checked:
@@ -376,9 +363,3 @@ class _ports_checked:
                 '%s %d cannot be bound (%s): choose another port, or 0 for any free one'
                 % (self._what, self._port, error.strerror)
             ) from error
-
-
-def _share_service_exception(module):
-    """rospy.service: one ServiceException for all nodes, so that ``except rospy.ServiceException``
-    catches it."""
-    module.ServiceException = process_rospy.rospy.ServiceException

@@ -19,57 +19,13 @@ class WatchedParameters:
         self._initialized = {}  # global name -> its first value
         # of those listened to, the outermost: of what is in them, the master tells for each
         self._subscribed = set()
-        self._cached = set()  # global names of which rospy itself has the master tell
+        self.cached = set()  # global names of which rospy itself has the master tell
         self._closed = False
         self._lock = threading.Lock()  # guards _listeners
         self._subscribing = threading.Lock()  # guards _subscribed
 
-    def hooks(self):
-        """The load hooks."""
-
-        def tell_listeners(module):
-            """rospy.impl.masterslave: only its own cache is told of a parameter that changed."""
-            handler = module.ROSHandler
-            update = handler.paramUpdate
-
-            @module.apivalidate(-1, (module.global_name('parameter_key'), None))
-            def paramUpdate(self_, caller_id, key, value):
-                answer = update(self_, caller_id, key, value)
-                return (1, '', 0) if self._tell(key, value) else answer
-
-            handler.paramUpdate = paramUpdate
-
-        def note_subscriptions(module):
-            """rospy.impl.paramserver: what get_param_cached subscribed to, as a log line does, is
-            never let go."""
-            set_ = module.ParamServerCache.set
-
-            def set(self_, key, value):
-                self._cached.add(key)
-                set_(self_, key, value)
-
-            module.ParamServerCache.set = set
-            self._cache = module.get_param_server_cache
-
-        def subscribe_while_running(module):
-            """rospy.msproxy: a line of the log subscribes to a parameter, which registers the node
-            anew."""
-            get_cached = module.MasterProxy.get_param_cached
-
-            def get_param_cached(self_, key):
-                if self._may_subscribe():
-                    return get_cached(self_, key)
-                return self_[key]
-
-            module.MasterProxy.get_param_cached = get_param_cached
-
-        return {
-            'rospy.impl.masterslave': tell_listeners,
-            'rospy.impl.paramserver': note_subscriptions,
-            'rospy.msproxy': subscribe_while_running,
-        }
-
-    def _may_subscribe(self):
+    def may_subscribe(self):
+        """Whether the master may still be asked to tell the node of a parameter."""
         return not (self._closed or self._instance.has_lost_name)
 
     def initialize(self, name, value):
@@ -115,7 +71,7 @@ class WatchedParameters:
     def _subscribe(self, name):
         master, uri = self._master(), self._instance.uri
         with self._subscribing:
-            if not self._may_subscribe():
+            if not self.may_subscribe():
                 return
             if any(_holds(other, name) for other in self._subscribed):
                 return
@@ -124,7 +80,7 @@ class WatchedParameters:
             self._subscribed.difference_update(within)
             self._subscribed.add(name)
             for other in within:
-                if other not in self._cached:
+                if other not in self.cached:
                     master.unsubscribeParam(uri, other)
 
     def _set_where_missing(self, name, value):
@@ -143,9 +99,11 @@ class WatchedParameters:
             self._instance.settings.argv
         ).items():
             self._instance.rospy.set_param('~' + name, value)
-        for name in list(self._cached):
+        for name in list(self.cached):
             with contextlib.suppress(KeyError):
-                self._cache().delete(name)  # rospy subscribes anew when it is asked for it
+                self._instance.parameter_cache.delete(
+                    name
+                )  # rospy subscribes anew when it is asked for it
         with self._subscribing:
             self._subscribed.clear()
         self.renew()
@@ -157,9 +115,9 @@ class WatchedParameters:
                 _holds(name, key) for name in self._subscribed
             )
         # those subscribed to a part of a dict are told, whoever sets it
-        self._tell(key, value, not told_by_master)
+        self.tell(key, value, not told_by_master)
 
-    def _tell(self, key, value, within=True):
+    def tell(self, key, value, within=True):
         """Tell the listeners of a parameter, and of what is around and ``within`` it; returns
         whether there are any."""
         key = '/' + key.strip('/')
@@ -182,7 +140,7 @@ class WatchedParameters:
     def unsubscribe(self, calls):
         """Add to the calls those that end the watch: a master keeps the name of a node that does
         not."""
-        for name in self._subscribed | self._cached:
+        for name in self._subscribed | self.cached:
             calls.unsubscribeParam(self._instance.name, self._instance.uri, name)
 
     def _value(self, name):

@@ -5,12 +5,9 @@ import threading
 import time
 from typing import NamedTuple
 
-import rosgraph
-
 from pharos.private_rospy import publishing
-from pharos.private_rospy.acceptor import brief
 from pharos.private_rospy.process_rospy import rospy
-from pharos.private_rospy.tcpros_connection import CALLER_ID, publisher_header
+from pharos.private_rospy.tcpros_connection import publisher_header
 
 TIMEOUT = 1.0  # seconds in which a publisher that refused says what it publishes
 REMEMBERED = (
@@ -178,49 +175,6 @@ def _remember(entries, key, entry):
     entries[key] = entry
     if len(entries) > REMEMBERED:
         del entries[next(iter(entries))]
-
-
-def hooks(instance):
-    """The load hooks of this module, for the :class:`~.instance.PrivateRospy` given."""
-
-    def tell_of_types(module):
-        """rospy.impl.tcpros_pubsub: tells the log of the subscriber, or nobody, and does not always
-        name the topic."""
-        handler = module.TCPROSHandler
-        handle = handler.topic_connection_handler
-
-        def topic_connection_handler(self, sock, address, header):
-            topic, name = header['topic'], header.get('callerid')
-            asked_for = instance.publisher(topic) if name == CALLER_ID else None
-            # who only asks for the definition is no subscriber, and misses no message
-            if asked_for is not None:
-                rosgraph.network.write_ros_handshake_header(
-                    sock, instance.connection_header(asked_for)
-                )
-                sock.close()
-                return None
-            said = handle(self, sock, address, header)
-            if not said:
-                instance.refusals.subscriber_connected(topic, name)
-                return said
-            publisher = instance.publisher(topic)
-            if (
-                publisher is None
-                or header.get('md5sum') in (None, publisher.data_class._md5sum)
-                or name is None
-            ):
-                return said
-            if topic not in said:
-                said = f'{topic}: {said} ({name})'
-            rosgraph.network.write_ros_handshake_header(sock, {'error': said})
-            sock.close()
-            line = f'TCPROS client {address[0]}:{address[1]} refused: {brief(said)}'
-            instance.refusals.subscriber_refused(publisher, name, said, line)
-            return None
-
-        handler.topic_connection_handler = topic_connection_handler
-
-    return {'rospy.impl.tcpros_pubsub': tell_of_types}
 
 
 def suits(wanted, md5sum):

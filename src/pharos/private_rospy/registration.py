@@ -1,25 +1,17 @@
 """How a node registers with the master and hears from it."""
 import http.client
 import threading
-import time
 import xml.parsers.expat
 import xmlrpc.client
 
 import rosgraph
 
 from pharos.errors import MasterUnreachableError, NodeNameInUseError
-from pharos.private_rospy import publishing
-from pharos.private_rospy.loader import Substitute
 from pharos.private_rospy.proxies import ServerProxy, master_api
-from pharos.private_rospy.xmlrpc_server import REFUSED, is_call_from_nearby
 
 PING_TIMEOUT = 1.0  # seconds in which a running node answers getPid
-STOP_TIMEOUT = 5.0  # seconds that who asks the node to stop waits for that
 REGISTER_TIMEOUT = 1.0  # seconds that the master has at least, to register what is opened
 UNREGISTER_TIMEOUT = 2.0  # seconds that it has, to unregister what is closed or stops
-PUBLISHER_LIMIT = (
-    1000  # publishers of a topic that a call may name; a thread tries to reach each of them
-)
 RETRY_DELAY = (
     2.0  # seconds between attempts to reach a publisher, for as long as the master knows it
 )
@@ -30,202 +22,7 @@ COMMUNICATION_ERRORS = (
     http.client.HTTPException,
     xml.parsers.expat.ExpatError,
 )
-_KINDS = {'pub': 'the publisher on', 'sub': 'the subscriber to', 'srv': 'the service'}
 _attempt = threading.local()  # .failure: of what this thread registers, where it waits for that
-
-
-def hooks(instance):
-    """The load hooks of this module, for the :class:`~.instance.PrivateRospy` given."""
-
-    def obey_only_the_master_of_the_name(module):
-        """rospy.impl.masterslave: who may end the node, and one connection per publisher."""
-        handler = module.ROSHandler
-        connect, lock = handler._connect_topic, threading.Lock()
-        connecting = {}  # (topic, URI) -> whether it was asked for again meanwhile
-        attempt = instance.connections.connecting
-
-        def note_attempt(topic, uri, has_reached):
-            subscriber = instance.subscriber(topic)
-            if subscriber is not None:
-                change = (
-                    subscriber.out_of_reach.discard if has_reached else subscriber.out_of_reach.add
-                )
-                change(uri)
-                publishing.notify()
-
-        def _connect_topic(self, topic, uri):
-            """rospy looks for a connection long before it adds one, and so may connect twice to one
-            publisher."""
-            with lock:
-                if (topic, uri) in connecting:
-                    connecting[topic, uri] = True
-                    return 1, f'connecting to {uri} already', 0
-                connecting[topic, uri] = False
-            again = True
-            while again:
-                try:
-                    attempt.topic, attempt.uri = topic, uri
-                    answer = connect(self, topic, uri)
-                except _NotWanted as error:
-                    answer = 0, str(error), 0
-                except (UnboundLocalError, TypeError, AttributeError):
-                    # rospy's, where it gave up because the node stops, or the subscription or the
-                    # protocols have gone
-                    answer = 0, f'{self.name} or its interest in {topic} ends', 0
-                except BaseException:  # else nobody would ever connect to it again
-                    with lock:
-                        del connecting[topic, uri]
-                    raise
-                with lock:
-                    # asked for again: what was no publisher a moment ago may be one now
-                    again = connecting[topic, uri] and answer[0] != 1
-                    connecting[topic, uri] = False
-                    if not again:
-                        del connecting[topic, uri]
-            note_attempt(topic, uri, answer[0] == 1)
-            return answer
-
-        handler._connect_topic = _connect_topic
-
-        def wait_for_next_attempt(_):
-            """rospy asks a publisher that is out of reach ever more rarely, and never stops."""
-            instance.ended.wait(RETRY_DELAY)
-            subscriber = instance.subscriber(attempt.topic)
-            if instance.ended.is_set() or subscriber is None:
-                raise _NotWanted(f'nobody is interested in {attempt.topic} any more')
-            if attempt.uri not in subscriber.publishers:
-                raise _NotWanted(
-                    f'the master knows no publisher of {attempt.topic} at {attempt.uri}'
-                )
-
-        module.time = Substitute(time, sleep=wait_for_next_attempt)
-
-        @module.apivalidate(-1, (module.is_topic('topic'), module.is_publishers_list('publishers')))
-        def publisherUpdate(self, caller_id, topic, publishers):
-            """rospy passes the list on once for each publisher in it, and so does not hear that
-            there is none."""
-            if len(publishers) > PUBLISHER_LIMIT:
-                return (
-                    -1,
-                    f'{REFUSED}{len(publishers)} publishers; the limit is {PUBLISHER_LIMIT}',
-                    0,
-                )
-            if self.reg_man:
-                self.reg_man.publisher_update(topic, publishers)
-            return 1, '', 0
-
-        handler.publisherUpdate = publisherUpdate
-
-        @module.apivalidate(0, (None,))
-        def shutdown(self, caller_id, msg=''):
-            # the master knows, whoever says so
-            if 'new node registered with same name' in str(msg):
-                # it meant an earlier owner of this URI (ros_comm #2241)
-                if not _name_is_anothers(self):
-                    return 1, f'the name {self.name} is still this node\'s', 0
-                instance.has_lost_name = True
-            elif not (instance.allows_remote_shutdown() or is_call_from_nearby(self.masterUri)):
-                return (
-                    -1,
-                    REFUSED + 'only this host and the master\'s may stop it, unless its '
-                    'allow_remote_shutdown is set',
-                    0,
-                )
-            instance.request_stop(f'{caller_id} asked for it: {msg}')
-            instance.wait_until_silent(STOP_TIMEOUT)  # whoever asked finds it gone, as with rospy
-            return 1, 'shutdown', 0
-
-        handler.shutdown = shutdown
-
-    def register_once(module):
-        """rospy.impl.registration: retries while it holds the topic lock, so that nothing can stop
-        it."""
-        manager = module.RegManager
-
-        def reg_added(self, name, type_or_uri, kind):
-            if instance.has_lost_name:
-                return
-            master, me = module.xmlrpcapi(self.master_uri), module.get_caller_id()
-            call = {
-                'pub': master.registerPublisher,
-                'sub': master.registerSubscriber,
-                'srv': master.registerService,
-            }[kind]
-            cause = None
-            try:
-                code, message, value = call(me, name, type_or_uri, self.uri)
-            except COMMUNICATION_ERRORS as error:
-                code, message, cause = 0, error, error
-            if code != 1:
-                _tell_failure(
-                    module,
-                    (
-                        f'cannot register {_KINDS[kind]} {name} of {me} with the master '
-                        f'{self.master_uri}: {message}'
-                    ),
-                    cause,
-                )
-            elif kind == 'sub':
-                self.publisher_update(name, value)
-            elif kind == 'pub':
-                instance.connections.subscribers_at_registration[name] = value
-
-        manager.reg_added = reg_added
-
-        def reg_removed(self, name, type_or_uri, kind):
-            """rospy's, but for what could not be registered: a master that is away is not asked
-            twice."""
-            if not hasattr(_attempt, 'failure'):
-                remove(self, name, type_or_uri, kind)
-
-        remove, manager.reg_removed = manager.reg_removed, reg_removed
-
-        def publisher_update(self, topic, uris):
-            subscriber = instance.subscriber(topic)
-            if subscriber is not None:
-                subscriber.publishers = uris
-                subscriber.out_of_reach.intersection_update(uris)
-            update(self, topic, uris)
-
-        update, manager.publisher_update = manager.publisher_update, publisher_update
-
-        def cleanup(self, reason):
-            """rospy's version trips over a time-out and then closes nothing."""
-            with self.cond:
-                self.cond.notify_all()
-            if not self.master_uri:
-                return
-            module.get_registration_listeners().clear()
-            topics, services, me = (
-                module.get_topic_manager(),
-                module.get_service_manager(),
-                module.get_caller_id(),
-            )
-            if topics.lock.acquire(timeout=UNREGISTER_TIMEOUT):
-                topics.lock.release()  # what another thread was just registering is registered
-            calls = xmlrpc.client.MultiCall(ServerProxy(self.master_uri, UNREGISTER_TIMEOUT))
-            for name, _ in topics.get_subscriptions():
-                calls.unregisterSubscriber(me, name, self.uri)
-            for name, _ in topics.get_publications():
-                calls.unregisterPublisher(me, name, self.uri)
-            for name, uri in services.get_services():
-                calls.unregisterService(me, name, uri)
-            instance.parameters.unsubscribe(calls)
-            try:
-                calls()
-            except COMMUNICATION_ERRORS as error:
-                self.logger.warning(
-                    'cannot unregister from the master %s: %s', self.master_uri, error
-                )
-            topics.close_all()
-            services.unregister_all()
-
-        manager.cleanup = cleanup
-
-    return {
-        'rospy.impl.masterslave': obey_only_the_master_of_the_name,
-        'rospy.impl.registration': register_once,
-    }
 
 
 def registered(make, undo):
@@ -248,28 +45,24 @@ def registered(make, undo):
         del _attempt.failure
 
 
-def _tell_failure(module, text, cause):
-    """Tell of a registration that failed: who waits for it in :func:`registered`, or else the
-    log."""
-    if hasattr(_attempt, 'failure'):
-        _attempt.failure = MasterUnreachableError(
-            text + ': is it running? Nothing was opened: try again when it is'
-        )
-        _attempt.failure.__cause__ = cause
-    else:
-        module.logerr(text + ': this is done as soon as it answers')
+def is_awaited():
+    """Whether this thread is in :func:`registered`."""
+    return hasattr(_attempt, 'failure')
 
 
-class _NotWanted(Exception):
-    """A publisher that is out of reach need not be reached any more."""
+def note_failure(text, cause):
+    """Have :func:`registered` raise for a registration that failed in it."""
+    _attempt.failure = MasterUnreachableError(
+        text + ': is it running? Nothing was opened: try again when it is'
+    )
+    _attempt.failure.__cause__ = cause
 
 
-def _name_is_anothers(handler):
-    """Whether the master gives the node's name to another node than this one."""
+def name_is_anothers(node):
+    """Whether the master gives the name of the node, a PrivateRospy, to another one."""
     try:
-        return _belongs_to_another(
-            master_api(handler.masterUri, handler.name, PING_TIMEOUT), handler.name, handler.uri
-        )
+        master = master_api(node.settings.master_url, node.name, PING_TIMEOUT)
+        return _belongs_to_another(master, node.name, node.uri)
     except Exception:  # there is no master, which then did not call either
         return False
 

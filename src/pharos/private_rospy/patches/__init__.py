@@ -19,7 +19,28 @@ A target that is missing, or that has other parameters, is an error when a node 
 test/test_patches.py compares the sources of the targets with the releases of rospy that are known
 (and says how to know another), and doc/patches.md is this table: ``tools/patches`` writes it.
 """
-from pharos.private_rospy.patches import names
+from pharos.private_rospy.patches import (
+    names,
+    parameters,
+    publishers,
+    registration,
+    slave,
+    startup,
+    subscribers,
+    tcpros,
+)
 from pharos.private_rospy.patches.table import TABLE, apply, check_applied
 
-__all__ = ['TABLE', 'apply', 'check_applied', 'names']
+__all__ = [
+    'TABLE',
+    'apply',
+    'check_applied',
+    'names',
+    'parameters',
+    'publishers',
+    'registration',
+    'slave',
+    'startup',
+    'subscribers',
+    'tcpros',
+]

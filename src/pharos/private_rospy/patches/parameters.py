@@ -1,0 +1,19 @@
+"""Parameters: subscriptions that rospy makes for itself are known, and none is made late."""
+from pharos.private_rospy.patches.table import patch
+
+
+@patch('rospy.impl.paramserver', 'ParamServerCache.set', 'never lets go what it subscribed to')
+def set_cached(self, key, value, *, node, original):
+    """Note what get_param_cached subscribes to, as a line of the log does."""
+    node.parameters.cached.add(key)
+    original(self, key, value)
+
+
+@patch(
+    'rospy.msproxy',
+    'MasterProxy.get_param_cached',
+    'subscribes for a line of the log, which registers anew a node that stops',
+)
+def get_param_cached(self, key, *, node, original):
+    """Subscribe only while the node runs."""
+    return original(self, key) if node.parameters.may_subscribe() else self[key]

@@ -1,0 +1,150 @@
+"""rospy's publishers: they send through INTRAPROCESS too, and latch by value."""
+import contextlib
+import functools
+import math
+
+from pharos.intraprocess.fanout import Fanout, links_of
+from pharos.private_rospy.patches.table import addition, patch
+from pharos.private_rospy.publishing import notify
+from pharos.private_rospy.sender import Sender
+
+
+@patch(
+    'rospy.topics',
+    '_PublisherImpl.__init__',
+    'latches the object of the user, which may change (ros_comm #1481), and one for all publishers'
+    ' of a node on the topic (#146)',
+)
+def init_publisher(self, name, data_class, *, original, module):
+    """Have a fan-out, which latches."""
+    original(self, name, data_class)
+    self.queue_bytes = math.inf  # that wait for a subscriber; an OutputChannel has a limit
+    self.fanout = Fanout(self, module)
+
+
+@patch(
+    'rospy.topics',
+    '_PublisherImpl.publish',
+    'keeps a part of a message that does not serialize, which corrupts the stream',
+)
+def publish(self, message, connection_override=None, *, original):
+    """Have the fan-out publish.
+
+    rospy calls this with the lock of the publisher; an OutputChannel calls the fan-out itself,
+    since each frame costs.
+    """
+    if self.closed:
+        return original(self, message)  # says so
+    return self.fanout.publish(message, connection=connection_override)
+
+
+@patch('rospy.topics', '_PublisherImpl.release', 'knows no delegate that is to run after publish')
+def release(self):
+    """Run those that are inline, without the lock; rospy calls this after publish."""
+    if self.publock is not None:
+        self.publock.release()
+    self.fanout.run()
+
+
+@patch(
+    'rospy.topics',
+    '_PublisherImpl.add_connection',
+    'puts a queue in front of each connection whose thread waits for ever, and leaves open what it'
+    ' does not add',
+)
+def add_connection(self, c, *, node, module):
+    """Send what is latched first, through the fan-out, and queue for TCPROS with a thread that
+    ends."""
+    link = getattr(c, 'link', None)
+    if link is None and self.queue_size is not None:
+        c = Sender(c, self.queue_size, node.start_thread, self.queue_bytes)
+    with _latched_first(self) as is_open:
+        if not (is_open and _add(self, c, link, module)):
+            c.close()
+            return False
+        if link:
+            self.fanout.send_latched(link.all_inboxes(), c.endpoint_id)
+        else:
+            self.fanout.write_latched(c)
+    publish_single = functools.partial(self.publish, connection_override=c)
+    for listener in self.subscriber_listeners or ():
+        listener.peer_subscribe(self.resolved_name, self.publish, publish_single)
+    notify()
+    self.fanout.run()
+    return True
+
+
+def _add(publisher, connection, link, module):
+    """Who counts the connections counts this one only when messages go through it."""
+    lock = publisher.c_lock
+    if lock is None:  # closed meanwhile
+        return False
+    with lock:
+        if not module._TopicImpl.add_connection(publisher, connection):
+            return False
+        # receivers may have come since the link was made, and have not seen it yet
+        _refresh(publisher, link)
+        return True
+
+
+@addition('rospy.topics', '_PublisherImpl.channels_changed', 'links call it')
+def channels_changed(self, link):
+    """The subscription at the other end of a link has other channels now."""
+    with _latched_first(self) as is_open:
+        if not is_open:
+            return
+        new = _refresh(self, link)
+        # otherwise it is just being added, and that sends it
+        if link.sending in (self.connections or ()):
+            self.fanout.send_latched(new, link.sending.endpoint_id)
+    self.fanout.run()
+
+
+@patch(
+    'rospy.topics', '_PublisherImpl.remove_connection', 'trips over listeners that are gone by then'
+)
+def remove_connection(self, c, *, module):
+    """Tell the fan-out, and the listeners that there are."""
+    module._TopicImpl.remove_connection(self, c)
+    _refresh(self)
+    for listener in self.subscriber_listeners or ():
+        listener.peer_unsubscribe(self.resolved_name, len(self.connections))
+    notify()
+
+
+@patch('rospy.topics', '_PublisherImpl.close', 'knows no fan-out')
+def close_publisher(self, *, original):
+    """Close it, too."""
+    original(self)
+    self.fanout.close()
+    notify()
+
+
+@contextlib.contextmanager
+def _latched_first(publisher):
+    """Within this, nothing is published that would come before what is latched; gives whether the
+    publisher is open.
+
+    One that does not latch goes on: who comes need not wait for a publisher that itself waits for a
+    slow subscriber, since it has no queue. One that latches does not wait for those of this process
+    meanwhile.
+    """
+    lock = publisher.publock
+    with contextlib.ExitStack() as stack:
+        if lock is not None and publisher.is_latch:
+            for link in links_of(publisher.connections or ()):
+                stack.enter_context(link.unbounded())
+            stack.enter_context(lock)
+        yield lock is not None
+
+
+def _refresh(publisher, link=None):
+    """Have the fan-out go by the connections, and a link by the receivers, that there are; returns
+    its new inboxes."""
+    lock = publisher.c_lock
+    if lock is None:  # closed meanwhile
+        return []
+    with lock:
+        new = link.match_receivers() if link else []
+        publisher.fanout.set_connections(publisher.connections or ())
+        return new

@@ -1,0 +1,94 @@
+"""Registering with the master: once, within a time limit, and not while it holds a lock for
+ever."""
+import xmlrpc.client
+
+from pharos.private_rospy import registration
+from pharos.private_rospy.patches.table import patch
+from pharos.private_rospy.proxies import ServerProxy
+
+_KINDS = {
+    'pub': ('registerPublisher', 'the publisher on'),
+    'sub': ('registerSubscriber', 'the subscriber to'),
+    'srv': ('registerService', 'the service'),
+}
+
+
+@patch(
+    'rospy.impl.registration',
+    'RegManager.reg_added',
+    'retries while it holds the lock of all topics, so that nothing can stop it',
+)
+def reg_added(self, resolved_name, data_type_or_uri, reg_type, *, node, module):
+    """Try once; the watcher repairs what failed."""
+    if node.has_lost_name:
+        return
+    method, kind = _KINDS[reg_type]
+    register = getattr(module.xmlrpcapi(self.master_uri), method)
+    cause = None
+    try:
+        code, message, value = register(node.name, resolved_name, data_type_or_uri, self.uri)
+    except registration.COMMUNICATION_ERRORS as error:
+        code, message, cause = 0, error, error
+    if code != 1:
+        text = (
+            f'cannot register {kind} {resolved_name} of {node.name} with the master'
+            f' {self.master_uri}: {message}'
+        )
+        if registration.is_awaited():
+            registration.note_failure(text, cause)
+        else:
+            module.logerr(f'{text}: this is done as soon as it answers')
+    elif reg_type == 'sub':
+        self.publisher_update(resolved_name, value)
+    elif reg_type == 'pub':
+        node.connections.subscribers_at_registration[resolved_name] = value
+
+
+@patch(
+    'rospy.impl.registration',
+    'RegManager.reg_removed',
+    'asks a master that is away, and has not registered it, a second time',
+)
+def reg_removed(self, resolved_name, data_type_or_uri, reg_type, *, original):
+    """Leave out what could not be registered."""
+    if not registration.is_awaited():
+        original(self, resolved_name, data_type_or_uri, reg_type)
+
+
+@patch('rospy.impl.registration', 'RegManager.publisher_update', 'forgets who publishes')
+def publisher_update(self, resolved_name, uris, *, node, original):
+    """Note whom the master named."""
+    subscriber = node.subscriber(resolved_name)
+    if subscriber is not None:
+        subscriber.publishers = uris
+        subscriber.out_of_reach.intersection_update(uris)
+    original(self, resolved_name, uris)
+
+
+@patch(
+    'rospy.impl.registration', 'RegManager.cleanup', 'trips over a time-out and then closes nothing'
+)
+def cleanup(self, reason, *, node, module):
+    """Unregister within a time limit, and close in any case."""
+    with self.cond:
+        self.cond.notify_all()
+    if not self.master_uri:
+        return
+    module.get_registration_listeners().clear()
+    topics, services = module.get_topic_manager(), module.get_service_manager()
+    if topics.lock.acquire(timeout=registration.UNREGISTER_TIMEOUT):
+        topics.lock.release()  # what another thread was just registering is registered
+    calls = xmlrpc.client.MultiCall(ServerProxy(self.master_uri, registration.UNREGISTER_TIMEOUT))
+    for name, _ in topics.get_subscriptions():
+        calls.unregisterSubscriber(node.name, name, self.uri)
+    for name, _ in topics.get_publications():
+        calls.unregisterPublisher(node.name, name, self.uri)
+    for name, uri in services.get_services():
+        calls.unregisterService(node.name, name, uri)
+    node.parameters.unsubscribe(calls)
+    try:
+        calls()
+    except registration.COMMUNICATION_ERRORS as error:
+        self.logger.warning('cannot unregister from the master %s: %s', self.master_uri, error)
+    topics.close_all()
+    services.unregister_all()

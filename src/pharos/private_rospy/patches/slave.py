@@ -1,0 +1,81 @@
+"""What the master and other nodes ask a node: to stop, to connect, to hear of parameters."""
+import contextlib
+
+from pharos.intraprocess.link import protocol_handler
+from pharos.private_rospy import registration
+from pharos.private_rospy.patches.table import patch
+from pharos.private_rospy.xmlrpc_server import REFUSED, is_call_from_nearby
+
+STOP_TIMEOUT = 5.0  # seconds that who asks the node to stop waits for that
+# publishers of a topic that a call may name; a thread tries to reach each of them
+PUBLISHER_LIMIT = 1000
+
+
+@patch('rospy.impl.masterslave', 'ROSHandler.__init__', 'offers TCPROS alone')
+def init_handler(self, name, master_uri, *, node, original):
+    """Offer INTRAPROCESS first: of the protocols of a node, the first that its peer has is
+    taken."""
+    original(self, name, master_uri)
+    self.protocol_handlers.insert(0, protocol_handler(node))
+
+
+@patch('rospy.impl.masterslave', 'ROSHandler._ready', 'tells no other node of this process')
+def _ready(self, uri, *, node, original):
+    """Be found by those who hear of the node from the master, as soon as it registers."""
+    node.uri = uri
+    node.connections.open()
+    original(self, uri)
+
+
+@patch(
+    'rospy.impl.masterslave',
+    'ROSHandler._connect_topic',
+    'looks for a connection long before it adds one, and so connects twice to one publisher;'
+    ' asks one that is out of reach ever more rarely, and never stops',
+)
+def _connect_topic(self, topic, pub_uri, *, node):
+    """Connect once."""
+    return node.connections.connect(topic, pub_uri)
+
+
+@patch(
+    'rospy.impl.masterslave',
+    'ROSHandler.publisherUpdate',
+    'passes the list on once for each publisher in it, and so does not hear that there is none',
+)
+def publisherUpdate(self, caller_id, topic, publishers):
+    """Pass it on once."""
+    if len(publishers) > PUBLISHER_LIMIT:
+        return -1, f'{REFUSED}{len(publishers)} publishers; the limit is {PUBLISHER_LIMIT}', 0
+    if self.reg_man:
+        self.reg_man.publisher_update(topic, publishers)
+    return 1, '', 0
+
+
+@patch('rospy.impl.masterslave', 'ROSHandler.paramUpdate', 'tells its own cache alone')
+def paramUpdate(self, caller_id, parameter_key, parameter_value, *, node, original):
+    """Tell those who watch the parameter, too."""
+    answer = -1, 'not subscribed', 0
+    with contextlib.suppress(TypeError):  # the cache has a value where the key has a namespace
+        answer = original(self, caller_id, parameter_key, parameter_value)
+    return (1, '', 0) if node.parameters.tell(parameter_key, parameter_value) else answer
+
+
+@patch(
+    'rospy.impl.masterslave',
+    'ROSHandler.shutdown',
+    'obeys everybody, also where an earlier node at its URI was meant (ros_comm #2241)',
+)
+def shutdown(self, caller_id, msg='', *, node):
+    """Stop where this host or the master's asks for it, or the node has lost its name."""
+    # the master knows, whoever says so
+    if 'new node registered with same name' in str(msg):
+        if not registration.name_is_anothers(node):
+            return 1, f'the name {node.name} is still this node\'s', 0
+        node.has_lost_name = True
+    elif not (node.allows_remote_shutdown() or is_call_from_nearby(self.masterUri)):
+        allowed = 'only this host and the master\'s may stop it'
+        return -1, f'{REFUSED}{allowed}, unless its allow_remote_shutdown is set', 0
+    node.request_stop(f'{caller_id} asked for it: {msg}')
+    node.wait_until_silent(STOP_TIMEOUT)  # whoever asked finds it gone, as with rospy
+    return 1, 'shutdown', 0

@@ -1,0 +1,106 @@
+"""rospy's subscriptions: they lose neither links nor callbacks, and hear links of this process."""
+import traceback
+
+from pharos.intraprocess.callbacks import is_of_channel
+from pharos.intraprocess.fanout import links_of
+from pharos.private_rospy.patches.table import addition, patch
+from pharos.private_rospy import registration
+from pharos.signals import is_from_signal
+
+RECONNECT_DELAY = 0.05  # seconds; a publisher that accepts and closes at once is not to be stormed
+
+
+@patch('rospy.topics', '_TopicImpl.close', 'keeps its epoll descriptor until the cycle collector')
+def close_topic(self, *, original):
+    """Close that, too."""
+    original(self)
+    self.connection_poll.poller.close()
+
+
+@patch('rospy.topics', '_SubscriberImpl.__init__', 'does not know its publishers')
+def init_subscriber(self, name, data_class, *, original):
+    """Have room for them."""
+    original(self, name, data_class)
+    self.publishers = ()  # URIs, as the master last said
+    # those of them that the last attempt to connect to has not reached
+    self.out_of_reach = set()
+
+
+@patch(
+    'rospy.topics', '_SubscriberImpl.receive_callback', 'runs a callback for each message at once'
+)
+def receive_callback(self, msgs, connection, *, node, original):
+    """Run the delegates after the batch: channels only queue in their callbacks, so that of a
+    batch the newest are kept."""
+    original(self, msgs, connection)
+    node.on_received()
+
+
+@patch(
+    'rospy.topics',
+    '_SubscriberImpl._invoke_callback',
+    'loses a message for other callbacks, and those after it, for what is raised and no Exception',
+)
+def _invoke_callback(self, msg, cb, cb_args, *, node, original):
+    """Let a callback fail alone."""
+    try:
+        original(self, msg, cb, cb_args)
+    except BaseException as error:
+        if is_from_signal(error):
+            raise
+        node.rospy.logerr('bad callback: %s\n%s', cb, traceback.format_exc())
+
+
+@patch(
+    'rospy.topics',
+    '_SubscriberImpl.remove_connection',
+    'lets a link that broke go, though its publisher is there, or there again (ros_comm #851)',
+)
+def remove_connection(self, c, *, node, original):
+    """Connect again soon, but to one who refused, or may not be talked to."""
+    original(self, c)
+    if self.closed:
+        return
+    if c.header:
+        delay = None if 'error' in c.header else RECONNECT_DELAY
+    else:
+        delay = registration.RETRY_DELAY if c.dest_address else None
+    if delay is not None:
+        node.start_thread(_reconnect, (node, self, c.endpoint_id, delay), 'reconnect')
+
+
+def _reconnect(node, subscriber, uri, delay):
+    if not node.ended.wait(delay) and not subscriber.closed:
+        node.connections.connect(subscriber.resolved_name, uri)
+
+
+@patch('rospy.topics', '_SubscriberImpl.add_callback', 'knows nothing of links and their inboxes')
+def add_callback(self, cb, cb_args, *, original):
+    """Links have inboxes for channels and one for all other callbacks, and know what was
+    latched."""
+    original(self, cb, cb_args)
+    for link in links_of(self.connections or ()):
+        for message in link.callback_added(cb):
+            self._invoke_callback(message, cb, cb_args)
+
+
+@patch('rospy.topics', '_SubscriberImpl.remove_callback', 'knows nothing of links')
+def remove_callback(self, cb, cb_args, *, original):
+    """Tell the links."""
+    original(self, cb, cb_args)
+    for link in links_of(self.connections or ()):
+        link.callback_removed()
+
+
+@addition('rospy.topics', '_SubscriberImpl.has_plain_callbacks', 'links ask for it')
+def has_plain_callbacks(self):
+    """Whether there are callbacks that are no channels'."""
+    return not all(is_of_channel(callback) for callback, _ in self.callbacks or ())
+
+
+@addition('rospy.topics', '_SubscriberImpl.run_callbacks', 'links call it')
+def run_callbacks(self, message):
+    """Run the callbacks that are no channels' for a message of a link."""
+    for callback, arguments in self.callbacks or ():
+        if not is_of_channel(callback):
+            self._invoke_callback(message, callback, arguments)
