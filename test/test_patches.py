@@ -1,10 +1,15 @@
 """The table of what is mended in rospy."""
+import pathlib
+import runpy
 import types
 
 import pytest
 
 from pharos.errors import PharosError
 from pharos.private_rospy.patches import table
+from pharos.private_rospy.process_rospy import rospy
+
+TOOL = runpy.run_path(str(pathlib.Path(__file__).resolve().parent.parent / 'tools' / 'patches'))
 
 SOURCE = """
 import time
@@ -139,3 +144,23 @@ class TestTheTable:
         table.patch('rospy.gone', 'double', 'doubles')(patched)
         with pytest.raises(PharosError, match=r'patched .*rospy\.gone\.double is not there'):
             table.check_applied({'rospy.example': None})
+
+
+class TestWhatIsPatched:
+    """What rospy has there, as tools/patches sees it."""
+
+    def test_it_is_what_it_is_in_a_release_that_is_known(self):
+        """A new release of rospy is known when each target that this names was looked at, its patch
+        fits, and ``tools/patches RELEASE FOLDER`` has noted the release (it says how)."""
+        _, known = TOOL['read_notes']()
+        found = TOOL['fingerprints'](pathlib.Path(rospy.__file__).parent.parent)
+        changed = [
+            target
+            for target, fingerprint in found.items()
+            if fingerprint == TOOL['UNKNOWN'] or fingerprint not in known.get(target, {}).values()
+        ]
+        assert changed == [], 'rospy has others than known: see the docstring of this test'
+        assert found.keys() == known.keys(), 'run tools/patches RELEASE FOLDER'
+
+    def test_the_page_of_the_documentation_shows_the_table(self):
+        assert TOOL['PAGE'].read_text() == TOOL['page'](), 'run tools/patches'
