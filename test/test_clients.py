@@ -741,11 +741,11 @@ def test_the_master_may_stop_a_node_whose_name_it_gave_away(master, far_client):
     """From wherever it calls: a host may have many addresses, but the master itself says whose the
     name is."""
     node = create(master, '/taken_over')
-    master._api('/taken_over').registerPublisher(
+    master.api('/taken_over').registerPublisher(
         '/clients/taken', 'std_msgs/String', 'http://127.0.0.1:1/'
     )
     until(lambda: node.lifecycle.value == 'stopped')
-    master._api('/taken_over').unregisterPublisher('/clients/taken', 'http://127.0.0.1:1/')
+    master.api('/taken_over').unregisterPublisher('/clients/taken', 'http://127.0.0.1:1/')
 
 
 @pytest.mark.parametrize(

@@ -383,9 +383,9 @@ def waiting(master, monkeypatch):
     peer.output_channel('/slow', 'std_msgs/Empty')
     peer.interested_in('/fast', 'std_msgs/Empty')
     mute = silent()
-    master._api('/mute_one').registerSubscriber('/mute', 'std_msgs/Empty', mute)
-    monkeypatch.setattr('pharos.master.PING_TIMEOUT', TIMEOUT)
-    monkeypatch.setattr('pharos.master.TIMEOUT', TIMEOUT)
+    master.api('/mute_one').registerSubscriber('/mute', 'std_msgs/Empty', mute)
+    monkeypatch.setattr('pharos.master_calls.PING_TIMEOUT', TIMEOUT)
+    monkeypatch.setattr('pharos.master_calls.TIMEOUT', TIMEOUT)
 
     def sleep(request):
         waiting.set()
@@ -405,7 +405,7 @@ def waiting(master, monkeypatch):
     )
     yield waiting
     over.set()
-    master._api('/mute_one').unregisterSubscriber('/mute', mute)
+    master.api('/mute_one').unregisterSubscriber('/mute', mute)
     while LISTENERS:
         LISTENERS.pop().close()
 

@@ -56,7 +56,7 @@ def test_a_name_left_by_a_dead_node_is_free(master):
     with socket.socket() as sock:
         sock.bind(('127.0.0.1', 0))
         dead = 'http://127.0.0.1:%d/' % sock.getsockname()[1]
-    master._api('/dead').registerPublisher('/left_behind', 'std_msgs/Empty', dead)
+    master.api('/dead').registerPublisher('/left_behind', 'std_msgs/Empty', dead)
     create(master, '/dead')
     assert '/left_behind' not in master.system_state()[0]
 

@@ -148,7 +148,7 @@ def test_a_topic_gives_channels_to_running_nodes_of_its_master_alone(master, ope
 def test_parameters_that_others_have_named_oddly_are_in_the_mapping_too(bare):
     names = ['/odd name', '/1st']
     for name in names:
-        bare._api().setParam(name, 5)
+        bare.api().setParam(name, 5)
         with pytest.raises(ValueError, match='cannot be a parameter name'):
             bare.parameters[name] = 6
         assert name in bare.parameters

@@ -922,11 +922,11 @@ def test_a_publisher_that_is_dead_is_not_waited_for(master):
     define_message('given_msgs/Reading', 'string level\n')
     topic, node = '/types/live_%d' % next(topic_numbers), create(master, '/node')
     node.connect_timeout = 100 * TIMEOUT
-    master._api('/dead').registerPublisher(topic, 'given_msgs/Reading', refused_url())
+    master.api('/dead').registerPublisher(topic, 'given_msgs/Reading', refused_url())
     try:
         assert describe(node.interested_in(topic, 'given_msgs/Reading')) == 'string'
     finally:
-        master._api('/dead').unregisterPublisher(topic, master._api().lookupNode('/dead'))
+        master.api('/dead').unregisterPublisher(topic, master.api().lookupNode('/dead'))
 
 
 def test_the_definition_that_is_taken_is_no_failure_and_those_it_does_not_suit_are(master, mailbox):

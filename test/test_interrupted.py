@@ -89,7 +89,7 @@ def test_what_is_opened_while_the_master_is_away_raises_and_leaves_nothing_behin
     )
     node.stop()
     assert registrations(away, '/node') == [[], [], []]
-    assert away._api('/test').subscribeParam('http://127.0.0.1:1/', '/interrupted/opened') in (
+    assert away.api('/test').subscribeParam('http://127.0.0.1:1/', '/interrupted/opened') in (
         {},
         5,
     )

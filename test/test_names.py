@@ -208,7 +208,7 @@ def test_remapped_channels_survive_a_restart_and_their_masters(master):
     node.serve('two', 'std_srvs/Empty', lambda request: None)
     node.stop()
     node.start()
-    api = master._api('/again/node')
+    api = master.api('/again/node')
     api.unregisterSubscriber('/again/two', node.uri)  # as a master that has been restarted
     until(lambda: master.topic('/again/two').subscribers == ['/again/node'], 'the repair')
     assert not master.topic('/again/one').subscribers
@@ -357,6 +357,6 @@ def test_to_costs_the_master_nothing_where_the_peer_is_connected(
     create(master, '/listener', delegate=mailbox).interested_in('/quick', STRING)
     channel = node.output_channel('/quick', STRING)
     assert channel.wait_for_subscribers(1, TIMEOUT)
-    monkeypatch.setattr(pharos.Master, '_api', None)
+    monkeypatch.setattr(pharos.Master, 'api', None)
     channel.send(data='at once', to='listener')
     assert mailbox.get().data == 'at once'

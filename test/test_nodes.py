@@ -296,7 +296,7 @@ def test_sleep_ends_when_the_node_stops(master):
 
 
 def test_every_and_sleep_follow_simulated_time(master):
-    master._api().setParam('/use_sim_time', True)
+    master.api().setParam('/use_sim_time', True)
     try:
         clock = create(master, '/clock_server').output_channel('/clock', 'rosgraph_msgs/Clock')
         node, turns = create(master, '/simulated'), Mailbox()
@@ -315,7 +315,7 @@ def test_every_and_sleep_follow_simulated_time(master):
             assert turns.get() == seconds
         node.stop()  # time stands still, the soul ends all the same
     finally:
-        master._api().deleteParam('/use_sim_time')
+        master.api().deleteParam('/use_sim_time')
 
 
 def test_delegates_of_a_node_run_one_at_a_time(master, mailbox):

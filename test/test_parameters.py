@@ -416,13 +416,13 @@ def test_a_master_no_longer_calls_where_a_stopped_node_was(master):
         )
         thread = threading.Thread(target=server.serve_forever, args=(0.01,))
         thread.start()
-        master._api(node.name).subscribeParam(node.uri, '/sentinel')
+        master.api(node.name).subscribeParam(node.uri, '/sentinel')
         for name in PRIVATE, '/gains', '/gains/p', '/sentinel':
             master.parameters[name] = 5
         assert calls.get() == '/sentinel/'  # a master calls one node in order
         server.shutdown()
         thread.join(TIMEOUT)
-    master._api(node.name).unsubscribeParam(node.uri, '/sentinel')
+    master.api(node.name).unsubscribeParam(node.uri, '/sentinel')
 
 
 def test_a_parameter_needs_a_running_node_and_goes_on_with_the_next_run(master):

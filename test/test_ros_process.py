@@ -288,7 +288,7 @@ def test_the_nodes_of_a_launch_file_are_ended_through_ros(master, package):
 
 
 def test_a_node_registered_with_a_port_that_cannot_be_keeps_no_program_from_ending(master):
-    liar, uri = master._api('/liar'), 'http://127.0.0.1:99999/'
+    liar, uri = master.api('/liar'), 'http://127.0.0.1:99999/'
     liar.registerPublisher('/lies', 'std_msgs/String', uri)
     try:
         process = master.run('topic_tools', 'relay', '/untyped', '/b', name='passes_on')

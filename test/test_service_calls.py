@@ -599,7 +599,7 @@ class Refuser:
     def __init__(self, master):
         self._listening = socket.create_server(('127.0.0.1', 0))
         self._uri = 'rosrpc://127.0.0.1:%d' % self._listening.getsockname()[1]
-        self._api = master._api('/refuser')
+        self._api = master.api('/refuser')
         self._api.registerService('/refuser/echo', self._uri, 'http://127.0.0.1:1/')
         self.ended = started(self._serve)
 

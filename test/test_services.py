@@ -310,14 +310,14 @@ def test_a_service_of_nobody_that_answers(master):
     with socket.socket() as sock:
         sock.bind(('127.0.0.1', 0))
         dead = 'rosrpc://127.0.0.1:%d' % sock.getsockname()[1]
-    master._api('/dead').registerService('/dead/clear', dead, 'http://127.0.0.1:1/')
+    master.api('/dead').registerService('/dead/clear', dead, 'http://127.0.0.1:1/')
     try:
         with pytest.raises(
             pharos.ServiceCallError, match=f'provider of /dead/clear at {dead} does not answer'
         ):
             master.lookup_service('/dead/clear')
     finally:
-        master._api('/dead').unregisterService('/dead/clear', dead)
+        master.api('/dead').unregisterService('/dead/clear', dead)
 
 
 def test_an_md5sum_by_hand_is_what_is_sent(master):
@@ -414,7 +414,7 @@ class SilentProvider:
         self._answer, self._taken = answer, []
         self._listening = socket.create_server(('127.0.0.1', 0))
         self.uri = 'rosrpc://127.0.0.1:%d' % self._listening.getsockname()[1]
-        self._api = master._api('/silent')
+        self._api = master.api('/silent')
         self._api.registerService('/silent/spawn', self.uri, 'http://127.0.0.1:1/')
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()

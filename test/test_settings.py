@@ -51,7 +51,7 @@ def test_topics_are_resolved_and_remapped_for_each_node(master):
 def test_private_parameters_come_from_argv(master):
     node = create(master, '/robot1/driver', argv=['_rate:=2.5', '_name:=bob'])
     assert node.ros.get_param('~rate') == 2.5
-    assert master._api().getParam('/robot1/driver/name') == 'bob'
+    assert master.api().getParam('/robot1/driver/name') == 'bob'
 
 
 @pytest.mark.parametrize(

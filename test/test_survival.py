@@ -207,7 +207,7 @@ def test_a_name_whose_dead_node_left_its_port_to_another_server_is_refused_with_
     with http.server.HTTPServer(('127.0.0.1', 0), http.server.SimpleHTTPRequestHandler) as other:
         threading.Thread(target=other.serve_forever, daemon=True).start()
         uri = 'http://127.0.0.1:%d/' % other.server_address[1]
-        left_behind = master._api('/left_behind')
+        left_behind = master.api('/left_behind')
         left_behind.registerPublisher('/survival/left', 'std_msgs/String', uri)
         try:
             with pytest.raises(pharos.NodeNameInUseError, match='rosnode cleanup'):

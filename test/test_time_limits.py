@@ -139,7 +139,7 @@ def prepared(bad, master, monkeypatch):
         silent.bind(('127.0.0.1', 0))
         silent.listen()
         uri = 'http://127.0.0.1:%d/' % silent.getsockname()[1]
-        api = master._api('/external')
+        api = master.api('/external')
         api.registerSubscriber('/limits/gone', STRING, uri)
         bad.channel = bad.node.output_channel('/limits/open', STRING)
         bad.served = bad.node.serve('/limits/closes', 'std_srvs/Empty', lambda request: None)

@@ -310,7 +310,7 @@ class OutputChannel(_Channel):
         if endpoint is None or self.node._rospy.connections.reaches(endpoint, name):
             return
         with time_limit(self.node.connect_timeout):
-            self.node.master._find(name)
+            self.node.master.uri_of(name)
         if name not in self._uninterested and not self.latch:
             self._uninterested.add(name)
             self.node.log(

@@ -1,9 +1,14 @@
 """Nodes outside this process."""
+import contextlib
 import urllib.parse
+from typing import TYPE_CHECKING, Any, Dict, List, Optional
 
 from pharos.errors import UnknownNodeError
 from pharos.private_rospy.proxies import ServerProxy
 from pharos.private_rospy.registration import COMMUNICATION_ERRORS
+
+if TYPE_CHECKING:
+    from pharos.master import Master
 
 TIMEOUT = 2.0  # seconds that a node may take to answer
 
@@ -11,63 +16,60 @@ TIMEOUT = 2.0  # seconds that a node may take to answer
 class ExternalNode:
     """An interface to any ROS node outside this process, written in any language."""
 
-    def __init__(self, master, name):
-        self.master, self.name = master, name
+    def __init__(self, master: 'Master', name: str) -> None:
+        self.master = master
+        self.name = name
 
     @property
-    def uri(self):
+    def uri(self) -> str:
         """The URI of its XML-RPC server."""
-        return self.master._find(self.name)
+        return self.master.uri_of(self.name)
 
     @property
-    def host(self):
+    def host(self) -> Optional[str]:
         """The host name or address that it advertises."""
         return urllib.parse.urlsplit(self.uri).hostname
 
     @property
-    def pid(self):
+    def pid(self) -> int:
         """Its process id, on its host."""
-        return self._ask('getPid')
+        return int(self._ask('getPid'))
 
-    def is_alive(self):
+    def is_alive(self) -> bool:
         """Whether it answers."""
         return self.master.is_node_alive(self.name)
 
     @property
-    def publications(self):
+    def publications(self) -> Dict[str, Optional[str]]:
         """``{topic: type}`` that it publishes, as the master knows it; the type is None where
         nobody has named it."""
         return self._topics(0)
 
     @property
-    def subscriptions(self):
+    def subscriptions(self) -> Dict[str, Optional[str]]:
         """``{topic: type}`` that it is interested in, as :attr:`publications`."""
         return self._topics(1)
 
-    def _topics(self, kind):
+    def _topics(self, kind: int) -> Dict[str, Optional[str]]:
         types = dict(self.master.topic_types())
-        return {
-            topic: types.get(topic)
-            for topic, nodes in self.master.system_state()[kind].items()
-            if self.name in nodes
-        }
+        return {name: types.get(name) for name in self._uses(kind)}
 
     @property
-    def services(self):
+    def services(self) -> List[str]:
         """Names of the services that it offers."""
-        return sorted(
-            name for name, nodes in self.master.system_state()[2].items() if self.name in nodes
-        )
+        return sorted(self._uses(2))
 
-    def shutdown(self):
+    def _uses(self, kind: int) -> List[str]:
+        users = self.master.system_state()[kind]
+        return [name for name, nodes in users.items() if self.name in nodes]
+
+    def shutdown(self) -> None:
         """Ask it to stop, as ``rosnode kill`` does."""
         self._ask('getPid')  # tells whether it is there to be asked
-        try:
+        with contextlib.suppress(UnknownNodeError):  # it was gone before its answer was through
             self._ask('shutdown', 'asked for by pharos')
-        except UnknownNodeError:
-            pass  # it was gone before its answer was through
 
-    def _ask(self, method, *args):
+    def _ask(self, method: str, *args: str) -> Any:
         uri = self.uri
         try:
             return getattr(ServerProxy(uri, TIMEOUT), method)('/pharos', *args)[2]
@@ -77,14 +79,15 @@ class ExternalNode:
                 ' rosnode cleanup removes it'
             ) from error
 
-    def __eq__(self, other):
-        return isinstance(other, ExternalNode) and (self.master, self.name) == (
-            other.master,
-            other.name,
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, ExternalNode)
+            and self.name == other.name
+            and self.master == other.master
         )
 
-    def __hash__(self):
+    def __hash__(self) -> int:
         return hash((self.master, self.name))
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f'<ExternalNode {self.name} of {self.master.url}>'

@@ -62,8 +62,7 @@ def health_of(node, ask):
 
 def _is_registered(node):
     try:
-        with node.master._reached():
-            return node.uri is not None and node.master._api().lookupNode(node.name) == node.uri
+        return node.uri is not None and node.master.call('lookupNode', node.name) == node.uri
     except rosgraph.MasterError:
         return False
     except MasterUnreachableError:

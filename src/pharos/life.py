@@ -95,7 +95,7 @@ class Life:
         for opened in (*self._channels, *self._services):
             self._live_rospy()
             opened._open()
-        with self.master._reached():
+        with self.master.reached():
             self._rospy.parameters.renew()
 
     def _start_run(self):

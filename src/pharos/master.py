@@ -1,39 +1,31 @@
 """The proxy of a ROS master."""
-import threading
-import time
-import urllib.parse
+import subprocess
+from typing import Any, Callable, Dict, Iterable, List, Optional, Type, TypeVar, Union
 
 import rosgraph
 from rosgraph.rosenv import ROS_MASTER_URI
 
-from pharos import node as nodes_of_ours
-from pharos import ros_process, running
+from pharos import embedded_master, node as nodes_of_ours, ros_process, running
 from pharos.blocks import check_block
-from pharos.errors import (
-    MasterUnreachableError,
-    NodeStoppedError,
-    PharosError,
-    UnknownNodeError,
-    suggest,
-)
+from pharos.errors import PharosError, UnknownNodeError, suggest
 from pharos.external_node import ExternalNode
 from pharos.life import Lifecycle
+from pharos.master_calls import MasterCalls
 from pharos.parameters import Parameters
-from pharos.private_rospy.addresses import check_port, check_url, is_same_master
-from pharos.private_rospy.lifetime import Interruption
+from pharos.private_rospy.addresses import check_port, check_url
 from pharos.private_rospy.names import check_name, global_name
-from pharos.private_rospy.proxies import MARGIN, ServerProxy, interruption, master_api, time_limit
-from pharos.private_rospy.registration import COMMUNICATION_ERRORS, PING_TIMEOUT
+from pharos.private_rospy.proxies import MARGIN, time_limit
+from pharos.ros_process import RosProcess
 from pharos.seconds import check_limit
 from pharos.service import Service
 from pharos.topic import Topic
 from pharos.watcher import watcher_of
 
-TIMEOUT = 5.0  # seconds that a question to the master may take
-POLL = 0.05  # seconds between two questions whether there is a master
+NodeType = TypeVar('NodeType', bound=nodes_of_ours.Node)
+AnyNode = Union[nodes_of_ours.Node, ExternalNode]
 
 
-class Master:
+class Master(MasterCalls):
     """The proxy of a ROS master: creates nodes, and finds others.
 
     The report (listing 3.2)::
@@ -49,14 +41,15 @@ class Master:
     :raises ValueError: if it is no URL
     """
 
-    def __init__(self, url=None):
-        self.url = (
+    def __init__(self, url: Optional[str] = None) -> None:
+        self.url: str = (
             check_url(rosgraph.get_master_uri(), ROS_MASTER_URI) if url is None else check_url(url)
         )
-        self._child = None  # the process of an embedded master
+        # the process of an embedded master
+        self._child: Optional['subprocess.Popen[str]'] = None
 
     @classmethod
-    def embedded(cls, port=0):
+    def embedded(cls, port: int = 0) -> 'Master':
         """A ROS master of one's own, with /rosout, as a child of this process; ``roscore`` is not
         needed.
 
@@ -66,21 +59,17 @@ class Master:
         :param port: its port, 0 for any free one
         :raises PortInUseError: if the port is taken
         """
-        from pharos import embedded_master  # only here: most programs have a master
-
         child, url = embedded_master.start(check_port('port', port))
         master = cls(url)
         master._child = child
         running.at_end(master.stop)  # the child would end by itself, but perhaps after us
         return master
 
-    def stop(self):
+    def stop(self) -> None:
         """Stop this process's nodes at an embedded master, and end it. Harmless when done twice.
 
         :raises PharosError: if it is not embedded: other nodes need it
         """
-        from pharos import embedded_master
-
         if self._child is None:
             raise PharosError(
                 f'{self} is not embedded in this program: stop it where it was started'
@@ -91,34 +80,33 @@ class Master:
         if self._child.returncode is None:
             embedded_master.end(self._child)
 
-    def __enter__(self):
+    def __enter__(self) -> 'Master':
         return self
 
-    def __exit__(self, *error):
+    def __exit__(self, *error: object) -> None:
         if self._child is not None:
             self.stop()
 
     def create(
         self,
-        node_class,
-        named,
-        domain=None,
-        tcp_port=0,
-        xmlrpc_port=0,
-        soul=None,
-        delegate=None,
-        argv=None,
-        **kwargs,
-    ):
+        node_class: Type[NodeType],
+        named: str,
+        domain: Optional[str] = None,
+        tcp_port: int = 0,
+        xmlrpc_port: int = 0,
+        soul: Optional[Callable[..., Any]] = None,
+        delegate: Optional[Callable[..., Any]] = None,
+        argv: Optional[List[str]] = None,
+        **kwargs: Any,
+    ) -> NodeType:
         """Create, register and start a node; returns it.
 
         The report (listing 3.7)::
 
-            master create: PhaROSBlockNode named: '/myNode' domain: '127.0.0.1' tcpPort: 9999
-            xmlRpcPort: 6123
-                soul: [...]
-            master.create(BlockNode, named='/myNode', domain='127.0.0.1', tcp_port=9999,
-            xmlrpc_port=6123, soul=...)
+            master create: PhaROSBlockNode named: '/myNode' domain: '127.0.0.1'
+                tcpPort: 9999 xmlRpcPort: 6123 soul: [...]
+            master.create(BlockNode, named='/myNode', domain='127.0.0.1',
+                          tcp_port=9999, xmlrpc_port=6123, soul=...)
 
         :param node_class: Node, BlockNode or a subclass
         :param named: the node's name, which may carry a namespace: '/robot1/driver'
@@ -163,7 +151,16 @@ class Master:
             raise
         return node
 
-    def run(self, package, executable, *args, name=None, remap=None, params=None, on_line=None):
+    def run(
+        self,
+        package: str,
+        executable: str,
+        *args: object,
+        name: Optional[str] = None,
+        remap: Optional[Dict[str, str]] = None,
+        params: Optional[Dict[str, object]] = None,
+        on_line: Optional[Callable[[str], Any]] = None,
+    ) -> RosProcess:
         """Start a ROS program at this master, as ``rosrun`` does; returns the :class:`RosProcess`.
 
         :param args: its further arguments
@@ -177,10 +174,16 @@ class Master:
         mappings = {**(remap or {}), **{'_' + key: value for key, value in (params or {}).items()}}
         if name is not None:
             mappings['__name'] = name
-        arguments = [*map(str, args), *('%s:=%s' % mapping for mapping in mappings.items())]
+        arguments = [*map(str, args), *(f'{key}:={value}' for key, value in mappings.items())]
         return ros_process.run(self.url, package, executable, arguments, on_line)
 
-    def launch(self, package, file, on_line=None, **args):
+    def launch(
+        self,
+        package: str,
+        file: str,
+        on_line: Optional[Callable[[str], Any]] = None,
+        **args: object,
+    ) -> RosProcess:
         """Start a launch file at this master, as ``roslaunch`` does; returns the
         :class:`RosProcess`.
 
@@ -192,15 +195,15 @@ class Master:
 
     # -- what is there
 
-    def nodes(self):
+    def nodes(self) -> List[AnyNode]:
         """All nodes: a Node where it runs in this process, an ExternalNode elsewhere."""
-        own = {node.name: node for node in self.local_nodes()}
-        names = sorted(
-            {name for kind in self.system_state() for users in kind.values() for name in users}
-        )
-        return [own[name] if name in own else ExternalNode(self, name) for name in names]
+        local = {node.name: node for node in self.local_nodes()}
+        names = {name for kind in self.system_state() for users in kind.values() for name in users}
+        return [
+            local[name] if name in local else ExternalNode(self, name) for name in sorted(names)
+        ]
 
-    def node(self, name):
+    def node(self, name: str) -> AnyNode:
         """The node of that name.
 
         :raises UnknownNodeError: if the master knows none
@@ -211,24 +214,22 @@ class Master:
             raise self._unknown(name, known)
         return known[name]
 
-    def _find(self, name):
-        """The URI of the node of that name.
+    def uri_of(self, name: str) -> str:
+        """The URI of the XML-RPC server of the node of that name.
 
         :raises UnknownNodeError: if the master knows none
         """
-        with self._reached():
-            try:
-                return self._api().lookupNode(name)
-            except rosgraph.MasterError:
-                pass
-        raise self._unknown(name, [node.name for node in self.nodes()])
+        try:
+            return str(self.call('lookupNode', name))
+        except rosgraph.MasterError:
+            raise self._unknown(name, [node.name for node in self.nodes()]) from None
 
-    def _unknown(self, name, known):
+    def _unknown(self, name: str, known: Iterable[str]) -> UnknownNodeError:
         return UnknownNodeError(
             f'no node {name} at {self.url}{suggest(name, known)}: see rosnode list'
         )
 
-    def wait_for_node(self, name, timeout=None):
+    def wait_for_node(self, name: str, timeout: Optional[float] = None) -> AnyNode:
         """Wait until a node of that name is there, which means registered and not dead; returns it.
 
         :param timeout: seconds, None: without limit, 0: whether it is there now
@@ -242,34 +243,22 @@ class Master:
             with time_limit(MARGIN):
                 node = self.live_node(name)
         if node is None:
-            self._ask('getPid', MARGIN)
+            self.call('getPid', timeout=MARGIN)
             raise UnknownNodeError(
                 f'no node {name} came to {self.url} within {timeout:g} s: is it started, with that'
                 ' master, and under that name?'
             )
         return node
 
-    def live_node(self, name):
+    def live_node(self, name: str) -> Optional[AnyNode]:
         """The node of that name, if it is there; one that only starts, has died or is unknown is
         not: None."""
-        own = next((node for node in self.local_nodes() if node.name == name), None)
-        if own is not None:
-            return own if own.is_running else None
-        try:
-            uri = self._api().lookupNode(name)
-        except (rosgraph.MasterException, *COMMUNICATION_ERRORS):
-            return None
-        node = ServerProxy(uri, PING_TIMEOUT)
-        try:
-            with interruption(node):
-                node.getPid('/pharos')
-        except ConnectionRefusedError:
-            return None
-        except COMMUNICATION_ERRORS:
-            pass  # it is there, and busy perhaps
-        return ExternalNode(self, name)
+        for node in self.local_nodes():
+            if node.name == name:
+                return node if node.is_running else None
+        return ExternalNode(self, name) if self.is_node_alive(name, or_busy=True) else None
 
-    def on_change(self, block):
+    def on_change(self, block: Callable[[str, str, bool], Any]) -> Callable[[], None]:
         """Run ``block(kind, name, is_there)`` for each node, topic and service that comes or goes.
 
         ``kind`` is 'node', 'topic' or 'service'. It runs in the thread that watches the master,
@@ -281,32 +270,30 @@ class Master:
         return watcher_of(self).listen(check_block(block, 'block', ('kind', 'name', 'is_there')))
 
     @property
-    def parameters(self):
+    def parameters(self) -> Parameters:
         """The parameter server as a mapping: ``master.parameters['/rosdistro']``."""
         return Parameters(self)
 
-    def local_nodes(self):
+    def local_nodes(self) -> List[nodes_of_ours.Node]:
         """The nodes of this process at this master."""
         return [node for node in running.nodes() if node.master == self]
 
-    def topics(self):
+    def topics(self) -> List[Topic]:
         """All topics that somebody publishes on or is interested in."""
         publishers, subscribers, _ = self.system_state()
         return [Topic(self, name) for name in sorted({*publishers, *subscribers})]
 
-    def topic(self, name):
+    def topic(self, name: str) -> Topic:
         """The topic of that name, whether anybody uses it yet or not."""
         return Topic(self, global_name(name, 'topic'))
 
-    def topic_types(self):
-        """``[(topic name, type name)]`` of all topics."""
-        return self._ask('getTopicTypes')
-
-    def services(self):
+    def services(self) -> List[str]:
         """Names of all services."""
         return sorted(self.system_state()[2])
 
-    def lookup_service(self, name, caller_id='/pharos', persistent=False):
+    def lookup_service(
+        self, name: str, caller_id: str = '/pharos', persistent: bool = False
+    ) -> Service:
         """The :class:`Service` of that name, to be called in the name of ``caller_id``.
 
         The report (listing 3.5): ``master lookupService: '/clear' with: '/myID'``.
@@ -317,103 +304,7 @@ class Master:
         """
         caller_id = global_name(caller_id, 'node')
         name = rosgraph.names.resolve_name(check_name(name, 'service', private=True), caller_id)
-        with self._reached():
-            return Service(self, name, caller_id, persistent)
+        return Service(self, name, caller_id, persistent)
 
-    def system_state(self):
-        """``(publishers, subscribers, services)``, each ``{name: [node names]}``."""
-        return tuple(
-            {name: list(nodes) for name, nodes in kind} for kind in self._ask('getSystemState')
-        )
-
-    # -- the master itself
-
-    @property
-    def pid(self):
-        """The process id of the master, on its host."""
-        return self._ask('getPid')
-
-    def is_reachable(self):
-        """Whether a master answers at the URL."""
-        try:
-            self._ask('getPid')
-        except MasterUnreachableError:
-            return False
-        return True
-
-    def wait(self, timeout=None):
-        """Wait until the master answers, for up to ``timeout`` seconds (None: without limit);
-        returns this Master.
-
-        :raises MasterUnreachableError: if it does not in time
-        :raises NodeStoppedError: if the node whose soul or delegate waits stops meanwhile
-        """
-        timeout = check_limit('timeout', timeout)
-        deadline = None if timeout is None else time.monotonic() + timeout
-        woken = threading.Event()
-        with Interruption(woken.set) as stop:
-            while True:
-                left = TIMEOUT if deadline is None else deadline - time.monotonic()
-                try:
-                    self._ask('getPid', min(TIMEOUT, max(left, 0.1)))
-                    return self
-                except MasterUnreachableError:
-                    if left <= 0:
-                        raise
-                    woken.wait(POLL)  # there is nobody yet who could tell
-                if stop.came:
-                    raise NodeStoppedError(f'the node that waited for the master {self.url} stops')
-
-    def is_node_alive(self, name):
-        """Whether the node of that name is registered and its XML-RPC server answers."""
-        try:
-            node = ServerProxy(self._api().lookupNode(name), PING_TIMEOUT)
-            with interruption(node):
-                node.getPid('/pharos')
-        except (rosgraph.MasterException, *COMMUNICATION_ERRORS):
-            return False
-        return True
-
-    def _api(self, caller_id='/pharos', timeout=TIMEOUT):
-        return master_api(self.url, caller_id, timeout)
-
-    def _ask(self, method, timeout=TIMEOUT):
-        api = self._api(timeout=timeout)
-        with self._reached(), interruption(api.handle) as stop:
-            try:
-                return getattr(api, method)()
-            except COMMUNICATION_ERRORS as error:
-                if stop.came:
-                    raise NodeStoppedError(
-                        f'the node that asked the master {self.url} stops'
-                    ) from error
-                raise
-
-    def _reached(self):
-        return _Reached(self.url)
-
-    def __eq__(self, other):
-        return isinstance(other, Master) and is_same_master(self.url, other.url)
-
-    def __hash__(self):
-        return urllib.parse.urlsplit(self.url).port  # the host may have several names
-
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f'<Master {self.url}>'
-
-
-class _Reached:
-    """Turns a failure to reach the master into an error that names it."""
-
-    def __init__(self, url):
-        self._url = url
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, kind, error, traceback):
-        if isinstance(error, COMMUNICATION_ERRORS):
-            raise MasterUnreachableError(
-                f'no ROS master answers at {self._url} ({error}): start one with roscore or'
-                ' Master.embedded(), or set ROS_MASTER_URI'
-            ) from error

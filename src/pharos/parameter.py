@@ -19,13 +19,14 @@ class Parameter:
     """
 
     def __init__(self, node, name, initialized=None):
-        self.node, self.name = node, name
+        self.node = node
+        self.name = name
         self._initialized = None if initialized is None else carried(name, initialized)
         self._kind = type(self._initialized)
         self._blocks = []
         if self._initialized is not None:
             watched = node._live_rospy().parameters
-            with node.master._reached():
+            with node.master.reached():
                 watched.initialize(name, self._initialized)
 
     @property
@@ -39,11 +40,10 @@ class Parameter:
 
     def _get(self):
         self.node._live_rospy()
-        with self.node.master._reached():
-            try:
-                return self.node.master._api(self.node.name).getParam(self.name)
-            except rosgraph.MasterError:
-                return None
+        try:
+            return self.node.master.call('getParam', self.name, caller_id=self.node.name)
+        except rosgraph.MasterError:
+            return None
 
     def set(self, value):
         """Set it on the parameter server.
@@ -58,8 +58,8 @@ class Parameter:
             )
         value = self._checked(carried(self.name, value))
         watched = self.node._live_rospy().parameters
-        with self.node.master._reached():
-            self.node.master._api(self.node.name).setParam(self.name, value)
+        self.node.master.call('setParam', self.name, value, caller_id=self.node.name)
+        with self.node.master.reached():
             watched.tell_of_own(self.name, value)
 
     def on_change(self, block):
@@ -81,7 +81,7 @@ class Parameter:
         watched = self.node._live_rospy().parameters
         self._blocks.append(block)
         try:
-            with self.node.master._reached():
+            with self.node.master.reached():
                 watched.watch(self.name, self._changed)
         except BaseException:
             self._blocks.remove(block)

@@ -58,11 +58,9 @@ class Service:
 
     def _look_up(self, deadline):
         """Find the provider, which may have moved; returns its URI."""
-        with time_limit(
-            None if deadline is None else deadline - time.monotonic()
-        ), self.master._reached():
+        with time_limit(None if deadline is None else deadline - time.monotonic()):
             try:
-                self.uri = self.master._api(self.caller_id, TIMEOUT).lookupService(self.name)
+                self.uri = self.master.call('lookupService', self.name, caller_id=self.caller_id)
             except rosgraph.MasterError:
                 raise UnknownServiceError(
                     f'no node of {self.master.url} offers the service'

@@ -6,6 +6,7 @@ import rosgraph
 from pharos import messages
 from pharos.channel import InputChannel, OutputChannel
 from pharos.errors import (
+    MasterUnreachableError,
     MessageTypeError,
     NodeStoppedError,
     PharosError,
@@ -15,7 +16,6 @@ from pharos.errors import (
 )
 from pharos.life import Life
 from pharos.private_rospy.proxies import MARGIN, time_limit
-from pharos.private_rospy.registration import COMMUNICATION_ERRORS
 from pharos.private_rospy.tcpros_connection import ask_publisher
 from pharos.seconds import check_seconds
 
@@ -187,8 +187,8 @@ class Topic:
         """``(node name, connection header)`` of each publisher that answers, one by one."""
         for name in self.publishers:
             try:
-                uri = self.master._api().lookupNode(name)
-            except (rosgraph.MasterException, *COMMUNICATION_ERRORS):
+                uri = self.master.call('lookupNode', name)
+            except (rosgraph.MasterException, MasterUnreachableError):
                 continue
             yield name, ask_publisher(uri, self.name)
 

@@ -1,0 +1,138 @@
+"""Calls to a ROS master."""
+import contextlib
+import threading
+import time
+import urllib.parse
+from typing import Any, Dict, Iterator, List, Optional, Tuple, TypeVar
+
+import rosgraph
+
+from pharos.errors import MasterUnreachableError, NodeStoppedError
+from pharos.private_rospy.addresses import is_same_master
+from pharos.private_rospy.lifetime import Interruption
+from pharos.private_rospy.proxies import ServerProxy, interruption, master_api
+from pharos.private_rospy.registration import COMMUNICATION_ERRORS, PING_TIMEOUT
+from pharos.seconds import check_limit
+
+TIMEOUT = 5.0  # seconds that a question to the master may take
+POLL = 0.05  # seconds between two questions whether there is a master
+
+Users = Dict[str, List[str]]  # name of a topic or service -> names of nodes
+Self = TypeVar('Self', bound='MasterCalls')
+
+
+class MasterCalls:
+    """What can be asked of the ROS master at a URL; each call has a time limit.
+
+    :attr:`url` is as :func:`check_url` has it.
+    """
+
+    url: str
+
+    def api(self, caller_id: str = '/pharos', timeout: float = TIMEOUT) -> rosgraph.Master:
+        """rosgraph's own API of the master; its calls take ``timeout`` seconds at the most."""
+        return master_api(self.url, caller_id, timeout)
+
+    def call(
+        self, method: str, *args: Any, caller_id: str = '/pharos', timeout: float = TIMEOUT
+    ) -> Any:
+        """Call a method of :meth:`api`.
+
+        A question ends with the node on whose behalf this thread runs. A change does not: nobody
+        would know whether the master has made it.
+
+        :raises MasterUnreachableError: if the master does not answer
+        :raises NodeStoppedError: if the node that asks stops meanwhile
+        :raises rosgraph.MasterError: if the master refuses
+        """
+        api = self.api(caller_id, timeout)
+        with self.reached():
+            if method.startswith(('set', 'delete')):
+                return getattr(api, method)(*args)
+            with interruption(api.handle) as stop:
+                try:
+                    return getattr(api, method)(*args)
+                except COMMUNICATION_ERRORS as error:
+                    if stop.came:
+                        raise NodeStoppedError(
+                            f'the node that asked the master {self.url} stops'
+                        ) from error
+                    raise
+
+    @contextlib.contextmanager
+    def reached(self) -> Iterator[None]:
+        """Within this, a failure to reach the master is a MasterUnreachableError that names it."""
+        try:
+            yield
+        except COMMUNICATION_ERRORS as error:
+            raise MasterUnreachableError(
+                f'no ROS master answers at {self.url} ({error}): start one with roscore or'
+                ' Master.embedded(), or set ROS_MASTER_URI'
+            ) from error
+
+    def system_state(self) -> Tuple[Users, Users, Users]:
+        """``(publishers, subscribers, services)``, each ``{name: [node names]}``."""
+        publishers, subscribers, services = map(dict, self.call('getSystemState'))
+        return publishers, subscribers, services
+
+    def topic_types(self) -> List[Tuple[str, str]]:
+        """``[(topic name, type name)]`` of all topics."""
+        return list(self.call('getTopicTypes'))
+
+    def is_node_alive(self, name: str, or_busy: bool = False) -> bool:
+        """Whether the node of that name is registered and its XML-RPC server answers.
+
+        :param or_busy: whether one counts, too, that does not answer in time but refuses nothing
+        """
+        try:
+            node = ServerProxy(self.api().lookupNode(name), PING_TIMEOUT)
+        except (rosgraph.MasterException, *COMMUNICATION_ERRORS):
+            return False
+        try:
+            with interruption(node):
+                node.getPid('/pharos')
+        except COMMUNICATION_ERRORS as error:
+            return or_busy and not isinstance(error, ConnectionRefusedError)
+        return True
+
+    @property
+    def pid(self) -> int:
+        """The process id of the master, on its host."""
+        return int(self.call('getPid'))
+
+    def is_reachable(self) -> bool:
+        """Whether a master answers at the URL."""
+        try:
+            self.call('getPid')
+        except MasterUnreachableError:
+            return False
+        return True
+
+    def wait(self: Self, timeout: Optional[float] = None) -> Self:
+        """Wait until the master answers, for up to ``timeout`` seconds (None: without limit);
+        returns this Master.
+
+        :raises MasterUnreachableError: if it does not in time
+        :raises NodeStoppedError: if the node whose soul or delegate waits stops meanwhile
+        """
+        timeout = check_limit('timeout', timeout)
+        deadline = None if timeout is None else time.monotonic() + timeout
+        woken = threading.Event()
+        with Interruption(woken.set) as stop:
+            while True:
+                left = TIMEOUT if deadline is None else deadline - time.monotonic()
+                try:
+                    self.call('getPid', timeout=min(TIMEOUT, max(left, 0.1)))
+                    return self
+                except MasterUnreachableError:
+                    if left <= 0:
+                        raise
+                woken.wait(POLL)  # there is nobody yet who could tell
+                if stop.came:
+                    raise NodeStoppedError(f'the node that waited for the master {self.url} stops')
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, MasterCalls) and is_same_master(self.url, other.url)
+
+    def __hash__(self) -> int:
+        return hash(urllib.parse.urlsplit(self.url).port)  # the host may have several names
