@@ -23,7 +23,7 @@ import rosmaster.master  # noqa: E402
 
 import pharos  # noqa: E402
 from pharos import running  # noqa: E402
-from pharos.intraprocess.link import PROTOCOL  # noqa: E402
+from pharos.private_rospy.local_link import PROTOCOL  # noqa: E402
 
 TIMEOUT = 20.0  # seconds; a bound on waits for events, never reached in a test that passes
 #: of a test that serializes a numpy_msg

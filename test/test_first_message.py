@@ -10,7 +10,7 @@ import rosgraph
 
 from conftest import TIMEOUT, Mailbox
 from pharos import BlockNode
-from pharos.intraprocess import link as intraprocess
+from pharos.intraprocess.link import Link
 from programs import until
 from sockets import subscribe
 
@@ -156,14 +156,14 @@ def test_who_waits_for_a_subscriber_waits_until_messages_go_to_it(master, mailbo
     sent = create(master, '/sender').output_channel('/first/counts', STRING)
     receiver = create(master, '/receiver', delegate=mailbox)
     reached, allowed = threading.Event(), threading.Event()
-    match = intraprocess.Link.match_receivers
+    match = Link.match_receivers
 
     def match_late(link):
         reached.set()
         allowed.wait(TIMEOUT)
         return match(link)
 
-    monkeypatch.setattr(intraprocess.Link, 'match_receivers', match_late)
+    monkeypatch.setattr(Link, 'match_receivers', match_late)
     opening = in_thread(receiver.interested_in, '/first/counts', STRING)
     assert reached.wait(TIMEOUT)
     assert sent.connections == []

@@ -12,7 +12,7 @@ import pytest
 import pharos
 from conftest import TIMEOUT, InProcessMaster, Mailbox, speak_tcpros_only
 from pharos import BlockNode, Master
-from pharos.intraprocess import dispatcher
+from pharos.intraprocess import dispatcher, inbox as inboxes
 from pharos.life import Lifecycle
 
 TWIST, IMAGE, STRING = 'geometry_msgs/Twist', 'sensor_msgs/Image', 'std_msgs/String'
@@ -281,7 +281,7 @@ def test_a_full_queue_drops_the_oldest_and_counts(master, transport):
     else:
         received._tcpros.put(sent.message_class(1))
         for number in range(2, 6):
-            received._offer(sent.message_class(number))
+            received.offer(sent.message_class(number))
         release.set()
         assert [message.data for message in mailbox.take(4)] == [0, 3, 4, 5]
         assert (received.received, received.dropped) == (4, 2)
@@ -576,15 +576,21 @@ def test_counters_hold_over_many_publishers(master, mailbox):
 def test_a_publisher_gives_way_to_a_receiver_that_takes_nothing_once_in_a_while(monkeypatch):
     now, naps = [1.0], []
     monkeypatch.setattr(
-        dispatcher, 'time', types.SimpleNamespace(perf_counter=lambda: now[0], sleep=naps.append)
+        inboxes, 'time', types.SimpleNamespace(perf_counter=lambda: now[0], sleep=naps.append)
     )
-    inbox = dispatcher.Inbox(
-        types.SimpleNamespace(queue_size=10), dispatcher.Dispatcher(None), inline=True
+    dropped = []
+    receiver = types.SimpleNamespace(
+        queue_size=10,
+        queue_bytes=1000,
+        inline=True,
+        shared=False,
+        count_dropped=lambda: dropped.append(1),
     )
+    inbox = inboxes.Inbox(receiver, dispatcher.Dispatcher(None))
     for number in range(1000):
         inbox.put(number)
-    assert len(naps) == 1 and inbox.dropped == 990
-    now[0] += 2 * dispatcher.STARVING
+    assert len(naps) == 1 and len(dropped) == 990
+    now[0] += 2 * inboxes.STARVATION_INTERVAL
     for number in range(1000):
         inbox.put(number)
-    assert len(naps) == 2 and inbox.dropped == 1990
+    assert len(naps) == 2 and len(dropped) == 1990

@@ -15,7 +15,7 @@ from sensor_msgs.msg import Image
 
 from conftest import TIMEOUT, Mailbox
 from load import CAMERA, IMAGE_SIZE, TOPICS, Busy, Viewer, camera, create, image, subscribe
-from pharos.intraprocess import dispatcher
+from pharos.intraprocess import inbox
 from programs import ROOT, Program, environment
 
 COUNT = 40  # images, 37 MB: several times what fits into the buffers of a connection
@@ -103,14 +103,14 @@ def test_images_for_a_slow_receiver_do_not_pile_up(receiving):
 
 def test_a_receiver_that_turns_slow_gets_an_old_image_once_at_the_most(master, monkeypatch):
     """As long as it is quick, the thread that reads from the socket runs its delegate."""
-    monkeypatch.setattr(dispatcher, 'QUICK', TIMEOUT)
+    monkeypatch.setattr(inbox, 'FAST_CALLBACK', TIMEOUT)
     quick = Mailbox()
     with Program(master.url, sys.executable, '-c', CAMERA % COUNT, PYTHONPATH=PATHS):
         viewer = Viewer(master, quick)
-        for _ in range(dispatcher.TRUSTED):
+        for _ in range(inbox.FAST_STREAK):
             viewer.ask(1)
             quick.get()
-        monkeypatch.setattr(dispatcher, 'QUICK', 0.0)
+        monkeypatch.setattr(inbox, 'FAST_CALLBACK', 0.0)
         viewer.channel.delegate = busy = Busy()
         viewer.ask(COUNT)
         assert busy.wait() == 0

@@ -11,7 +11,8 @@ from rospy.numpy_msg import numpy_msg
 
 from conftest import TIMEOUT, Mailbox, speak_tcpros_only
 from pharos import BlockNode
-from pharos.intraprocess import callbacks, link as intraprocess
+from pharos.private_rospy import plain_receivers
+from pharos.private_rospy.local_link import LocalLink
 from programs import until
 
 INT, STRING, ARRAY = std_msgs.msg.Int32, std_msgs.msg.String, std_msgs.msg.UInt8MultiArray
@@ -437,13 +438,13 @@ def test_no_thread_is_left_when_a_channel_opens_while_the_last_callback_goes(
     channel = sender.output_channel('/threads/last', INT)
     subscriber, _ = listen(both, '/threads/last', INT)
     assert channel.wait_for_subscribers(1, TIMEOUT)
-    removed = intraprocess.Link.callback_removed
+    removed = LocalLink.callback_removed
 
     def open_first(link):
         both.interested_in('/threads/last', INT, delegate=mailbox)
         removed(link)
 
-    monkeypatch.setattr(intraprocess.Link, 'callback_removed', open_first)
+    monkeypatch.setattr(LocalLink, 'callback_removed', open_first)
     both.interested_in('/threads/last', INT, delegate=mailbox)
     subscriber.unregister()
     until(lambda: len(link_threads(both)) == 1)  # the node's own
@@ -490,17 +491,21 @@ def test_what_is_put_while_another_thread_takes_is_counted():
                 inbox.put(meanwhile.pop(), size=1000)
             return size
 
-    meanwhile = ['third']
-    publisher = types.SimpleNamespace(queue_size=10, queue_bytes=1 << 20)
-    subscriber = types.SimpleNamespace(queue_size=1, callbacks=None)
-    inbox = callbacks.CallbackInbox(None, publisher, subscriber, lambda target, name: None)
+    meanwhile = [(2,)]
+    link = types.SimpleNamespace(
+        publisher=types.SimpleNamespace(data_class=INT, queue_size=10, queue_bytes=1 << 20),
+        subscriber=types.SimpleNamespace(
+            resolved_name='/plain', data_class=INT, queue_size=None, callbacks=None
+        ),
+        header={},
+    )
+    inbox = plain_receivers.PlainCallbacks(link, lambda target, name: None)
     inbox._sizes = Sizes()
-    inbox.put('first', size=1000)
-    inbox.put('second', size=1000)
-    while not inbox.is_empty:
+    inbox.put((1,), size=1000)
+    while inbox._queue:
         inbox.run_next()
     assert not meanwhile
-    assert inbox._bytes == 0
+    assert inbox.waiting_bytes == 0
 
 
 def test_large_messages_are_dropped_from_a_full_queue_the_oldest_first(master):
@@ -518,6 +523,6 @@ def test_large_messages_are_dropped_from_a_full_queue_the_oldest_first(master):
     publisher.publish(data=b'')
     assert entered.wait(TIMEOUT)
     for number in range(10):
-        publisher.publish(data=bytes(callbacks.UNDER_WAY + number))
+        publisher.publish(data=bytes(plain_receivers.UNDER_WAY + number))
     release.set()
-    assert sizes.take(3) == [0, callbacks.UNDER_WAY + 8, callbacks.UNDER_WAY + 9]
+    assert sizes.take(3) == [0, plain_receivers.UNDER_WAY + 8, plain_receivers.UNDER_WAY + 9]

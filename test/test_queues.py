@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from conftest import TIMEOUT, Mailbox
 from pharos import BlockNode, Node, define_message
-from pharos.intraprocess import dispatcher
+from pharos.intraprocess.dispatcher import Dispatcher
+from pharos.intraprocess.inbox import Inbox
 from pharos.private_rospy import sender
 
 BYTES, NUMBERS = 'std_msgs/UInt8MultiArray', 'std_msgs/Float64MultiArray'
@@ -97,30 +98,34 @@ def test_what_comes_through_tcpros_is_bounded_by_bytes_too(master):
     gate = Gate()
     received = create(master, '/receiver', Small, delegate=gate).interested_in('/remote', NUMBERS)
     message = received.message_class
-    received._offer(message())
-    received.node._dispatcher.announce(received._tcpros)
+    received.offer(message())
+    received.node._dispatcher.schedule(received._tcpros)
     assert gate.entered.wait(TIMEOUT)
     for _ in range(10):
-        received._offer(message(data=(1.0,) * (MEGABYTE // 8)))
+        received.offer(message(data=(1.0,) * (MEGABYTE // 8)))
     assert received.dropped == 7
     gate.opened.set()
 
 
 class Receiver:
-    queue_size, queue_bytes, closed, received = 5, 100, False, 0
+    queue_size, queue_bytes, inline, shared = 5, 100, True, False
+
+    def __init__(self):
+        self.taken, self.dropped = [], 0
+
+    def deliver(self, message, header):
+        self.taken.append(message)
+
+    def count_dropped(self):
+        self.dropped += 1
 
 
 @settings(max_examples=300, deadline=None)
 @given(st.lists(st.one_of(st.none(), st.integers(1, 150)), max_size=60))
 def test_a_queue_never_holds_more_than_it_may_and_counts_what_it_drops(steps):
     """None takes a message, a number puts one of so many bytes."""
-    taken = []
-
-    class Channel(Receiver):
-        _delegate = staticmethod(lambda message, channel: taken.append(message))
-        node = None
-
-    inbox = dispatcher.Inbox(Channel(), dispatcher.Dispatcher(None), inline=True)
+    receiver = Receiver()
+    inbox = Inbox(receiver, Dispatcher(None))
     put = []
     for size in steps:
         if size is None:
@@ -131,7 +136,7 @@ def test_a_queue_never_holds_more_than_it_may_and_counts_what_it_drops(steps):
             waiting = list(inbox._queue)
             assert waiting == put[len(put) - len(waiting) :]
             assert len(waiting) <= 5 and (sum(waiting) <= 100 or len(waiting) == 1)
-        assert inbox.dropped == len(put) - len(taken) - len(inbox._queue)
+        assert receiver.dropped == len(put) - len(receiver.taken) - len(inbox._queue)
 
 
 class Connection:

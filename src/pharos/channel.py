@@ -6,18 +6,16 @@ import time
 import genpy
 
 from pharos import messages
+from pharos import first_message
 from pharos.blocks import check_block, check_delegate, check_runs
-from pharos.intraprocess.dispatcher import Inbox, SocketInbox
-from pharos.errors import MasterUnreachableError, MessageTypeError, NodeStoppedError, PharosError
+from pharos.intraprocess.inbox import Inbox, SocketInbox
+from pharos.errors import MessageTypeError, NodeStoppedError, PharosError
 from pharos.intraprocess import copier
 from pharos.private_rospy.refusals import suits
 from pharos.intraprocess.fanout import Latch
 from pharos.private_rospy.proxies import time_limit
 from pharos.seconds import check_limit
-from pharos.private_rospy.registration import REGISTER_TIMEOUT
 
-# seconds in which the master has told a live subscriber; then it is asked whether it lives
-ANSWER_TIMEOUT = 0.5
 # bytes read from a socket at once; rospy's 64 KiB let subscribers of images fall behind
 BUFFER_SIZE = 1 << 20
 
@@ -129,19 +127,24 @@ class InputChannel(_Channel):
         self.from_ = None if from_ is None else str(node._name_of(from_))
         self.received = 0
         self._size = copier.copier_for(message_class).size
-        self._inboxes, self._dropped_before = [], 0
+        self.dropped = 0  # how many messages, the oldest first, while the node was slower
+        self._dropping = threading.Lock()  # held to change that
         self._begin()
 
     def _open(self):
         dispatcher = self.node._dispatcher
         if not self.inline:
             dispatcher.need_thread()
-        self._tcpros = self._add_inbox(
-            Inbox(self, dispatcher, True) if self.inline else SocketInbox(self, dispatcher)
-        )
+        self._tcpros = Inbox(self, dispatcher) if self.inline else SocketInbox(self, dispatcher)
         # rospy's queue_size would drop without counting; the inbox has ours
         self._opened(
-            self.node._rospy.connections.subscribe(self, tcp_nodelay=True, buff_size=BUFFER_SIZE)
+            self.node._rospy.connections.subscribe(
+                self,
+                self.offer,
+                self.node.connect_timeout,
+                tcp_nodelay=True,
+                buff_size=BUFFER_SIZE,
+            )
         )
         dispatcher.run()  # what came latched
 
@@ -153,14 +156,8 @@ class InputChannel(_Channel):
         """Take another class than it was opened with, of which nothing has come."""
         self._release()
         self.node._forget_channel(self)
-        self._tcpros.close()
         self.message_class, self._size = message_class, copier.copier_for(message_class).size
         self._begin()
-
-    def _stopped(self):
-        super()._stopped()
-        # an inbox holds on to the run of the node that it was made for
-        self._dropped_before, self._inboxes = self.dropped, []
 
     @property
     def refused(self):
@@ -184,39 +181,54 @@ class InputChannel(_Channel):
         self.node._dispatcher.run_in_turn(lambda: self._run(message))
 
     def _run(self, message):
-        block = self.node._delegate if self._delegate is None else self._delegate
-        if block is None:
+        if self._present_delegate is None:
             raise PharosError(
                 f'{self.topic} has no delegate any more: give {self.node.name} or its '
                 'channel one first'
             )
+        block = self._present_delegate
         try:
             block(message, self)
         except BaseException as error:
             self.node._report(error, block, 'delegate', self, message)
 
     @property
-    def dropped(self):
-        """How many messages were dropped, the oldest first, because the node was slower than they
-        came."""
-        return self._dropped_before + sum(inbox.dropped for inbox in self._inboxes)
+    def _present_delegate(self):
+        return self.node.delegate if self._delegate is None else self._delegate
 
-    def _new_inbox(self, thaw, header):
+    # -- as a pharos.intraprocess.inbox.Receiver
+
+    def open_inbox(self, thaw, header):
         """An inbox for what a node of this process sends."""
-        if self.shared:  # the messages are marked with the header when they are handed over
-            thaw = header = None
-        return self._add_inbox(
-            Inbox(self, self.node._dispatcher, self.inline, thaw, header, self.shared)
-        )
+        return Inbox(self, self.node._dispatcher, thaw, header)
 
-    def _add_inbox(self, inbox):
-        with self._lock:
-            over = [inbox for inbox in self._inboxes if inbox.closed and inbox.is_empty]
-            self._dropped_before += sum(inbox.dropped for inbox in over)
-            self._inboxes = [inbox for inbox in self._inboxes if inbox not in over] + [inbox]
-        return inbox
+    def deliver(self, message, header):
+        """Run the delegate."""
+        if self.closed:
+            return
+        self.received += 1
+        block = self._delegate
+        if block is None:
+            block = self.node._delegate
+            if block is None:
+                return
+        if header is not None:
+            message._connection_header = header
+        try:
+            block(message, self)
+        except BaseException as error:
+            self.node._report(error, block, 'delegate', self, message)
 
-    def _offer(self, message):
+    def report(self, error):
+        """A message could not be made for the delegate."""
+        self.node._report(error, self._present_delegate, 'delegate', self)
+
+    def count_dropped(self):
+        """A message was dropped."""
+        with self._dropping:
+            self.dropped += 1
+
+    def offer(self, message):
         """Take a message from rospy, which runs the dispatcher after a batch of them."""
         if self.from_ is None or message._connection_header.get('callerid') == self.from_:
             if message.__class__ is not self.message_class:
@@ -226,7 +238,7 @@ class InputChannel(_Channel):
             with self._lock:  # TCPROS connections offer side by side
                 self._tcpros.put(message, self._size(message) if self._size else 0)
 
-    _offer.is_of_channel = True  # unlike other callbacks of rospy's
+    offer.has_own_inbox = True  # unlike other callbacks of rospy's
 
     def _of_own_class(self, message):
         """The message, where the first subscriber of the node, which rospy goes by, wants another
@@ -254,7 +266,7 @@ class OutputChannel(_Channel):
     def __init__(self, node, topic, message_class, latch=False, queue_size=1, connect_timeout=None):
         super().__init__(node, topic, message_class, queue_size)
         self.latch = latch
-        self.latched = Latch()
+        self._latch = Latch() if latch else None
         self.sent = 0
         self._uninterested = set()  # names of nodes of which the log says so
         self._freeze = copier.copier_for(message_class).freeze
@@ -267,10 +279,16 @@ class OutputChannel(_Channel):
         self._opener, self._connected = threading.current_thread(), threading.Event()
         try:
             endpoint, self._fanout = self.node._rospy.connections.advertise(
-                self, timeout, tcp_nodelay=True, queue_size=self.queue_size
+                self.topic,
+                self.message_class,
+                self._latch,
+                timeout,
+                self.queue_bytes,
+                tcp_nodelay=True,
+                queue_size=self.queue_size,
             )
             self._opened(endpoint)
-            self._wait_for_known_subscribers(timeout, deadline)
+            first_message.wait_for_known_subscribers(self, timeout, deadline)
         finally:
             self._connected.set()
 
@@ -297,7 +315,7 @@ class OutputChannel(_Channel):
             to = str(self.node._name_of(to))
             self._check_is_there(to)
         try:
-            is_sent = self._fanout.publish(message, self, to)
+            is_sent = self._fanout.publish(message, self._latch, to)
         except Exception as error:
             self._explain(error, message)
         if is_sent or to is None:
@@ -342,7 +360,7 @@ class OutputChannel(_Channel):
 
     def _unregister(self, endpoint):
         self._fanout = _ClosedFanout
-        self.node._rospy.connections.unadvertise(self, endpoint)
+        self.node._rospy.connections.unadvertise(endpoint, self._latch)
 
     def send(self, block=None, *, to=None, **fields):
         """Fill a fresh message with ``block(message)`` and by keywords, publish it, and return
@@ -377,51 +395,6 @@ class OutputChannel(_Channel):
             )
         self.node._end_soul()
         return self.is_open and len(self.connections) >= count
-
-    def _wait_for_known_subscribers(self, timeout, deadline):
-        """Wait until those that the master knows are connected, until the deadline, ``timeout``
-        after the beginning.
-
-        rospy loses what is published before (ros_comm #176, #286).
-        """
-        missing = self.node._rospy.connections.known_subscribers(self.topic)
-        if missing is None:  # not always: a large graph's state takes long to read
-            try:
-                with time_limit(max(REGISTER_TIMEOUT, deadline - time.monotonic())):
-                    missing = set(self.node.master.topic(self.topic).subscribers)
-            except MasterUnreachableError:  # the topic is registered already
-                return
-
-        def connected():
-            missing.difference_update(name for name, _ in self.connections)
-            missing.difference_update(
-                node.name for node in self.node.master.local_nodes() if node._is_ending()
-            )
-            missing.difference_update(self.node._rospy.refusals.subscribers(self.topic))
-            return not missing or not self.is_open
-
-        wait_until = self.node._rospy.wait_until
-        wait_until(connected, min(deadline - time.monotonic(), ANSWER_TIMEOUT))
-        if not connected() and self.node.is_running:
-            # those that do not answer any more, killed for example, are not worth the wait
-            with time_limit(deadline - time.monotonic()):
-                missing.intersection_update(filter(self.node.master.is_node_alive, tuple(missing)))
-            wait_until(connected, deadline - time.monotonic())
-            if timeout and not connected() and self.node.is_running:
-                self._tell_who_is_late(missing, timeout)
-
-    def _tell_who_is_late(self, names, timeout):
-        """Say in the log, once for each topic, which subscribers may miss the first message."""
-        told = self.node._rospy.connections.told_late
-        if self.topic not in told:
-            told.add(self.topic)
-            self.node.log(
-                f'{self.topic}: {", ".join(sorted(names))} did not connect within'
-                f' {timeout:g} s, though the master has them as subscribers, and may miss the'
-                f' first messages of {self.node.name}: can they reach this host, and are they'
-                ' of the same type? A longer connect_timeout waits longer',
-                level='warning',
-            )
 
     def _stopped(self):
         super()._stopped()

@@ -39,7 +39,7 @@ import io
 import itertools
 import struct
 import sys
-from typing import Callable, NamedTuple, Optional
+from typing import Any, Callable, NamedTuple, Optional, Tuple, Union
 
 import genpy
 from genmsg.msgs import parse_type
@@ -49,6 +49,8 @@ from pharos.messages import nested_class
 
 # genpy sends a bool as a number: 7 goes out, True arrives
 ARRIVAL_CODES = {**STRUCT_CODES, 'bool': '?'}
+#: what is kept of a message until receivers get theirs
+Frozen = Union[Tuple[Any, ...], bytes]
 SMALL = 64  # bytes that a message is taken to have beside its texts and arrays
 FEW = 1024  # bytes; messages that all have one size, of so many, are not worth counting
 

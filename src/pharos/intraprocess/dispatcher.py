@@ -1,225 +1,53 @@
 """Runs the delegates of one node, one at a time, and hands messages to it quickly.
 
 A node's delegates run in one of two threads: in the thread that brings the message (a TCPROS
-connection's, where the delegate is quick, or the publisher's where a channel is inline), or in the
+connection's, where the delegate is fast, or the publisher's where a channel is inline), or in the
 node's dispatcher thread. Nobody ever waits for a busy node: what comes meanwhile waits in its inbox
 for whoever is running the node. So no wiring deadlocks or recurses. Nor does a thread run a node
 for long because others bring messages: those it leaves to the dispatcher thread.
 """
-import _thread
 import collections
 import threading
 import time
+from _thread import allocate_lock, get_ident
+from typing import Any, Callable, Deque, Optional, Protocol
 
-BURST = (
-    100e-6  # seconds; a publisher that comes again within them does not give way to the receiver
-)
-GIVE_WAY = (
-    1e-3  # seconds that a publisher at the most gives way, until the dispatcher thread has woken up
-)
-# seconds; so often a publisher gives way to a receiver that takes nothing from a full inbox
-STARVING = 1e-3
-QUICK = (
-    1e-3  # seconds; a delegate that takes longer is not run by a thread that has a socket to read,
-)
-TRUSTED = 10  # and one is that has been quick so many times in a row
-COURTESY = (
-    1e-3  # seconds for which a thread that brings a message also runs what others bring meanwhile
-)
+# seconds; a publisher that comes again within them does not yield to the receiver
+BURST_INTERVAL = 100e-6
+# seconds for which a publisher at the most yields, until the dispatcher thread has woken up
+YIELD_LIMIT = 1e-3
+# seconds for which a thread that brings a message also runs what others bring meanwhile
+COURTESY = 1e-3
 
 
-class Inbox:
-    """The messages on their way to one channel, through one connection: drops the oldest, counts.
+class Runnable(Protocol):
+    """What a dispatcher runs: an inbox."""
 
-    It is bounded by a number of messages and, where they are large, by their bytes; the newest
-    always has room.
-
-    One thread at a time puts (it holds the publisher's lock), one at a time runs (it holds the
-    node's).
-
-    :param channel: the InputChannel
-    :param thaw: makes the receiver's message of what was put; None where that is the message itself
-    :param header: the ``_connection_header`` of the messages; None where they have one already
-    """
-
-    # a message that comes alone meets cold caches: all that it needs lies together
-    __slots__ = (
-        'channel',
-        'dispatcher',
-        'inline',
-        'shared',
-        'arrived',
-        'taken',
-        'closed',
-        '_thaw',
-        '_header',
-        '_queue',
-        '_limit',
-        '_announce',
-        '_announced',
-        '_seen',
-        '_given',
-        '_sizes',
-        '_put_bytes',
-        '_taken_bytes',
-    )
-
-    def __init__(self, channel, dispatcher, inline, thaw=None, header=None, shared=False):
-        self.channel, self.dispatcher, self.inline, self.shared = (
-            channel,
-            dispatcher,
-            inline,
-            shared,
-        )
-        self.arrived = self.taken = 0
-        self.closed = False  # nothing more arrives
-        self._thaw, self._header = thaw, header
-        self._queue = collections.deque(maxlen=channel.queue_size)
-        self._limit = channel.queue_size
-        self._announce = dispatcher.inline.append if inline else dispatcher.announced.append
-        self._announced = False
-        self._seen = -1  # how many were taken when a publisher last gave way,
-        self._given = 0.0  # and when that was
-        # of the large messages in the queue, and for a moment of one more
-        self._sizes = collections.deque()
-        self._put_bytes = self._taken_bytes = 0  # of those put and not dropped, and of those taken
-
-    @property
-    def dropped(self):
-        return self.arrived - self.taken - len(self._queue)
-
-    @property
-    def is_empty(self):
-        return not self._queue
-
-    def close(self):
-        """Nothing more arrives."""
-        self.closed = True
-
-    def put(self, value, size=0):
-        """Add a message; the dispatcher is to be told afterwards.
-
-        :param size: its bytes, if that matters
-        """
-        queue = self._queue
-        if len(queue) == self._limit:
-            self._let_receiver_run()
-        if size:
-            self._make_room(size)
-        queue.append(value)
-        self.arrived += 1
-        if not self._announced:
-            self._announced = True
-            self._announce(self)
-
-    def _let_receiver_run(self):
-        """Where the queue is full, a publisher that never lets go of the interpreter would starve
-        the receiver."""
-        if self._seen != self.taken or time.perf_counter() - self._given > STARVING:
-            self._seen = self.taken
-            time.sleep(1e-6)
-            self._given = time.perf_counter()
-
-    def _make_room(self, size):
-        """Drop the oldest messages, where there is no room for another of ``size`` bytes."""
-        queue, sizes = self._queue, self._sizes
-        self._put_bytes += size
-        sizes.append(size)
-        if queue and self._put_bytes - self._taken_bytes > self.channel.queue_bytes:
-            self._let_receiver_run()
-        while (
-            self._put_bytes - self._taken_bytes > self.channel.queue_bytes
-            or len(queue) == self._limit
-        ):
-            try:
-                queue.popleft()
-            except IndexError:  # the receiver has taken them all
-                return
-            self._put_bytes -= sizes.popleft()
-
-    def run_next(self):
-        """Run the delegate for the oldest message, if there is one still."""
-        self._announced = (
-            False  # before looking at the queue: what is put from now on announces itself
-        )
-        try:
-            value = self._queue.popleft()
-        except IndexError:
-            return
-        self.taken += 1
-        if self._sizes:
-            self._taken_bytes += self._sizes.popleft()
-        if self._queue and not self._announced:
-            self._announced = True
-            self._announce(self)
-        channel, thaw, header = self.channel, self._thaw, self._header
-        if channel.closed:
-            return
-        channel.received += 1
-        node = channel.node
-        block = channel._delegate
-        if block is None:
-            block = node._delegate
-            if block is None:
-                return
-        message = None
-        try:
-            message = value if thaw is None else thaw(value)
-            if header is not None:
-                message._connection_header = header
-            block(message, channel)
-        except BaseException as error:
-            node._report(error, block, 'delegate', channel, message)
-
-
-class SocketInbox(Inbox):
-    """The messages that come to one channel, one that is not inline, through TCPROS.
-
-    As long as the delegate is quick, the thread that reads the socket runs it, for waking another
-    one takes longer. But while it runs a slow one it does not read, and what that gets next has
-    waited longest in the socket, for all that the queue is short (ros_comm #536, #1901). So slow
-    delegates are the dispatcher thread's, and those not known yet.
-    """
-
-    __slots__ = ('_quick',)
-
-    def __init__(self, channel, dispatcher):
-        super().__init__(channel, dispatcher, inline=False)
-        self._announce = dispatcher.announce
-        self._quick = 0  # how many times in a row, TRUSTED at the most
-
-    def run_next(self):
-        taken, begin = self.taken, time.perf_counter()
-        super().run_next()
-        if self.taken == taken:
-            return
-        if time.perf_counter() - begin >= QUICK:
-            self._quick, self._announce = 0, self.dispatcher.announce
-        elif self._quick < TRUSTED:
-            self._quick += 1
-            if self._quick == TRUSTED:
-                self._announce = self.dispatcher.inline.append
+    def run_next(self) -> None:
+        """Deliver the oldest message, if there is one; raises nothing."""
 
 
 class Dispatcher:
     """Whoever has messages for a node puts them into inboxes, then calls :meth:`run` for those that
-    are inline or came
-    through a socket, :meth:`wake` for others if the thread is :attr:`idle`.
+    are inline or came through a socket, :meth:`wake` for others if the thread is :attr:`idle`.
+
+    :param start_thread: ``start_thread(target, name=name)``
     """
 
-    def __init__(self, start_thread):
-        self.inline = collections.deque()  # inboxes that whoever comes by may run
-        self.announced = collections.deque()  # inboxes for the dispatcher thread
+    def __init__(self, start_thread: Callable[..., Any], name: str = 'dispatcher') -> None:
+        self.inline: Deque[Runnable] = collections.deque()  # that whoever comes by may run
+        self.scheduled: Deque[Runnable] = collections.deque()  # for the dispatcher thread
         self.idle = False  # whether that thread waits for inboxes
         self._running = threading.Lock()  # held by the thread that runs delegates,
-        self._runner = None  # which is this one, by its identifier
-        self._start_thread, self._started, self._closed = start_thread, threading.Lock(), False
+        self._runner: Optional[int] = None  # which is this one, by its identifier
+        self._start_thread, self._name, self._started = start_thread, name, threading.Lock()
+        self._closed = self._finishing = False
         # bare locks as signals: every other primitive costs several of them
-        self._woken, self._awake = _thread.allocate_lock(), _thread.allocate_lock()
+        self._woken, self._awake = allocate_lock(), allocate_lock()
         self._woken.acquire()
         self._awake.acquire()
 
-    def run(self):
+    def run(self) -> None:
         """Run the delegates of the inline inboxes in this thread, unless another thread is running
         the node.
 
@@ -228,9 +56,9 @@ class Dispatcher:
         let this thread go.
         """
         inline, running = self.inline, self._running
-        turns, until = len(inline), None
+        turns, until = len(inline), 0.0
         while inline and running.acquire(False):
-            self._runner = _thread.get_ident()
+            self._runner = get_ident()
             try:
                 while inline:
                     if turns <= 0:
@@ -245,45 +73,43 @@ class Dispatcher:
             finally:
                 self._runner = None
                 running.release()
-            # looked at again: what was announced just before the release found the node busy
+            # looked at again: what was scheduled just before the release found the node busy
             if until and inline:
                 self._leave_to_thread()
                 return
 
-    def _leave_to_thread(self):
+    def _leave_to_thread(self) -> None:
         """Have the dispatcher thread run the inline inboxes that have messages."""
         if self._closed:
             return
         self.need_thread()
         try:
             for _ in range(len(self.inline)):
-                self.announced.append(self.inline.popleft())
+                self.scheduled.append(self.inline.popleft())
         except IndexError:
             pass  # another thread runs them
         if self.idle:
             self.wake()
 
-    def is_run_here(self):
+    def is_run_here(self) -> bool:
         """Whether it is this thread that runs delegates just now."""
-        return self._runner == _thread.get_ident()
+        return self._runner == get_ident()
 
-    def wait_for_delegate(self, timeout):
+    def wait_for_delegate(self, timeout: float) -> None:
         """Wait until the delegate that another thread runs just now has ended, for up to
         ``timeout`` seconds."""
-        if self.is_run_here():
-            return
-        if self._running.acquire(True, timeout):
+        if not self.is_run_here() and self._running.acquire(True, timeout):
             self._running.release()
-            if self.inline:  # announced meanwhile by a thread that found the node busy
+            if self.inline:  # scheduled meanwhile by a thread that found the node busy
                 self._leave_to_thread()
 
-    def run_in_turn(self, job):
+    def run_in_turn(self, job: Callable[[], Any]) -> None:
         """Run ``job()`` in this thread when no delegate runs; at once in one that it runs."""
-        if self._runner == _thread.get_ident():
+        if self.is_run_here():
             job()
             return
         with self._running:
-            self._runner = _thread.get_ident()
+            self._runner = get_ident()
             try:
                 job()
             finally:
@@ -291,38 +117,40 @@ class Dispatcher:
         if self.inline:  # as in wait_for_delegate
             self._leave_to_thread()
 
-    def need_thread(self):
+    def need_thread(self) -> None:
         """Have the dispatcher thread, from the first channel on that is not inline."""
         if self._started.acquire(blocking=False):
-            self._start_thread(self._loop, name='dispatcher')
+            self._start_thread(self._loop, name=self._name)
 
-    def announce(self, inbox):
+    def schedule(self, inbox: Runnable) -> None:
         """Have the dispatcher thread run an inbox."""
-        self.announced.append(inbox)
+        self.scheduled.append(inbox)
         if self.idle:
             self.wake()
 
-    def wake(self):
+    def wake(self) -> None:
         """Wake the dispatcher thread, which is idle."""
         self.idle = False
         self._awake.acquire(False)  # a stale acknowledgement
         _release(self._woken)
 
-    def give_way(self):
+    def yield_gil(self) -> None:
         """Let the woken dispatcher thread have the interpreter: it would get it 5 ms later from a
         busy publisher."""
-        self._awake.acquire(True, GIVE_WAY)
+        self._awake.acquire(True, YIELD_LIMIT)
 
-    def _loop(self):
-        announced, inline = self.announced, self.inline
+    def _loop(self) -> None:
+        scheduled, inline = self.scheduled, self.inline
         acquire, release = self._running.acquire, self._running.release  # ``with`` costs more
-        me = _thread.get_ident()
+        me = get_ident()
         while not self._closed:
             try:
-                inbox = announced.popleft()
+                inbox = scheduled.popleft()
             except IndexError:
+                if self._finishing:
+                    return
                 self.idle = True
-                if not announced and not self._closed:
+                if not (scheduled or self._closed or self._finishing):
                     self._woken.acquire()
                     _release(self._awake)
                 self.idle = False
@@ -337,15 +165,20 @@ class Dispatcher:
             if inline:
                 self.run()
 
-    def close(self):
+    def finish(self) -> None:
+        """End the thread when all that is scheduled has run."""
+        self._finishing = True
+        self.wake()
+
+    def close(self) -> None:
         """Forget what has not run, and end the thread."""
         self._closed = True
         self.inline.clear()
-        self.announced.clear()
+        self.scheduled.clear()
         self.wake()
 
 
-def _release(lock):
+def _release(lock: Any) -> None:
     try:
         lock.release()
     except RuntimeError:

@@ -1,228 +1,52 @@
 """The way of a message from a publisher to all who are interested."""
-import io
-import struct
 import time
+from typing import (
+    Any,
+    ContextManager,
+    Dict,
+    Iterable,
+    List,
+    NamedTuple,
+    Optional,
+    Protocol,
+    Tuple,
+    Type,
+)
 
-from pharos.intraprocess.dispatcher import BURST
-from pharos.intraprocess import copier, sharing
+import genpy
 
-EARLY = 2.0  # seconds after the start in which log lines are kept for listeners that connect later
+from pharos.intraprocess import sharing
+from pharos.intraprocess.copier import Frozen, copier_for
+from pharos.intraprocess.dispatcher import BURST_INTERVAL, Dispatcher
+from pharos.intraprocess.inbox import Inbox
+from pharos.intraprocess.link import links_of
+
+# seconds after the start in which log lines are kept for listeners that connect later
+STARTUP = 2.0
 _clock = time.perf_counter
 
 
-class Fanout:
-    """Where the messages of one node on one topic go, through INTRAPROCESS and TCPROS, and what is
-    latched.
+class ClosedError(Exception):
+    """The topic is published on no more."""
 
-    :param publisher: rospy's _PublisherImpl
-    :param module: the rospy.topics that it is of
+
+class Connection(Protocol):
+    """A connection to one subscriber, in this process or elsewhere.
+
+    One to a node of this process has the attribute ``link``, a :class:`~.link.Link`.
     """
 
-    # a message that comes alone meets cold caches: all that it needs lies together
-    __slots__ = (
-        '_lock',
-        '_closed',
-        '_seq',
-        '_has_header',
-        '_freeze',
-        '_ways',
-        '_last',
-        '_size',
-        '_mark',
-        '_publisher',
-        '_module',
-        '_thaw',
-        '_buffer',
-        '_latches',
-        '_early',
-        'connections',
-    )
+    endpoint_id: str  # the subscriber's name
 
-    def __init__(self, publisher, module):
-        self._publisher, self._module = publisher, module
-        self._lock, self._closed, self._seq = publisher.publock, False, 0
-        self._has_header = getattr(publisher.data_class, '_has_header', False)
-        self._freeze, self._thaw, self._size = copier.copier_for(publisher.data_class)[:3]
-        self._buffer = io.BytesIO()
-        self._latches = {}  # channel, None: rospy's Publishers -> its Latch
-        self._early = _EarlyLines() if publisher.resolved_name == '/rosout' else None
-        self._last = 0.0  # when the last message woke a dispatcher
-        self.set_connections(())
 
-    def set_connections(self, connections):
-        """Sort the connections out, whenever they change: by how a message goes to them."""
-        inboxes, remote = _split(connections)
-        inline = list({inbox.dispatcher for inbox in inboxes if inbox.inline})
-        mark = None  # of the messages that receivers share
-        if any(inbox.shared for inbox in inboxes):
-            mark = sharing.Mark(links_of(connections)[0].header)
-        self._mark = mark
-        # all at once: somebody may be publishing
-        self._ways = inboxes, remote, _dispatchers(inboxes), inline, mark
-        # those through which a message goes that is published from now on
-        self.connections = tuple(connections)
+class Sockets(Protocol):
+    """How messages get to subscribers of other processes."""
 
-    def publish(self, message, by=None, to=None, connection=None):
-        """Send a message to all; returns whether there is anybody.
+    def serialize(self, message: genpy.Message, seq: int) -> bytes:
+        """The message as it is written into a socket; raises what does not serialize."""
 
-        :param by: the channel whose message it is; None: a rospy Publisher's, which calls
-            :meth:`run` when it has released the lock
-        :param to: name of the only node that is to get it, None: all
-        :param connection: the only connection through which it is to go, None: all
-        """
-        with self._lock:
-            if self._closed:
-                raise self._module.ROSException('publish() to a closed topic')
-            inboxes, remote, dispatchers, inline, mark = self._ways
-            if to is not None or connection is not None:
-                inboxes, remote = self._only(to, connection)
-                dispatchers = _dispatchers(inboxes)
-                mark = mark if any(inbox.shared for inbox in inboxes) else None
-            latch = self._publisher.is_latch if by is None else by.latch
-            if not (inboxes or remote or latch):
-                return False
-            self._seq += 1
-            if self._has_header and message._md5sum != '*':  # AnyMsg has none
-                if sharing.is_held(message.header):
-                    message = sharing.with_own_header(message)
-                message.header.seq = self._seq
-                if message.header.frame_id is None:
-                    message.header.frame_id = '0'
-            if inboxes or latch:
-                try:
-                    frozen = self._freeze(message)
-                except struct.error as error:
-                    raise self._module.ROSSerializationException(error) from error
-            data = self._serialized(message, self._seq) if remote else None
-            if latch:
-                self._latch(by, frozen, to or connection and connection.endpoint_id)
-            if mark is not None:
-                message = mark.put_on(message)
-            if inboxes:
-                size = self._size_of(message, frozen) if self._size else 0
-                for inbox in inboxes:
-                    inbox.put(message if inbox.shared else frozen, size)
-            woken = None
-            for dispatcher in dispatchers:
-                if dispatcher.idle:
-                    dispatcher.wake()
-                    woken = dispatcher
-            if woken is not None:
-                last, self._last = self._last, _clock()
-                if self._last - last > BURST:
-                    woken.give_way()
-            if remote:
-                self._write(data, remote)
-        if by is not None:
-            for dispatcher in inline:
-                dispatcher.run()
-        return True
-
-    def _size_of(self, message, frozen):
-        return len(frozen) if type(frozen) is bytes else self._size(message)
-
-    def run(self):
-        """Run the delegates that are inline, without the lock, which others may wait for."""
-        for dispatcher in self._ways[3]:
-            dispatcher.run()
-
-    def reaches(self, name):
-        """Whether the node of that name gets what is sent to it alone."""
-        return any(self._only(name, None))
-
-    def _only(self, name, connection):
-        """The inboxes and the TCPROS connections of a node, or of a connection."""
-        if connection is not None:
-            return _split([connection])
-        return _split([other for other in self._publisher.connections if other.endpoint_id == name])
-
-    def _serialized(self, message, seq):
-        buffer = self._buffer
-        try:
-            self._module.serialize_message(buffer, seq, message)
-            return buffer.getvalue()
-        finally:  # what does not serialize must leave nothing that would corrupt the stream
-            buffer.seek(0)
-            buffer.truncate()
-
-    def _write(self, data, connections):
-        self._publisher.message_data_sent += len(data)
-        for connection in connections:
-            try:
-                connection.write_data(data)
-            except Exception as error:  # the connection broke
-                self._module.logdebug(
-                    f'publisher connection to [{connection.endpoint_id}] terminated: {error}'
-                )
-                connection.close()
-
-    def _latch(self, by, frozen, receiver):
-        if by not in self._latches:
-            self._latches[by] = Latch() if by is None else by.latched
-        self._latches[by].keep(frozen, receiver)
-        if self._early is not None:
-            self._early.add(frozen)
-
-    def _latched_for(self, receiver):
-        """What is latched for the node of that name, frozen."""
-        latches = tuple(self._latches.values())  # a channel may close meanwhile
-        return self._early or [frozen for latch in latches for frozen in latch.of(receiver)]
-
-    def send_latched(self, inboxes, receiver):
-        """Put what is latched into new inboxes; :meth:`run` is to be called when the lock is
-        released.
-
-        :param receiver: the name of the node whose inboxes they are
-        """
-        if self._publisher.is_latch:
-            with self._lock:
-                for frozen in self._latched_for(receiver):
-                    self._put_latched(frozen, inboxes)
-
-    def _put_latched(self, frozen, inboxes):
-        message = self._thaw(frozen)
-        size = self._size_of(message, frozen) if self._size else 0
-        for inbox in inboxes:
-            inbox.put(self._mark.put_on(self._thaw(frozen)) if inbox.shared else frozen, size)
-        for dispatcher in _dispatchers(inboxes):
-            if dispatcher.idle:
-                dispatcher.wake()
-
-    def write_latched(self, connection):
-        """Write what is latched to a new TCPROS connection."""
-        if self._publisher.is_latch:
-            with self._lock:
-                for frozen in self._latched_for(connection.endpoint_id):
-                    self._write_latched(frozen, connection)
-
-    def _write_latched(self, frozen, connection):
-        message = self._thaw(frozen)
-        seq = message.header.seq if self._has_header else 0
-        self._write(self._serialized(message, seq), [connection])
-
-    def resume(self, channel):
-        """A channel opens again: who has connected by now gets what it latched before, too.
-
-        :meth:`run` is to be called afterwards.
-        """
-        with self._lock:
-            self._latches[channel] = channel.latched
-            for connection in self._publisher.connections:
-                for frozen in channel.latched.of(connection.endpoint_id):
-                    link = getattr(connection, 'link', None)
-                    if link is None:
-                        self._write_latched(frozen, connection)
-                    else:
-                        self._put_latched(frozen, link.all_inboxes())
-
-    def forget(self, channel):
-        """A channel closes, and what it latched goes with it."""
-        self._latches.pop(channel, None)
-
-    def close(self):
-        """Nothing is sent any more."""
-        self._closed = True
-        self.set_connections(())
+    def write(self, data: bytes, connections: Iterable[Connection]) -> None:
+        """Write it into the sockets of these connections; raises nothing."""
 
 
 class Latch:
@@ -232,58 +56,239 @@ class Latch:
     for all others.
     """
 
-    def __init__(self):
-        self._to_all = ()  # the message, frozen, if there is one
-        self._to_one = {}  # node name -> likewise, where that is newer
+    def __init__(self) -> None:
+        self._to_all: Tuple[Frozen, ...] = ()  # the message, if there is one
+        self._to_one: Dict[str, Tuple[Frozen, ...]] = {}  # by node name, where that is newer
 
-    def keep(self, frozen, receiver):
+    def keep(self, frozen: Frozen, receiver: Optional[str]) -> None:
         """Keep a message that was sent to the node of that name, None: to all."""
         if receiver is None:
             self._to_all, self._to_one = (frozen,), {}
         else:
             self._to_one[receiver] = (frozen,)
 
-    def of(self, receiver):
-        """The last message for the node of that name, frozen; none or one."""
+    def of(self, receiver: str) -> Tuple[Frozen, ...]:
+        """What a node of that name is to get when it connects."""
         return self._to_one.get(receiver, self._to_all)
 
 
-def links_of(connections):
-    """The links among the connections of a publisher or a subscription, as rospy has them."""
-    return [
-        connection.link for connection in connections if connection.transport_type == 'INTRAPROCESS'
-    ]
+class StartupLogBuffer(Latch):
+    """The latch of /rosout, with the first lines of a node.
+
+    Its listeners connect a tenth of a second after the start, and would miss them.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._until = time.monotonic() + STARTUP
+        self._lines: Tuple[Frozen, ...] = ()
+
+    def keep(self, frozen: Frozen, receiver: Optional[str]) -> None:
+        """Keep the line, and those before it while the node is young."""
+        super().keep(frozen, receiver)
+        self._lines = (*self._lines, frozen) if time.monotonic() < self._until else ()
+
+    def of(self, receiver: str) -> Tuple[Frozen, ...]:
+        """All lines so far, later the last one."""
+        is_young = time.monotonic() < self._until
+        return self._lines if is_young and self._lines else super().of(receiver)
 
 
-def _split(connections):
-    """The inboxes behind those that are INTRAPROCESS, and the others."""
-    inboxes = [inbox for link in links_of(connections) for inbox in link.all_inboxes()]
-    return inboxes, [
-        connection for connection in connections if connection.transport_type != 'INTRAPROCESS'
-    ]
+class _Ways(NamedTuple):
+    """Some connections, by how a message goes to them."""
+
+    inboxes: List[Inbox]  # in this process
+    remote: List[Connection]
+    dispatchers: List[Dispatcher]  # whose threads run what is put into the inboxes
+    inline: List[Dispatcher]  # whose inboxes the publisher's thread runs
+    mark: Optional[sharing.Mark]  # of messages that receivers share; None if there are none
 
 
-def _dispatchers(inboxes):
-    """Those whose threads run what is put into the inboxes."""
-    return list({inbox.dispatcher for inbox in inboxes if not inbox.inline})
+class Fanout:
+    """Where the messages of one node on one topic go, in this process and elsewhere, and what is
+    latched.
+
+    Any thread may publish: ``lock`` is held meanwhile, but not while delegates run inline.
+
+    :param lock: the publisher's, reentrant
+    """
+
+    # All that a message needs lies together, which a message that comes alone finds in the
+    # processor's caches with fewer misses.
+    __slots__ = (
+        '_lock',
+        '_closed',
+        '_seq',
+        '_has_header',
+        '_freeze',
+        '_size',
+        '_ways',
+        '_last_wake',
+        '_thaw',
+        '_sockets',
+        '_latches',
+        'connections',
+    )
+
+    def __init__(
+        self, message_class: Type[genpy.Message], lock: ContextManager[Any], sockets: Sockets
+    ) -> None:
+        self._lock, self._sockets = lock, sockets
+        self._closed, self._seq = False, 0
+        self._has_header = getattr(message_class, '_has_header', False)
+        self._freeze, self._thaw, self._size = copier_for(message_class)[:3]
+        self._latches: Dict[Latch, None] = {}  # those that hold something, in order
+        self._last_wake = 0.0  # when the last message woke a dispatcher
+        self.set_connections(())
+
+    def set_connections(self, connections: Iterable[Connection]) -> None:
+        """Send to these connections from now on."""
+        #: those through which a message goes that is published from now on
+        self.connections = tuple(connections)
+        # at once: somebody may be publishing
+        self._ways = _ways_of(self.connections)
+
+    def publish(
+        self,
+        message: genpy.Message,
+        latch: Optional[Latch] = None,
+        to: Optional[str] = None,
+        connection: Optional[Connection] = None,
+        runs_inline: bool = True,
+    ) -> bool:
+        """Send a message to all; returns whether there is anybody.
+
+        :param latch: is to keep the message
+        :param to: name of the only node that is to get it, None: all
+        :param connection: the only connection through which it is to go, None: all
+        :param runs_inline: False where the caller holds the lock, and calls :meth:`run` when it
+            has released it
+        :raises ClosedError: after :meth:`close`
+        :raises Exception: what ``message.serialize()`` raises
+        """
+        with self._lock:
+            if self._closed:
+                raise ClosedError('publish() to a closed topic')
+            if to is None and connection is None:
+                ways = self._ways
+            else:
+                ways = self._select(to, connection)
+            inboxes, remote, dispatchers, inline, mark = ways
+            if not (inboxes or remote or latch):
+                return False
+            self._seq += 1
+            if self._has_header and message._md5sum != '*':  # AnyMsg has none
+                if sharing.Mark.is_used and sharing.is_held(message.header):
+                    message = sharing.with_own_header(message)
+                header = message.header
+                header.seq = self._seq
+                if header.frame_id is None:
+                    header.frame_id = '0'
+            if inboxes or latch:
+                frozen = self._freeze(message)
+            data = self._sockets.serialize(message, self._seq) if remote else b''
+            if latch:
+                latch.keep(frozen, to or connection and connection.endpoint_id)
+                self._latches[latch] = None
+            if inboxes:
+                size = 0
+                if self._size:
+                    size = len(frozen) if type(frozen) is bytes else self._size(message)
+                if mark:
+                    message = mark.put_on(message)
+                for inbox in inboxes:
+                    inbox.put(message if inbox.shared else frozen, size)
+            woken = None
+            for dispatcher in dispatchers:
+                if dispatcher.idle:
+                    dispatcher.wake()
+                    woken = dispatcher
+            if woken is not None:
+                last, self._last_wake = self._last_wake, _clock()
+                if self._last_wake - last > BURST_INTERVAL:
+                    woken.yield_gil()
+            if remote:
+                self._sockets.write(data, remote)
+        if runs_inline:
+            for dispatcher in inline:
+                dispatcher.run()
+        return True
+
+    def run(self) -> None:
+        """Run the delegates that are inline, without the lock, which others may wait for."""
+        for dispatcher in self._ways.inline:
+            dispatcher.run()
+
+    def reaches(self, name: str) -> bool:
+        """Whether the node of that name gets what is sent to it alone."""
+        ways = self._select(name, None)
+        return bool(ways.inboxes or ways.remote)
+
+    def _select(self, name: Optional[str], connection: Optional[Connection]) -> _Ways:
+        """The ways to one node, or through one connection."""
+        if connection is not None:
+            return _ways_of([connection])
+        return _ways_of([each for each in self.connections if each.endpoint_id == name])
+
+    def send_latched(
+        self, connection: Connection, inboxes: Optional[Iterable[Inbox]] = None
+    ) -> None:
+        """Send what is latched through a new connection, or into new inboxes of one.
+
+        :meth:`run` is to be called afterwards, without the lock.
+        """
+        if self._latches:
+            with self._lock:
+                for latch in tuple(self._latches):  # a channel may close meanwhile
+                    for frozen in latch.of(connection.endpoint_id):
+                        self._send_again(frozen, connection, inboxes)
+
+    def resume(self, latch: Latch) -> None:
+        """A channel opens again: who has connected by now gets what it latched before, too.
+
+        :meth:`run` is to be called afterwards, without the lock.
+        """
+        with self._lock:
+            self._latches[latch] = None
+            for connection in self.connections:
+                for frozen in latch.of(connection.endpoint_id):
+                    self._send_again(frozen, connection)
+
+    def _send_again(
+        self, frozen: Frozen, connection: Connection, inboxes: Optional[Iterable[Inbox]] = None
+    ) -> None:
+        message = self._thaw(frozen)
+        link = getattr(connection, 'link', None)
+        if link is None:
+            seq = message.header.seq if self._has_header else 0
+            self._sockets.write(self._sockets.serialize(message, seq), [connection])
+            return
+        size = self._size(message) if self._size else 0
+        for inbox in link.inboxes.values() if inboxes is None else inboxes:
+            if inbox.shared:
+                inbox.put(sharing.Mark(link.header).put_on(self._thaw(frozen)), size)
+            else:
+                inbox.put(frozen, size)
+            if not inbox.inline and inbox.dispatcher.idle:
+                inbox.dispatcher.wake()
+
+    def forget(self, latch: Latch) -> None:
+        """A channel closes, and what it latched goes with it."""
+        self._latches.pop(latch, None)
+
+    def close(self) -> None:
+        """Nothing is sent any more."""
+        self._closed = True
+        self.set_connections(())
 
 
-class _EarlyLines:
-    """The first log lines of a node: its listeners connect a tenth of a second later, and would
-    miss them."""
-
-    def __init__(self):
-        self._until = time.monotonic() + EARLY
-        self._lines = []
-
-    def add(self, line):
-        if time.monotonic() < self._until:
-            self._lines.append(line)
-        else:
-            self._lines = ()
-
-    def __iter__(self):
-        return iter(self._lines)
-
-    def __bool__(self):
-        return bool(self._lines) and time.monotonic() < self._until
+def _ways_of(connections: Iterable[Connection]) -> _Ways:
+    links = links_of(connections)
+    inboxes = [inbox for link in links for inbox in link.inboxes.values()]
+    return _Ways(
+        inboxes,
+        [connection for connection in connections if not hasattr(connection, 'link')],
+        list({inbox.dispatcher for inbox in inboxes if not inbox.inline}),
+        list({inbox.dispatcher for inbox in inboxes if inbox.inline}),
+        sharing.Mark(links[0].header) if any(inbox.shared for inbox in inboxes) else None,
+    )

@@ -13,9 +13,12 @@ class Mark(dict):
     """The ``_connection_header`` of the messages that one publisher hands over, and of their
     headers."""
 
+    is_used = False  # whether there is any
+
     def put_on(self, message):
         """Mark a message that is handed over; returns it, or a copy if it is held as another
         publisher's already."""
+        Mark.is_used = True
         if is_held(message) and message._connection_header != self:
             message = _copied(message)
         message._connection_header = self

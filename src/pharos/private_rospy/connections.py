@@ -26,7 +26,7 @@ class Connections:
 
     def __init__(self, instance):
         self._instance = instance
-        self._channels = {}  # topic -> the channels that receive from it
+        self._receivers = {}  # topic -> those that :meth:`subscribe` has connected to it
         self._lock = threading.Lock()  # held to change that
         self.subscribers_at_registration = (
             {}
@@ -47,35 +47,37 @@ class Connections:
 
     # -- channels
 
-    def subscribe(self, channel, **options):
-        """rospy's Subscriber for an InputChannel, connected to the publishers in this process.
+    def subscribe(self, receiver, offer, timeout, **options):
+        """rospy's Subscriber for a receiver, connected to the publishers in this process.
 
         The master's word of them takes its time.
 
+        :param receiver: a :class:`pharos.intraprocess.inbox.Receiver`
+        :param offer: ``offer(message)`` takes what comes through a socket
+        :param timeout: seconds that all may take
         :raises MasterUnreachableError: if it cannot be registered
         """
-        topic = channel.topic
+        topic = receiver.topic
         with self._lock:
-            self._channels[topic] = (*self.channels_on(topic), channel)
+            self._receivers[topic] = (*self.receivers_on(topic), receiver)
         endpoint = None
         try:
-            with time_limit(max(REGISTER_TIMEOUT, channel.node.connect_timeout)):
+            with time_limit(max(REGISTER_TIMEOUT, timeout)):
                 endpoint = registered(
                     lambda: self._instance.rospy.Subscriber(
-                        Resolved(topic), channel.message_class, channel._offer, **options
+                        Resolved(topic), receiver.message_class, offer, **options
                     ),
                     _unregister,
                 )
-            self._connect(channel)
+            self._connect(topic, timeout)
         except BaseException:
-            self._forget(channel)
+            self._forget(receiver)
             if endpoint is not None:
                 _unregister(endpoint)
             raise
         return endpoint
 
-    def _connect(self, channel):
-        topic = channel.topic
+    def _connect(self, topic, timeout):
         publishers = [other for other in self._neighbours() if other.publisher(topic)]
         for other in publishers:
             self.connect(topic, other.uri)
@@ -85,43 +87,46 @@ class Connections:
                 other.connections.sends_to(name, topic) or refuses(topic, other.uri)
                 for other in publishers
             ),
-            channel.node.connect_timeout,
+            timeout,
         )
 
-    def unsubscribe(self, channel, endpoint):
+    def unsubscribe(self, receiver, endpoint):
         """End what :meth:`subscribe` began."""
-        self._forget(channel)
+        self._forget(receiver)
         _unregister(endpoint)
 
-    def _forget(self, channel):
-        topic = channel.topic
+    def _forget(self, receiver):
+        topic = receiver.topic
         with self._lock:
-            self._channels[topic] = tuple(c for c in self.channels_on(topic) if c is not channel)
+            others = tuple(other for other in self.receivers_on(topic) if other is not receiver)
+            self._receivers[topic] = others
 
-    def advertise(self, channel, timeout, **options):
-        """rospy's Publisher for an OutputChannel, and its fan-out; subscribers in this process are
-        told at once.
+    def advertise(self, topic, message_class, latch, timeout, queue_bytes, **options):
+        """rospy's Publisher, and its fan-out; subscribers in this process are told at once.
 
         rosmaster tells them in steps of 0.1 s.
 
+        :param latch: the :class:`pharos.intraprocess.fanout.Latch` to go on with, None: none
         :param timeout: seconds that the master may take
+        :param queue_bytes: that wait for a slow subscriber elsewhere
         :raises MasterUnreachableError: if it cannot be registered
         """
         with time_limit(max(REGISTER_TIMEOUT, timeout)):
             endpoint = registered(
                 lambda: self._instance.rospy.Publisher(
-                    Resolved(channel.topic), channel.message_class, latch=channel.latch, **options
+                    Resolved(topic), message_class, latch=latch is not None, **options
                 ),
                 _unregister,
             )
-        endpoint.impl.queue_bytes = channel.queue_bytes
-        if channel.latch:
-            endpoint.impl.fanout.resume(channel)
-            endpoint.impl.fanout.run()
+        fanout = endpoint.impl.fanout
+        endpoint.impl.queue_bytes = queue_bytes
+        if latch is not None:
+            fanout.resume(latch)
+            fanout.run()
         for other in self._neighbours():
-            if other.subscriber(channel.topic):
-                other.connections.connect(channel.topic, self._instance.uri)
-        return endpoint, endpoint.impl.fanout
+            if other.subscriber(topic):
+                other.connections.connect(topic, self._instance.uri)
+        return endpoint, fanout
 
     def known_subscribers(self, topic):
         """Names of the nodes that the master knew to be interested when this one registered as a
@@ -133,9 +138,10 @@ class Connections:
         nodes = [_running.get(uri) for uri in self.subscribers_at_registration.pop(topic, [None])]
         return None if None in nodes else {node.name for node in nodes}
 
-    def unadvertise(self, channel, endpoint):
+    @staticmethod
+    def unadvertise(endpoint, latch):
         """End what :meth:`advertise` began."""
-        endpoint.impl.fanout.forget(channel)
+        endpoint.impl.fanout.forget(latch)
         _unregister(endpoint)
 
     @staticmethod
@@ -171,9 +177,9 @@ class Connections:
 
     # -- links
 
-    def channels_on(self, topic):
-        """The channels of the node that receive from the topic."""
-        return self._channels.get(topic, ())
+    def receivers_on(self, topic):
+        """The receivers that :meth:`subscribe` has connected to the topic."""
+        return self._receivers.get(topic, ())
 
     def _may_be_in_process(self, topic):
         """Whether a connection on the topic may be INTRAPROCESS.
@@ -181,7 +187,7 @@ class Connections:
         Not where nobody but plain rospy callbacks listens: actionlib, for one, does not stand
         answers that come so quickly, and waits for ever.
         """
-        return self.takes_plain_callbacks or bool(self.channels_on(topic))
+        return self.takes_plain_callbacks or bool(self.receivers_on(topic))
 
     def connect(self, topic, uri):
         """Connect the subscription to the publisher at that URI, unless it is connected.

@@ -1,5 +1,6 @@
-"""What is on its way to one subscriber over TCPROS."""
+"""What is on its way to subscribers over TCPROS."""
 import collections
+import io
 import math
 import socket
 import threading
@@ -7,6 +8,42 @@ import time
 
 # bytes; copying more into the socket would hold the publisher up longer than waking a thread
 AT_ONCE = 1 << 16
+
+
+class Sockets:
+    """Has rospy serialize the messages of a publisher and write them into sockets.
+
+    See :class:`pharos.intraprocess.fanout.Sockets`; the publisher's lock is held.
+
+    :param publisher: rospy's _PublisherImpl
+    :param module: the rospy.topics that it is of
+    """
+
+    def __init__(self, publisher, module):
+        self._publisher, self._module = publisher, module
+        self._buffer = io.BytesIO()
+
+    def serialize(self, message, seq):
+        """The message, with its length."""
+        buffer = self._buffer
+        try:
+            self._module.serialize_message(buffer, seq, message)
+            return buffer.getvalue()
+        finally:  # what does not serialize must leave nothing that would corrupt the stream
+            buffer.seek(0)
+            buffer.truncate()
+
+    def write(self, data, connections):
+        """Write it to each subscriber; one whose connection broke is left."""
+        self._publisher.message_data_sent += len(data)
+        for connection in connections:
+            try:
+                connection.write_data(data)
+            except Exception as error:
+                self._module.logdebug(
+                    f'publisher connection to [{connection.endpoint_id}] terminated: {error}'
+                )
+                connection.close()
 
 
 class Sender:

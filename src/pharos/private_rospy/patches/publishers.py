@@ -2,11 +2,13 @@
 import contextlib
 import functools
 import math
+import struct
 
-from pharos.intraprocess.fanout import Fanout, links_of
+from pharos.intraprocess.fanout import ClosedError, Fanout, Latch, StartupLogBuffer
+from pharos.intraprocess.link import links_of
 from pharos.private_rospy.patches.table import addition, patch
 from pharos.private_rospy.publishing import notify
-from pharos.private_rospy.sender import Sender
+from pharos.private_rospy.sender import Sender, Sockets
 
 
 @patch(
@@ -19,7 +21,10 @@ def init_publisher(self, name, data_class, *, original, module):
     """Have a fan-out, which latches."""
     original(self, name, data_class)
     self.queue_bytes = math.inf  # that wait for a subscriber; an OutputChannel has a limit
-    self.fanout = Fanout(self, module)
+    self.fanout = Fanout(data_class, self.publock, Sockets(self, module))
+    is_log = self.resolved_name == '/rosout'
+    # of all Publishers of rospy on the topic; each OutputChannel has its own
+    self.own_latch = StartupLogBuffer() if is_log else Latch()
 
 
 @patch(
@@ -27,15 +32,19 @@ def init_publisher(self, name, data_class, *, original, module):
     '_PublisherImpl.publish',
     'keeps a part of a message that does not serialize, which corrupts the stream',
 )
-def publish(self, message, connection_override=None, *, original):
+def publish(self, message, connection_override=None, *, original, module):
     """Have the fan-out publish.
 
     rospy calls this with the lock of the publisher; an OutputChannel calls the fan-out itself,
     since each frame costs.
     """
-    if self.closed:
+    latch = self.own_latch if self.is_latch else None
+    try:
+        return self.fanout.publish(message, latch, None, connection_override, runs_inline=False)
+    except ClosedError:
         return original(self, message)  # says so
-    return self.fanout.publish(message, connection=connection_override)
+    except struct.error as error:
+        raise module.ROSSerializationException(error) from error
 
 
 @patch('rospy.topics', '_PublisherImpl.release', 'knows no delegate that is to run after publish')
@@ -62,10 +71,7 @@ def add_connection(self, c, *, node, module):
         if not (is_open and _add(self, c, link, module)):
             c.close()
             return False
-        if link:
-            self.fanout.send_latched(link.all_inboxes(), c.endpoint_id)
-        else:
-            self.fanout.write_latched(c)
+        self.fanout.send_latched(c)
     publish_single = functools.partial(self.publish, connection_override=c)
     for listener in self.subscriber_listeners or ():
         listener.peer_subscribe(self.resolved_name, self.publish, publish_single)
@@ -87,16 +93,16 @@ def _add(publisher, connection, link, module):
         return True
 
 
-@addition('rospy.topics', '_PublisherImpl.channels_changed', 'links call it')
-def channels_changed(self, link):
-    """The subscription at the other end of a link has other channels now."""
+@addition('rospy.topics', '_PublisherImpl.receivers_changed', 'links call it')
+def receivers_changed(self, link):
+    """The subscription at the other end of a link has other receivers now."""
     with _latched_first(self) as is_open:
         if not is_open:
             return
         new = _refresh(self, link)
         # otherwise it is just being added, and that sends it
         if link.sending in (self.connections or ()):
-            self.fanout.send_latched(new, link.sending.endpoint_id)
+            self.fanout.send_latched(link.sending, new)
     self.fanout.run()
 
 
@@ -132,7 +138,7 @@ def _latched_first(publisher):
     lock = publisher.publock
     with contextlib.ExitStack() as stack:
         if lock is not None and publisher.is_latch:
-            for link in links_of(publisher.connections or ()):
+            for link in links_of(publisher.connections):
                 stack.enter_context(link.unbounded())
             stack.enter_context(lock)
         yield lock is not None

@@ -1,8 +1,8 @@
 """What the master and other nodes ask a node: to stop, to connect, to hear of parameters."""
 import contextlib
 
-from pharos.intraprocess.link import protocol_handler
 from pharos.private_rospy import registration
+from pharos.private_rospy.local_link import IntraprocessHandler
 from pharos.private_rospy.patches.table import patch
 from pharos.private_rospy.xmlrpc_server import REFUSED, is_call_from_nearby
 
@@ -16,7 +16,7 @@ def init_handler(self, name, master_uri, *, node, original):
     """Offer INTRAPROCESS first: of the protocols of a node, the first that its peer has is
     taken."""
     original(self, name, master_uri)
-    self.protocol_handlers.insert(0, protocol_handler(node))
+    self.protocol_handlers.insert(0, IntraprocessHandler(node))
 
 
 @patch('rospy.impl.masterslave', 'ROSHandler._ready', 'tells no other node of this process')

@@ -1,8 +1,8 @@
 """rospy's subscriptions: they lose neither links nor callbacks, and hear links of this process."""
 import traceback
 
-from pharos.intraprocess.callbacks import is_of_channel
-from pharos.intraprocess.fanout import links_of
+from pharos.intraprocess.link import links_of
+from pharos.private_rospy.plain_receivers import has_own_inbox
 from pharos.private_rospy.patches.table import addition, patch
 from pharos.private_rospy import registration
 from pharos.signals import is_from_signal
@@ -79,7 +79,7 @@ def add_callback(self, cb, cb_args, *, original):
     """Links have inboxes for channels and one for all other callbacks, and know what was
     latched."""
     original(self, cb, cb_args)
-    for link in links_of(self.connections or ()):
+    for link in links_of(self.connections):
         for message in link.callback_added(cb):
             self._invoke_callback(message, cb, cb_args)
 
@@ -88,19 +88,19 @@ def add_callback(self, cb, cb_args, *, original):
 def remove_callback(self, cb, cb_args, *, original):
     """Tell the links."""
     original(self, cb, cb_args)
-    for link in links_of(self.connections or ()):
+    for link in links_of(self.connections):
         link.callback_removed()
 
 
 @addition('rospy.topics', '_SubscriberImpl.has_plain_callbacks', 'links ask for it')
 def has_plain_callbacks(self):
     """Whether there are callbacks that are no channels'."""
-    return not all(is_of_channel(callback) for callback, _ in self.callbacks or ())
+    return not all(has_own_inbox(callback) for callback, _ in self.callbacks or ())
 
 
 @addition('rospy.topics', '_SubscriberImpl.run_callbacks', 'links call it')
 def run_callbacks(self, message):
     """Run the callbacks that are no channels' for a message of a link."""
     for callback, arguments in self.callbacks or ():
-        if not is_of_channel(callback):
+        if not has_own_inbox(callback):
             self._invoke_callback(message, callback, arguments)
