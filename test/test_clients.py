@@ -23,7 +23,8 @@ from rosgraph.network import encode_ros_handshake_header
 from conftest import TIMEOUT, Mailbox, speak_tcpros_only
 from fuzz import Fuzz
 from pharos import BlockNode
-from pharos.private_rospy import acceptor, registration, servers, xmlrpc_server
+from pharos.private_rospy import acceptor, registration, xmlrpc_server
+from pharos.private_rospy.patches import tcpros_server
 from programs import Program, until
 
 FUZZ_COUNT = int(os.environ.get('PHAROS_FUZZ_COUNT', 2500))  # bad clients; tools/soak makes it more
@@ -131,7 +132,7 @@ signal.pause()
 
 def test_hundreds_of_silent_clients_keep_nobody_out(master, mailbox, node, warnings, monkeypatch):
     """400 at each port say nothing, or begin and do not go on."""
-    monkeypatch.setattr(servers, 'HANDSHAKE_TIMEOUT', TIMEOUT)
+    monkeypatch.setattr(tcpros_server, 'HANDSHAKE_TIMEOUT', TIMEOUT)
     with Program(
         master.url, sys.executable, '-c', HANG, str(node.tcp_port), str(node.xmlrpc_port)
     ) as crowd:
@@ -182,7 +183,7 @@ def test_of_hundreds_of_good_clients_none_is_taken_for_a_silent_one(
 
 def test_a_slow_handshake_ends_after_its_limit(node, warnings, monkeypatch):
     """However steadily it comes, a byte at a time."""
-    monkeypatch.setattr(servers, 'HANDSHAKE_TIMEOUT', 0.3)
+    monkeypatch.setattr(tcpros_server, 'HANDSHAKE_TIMEOUT', 0.3)
     with connect(node.tcp_port) as client:
         dribble(client, struct.pack('<I', 100000))
         assert is_closed(client)
@@ -639,27 +640,10 @@ def test_a_flood_of_bad_clients_does_not_fill_the_log(node, warnings, monkeypatc
     assert 'and 5 more' in warnings.get()
 
 
-def test_only_a_few_large_requests_are_held_at_a_time(node, warnings):
-    """Hundreds of clients that each send all but the last byte of 8 MB do not fill the memory."""
-    size = xmlrpc_server.REQUEST_LIMIT
-    with contextlib.ExitStack() as clients:
-
-        def answer():
-            client = clients.enter_context(connect(node.xmlrpc_port))
-            client.sendall(post(b'', length=size, more='Expect: 100-continue\r\n'))
-            return client.recv(100)
-
-        for _ in range(xmlrpc_server.LARGE_REQUESTS):
-            assert answer().startswith(b'HTTP/1.1 100')  # it waits for the body
-        assert answer().startswith(b'HTTP/1.1 503')
-        assert 'too many large requests at once' in warnings.get()
-        assert answers(node)
-
-
 def test_a_large_call_is_answered(node, warnings):
     with xmlrpc.client.ServerProxy(node.uri) as proxy:
         # not subscribed
-        assert proxy.paramUpdate('/test', '/robot_description', 'x' * 2000000)[0] == -1
+        assert proxy.paramUpdate('/test', '/robot_description', 'x' * 1000000)[0] == -1
         assert proxy.getPid('/test')[0] == 1
     assert warnings.empty()
 

@@ -18,7 +18,8 @@ from pharos import (
     running,
 )
 from pharos import message_class, stopping
-from pharos.private_rospy import acceptor, lifetime, proxies, xmlrpc_server
+from pharos.private_rospy import acceptor, lifetime, proxies
+from pharos.private_rospy.patches import xmlrpc_server
 from pharos.intraprocess import services
 from programs import until
 from sockets import refused_url, silent_peer

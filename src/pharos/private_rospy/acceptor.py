@@ -25,21 +25,22 @@ _SHUT = errno.EINVAL, errno.EBADF
 class Acceptor:
     """Lets the clients of one server in, each into a thread of its own.
 
-    A client that is to say something before it is served, a handshake or a request, is *expected*.
-    Where too many are, the one expected longest is closed: silent clients keep nobody from coming
-    in, and are told from those that come in a rush by their age.
+    A client that is to say something before it is served, whether it shakes hands or makes a
+    request, is in its *handshake*. Where too many are, the one whose handshake began first is
+    closed: silent clients keep nobody from coming in, and are told from those that come in a rush
+    by their age.
 
     :param kind: of the clients, for the log and the names of threads
-    :param warn: ``warn(text)`` logs that a client was refused
+    :param node: the :class:`~.instance.PrivateRospy` whose server it is
     """
 
-    def __init__(self, kind, lifetime, warn):
-        self._kind, self._lifetime, self._warn = kind, lifetime, warn
-        self._changed = threading.Condition()  # guards all below; notified when fewer are expected
-        self._expected = {}  # socket -> since when; those expected longest first
-        self._inside = 0  # threads
-        self._crowded = False  # and the log says so
-        self._logged = collections.deque(maxlen=REJECTION_LINES)  # when the last were logged
+    def __init__(self, kind, node):
+        self._kind, self._node = kind, node
+        self._changed = threading.Condition()  # guards all below; notified when a handshake ends
+        self._handshakes = {}  # socket -> since when; the longest first
+        self._threads = 0
+        self._is_crowded = False  # and the log says so
+        self._rejections = collections.deque(maxlen=REJECTION_LINES)  # when the last were logged
         self._not_logged = 0  # since then
 
     def accept(self, listener, serve):
@@ -59,26 +60,26 @@ class Acceptor:
                     return
                 if error.errno in _EXHAUSTED:
                     self._close_longest(error.strerror)
-                    self._lifetime.ended.wait(PAUSE)
+                    self._node.ended.wait(PAUSE)
                 continue  # else the client went before it was let in
             # rospy waits for ever for a service's client, or in vain for a subscriber's leaving
             keep_alive(sock)
-            self._lifetime.track_socket(sock)
+            self._node.track_socket(sock)
             self.start_handshake(sock)
             self._let_in(sock, address, serve)
 
     def _let_in(self, sock, address, serve):
         with self._changed:
-            self._inside += 1
+            self._threads += 1
             # those that are served, or are closed and do not know it yet
-            full = self._inside > 2 * CLIENTS
+            is_full = self._threads > 2 * CLIENTS
         try:
-            if full:
-                raise RuntimeError('%d %s clients are being served' % (2 * CLIENTS, self._kind))
-            self._lifetime.start_thread(self._serve, (sock, address, serve), self._kind)
+            if is_full:
+                raise RuntimeError(f'{2 * CLIENTS} {self._kind} clients are being served')
+            self._node.start_thread(self._serve, (sock, address, serve), self._kind)
         except RuntimeError as error:  # Python's own, where the system gives no more threads
             self._leave(sock)
-            self._say_crowded(error)
+            self._log_crowd(error)
             sock.close()
 
     def _serve(self, sock, address, serve):
@@ -93,71 +94,73 @@ class Acceptor:
     def _leave(self, sock):
         self.finish_handshake(sock)
         with self._changed:
-            self._inside -= 1
+            self._threads -= 1
 
     def start_handshake(self, sock):
         """The client is to say something now."""
         with self._changed:
-            self._expected[sock] = time.monotonic()
-        self._make_room()
+            self._handshakes[sock] = time.monotonic()
+        self._make_room(wait=False)
 
     def finish_handshake(self, sock):
-        """It has said it; returns whether it was expected, and not closed for others meanwhile."""
+        """It has said it; returns whether it was to, and was not closed for others meanwhile."""
         with self._changed:
-            since = self._expected.pop(sock, None)
-            if len(self._expected) < CLIENTS // 2:
-                self._crowded = False
+            since = self._handshakes.pop(sock, None)
+            if len(self._handshakes) < CLIENTS // 2:
+                self._is_crowded = False
             self._changed.notify_all()
             return since is not None
 
     def reject(self, sock, address, why):
-        """Log why a client that was expected is not served; what happens to it later is its own
-        affair."""
+        """Log why a client's handshake failed; what happens to it later is its own affair."""
         if self.finish_handshake(sock):
             self.log_rejection(address, why)
 
     def log_rejection(self, address, why):
         """Log what is wrong with a client, unless so many others are wrong that it would fill the
         log."""
-        if self._lifetime.ended.is_set():
+        if self._node.ended.is_set():
             return
-        now = time.monotonic()
+        now, logged = time.monotonic(), self._rejections
         with self._changed:
-            told = self._logged
-            if len(told) == REJECTION_LINES and now - told[0] < REJECTION_PERIOD:
+            if len(logged) == REJECTION_LINES and now - logged[0] < REJECTION_PERIOD:
                 self._not_logged += 1
                 return
-            told.append(now)
-            untold, self._not_logged = self._not_logged, 0
-        more = f' (and {untold} more before, which were too many for the log)' if untold else ''
-        self._warn('%s client %s:%s refused: %s%s' % (self._kind, *address[:2], brief(why), more))
+            logged.append(now)
+            not_logged, self._not_logged = self._not_logged, 0
+        line = '%s client %s:%s refused: %s' % (self._kind, *address[:2], brief(why))
+        if not_logged:
+            line += f' (and {not_logged} more before, which were too many for the log)'
+        self._node.warn(line)
 
-    def _make_room(self, wait=False):
+    def _make_room(self, wait):
         while True:
             with self._changed:
-                if len(self._expected) < CLIENTS:
+                if len(self._handshakes) < CLIENTS:
                     return
-                left = GRACE - (time.monotonic() - next(iter(self._expected.values())))
+                left = GRACE - (time.monotonic() - next(iter(self._handshakes.values())))
                 if left > 0:
                     if not wait:
                         return
                     self._changed.wait(left)
                     continue
-            self._close_longest('%d %s clients say nothing' % (CLIENTS, self._kind))
+            self._close_longest(f'{CLIENTS} {self._kind} clients say nothing')
 
     def _close_longest(self, why):
         with self._changed:
-            longest = next(iter(self._expected), None)
+            longest = next(iter(self._handshakes), None)
             if longest is not None:
-                del self._expected[longest]
+                del self._handshakes[longest]
                 shutdown_socket(longest)  # its thread wakes
-        self._say_crowded(why)
+        self._log_crowd(why)
 
-    def _say_crowded(self, why):
+    def _log_crowd(self, why):
         with self._changed:
-            said, self._crowded = self._crowded, True
-        if not said and not self._lifetime.ended.is_set():
-            self._warn(f'{why}: those that said nothing for longest are closed, to let others in')
+            is_logged, self._is_crowded = self._is_crowded, True
+        if not is_logged and not self._node.ended.is_set():
+            self._node.warn(
+                f'{why}: those that said nothing for longest are closed, to let others in'
+            )
 
 
 def brief(text, limit=TEXT_LIMIT):

@@ -10,8 +10,11 @@ import rosgraph.network
 from rosgraph.rosenv import ROS_HOSTNAME, ROS_IP
 
 _HOST = re.compile(r'\w([\w.-]*\w)?\.?', re.ASCII)  # Docker's names have underscores
-_NOBODYS = ipaddress.ip_network('0.0.0.0/8')  # '5' is one of these
-_BROADCAST = ipaddress.ip_address('255.255.255.255')
+# '5' is one of the first, multicast and broadcast are the others
+_UNREACHABLE = [
+    ipaddress.ip_network(network)
+    for network in ('0.0.0.0/8', '224.0.0.0/4', '255.255.255.255', '::', 'ff00::/8')
+]
 
 
 def check_port(what, port):
@@ -61,7 +64,7 @@ def check_domain(what, domain):
     if not isinstance(domain, str) or not _HOST.fullmatch(domain):
         raise ValueError(f'{what} cannot be {domain!r}: {advice}, without http:// and port')
     try:
-        found = _look_up(
+        found = addresses_of(
             domain, socket.AF_UNSPEC if rosgraph.network.use_ipv6() else socket.AF_INET
         )
     except (OSError, UnicodeError) as error:
@@ -70,11 +73,7 @@ def check_domain(what, domain):
             f'{advice}'
         ) from error
     for address in found:
-        if (
-            address in _NOBODYS
-            or address.is_multicast
-            or address in (_BROADCAST, ipaddress.ip_address('::'))
-        ):
+        if any(address in network for network in _UNREACHABLE):
             raise ValueError(
                 f'{what} {domain!r} means {address}, at which nobody would reach the node: {advice}'
             )
@@ -113,10 +112,10 @@ def is_same_master(url, other):
     if url == other:
         return True
     one, two = urllib.parse.urlsplit(url), urllib.parse.urlsplit(other)
-    if one.port != two.port:
-        return False
     try:
-        return not _of_master(one.hostname).isdisjoint(_of_master(two.hostname))
+        return one.port == two.port and not _of_master(one.hostname).isdisjoint(
+            _of_master(two.hostname)
+        )
     except (OSError, UnicodeError):
         # what cannot be looked up is the same only where it is spelt so
         return False
@@ -125,25 +124,25 @@ def is_same_master(url, other):
 @functools.lru_cache(maxsize=1000)
 def _of_master(host):
     """The addresses of a host; this one has a master at all of its own."""
-    found = _look_up(host, socket.AF_UNSPEC)
-    here = {_address(own) for own in rosgraph.network.get_local_addresses()}
-    here |= {_address('0.0.0.0'), _address('::')}  # to which a client connects here
-    for own in 'localhost', socket.gethostname():
+    found = addresses_of(host)
+    # a client that connects to 0.0.0.0 or :: connects here
+    own_names = ['localhost', socket.gethostname(), '0.0.0.0', '::']
+    here = set()
+    for own in own_names + rosgraph.network.get_local_addresses():
         with contextlib.suppress(OSError, UnicodeError):
-            here |= _look_up(own, socket.AF_UNSPEC)
+            here |= addresses_of(own)
     return found if found.isdisjoint(here) else found | here
 
 
-def _look_up(host, family):
-    """The IP addresses of a host."""
+def addresses_of(host, family=socket.AF_UNSPEC):
+    """The IP addresses of a host, given by its name or one of them, as of :mod:`ipaddress`.
+
+    :raises OSError, UnicodeError: if the name has none
+    """
     return {
-        _address(found[0])
+        ipaddress.ip_address(found[0].partition('%')[0])
         for *_, found in socket.getaddrinfo(host, None, family, socket.SOCK_STREAM)
     }
-
-
-def _address(text):
-    return ipaddress.ip_address(text.partition('%')[0])
 
 
 def _is_ipv6(host):

@@ -1,6 +1,5 @@
 """One node's rospy: loaded, started and stopped."""
 import atexit
-import collections
 import contextlib
 import errno
 import logging.config
@@ -23,10 +22,11 @@ from pharos.private_rospy import (
     publishing,
     refusals,
     registration,
-    servers,
 )
+from pharos.private_rospy.acceptor import Acceptor
 from pharos.private_rospy.lifetime import Lifetime
 from pharos.private_rospy.loader import PrivateImports, Substitute
+from pharos.private_rospy.patches import tcpros_server
 from pharos.private_rospy.parameters import WatchedParameters
 from pharos.private_rospy.proxies import ServerProxy, is_time_up, time_limit
 from pharos.intraprocess.services import Workers
@@ -49,6 +49,7 @@ class PrivateRospy:
         self.name = settings.name
         self._on_stop_request, self.allows_remote_shutdown = on_stop_request, allows_remote_shutdown
         self.lifetime = Lifetime(self.name)
+        self.service_clients = Acceptor('service', self)
         self._stopping = threading.Lock()
         # whether a newer node has it: what registers this one again would end that one
         self.has_lost_name = False
@@ -68,15 +69,7 @@ class PrivateRospy:
         lifetime, logging_module = self.lifetime, logs.private_logging()
         proxies = Substitute(xmlrpc.client, ServerProxy=ServerProxy)
         private_os = Substitute(os, environ=self.settings.environ)
-        hooks = collections.defaultdict(list)
-        for part in (
-            logs.hooks(),
-            servers.hooks(lifetime, self.warn, self.debug),
-        ):
-            for name, hook in part.items():
-                hooks[name].append(hook)
         modules = PrivateImports(
-            hooks=hooks,
             patch=lambda module: patches.apply(module, self),
             substitutes={
                 'os': private_os,
@@ -131,7 +124,7 @@ class PrivateRospy:
         core._shutdown_hooks.insert(0, self._wake)
         try:
             with _ports_checked('tcp_port', settings.tcp_port):
-                self.tcp_port = servers.listen(
+                self.tcp_port = tcpros_server.listen(
                     self._modules.load('rospy.impl.tcpros_base'), settings.tcp_port
                 )
             with _ports_checked('xmlrpc_port', settings.xmlrpc_port):

@@ -16,21 +16,23 @@ KEEPALIVE_IDLE = 10  # seconds of silence after which the peer's host is asked w
 KEEPALIVE_INTERVAL = 5  # seconds between two such questions
 KEEPALIVE_COUNT = 4  # of them without an answer, and the connection is broken
 
-_thread = threading.local()  # .lifetime: of the node on whose behalf the thread runs, if it does
+# .lifetime: of the node on whose behalf the thread runs; .interruption: the innermost it is within
+_thread = threading.local()
 
 
 class Lifetime:
-    """The threads and accepted sockets of one run of a node, and the event that ends it.
+    """The threads and sockets of one run of a node, and the event that ends it.
 
-    :attr:`ended` is set when the node stops: sleeps inside rospy end with it, as do waits in an
-        :class:`Interruption`.
+    Sleeps inside rospy end when the node stops, as do waits in an :class:`Interruption`.
+
+    :param name: the node's, for the names of its threads
     """
 
     def __init__(self, name):
-        self.ended = threading.Event()
+        self.ended = threading.Event()  # set when the node stops
         # set when the node is unregistered, and its XML-RPC server closed
         self.silent = threading.Event()
-        self._interruptions = set()  # of waits under way
+        self.interruptions = set()  # of waits under way
         self.threads = weakref.WeakSet()
         self.xmlrpc = None  # the node's XML-RPC server, once it is bound
         self._sockets = weakref.WeakSet()
@@ -62,16 +64,17 @@ class Lifetime:
     def interrupts_waits(self):
         """Within this, what waits in this thread does so on behalf of the node, and ends with
         it."""
-        before, _thread.lifetime = getattr(_thread, 'lifetime', None), self
+        before = getattr(_thread, 'lifetime', None)
+        _thread.lifetime = self
         try:
             yield
         finally:
             _thread.lifetime = before
 
     def begin_shutdown(self):
-        """Begin the end: all that waits on behalf of the node ends."""
+        """Begin the stop: all that waits on behalf of the node ends."""
         self.ended.set()
-        for interruption in tuple(self._interruptions):
+        for interruption in tuple(self.interruptions):
             interruption.wake()
 
     def sleep(self, seconds):
@@ -79,12 +82,11 @@ class Lifetime:
         it to."""
         if seconds <= 0:
             time.sleep(0)
-        elif threading.current_thread() is not threading.main_thread():
-            self.ended.wait(seconds)
-        else:
-            until = time.monotonic() + seconds
-            while seconds > 0 and not self.ended.wait(min(seconds, SIGNAL_LATENCY)):
-                seconds = until - time.monotonic()
+        is_main = threading.current_thread() is threading.main_thread()
+        longest = SIGNAL_LATENCY if is_main else seconds
+        until = time.monotonic() + seconds
+        while seconds > 0 and not self.ended.wait(min(seconds, longest)):
+            seconds = until - time.monotonic()
 
     def track_socket(self, sock):
         """Shut this socket down at the end: a thread that waits for what comes through it then
@@ -92,24 +94,23 @@ class Lifetime:
         self._sockets.add(sock)
 
     def untrack_socket(self, sock):
-        """Do not shut this socket: its client is to hear that the node has stopped."""
+        """Do not shut this socket down: its client is to hear that the node has stopped."""
         self._sockets.discard(sock)
 
     def end(self, abandoned=()):
-        """Shut the sockets, wait for the threads but those given up; returns those that did not end
-        in time."""
+        """Shut the sockets down, and wait for the threads but those that are ``abandoned``.
+
+        :returns: the threads that did not end in time
+        """
         self.begin_shutdown()
         for sock in list(self._sockets):
             shutdown_socket(sock)
-        me = threading.current_thread()
-        threads = [
-            thread for thread in list(self.threads) if thread is not me and thread not in abandoned
-        ]
+        others = set(self.threads) - {threading.current_thread(), *abandoned}
+        # Else it has ended, or is only just being started, and will see that all has.
+        threads = [thread for thread in others if thread.is_alive()]
         deadline = time.monotonic() + JOIN_TIMEOUT
         for thread in threads:
-            # else it has ended, or is only just being started, and will see that all has
-            if thread.is_alive():
-                thread.join(max(0.0, deadline - time.monotonic()))
+            thread.join(max(0.0, deadline - time.monotonic()))
         return [thread for thread in threads if thread.is_alive()]
 
 
@@ -126,32 +127,29 @@ class Interruption:
 
     def __init__(self, wake=None, lifetime=None):
         self.wake = wake
-        here, self._outer = getattr(_thread, 'lifetime', None), getattr(
-            _thread, 'interruption', None
-        )
-        self._lifetimes = {
-            each for each in (lifetime, here) if each is not None and not each.ended.is_set()
-        }
+        self._outer = getattr(_thread, 'interruption', None)
+        given = lifetime, getattr(_thread, 'lifetime', None)
+        self.lifetimes = {each for each in given if each is not None and not each.ended.is_set()}
         if self._outer is not None:
-            self._lifetimes |= self._outer._lifetimes
+            self.lifetimes |= self._outer.lifetimes
 
     @property
     def came(self):
         """Whether the node stops."""
-        return any(lifetime.ended.is_set() for lifetime in self._lifetimes)
+        return any(lifetime.ended.is_set() for lifetime in self.lifetimes)
 
     def __enter__(self):
         _thread.interruption = self
-        for lifetime in self._lifetimes:
-            lifetime._interruptions.add(self)
+        for lifetime in self.lifetimes:
+            lifetime.interruptions.add(self)
         if self.came:
             self.wake()
         return self
 
     def __exit__(self, *error):
         _thread.interruption = self._outer
-        for lifetime in self._lifetimes:
-            lifetime._interruptions.discard(self)
+        for lifetime in self.lifetimes:
+            lifetime.interruptions.discard(self)
 
 
 def keep_alive(sock, while_sending=False):
@@ -161,7 +159,7 @@ def keep_alive(sock, while_sending=False):
         sending for a quarter of an hour; not for publishers, since a peer that stops reading is
         then taken for one that has gone
     """
-    try:
+    with contextlib.suppress(OSError):  # closed already
         if while_sending:
             limit = KEEPALIVE_IDLE + KEEPALIVE_INTERVAL * KEEPALIVE_COUNT
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 1000 * limit)
@@ -169,13 +167,9 @@ def keep_alive(sock, while_sending=False):
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, KEEPALIVE_IDLE)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, KEEPALIVE_INTERVAL)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, KEEPALIVE_COUNT)
-    except OSError:
-        pass  # closed already
 
 
 def shutdown_socket(sock):
     """Shut a socket down: unlike ``close`` alone, this wakes a thread that waits on it."""
-    try:
+    with contextlib.suppress(OSError):  # not connected, or closed already
         sock.shutdown(socket.SHUT_RDWR)
-    except OSError:
-        pass  # not connected, or closed already

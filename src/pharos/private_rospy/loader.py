@@ -72,16 +72,14 @@ class PrivateImports:
 
     :param substitutes: ``{module name: object}`` that private modules get when they import that
         name
-    :param hooks: ``{module name: [function(module)]}`` run right after a private module's code,
-        before any other module can import names from it
-    :param patch: ``patch(module)``, called likewise with every private module
+    :param patch: ``patch(module)``, called right after the code of every private module, before any
+        other module can import names from it
     """
 
-    def __init__(self, substitutes, hooks, patch):
+    def __init__(self, substitutes, patch):
         self.modules = {}
         self._private = {'rospy', 'rosgraph'}
         self._substitutes = substitutes
-        self._hooks = hooks
         self._patch = patch
         self._builtins = dict(vars(builtins), __import__=self._import)
 
@@ -106,8 +104,6 @@ class PrivateImports:
             module = self.modules[name] = _SHARED[name]
         else:
             module = self._run(*_find(name, parent.__path__ if parent else None), into=self.modules)
-            for hook in self._hooks.get(name, ()):
-                hook(module)
             self._patch(module)
         if parent:
             setattr(parent, leaf, module)

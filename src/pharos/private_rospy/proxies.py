@@ -2,6 +2,7 @@
 answer."""
 import contextlib
 import http.client
+import math
 import socket
 import threading
 import time
@@ -12,10 +13,15 @@ import rosgraph
 from pharos.private_rospy.lifetime import Interruption, shutdown_socket
 
 TIMEOUT = 10.0  # seconds for one call, where nothing else is said
-MARGIN = (
-    0.5  # seconds beyond a time limit, to tell a master that does not answer from what did not come
-)
-_limits = threading.local()  # .deadline: by which all calls of this thread are to end
+# seconds beyond a time limit, to tell a master that does not answer from what did not come
+MARGIN = 0.5
+
+
+class _ThreadLimit(threading.local):
+    deadline = math.inf  # by which all calls of this thread are to end, by time.monotonic()
+
+
+_limits = _ThreadLimit()
 
 
 @contextlib.contextmanager
@@ -24,7 +30,7 @@ def time_limit(seconds):
 
     :param seconds: None: no limit
     """
-    before = getattr(_limits, 'deadline', None)
+    before = _limits.deadline
     if seconds is not None:
         _limits.deadline = deadline_in(max(0.0, seconds))
     try:
@@ -36,14 +42,23 @@ def time_limit(seconds):
 def deadline_in(seconds):
     """The time, by ``time.monotonic()``, in so many seconds, or when the :func:`time_limit` of this
     thread is over."""
-    deadline, limit = time.monotonic() + seconds, getattr(_limits, 'deadline', None)
-    return deadline if limit is None else min(deadline, limit)
+    return min(time.monotonic() + seconds, _limits.deadline)
 
 
 def is_time_up():
     """Whether the :func:`time_limit` of this thread is over."""
-    deadline = getattr(_limits, 'deadline', None)
-    return deadline is not None and time.monotonic() >= deadline
+    return time.monotonic() >= _limits.deadline
+
+
+def seconds_left(deadline):
+    """The seconds until that time, by ``time.monotonic()``.
+
+    :raises socket.timeout: if it is over
+    """
+    left = deadline - time.monotonic()
+    if left <= 0:
+        raise socket.timeout('timed out')
+    return left
 
 
 class _Limits:
@@ -57,16 +72,11 @@ class _Limits:
     is_shut = False  # whether none is to go on
 
     def left(self):
-        """The seconds left for the present call."""
-        left = self.deadline - time.monotonic()
-        if left <= 0:
-            raise socket.timeout('timed out')
-        return left
-
-    def check(self):
-        """Raise an OSError if the calls were ended."""
+        """The seconds left for the present call; an OSError if there are none, or no call is to go
+        on."""
         if self.is_shut:
             raise ConnectionAbortedError('it is not waited for any more')
+        return seconds_left(self.deadline)
 
 
 class _Transport(xmlrpc.client.Transport):
@@ -82,7 +92,6 @@ class _Transport(xmlrpc.client.Transport):
         return super().request(*args, **options)
 
     def make_connection(self, host):
-        self._limits.check()
         if not self._connection or self._connection[0] != host:
             address, self._extra_headers, _ = self.get_host_info(host)
             self._connection = host, _Connection(address, self._limits)
@@ -107,7 +116,7 @@ class _Connection(http.client.HTTPConnection):
         super().connect()
         self.sock = _Socket(fileno=self.sock.detach())
         self.sock.limits = self._limits
-        self._limits.check()  # shut() may have come before there was a socket
+        self._limits.left()  # shut() may have come before there was a socket
 
 
 class _Socket(socket.socket):

@@ -1,4 +1,5 @@
-"""A node's XML-RPC server: who may say how much to it, and for how long."""
+"""Who may say how much to a node's XML-RPC server, and for how long."""
+import contextlib
 import io
 import ipaddress
 import socket
@@ -7,101 +8,97 @@ import time
 import urllib.parse
 import xml.parsers.expat
 import xmlrpc.client
+import xmlrpc.server
 
-from pharos.private_rospy.acceptor import BACKLOG, Acceptor, brief
-from pharos.private_rospy.lifetime import shutdown_socket
-from pharos.private_rospy.loader import Substitute
+from pharos.private_rospy.acceptor import brief
+from pharos.private_rospy.addresses import addresses_of
+from pharos.private_rospy.proxies import seconds_left
 
 REQUEST_TIMEOUT = 30.0  # seconds from one answer until the next request has come, however slowly
-REQUEST_LIMIT = 8 << 20  # bytes of a request
-LARGE_REQUEST = 1 << 16  # bytes; of requests beyond, only so many are held at a time:
-LARGE_REQUESTS = 8
+REQUEST_LIMIT = 1 << 20  # bytes of a request
 
 REFUSED = 'refused: '  # how an answer begins by which a node defends itself
-# .client: the address of the client whose call this thread answers; .here: ours
-_call = threading.local()
+_thread = threading.local()  # .handler: the RequestHandler whose client's call it answers
 
 
-def hooks(lifetime, warn, debug):
-    """The load hooks of this module, for a node of that lifetime; ``warn(text)``, ``debug(text)``
-    write to its log."""
+class RequestHandler(xmlrpc.server.SimpleXMLRPCRequestHandler):
+    """Reads the requests of one client, within limits, and answers them, in a thread of its own.
 
-    def limit_requests(module):
-        """rosgraph.xmlrpc: a request may be silent or huge for ever, and runs in a thread that
-        nobody knows."""
-        acceptor = Acceptor('XML-RPC', lifetime, warn)
-        module.SilenceableXMLRPCRequestHandler = _request_handler(
-            module.SilenceableXMLRPCRequestHandler, acceptor, lifetime
-        )
-        server, node = module.ThreadingXMLRPCServer, module.XmlRpcNode
-        dispatch = server._dispatch
+    Its server has the client's :class:`~.acceptor.Acceptor` as ``acceptor``, and the
+    :class:`~.instance.PrivateRospy` as ``node``.
+    """
 
-        def _dispatch(self, method, parameters):
-            """Nothing in rospy says whose the calls were that it refused.
+    protocol_version = 'HTTP/1.1'
+    is_answered = False  # whether the client has had an answer
 
-            A call that ROS's slave API answers with an error is the caller's affair: peers come too
-            late, or try.
-            """
-            try:
-                answer = dispatch(self, method, parameters)
-            except Exception as error:
-                acceptor.log_rejection(_call.client, f'call of {brief(method)}: {error}')
-                raise
-            if type(answer) is tuple and answer[0] < 1:
-                if answer[1].startswith(REFUSED):
-                    acceptor.log_rejection(
-                        _call.client, f'call of {method}: {answer[1][len(REFUSED):]}'
-                    )
-                else:
-                    client = '%s:%s' % _call.client[:2]
-                    debug(f'XML-RPC client {client}: call of {method}: {brief(answer[1])}')
-            return answer
+    def setup(self):
+        """Called by socketserver."""
+        super().setup()
+        self.rfile = io.BufferedReader(_Reader(self.connection))
 
-        server._dispatch = _dispatch
+    def finish(self):
+        """Called by socketserver."""
+        with contextlib.suppress(OSError):  # the client has gone without its answer
+            super().finish()
 
-        def serve(self, sock, address):
-            try:
-                self.finish_request(sock, address)
-            finally:
-                self.shutdown_request(sock)
+    def handle_one_request(self):
+        """Called by http.server, until close_connection is set."""
+        self.server.acceptor.start_handshake(self.connection)
+        self.rfile.raw.deadline = time.monotonic() + REQUEST_TIMEOUT
+        self.raw_requestline = b''
+        try:
+            super().handle_one_request()
+        except OSError as error:
+            self.close_connection = True
+            self.log_error('%s', error)
 
-        server.serve = serve
+    def log_error(self, format, *args):
+        """Called by http.server, also where a client went that had nothing more to ask."""
+        if self.raw_requestline or not self.is_answered:
+            self.server.acceptor.reject(self.connection, self.client_address, format % args)
 
-        def start(self):
-            """Bind here, in the caller's thread, where an error can be raised; rosgraph prints it
-            in another."""
-            lifetime.xmlrpc = self
-            self._run_init()
-            self.server.socket.listen(BACKLOG)
-            ways_in = self.server.socket, self.server.serve
-            self.accepting = lifetime.start_thread(acceptor.accept, ways_in, 'xmlrpc-accept')
+    def log_rejection(self, why):
+        """Log what is wrong with a call of the client."""
+        self.server.acceptor.log_rejection(self.client_address, why)
 
-        node.start = start
+    def do_POST(self):
+        """Called by http.server for a request whose header has come."""
+        length = self.headers.get('content-length', '')
+        if not self.is_rpc_path_valid():
+            self.send_error(404)
+        elif not length.isdecimal() or 'transfer-encoding' in self.headers:
+            self.send_error(411)
+        elif len(length) > 10 or int(length) > REQUEST_LIMIT:
+            self.send_error(413, f'a request of {length:.20} bytes; the limit is {REQUEST_LIMIT}')
+        elif 'content-encoding' in self.headers:  # what is small may become huge
+            self.send_error(415)
+        else:
+            self._answer(int(length))
 
-        def shutdown(self, reason):
-            """rosgraph only closes the socket, on which its thread then spins (ros_comm #2238)."""
-            self.is_shutdown = True
-            server, handler = self.server, self.handler
-            self.server = self.handler = None  # first, for others take that for stopped
-            if handler:
-                handler._shutdown(reason)
-            if server:
-                shutdown_socket(server.socket)
-                self.accepting.join()  # closed any earlier, the socket could not wake it any more
-                server.server_close()
-            lifetime.silent.set()
-
-        node.shutdown = shutdown
-
-    def leave_logged_to_the_server(module):
-        """rospy.impl.masterslave: writes tracebacks of calls with wrong arguments, and not whose
-        they were."""
-        module._logger = Substitute(module._logger, error=module._logger.debug)
-
-    return {
-        'rosgraph.xmlrpc': limit_requests,
-        'rospy.impl.masterslave': leave_logged_to_the_server,
-    }
+    def _answer(self, length):
+        body = self.rfile.read(length)
+        try:
+            if len(body) < length:
+                raise ValueError(f'closed after {len(body)} of {length} bytes')
+            _refuse_document_type(body)
+            _, method = xmlrpc.client.loads(body)
+        except Exception as error:  # xmlrpc raises whatever it is that it trips over
+            text = brief(error).encode('ascii', 'replace').decode()
+            self.send_error(400, f'no XML-RPC call: {text}')
+            return
+        self.server.acceptor.finish_handshake(self.connection)
+        if method == 'shutdown':  # the client is to hear that the node has stopped
+            self.server.node.lifetime.untrack_socket(self.connection)
+            self.close_connection = True
+        _thread.handler = self
+        answer = self.server._marshaled_dispatch(body)
+        self.connection.settimeout(REQUEST_TIMEOUT)
+        self.send_response(200)
+        self.send_header('Content-type', 'text/xml')
+        self.send_header('Content-length', str(len(answer)))
+        self.end_headers()
+        self.wfile.write(answer)
+        self.is_answered = True
 
 
 class _Reader(io.RawIOBase):
@@ -110,129 +107,21 @@ class _Reader(io.RawIOBase):
     def __init__(self, sock):
         super().__init__()
         self._socket = sock
-
-    def begin(self):
-        """The next request is expected."""
-        self.received, self._deadline = 0, time.monotonic() + REQUEST_TIMEOUT
+        self.deadline = 0.0  # by time.monotonic()
 
     def readable(self):
         return True
 
     def readinto(self, buffer):
-        left = self._deadline - time.monotonic()
-        if left <= 0:
-            raise socket.timeout('time is up')
-        self._socket.settimeout(left)
-        count = self._socket.recv_into(buffer)
-        self.received += count
-        return count
+        self._socket.settimeout(seconds_left(self.deadline))
+        return self._socket.recv_into(buffer)
 
 
-def _request_handler(base, acceptor, lifetime):
-    """The class that serves one client, derived from rosgraph's."""
-    large = threading.BoundedSemaphore(LARGE_REQUESTS)
-
-    class Handler(base):
-        """Reads a client's requests, within limits, and answers them."""
-
-        def setup(self):
-            self.connection, self.answered = self.request, False
-            # one segment per answer, and no waiting for its acknowledgement: 40 ms a call otherwise
-            self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self.rfile, self.wfile = io.BufferedReader(
-                _Reader(self.connection)
-            ), self.connection.makefile('wb')
-
-        def handle(self):
-            self.close_connection = False
-            try:
-                while not self.close_connection:
-                    acceptor.start_handshake(self.connection)
-                    self.rfile.raw.begin()
-                    self.waits_for_us = False
-                    self.handle_one_request()
-            except OSError as error:
-                self.log_error('%s', error)
-
-        def log_error(self, format, *args):
-            # else it went, having nothing more to ask
-            if self.rfile.raw.received or not self.answered:
-                acceptor.reject(self.connection, self.client_address, format % args)
-
-        def handle_expect_100(self):
-            """The client is told to go on when its request is accepted."""
-            self.waits_for_us = True
-            return True
-
-        def do_POST(self):
-            length, headers = self.headers.get('content-length', ''), self.headers
-            if not self.is_rpc_path_valid():
-                self.send_error(404)
-            elif not length.isdecimal() or 'transfer-encoding' in headers:
-                self.send_error(411)
-            elif len(length) > 10 or int(length) > REQUEST_LIMIT:
-                self.send_error(
-                    413, 'a request of %.20s bytes; the limit is %d' % (length, REQUEST_LIMIT)
-                )
-            elif 'content-encoding' in headers:  # what is small may become huge
-                self.send_error(415)
-            elif int(length) <= LARGE_REQUEST:
-                self._answer(int(length))
-            elif large.acquire(blocking=False):
-                try:
-                    self._answer(int(length))
-                finally:
-                    large.release()
-            else:
-                self.send_error(503, 'too many large requests at once')
-
-        def _answer(self, length):
-            if self.waits_for_us:
-                super().handle_expect_100()
-                self.wfile.flush()
-            body = self.rfile.read(length)
-            try:
-                if len(body) < length:
-                    raise ValueError('closed after %d of %d bytes' % (len(body), length))
-                _refuse_entities(body)
-                parameters, method = xmlrpc.client.loads(body)
-            except Exception as error:  # xmlrpc raises whatever it is that it trips over
-                self.send_error(
-                    400, 'no XML-RPC call: ' + brief(error).encode('ascii', 'replace').decode()
-                )
-                return
-            if not acceptor.finish_handshake(self.connection):
-                self.close_connection = True
-                return
-            if method == 'shutdown':
-                lifetime.untrack_socket(self.connection)
-                self.close_connection = True
-            _call.client, _call.here = self.client_address, self.connection.getsockname()
-            try:
-                answer = xmlrpc.client.dumps(
-                    (self.server._dispatch(method, parameters),), methodresponse=True
-                )
-            except Exception as error:
-                answer = xmlrpc.client.dumps(
-                    xmlrpc.client.Fault(1, f'{type(error).__name__}: {brief(error)}')
-                )
-            answer = answer.encode()
-            self.connection.settimeout(REQUEST_TIMEOUT)
-            self.send_response(200)
-            self.send_header('Content-type', 'text/xml')
-            self.send_header('Content-length', str(len(answer)))
-            self.end_headers()
-            self.wfile.write(answer)
-            self.answered = True
-
-    return Handler
-
-
-def _refuse_entities(body):
+def _refuse_document_type(body):
     """Raise an error where the body is no XML, or defines entities, by which a little of it becomes
     a lot."""
 
-    def refuse(*doctype):
+    def refuse(*_):
         raise ValueError('it has a document type')
 
     parser = xml.parsers.expat.ParserCreate()
@@ -240,24 +129,29 @@ def _refuse_entities(body):
     parser.Parse(body, True)
 
 
+def caller():
+    """The :class:`RequestHandler` of the client whose call this thread answers."""
+    return _thread.handler
+
+
 def ends_of_call():
     """The IP addresses, the client's and ours, of the call that this thread answers; None if it
     answers none."""
-    if not hasattr(_call, 'client'):
+    if not hasattr(_thread, 'handler'):
         return None
-    return [
-        address[0].partition('%')[0].removeprefix('::ffff:')
-        for address in (_call.client, _call.here)
-    ]
+    ends = caller().client_address, caller().connection.getsockname()
+    return [address.partition('%')[0].replace('::ffff:', '') for address, *_ in ends]
 
 
 def is_call_from_nearby(master_url):
     """Whether the call that this thread answers comes from this host, or that of the master."""
     ends = ends_of_call()
-    if ends is None or ends[0] == ends[1] or ipaddress.ip_address(ends[0]).is_loopback:
+    if ends is None or ends[0] == ends[1]:
         return True
+    client = ipaddress.ip_address(ends[0])
     try:
-        found = socket.getaddrinfo(urllib.parse.urlsplit(master_url).hostname, None)
+        return client.is_loopback or client in addresses_of(
+            urllib.parse.urlsplit(master_url).hostname
+        )
     except OSError:  # the name has no address, or none that can be found now
         return False
-    return ends[0] in {address[0] for *_, address in found}

@@ -20,6 +20,7 @@ test/test_patches.py compares the sources of the targets with the releases of ro
 (and says how to know another), and doc/patches.md is this table: ``tools/patches`` writes it.
 """
 from pharos.private_rospy.patches import (
+    logs,
     names,
     parameters,
     publishers,
@@ -28,6 +29,8 @@ from pharos.private_rospy.patches import (
     startup,
     subscribers,
     tcpros,
+    tcpros_server,
+    xmlrpc_server,
 )
 from pharos.private_rospy.patches.table import TABLE, apply, check_applied
 
@@ -35,6 +38,7 @@ __all__ = [
     'TABLE',
     'apply',
     'check_applied',
+    'logs',
     'names',
     'parameters',
     'publishers',
@@ -43,4 +47,6 @@ __all__ = [
     'startup',
     'subscribers',
     'tcpros',
+    'tcpros_server',
+    'xmlrpc_server',
 ]
