@@ -23,7 +23,7 @@ from rosgraph.network import encode_ros_handshake_header
 from conftest import TIMEOUT, Mailbox, speak_tcpros_only
 from fuzz import Fuzz
 from pharos import BlockNode
-from pharos.private_rospy import acceptor, registration, xmlrpc_server
+from pharos.private_rospy import acceptor, xmlrpc_server
 from pharos.private_rospy.patches import tcpros_server
 from programs import Program, until
 
@@ -747,4 +747,3 @@ def test_the_master_may_stop_a_node_whose_name_it_gave_away(master, far_client):
 def test_who_calls_from_nearby(monkeypatch, ends, master_url, nearby):
     monkeypatch.setattr(xmlrpc_server, 'ends_of_call', lambda: ends)
     assert xmlrpc_server.is_call_from_nearby(master_url) is nearby
-    assert registration.is_call_from_nearby is xmlrpc_server.is_call_from_nearby
