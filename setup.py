@@ -2,4 +2,17 @@
 from catkin_pkg.python_setup import generate_distutils_setup
 from setuptools import setup
 
-setup(**generate_distutils_setup(packages=['pharos', 'pharos.intraprocess', 'pharos.messages', 'pharos.private_rospy', 'pharos_turtle'], package_dir={'': 'src'}))
+setup(
+    **generate_distutils_setup(
+        packages=[
+            'pharos',
+            'pharos.intraprocess',
+            'pharos.messages',
+            'pharos.private_rospy',
+            'pharos.private_rospy.patches',
+            'pharos_turtle',
+        ],
+        package_dir={'': 'src'},
+        package_data={'pharos': ['py.typed']},
+    )
+)

@@ -14,13 +14,20 @@ KEYS = {
     'PIL': 'python3-pil',
     'hypothesis': 'python3-hypothesis',
     'numpy': 'python3-numpy',
+    'psutil': 'python3-psutil',
     'pytest': 'python3-pytest',
     'rospkg': 'python3-rospkg',
     'tkinter': 'python3-tk',
     'yaml': 'python3-yaml',
 }
 #: what is part of this package: its modules, those of its tests, and types that it defines itself
-OWN = {'pharos', 'nested', 'turtlesim', *(path.stem for path in (ROOT / 'test').glob('*.py'))}
+OWN = {
+    'pharos',
+    'pharos_turtle',
+    'nested',
+    'turtlesim',
+    *(path.stem for path in (ROOT / 'test').glob('*.py')),
+}
 
 
 def sources(*folders):
@@ -36,8 +43,14 @@ def sources(*folders):
 
 def imports(source):
     """The top-level modules that it imports, in its functions and in the programs that it has in
-    strings, too."""
-    for node in ast.walk(ast.parse(source)):
+    strings, too, but for what only a type checker imports."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and ast.dump(node.test) == ast.dump(
+            ast.Name('TYPE_CHECKING', ast.Load())
+        ):
+            node.body = []
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name.partition('.')[0] for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and not node.level:

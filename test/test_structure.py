@@ -146,3 +146,12 @@ def test_an_exported_class_has_a_docstring_for_each_of_its_methods_and_propertie
     assert [
         own for own, member in members if not own.startswith('_') and not inspect.getdoc(member)
     ] == []
+
+
+def test_setup_py_names_every_package(monkeypatch):
+    given = {}
+    monkeypatch.setattr('catkin_pkg.python_setup.generate_distutils_setup', lambda **named: named)
+    monkeypatch.setattr('setuptools.setup', given.update)
+    exec((ROOT.parent.parent / 'setup.py').read_text(), {})
+    packages = [dotted(path) for path in ROOT.parent.rglob('__init__.py')]
+    assert sorted(given['packages']) == sorted(packages)

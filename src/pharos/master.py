@@ -1,6 +1,16 @@
 """The proxy of a ROS master."""
 import subprocess
-from typing import Any, Callable, Dict, Iterable, List, Optional, Type, TypeVar, Union
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Callable,
+    Dict,
+    Iterable,
+    List,
+    Optional,
+    TypeVar,
+    Union,
+)
 
 import rosgraph
 from rosgraph.rosenv import ROS_MASTER_URI
@@ -21,6 +31,10 @@ from pharos.service import Service
 from pharos.topic import Topic
 from pharos.watcher import watcher_of
 
+if TYPE_CHECKING:
+    from typing_extensions import ParamSpec  # part of typing since Python 3.10
+
+    Init = ParamSpec('Init')
 NodeType = TypeVar('NodeType', bound=nodes_of_ours.Node)
 AnyNode = Union[nodes_of_ours.Node, ExternalNode]
 
@@ -89,7 +103,7 @@ class Master(MasterCalls):
 
     def create(
         self,
-        node_class: Type[NodeType],
+        node_class: 'Callable[Init, NodeType]',
         named: str,
         domain: Optional[str] = None,
         tcp_port: int = 0,
@@ -97,7 +111,8 @@ class Master(MasterCalls):
         soul: Optional[Callable[..., Any]] = None,
         delegate: Optional[Callable[..., Any]] = None,
         argv: Optional[List[str]] = None,
-        **kwargs: Any,
+        *args: 'Init.args',
+        **kwargs: 'Init.kwargs',
     ) -> NodeType:
         """Create, register and start a node; returns it.
 
@@ -121,7 +136,7 @@ class Master(MasterCalls):
             others keep ``named``, in the namespace of ``__ns``; all else holds for all.
             ``eye:image:=/camera/image``, ``eye:__name:=left`` and ``eye:_rate:=5`` are for the one
             whose ``named`` ends in 'eye'.
-        :param kwargs: for the node's ``__init__``
+        :param args, kwargs: for the node's ``__init__``
         :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: and nothing is left
             behind
         :raises ValueError: if a name, port or address cannot be one, also an address in
@@ -133,6 +148,7 @@ class Master(MasterCalls):
             named,
             soul,
             delegate,
+            args,
             kwargs,
             domain=domain,
             tcp_port=tcp_port,

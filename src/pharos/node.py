@@ -415,13 +415,13 @@ class BlockNode(Node):
     """
 
 
-def make(node_class, master, named, soul, delegate, init, **settings):
+def make(node_class, master, named, soul, delegate, args, kwargs, **settings):
     """A new node of ``node_class``, configured and not yet started."""
     if not (isinstance(node_class, type) and issubclass(node_class, Node)):
         raise TypeError(f'a node is made of a subclass of Node, or BlockNode; not {node_class!r}')
     node = node_class.__new__(node_class)
     node._configure(master, Settings(named, master.url, **settings), soul, delegate)
-    node.__init__(**init)
+    node.__init__(*args, **kwargs)
     return node
 
 
