@@ -22,7 +22,7 @@ import pytest  # noqa: E402
 import rosmaster.master  # noqa: E402
 
 import pharos  # noqa: E402
-from pharos import running  # noqa: E402
+from pharos import node_registry  # noqa: E402
 from pharos.private_rospy.local_link import PROTOCOL  # noqa: E402
 
 TIMEOUT = 20.0  # seconds; a bound on waits for events, never reached in a test that passes
@@ -58,7 +58,7 @@ class Mailbox:
 
 def speak_tcpros_only(node):
     """Have the node connect by sockets alone, as those of other processes do; returns it."""
-    handlers = node._rospy.lifetime.xmlrpc.handler.protocol_handlers
+    handlers = node.latest_run.rospy.lifetime.xmlrpc.handler.protocol_handlers
     handlers[:] = [handler for handler in handlers if not handler.supports(PROTOCOL)]
     return node
 
@@ -95,7 +95,7 @@ def master(ros_master, monkeypatch):
     registered."""
     monkeypatch.setenv('ROS_MASTER_URI', ros_master.url)
     yield pharos.Master(ros_master.url)
-    running.stop_all()
+    node_registry.stop_all()
 
 
 @pytest.fixture

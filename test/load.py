@@ -22,7 +22,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Int32
 from std_srvs.srv import SetBool
 
-from pharos import BlockNode, ServiceCallError, UnknownServiceError, running
+from pharos import BlockNode, ServiceCallError, UnknownServiceError, node_registry
 from programs import TIMEOUT, until
 
 NODES, TOPICS = 100, 1000
@@ -113,7 +113,7 @@ class Crowd:
         took = time.monotonic() - begin
         dropped = sum(channel.dropped for channel in self._inputs)
         until(lambda: sum(self._received) + dropped == sent, 'all %d messages' % sent)
-        assert not any(node.errors for node in running.nodes())
+        assert not any(node.errors for node in node_registry.nodes())
         return {
             'sent': sent,
             'delivered': sum(self._received),
@@ -128,7 +128,7 @@ def crowd(master, rounds, rate=None):
     try:
         counts = Crowd(master).send(rounds, rate)
     finally:
-        running.stop_all()
+        node_registry.stop_all()
     assert not before and not registered(master, '/crowd/')
     return counts
 

@@ -29,7 +29,7 @@ from std_msgs.msg import String
 import load
 from fuzz import Fuzz
 from load import create
-from pharos import Master, ServiceCallError, running
+from pharos import Master, ServiceCallError, node_registry
 from programs import Program, environment, until
 
 HERE = pathlib.Path(__file__).resolve().parent
@@ -246,7 +246,7 @@ def images(soak):
             assert resident() - before < MEMORY_LIMIT, 'images pile up: %d MB' % (
                 (resident() - before) / 1e6
             )
-        running.stop_all()
+        node_registry.stop_all()
 
     seconds = soak.left / 2
     load.camera(soak.master, IMAGES)
@@ -302,7 +302,7 @@ def run_stage(soak, stage, seconds):
         stage(soak)
     except Exception:
         failure = traceback.format_exc()
-    running.stop_all()
+    node_registry.stop_all()
     with contextlib.suppress(AssertionError):
         until(lambda: load.in_use() == before)
     after = load.in_use()
@@ -352,7 +352,7 @@ def soak_all(options, say):
     with Master.embedded() as master:
         soak = Soak(master, options.seed)
         create(master, '/soak/first').stop()  # what is loaded once per process
-        running.stop_all()
+        node_registry.stop_all()
         until(lambda: not any('watcher' in thread.name for thread in threading.enumerate()))
         before = resident() / 1e6, load.in_use()
         for stage, share in stages.items():

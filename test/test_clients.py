@@ -258,7 +258,7 @@ def test_a_client_for_whom_there_is_no_thread_is_closed(node, warnings, monkeypa
         raise RuntimeError("can't start new thread")
 
     with monkeypatch.context() as patch:
-        patch.setattr(node._rospy.lifetime.Thread, 'start', start)
+        patch.setattr(node.latest_run.rospy.lifetime.Thread, 'start', start)
         for port in node.tcp_port, node.xmlrpc_port:
             with connect(port) as client:
                 assert is_closed(client)
@@ -356,7 +356,7 @@ def test_a_node_whose_screen_is_closed_refuses_as_before(node, warnings):
     the connection."""
     (screen,) = [
         handler
-        for handler in node._rospy._logging.getLogger('rosout').handlers
+        for handler in node.latest_run.rospy._logging.getLogger('rosout').handlers
         if hasattr(handler, '_stderr')
     ]
     screen._stderr = io.StringIO()
@@ -458,14 +458,14 @@ def test_a_publisher_that_announces_4_gib_is_left_and_found_again(master, mailbo
         'cannot deserialize',
     ):
         assert sent.wait_for_subscribers(1, TIMEOUT)
-        (connection,) = other._rospy.publisher('/clients/in').connections
+        (connection,) = other.latest_run.rospy.publisher('/clients/in').connections
         connection.write_data(said)
         line = warnings.get()
         assert logged in line and line.startswith(
             f'connection with {other.uri} for /clients/in closed: '
         )
         until(
-            lambda: connection not in other._rospy.publisher('/clients/in').connections
+            lambda: connection not in other.latest_run.rospy.publisher('/clients/in').connections
             and sent.connections
         )
     sent.send(data='understood')

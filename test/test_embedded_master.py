@@ -65,7 +65,7 @@ def speaker_connections(node):
     """The node's connections on /rosout, where rospy itself publishes."""
     return [
         (connection.endpoint_id, None)
-        for connection in node._rospy.publisher('/rosout').connections
+        for connection in node.latest_run.rospy.publisher('/rosout').connections
     ]
 
 
@@ -229,7 +229,7 @@ def test_without_a_master_the_error_names_it(monkeypatch):
         MasterUnreachableError, match=r'start one with roscore or Master.embedded\(\)'
     ):
         Master().create(BlockNode, named='/n')
-    assert pharos.running.nodes() == []
+    assert pharos.node_registry.nodes() == []
     ended = run(refused_url(), sys.executable, '-c', 'from pharos import Master; Master().nodes()')
     assert 'Master.embedded()' in ended.stderr.splitlines()[-1]
 

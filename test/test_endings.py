@@ -15,9 +15,9 @@ from pharos import (
     Node,
     NodeNameInUseError,
     NodeStoppedError,
-    running,
+    node_registry,
 )
-from pharos import message_class, stopping
+from pharos import message_class
 from pharos.private_rospy import acceptor, lifetime, proxies
 from pharos.private_rospy.patches import xmlrpc_server
 from pharos.intraprocess import services
@@ -97,7 +97,7 @@ def test_of_threads_that_create_a_node_of_one_name_one_wins(master):
 def test_a_name_is_free_again_when_the_start_has_failed(master):
     with pytest.raises(Exception, match='no ROS master answers'):
         create(Master(refused_url()), '/unlucky')
-    assert running.nodes() == []
+    assert node_registry.nodes() == []
     assert create(master, '/unlucky').is_running
 
 
@@ -124,9 +124,9 @@ def test_an_overridden_stop_runs_once_and_others_wait_for_its_end(master):
     assert node.begun.wait(TIMEOUT)
     others = [
         in_thread(ask)[0]
-        for ask in (node.stop, running.stop_all, running.spin, lambda: node.__exit__())
+        for ask in (node.stop, node_registry.stop_all, node_registry.spin, lambda: node.__exit__())
     ]
-    until(lambda: len(stopping._waiting) == 2)
+    until(lambda: len(node_registry._waiting) == 3)
     assert all(thread.is_alive() for thread in (first, *others))
     node.may_end.set()
     assert all(map(ended, (first, *others)))
@@ -158,7 +158,7 @@ def test_a_stop_that_comes_from_the_node_itself_is_waited_for(master, how):
         ExternalNode(master, '/careful').shutdown()
     assert node.begun.wait(TIMEOUT)
     thread, _ = in_thread(node.stop)
-    until(lambda: stopping._waiting)
+    until(lambda: node_registry._waiting)
     assert thread.is_alive()
     node.may_end.set()
     assert ended(thread)
@@ -230,18 +230,18 @@ def test_nodes_that_stop_each_other_do_not_wait_for_ever(master):
     first, second = create(master, '/partner', Partner), create(master, '/partner_too', Partner)
     first.other, second.other = second, first
     begin = time.monotonic()
-    running.stop_all()
-    assert time.monotonic() - begin < stopping.LIMIT / 2
+    node_registry.stop_all()
+    assert time.monotonic() - begin < node_registry.STOP_LIMIT / 2
     assert first.lifecycle is second.lifecycle is Lifecycle.STOPPED
 
 
 def test_a_stop_that_does_not_end_is_given_up(master, monkeypatch):
-    monkeypatch.setattr(stopping, 'LIMIT', 0.2)
+    monkeypatch.setattr(node_registry, 'STOP_LIMIT', 0.2)
     node = create(master, '/careful', Careful)
     thread, _ = in_thread(node.stop)
     assert node.begun.wait(TIMEOUT)
-    running.spin()
-    running.stop_all()
+    node_registry.spin()
+    node_registry.stop_all()
     assert thread.is_alive()
     node.may_end.set()
     assert ended(thread)
@@ -278,14 +278,14 @@ def test_a_stop_during_the_start_ends_it(master, monkeypatch):
     monkeypatch.setattr(registration, 'claim_name', claim_name)
     starting, outcome = in_thread(create, master, '/premature')
     assert claiming.wait(TIMEOUT)
-    (node,) = running.nodes()
+    (node,) = node_registry.nodes()
     assert node.lifecycle is Lifecycle.STARTING
     stop, _ = in_thread(node.stop)
-    until(lambda: stopping._waiting)
+    until(lambda: node_registry._waiting)
     go_on.set()
     assert ended(starting) and ended(stop)
     assert isinstance(outcome[0], NodeStoppedError) and '/premature' in str(outcome[0])
-    assert node.lifecycle is Lifecycle.NEW and running.nodes() == []
+    assert node.lifecycle is Lifecycle.NEW and node_registry.nodes() == []
     assert '/premature' not in [each.name for each in master.nodes()]
     monkeypatch.undo()
     node.start()
@@ -299,12 +299,12 @@ def test_stops_at_any_time_of_the_start_leave_nothing(master):
     duration = time.perf_counter() - begin
     for turn in range(30):
         starting, outcome = in_thread(create, master, '/premature')
-        until(lambda: running.nodes() or outcome)
+        until(lambda: node_registry.nodes() or outcome)
         threading.Event().wait(duration * turn / 30)
-        running.stop_all()
+        node_registry.stop_all()
         assert ended(starting)
         assert isinstance(outcome[0], (NodeStoppedError, BlockNode))
-        assert running.nodes() == []
+        assert node_registry.nodes() == []
         assert '/premature' not in [each.name for each in master.nodes()]
 
 
@@ -336,10 +336,10 @@ def test_a_node_stopped_before_it_accepts_anybody_ends_its_threads(master, monke
 def test_a_stop_ends_a_start_at_a_master_that_says_nothing():
     with silent_peer() as url:
         starting, outcome = in_thread(create, Master(url), '/premature')
-        until(running.nodes)
-        running.stop_all()
+        until(node_registry.nodes)
+        node_registry.stop_all()
         assert ended(starting)
-        assert isinstance(outcome[0], NodeStoppedError) and running.nodes() == []
+        assert isinstance(outcome[0], NodeStoppedError) and node_registry.nodes() == []
 
 
 # -- what waits ends with the node

@@ -14,7 +14,7 @@ import pytest
 
 import pharos
 from conftest import TIMEOUT, Mailbox
-from pharos import BlockNode, Transcript, failures, running
+from pharos import BlockNode, Transcript, failures, node_registry
 from programs import Program, run, until
 
 
@@ -168,7 +168,7 @@ def test_a_block_for_changes_may_raise_anything(master, transcript):
 
 def test_a_node_whose_registration_fails_leaves_the_others_watched(master, transcript):
     node, watched = create(master), Mailbox()
-    node._rospy.repair = lambda *arguments: 1 / 0
+    node.latest_run.rospy.repair = lambda *arguments: 1 / 0
     end = master.on_change(lambda kind, name, is_there: watched((kind, name), None))
     create(master, '/another')
     while watched.get() != ('node', '/another'):
@@ -288,7 +288,7 @@ def test_a_stop_that_fails_in_a_thread_of_ours_is_a_failure_and_the_node_stops(
     if how == 'asked by ROS':
         node.ros.signal_shutdown('enough')
     else:
-        running.stop_all()
+        node_registry.stop_all()
     until(lambda: node.failures)
     assert (
         node.lifecycle.value == 'stopped'

@@ -41,7 +41,7 @@ print('still', me.lifecycle.value, other.health().registered, started.poll(),
 back.send(data='back')
 
 def tell_of_the_wait():
-    while not pharos.signals._waiting:
+    while not pharos.signals._waits:
         threading.Event().wait(0.001)
     print('waiting', flush=True)
 
@@ -63,7 +63,7 @@ CHILDREN = {
     'os._exit': 'os._exit(3)',
     'SIGTERM': 'os.kill(os.getpid(), signal.SIGTERM)',
     'SIGINT': 'os.kill(os.getpid(), signal.SIGINT)',
-    'stop()': 'me.stop(); pharos.running.stop_all()',
+    'stop()': 'me.stop(); pharos.node_registry.stop_all()',
     'with': '''
     with embedded, other, me, started:
         sys.exit()''',

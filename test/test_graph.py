@@ -55,7 +55,7 @@ def bare():
     """A master that has nothing on it."""
     ros_master = InProcessMaster()
     yield Master(ros_master.url)
-    pharos.running.stop_all()
+    pharos.node_registry.stop_all()
     ros_master.stop()
 
 

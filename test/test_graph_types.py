@@ -838,7 +838,9 @@ def test_who_asks_for_a_definition_is_no_subscriber(master):
     header = publisher_header(tuple(asked[2][1:]), topic, time.monotonic() + TIMEOUT)
     assert (header['type'], header['callerid']) == ('std_msgs/Int32', '/sender')
     assert 'int32 data' in header['message_definition']
-    assert channel.connections == [] and not channel.node._rospy.publisher(topic).connections
+    assert (
+        channel.connections == [] and not channel.node.latest_run.rospy.publisher(topic).connections
+    )
 
 
 def test_who_sends_takes_the_definition_given(master, mailbox):

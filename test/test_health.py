@@ -5,7 +5,7 @@ import time
 import pytest
 
 from conftest import TIMEOUT
-from pharos import BlockNode, Master, running, watcher
+from pharos import BlockNode, Master, node_registry, watcher
 from programs import until
 
 
@@ -79,7 +79,7 @@ def test_a_master_that_goes_and_comes_back(monkeypatch):
         threading.Event().wait(0.01)
     assert node.health().reachable_since > since
     assert 'registered, master reachable since ' in str(node.health())
-    running.stop_all()
+    node_registry.stop_all()
     back.stop()
 
 

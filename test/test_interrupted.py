@@ -10,7 +10,7 @@ import std_srvs.srv
 
 import pharos
 from conftest import TIMEOUT, Mailbox
-from pharos import BlockNode, Master, running, watcher
+from pharos import BlockNode, Master, node_registry, watcher
 from pharos.private_rospy import proxies
 from programs import until
 
@@ -54,7 +54,7 @@ def away(monkeypatch):
     master = Away(embedded.url)
     yield master
     master.go_on()
-    running.stop_all()
+    node_registry.stop_all()
     master.end()
 
 
@@ -79,7 +79,7 @@ def test_what_is_opened_while_the_master_is_away_raises_and_leaves_nothing_behin
         with pytest.raises(pharos.MasterUnreachableError, match=away.url) as raised:
             OPENERS[opener](node)
         assert isinstance(raised.value.__cause__, ConnectionRefusedError)
-    assert (node.channels, node._services) == ([], []) and not node.errors
+    assert node.channels == node.latest_run.opened == [] and not node.errors
     away.come_back()
     until(lambda: registrations(away, '/node') == before)
     assert '/interrupted/opened' not in away.parameters
@@ -205,10 +205,10 @@ def test_a_start_that_is_interrupted_while_it_opens_what_it_had_loses_nothing(
         if what == 'parameter':
             patch.setattr('pharos.private_rospy.parameters.WatchedParameters._subscribe', interrupt)
         elif what == 'serve':
-            patch.setattr('pharos.offered_service.OfferedService._open', interrupt)
+            patch.setattr('pharos.offered_service.OfferedService.open', interrupt)
         else:
             kind = 'InputChannel' if what == 'interested_in' else 'OutputChannel'
-            patch.setattr(f'pharos.channel.{kind}._open', interrupt)
+            patch.setattr(f'pharos.channel.{kind}.open', interrupt)
         for _ in range(2):
             with pytest.raises(type(error)):
                 stopped.start()
@@ -219,14 +219,14 @@ def test_a_start_that_is_interrupted_while_it_opens_what_it_had_loses_nothing(
 
 
 def test_a_start_during_which_the_master_goes_loses_nothing(away, stopped, mailbox, monkeypatch):
-    begin = pharos.InputChannel._open
+    begin = pharos.InputChannel.open
 
     def open_when_it_has_gone(self):
         away.end()
         begin(self)
 
     with monkeypatch.context() as patch:
-        patch.setattr(pharos.InputChannel, '_open', open_when_it_has_gone)
+        patch.setattr(pharos.InputChannel, 'open', open_when_it_has_gone)
         with pytest.raises(pharos.MasterUnreachableError):
             stopped.start()
     away.come_back()
@@ -237,7 +237,7 @@ def test_a_start_during_which_the_master_goes_loses_nothing(away, stopped, mailb
 def test_a_start_that_is_stopped_while_it_opens_what_it_had_loses_nothing(
     away, stopped, mailbox, monkeypatch
 ):
-    begin = pharos.OutputChannel._open
+    begin = pharos.OutputChannel.open
 
     def open_when_it_was_stopped(self, *args):
         stopper = threading.Thread(target=self.node.stop)
@@ -246,7 +246,7 @@ def test_a_start_that_is_stopped_while_it_opens_what_it_had_loses_nothing(
         begin(self, *args)
 
     with monkeypatch.context() as patch:
-        patch.setattr(pharos.OutputChannel, '_open', open_when_it_was_stopped)
+        patch.setattr(pharos.OutputChannel, 'open', open_when_it_was_stopped)
         with pytest.raises(pharos.NodeStoppedError, match='stopped while it started'):
             stopped.start()
     stopped.start()
@@ -254,7 +254,7 @@ def test_a_start_that_is_stopped_while_it_opens_what_it_had_loses_nothing(
 
 
 def test_a_channel_closed_while_its_node_is_stopped_does_not_come_back(away, stopped):
-    for channel in list(stopped._channels):
+    for channel in list(stopped.latest_run.opened):
         channel.close()
     stopped.start()
     assert stopped.channels == [] and '/interrupted/in' not in registrations(away, '/node')[1]

@@ -13,7 +13,7 @@ import pharos
 from conftest import TIMEOUT, InProcessMaster, Mailbox, speak_tcpros_only
 from pharos import BlockNode, Master
 from pharos.intraprocess import dispatcher, inbox as inboxes
-from pharos.life import Lifecycle
+from pharos.run import Lifecycle
 
 TWIST, IMAGE, STRING = 'geometry_msgs/Twist', 'sensor_msgs/Image', 'std_msgs/String'
 
@@ -118,7 +118,7 @@ def test_nodes_of_different_masters_do_not_mix(master, mailbox):
         sent.send(data='not for you')
         assert sent.connections == [] and mailbox.empty()
     finally:
-        pharos.running.stop_all()
+        pharos.node_registry.stop_all()
         other.stop()
 
 
@@ -153,7 +153,7 @@ def test_a_receivers_message_is_its_own(master):
 def test_two_channels_of_one_node_get_a_message_each(master):
     sent, _, first = pair(master, '/t', TWIST)
     second = Mailbox()
-    pharos.running.nodes()[0].interested_in('/t', delegate=second)
+    pharos.node_registry.nodes()[0].interested_in('/t', delegate=second)
     sent.send(linear={'x': 1})
     one, two = first.get(), second.get()
     assert one == two and one is not two and one.linear is not two.linear
@@ -224,7 +224,7 @@ def test_a_latched_message_reaches_those_who_come_late_as_it_was(master):
     remote = by_tcpros(master, '/remote', '/t', 'std_msgs/Header')
     assert late.get().frame_id == remote.get().frame_id == 'as it was'
     second = Mailbox()
-    pharos.running.nodes()[1].interested_in('/t', delegate=second)
+    pharos.node_registry.nodes()[1].interested_in('/t', delegate=second)
     assert second.get().frame_id == 'as it was' and late.empty()
 
 

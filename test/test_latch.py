@@ -155,7 +155,7 @@ def test_a_latched_value_survives_a_restart_of_the_master():
         with Program(master.url, 'rostopic', 'echo', '-n1', '/latch/master') as echo:
             echo.wait_for('data: "kept"')
     finally:
-        pharos.running.stop_all()
+        pharos.node_registry.stop_all()
         first.stop()
 
 

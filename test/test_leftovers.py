@@ -31,7 +31,7 @@ def count():
     """What a node may leave behind; threads are the kernel's, not only those that Python knows."""
     gc.collect()
     for thread in threading.enumerate():
-        if thread.name.startswith('watcher') and not pharos.running.nodes():
+        if thread.name.startswith('watcher') and not pharos.node_registry.nodes():
             thread.join(20)    # it watches the master while there are nodes, and ends once it sees that there are none
     deadline = time.monotonic() + 20
     while len(os.listdir('/proc/self/task')) > threading.active_count() and time.monotonic() < deadline:
@@ -184,13 +184,13 @@ def test_what_a_stopped_node_held_is_freed(master):
     node.interested_in('/a', 'std_msgs/String')
     node.send_to('/a', data='to itself', typed_as='std_msgs/String')
     node.serve('/b', 'std_srvs/Empty', lambda request: None)
-    held = [weakref.ref(thing) for thing in (node._rospy, node.ros, node.ros.Publisher)]
+    held = [weakref.ref(thing) for thing in (node.latest_run.rospy, node.ros, node.ros.Publisher)]
     node.stop()
     node.start()  # under the same name, another rospy
     gc.collect()
     assert [ref() for ref in held] == [None] * 3
     node.stop()
-    last = weakref.ref(node), weakref.ref(node._rospy)
+    last = weakref.ref(node), weakref.ref(node.latest_run.rospy)
     del node
     gc.collect()
     assert [ref() for ref in last] == [None] * 2
@@ -229,7 +229,7 @@ def test_a_library_of_a_stopped_node_is_freed(master, library):
     held = []
     for name in '/mortal', '/survivor':
         node = master.create(BlockNode, named=name, domain='127.0.0.1')
-        held += weakref.ref(node.ros_import(library)), weakref.ref(node._rospy)
+        held += weakref.ref(node.ros_import(library)), weakref.ref(node.latest_run.rospy)
         node.stop()
         del node
     gc.collect()

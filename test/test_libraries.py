@@ -11,7 +11,7 @@ import std_srvs.srv
 
 import pharos
 from conftest import TIMEOUT, Mailbox
-from pharos import BlockNode
+from pharos import BlockNode, node_registry
 from pharos.private_rospy.process_rospy import rospy
 from programs import until
 
@@ -283,8 +283,8 @@ def test_what_is_private_to_a_node_stays_so(pair):
 def test_signal_shutdown_stops_that_node(pair):
     asking, serving = pair
     asking.ros.signal_shutdown('enough')
-    with asking._changing:
-        assert asking._changing.wait_for(lambda: asking.lifecycle.value == 'stopped', TIMEOUT)
+    with node_registry.changed:
+        assert node_registry.changed.wait_for(lambda: asking.lifecycle.value == 'stopped', TIMEOUT)
     assert serving.is_running and not serving.ros.is_shutdown()
 
 

@@ -25,7 +25,7 @@ def masters():
     """Two masters, as of two robots."""
     both = InProcessMaster(), InProcessMaster()
     yield [Master(ros_master.url) for ros_master in both]
-    pharos.running.stop_all()
+    pharos.node_registry.stop_all()
     for ros_master in both:
         ros_master.stop()
 

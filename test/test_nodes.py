@@ -9,8 +9,8 @@ import rosnode
 
 import pharos
 from conftest import TIMEOUT, Mailbox
-from pharos import BlockNode, Node
-from pharos.life import Lifecycle
+from pharos import BlockNode, Node, node_registry
+from pharos.run import Lifecycle
 from programs import until
 
 
@@ -176,8 +176,10 @@ def test_rosnode_kill_stops_that_node_and_no_other(master):
     victim.fork(lambda me: [None for _ in me.every(0.01)] and stopped.set())
     run('rosnode', 'kill', '/victim')
     assert stopped.wait(TIMEOUT)
-    with victim._changing:
-        assert victim._changing.wait_for(lambda: victim.lifecycle is Lifecycle.STOPPED, TIMEOUT)
+    with node_registry.changed:
+        assert node_registry.changed.wait_for(
+            lambda: victim.lifecycle is Lifecycle.STOPPED, TIMEOUT
+        )
     assert (
         other.is_running and '/victim' not in registered(master) and '/other' in registered(master)
     )

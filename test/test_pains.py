@@ -464,7 +464,7 @@ def test_small_messages_are_sent_without_delay_whatever_the_subscriber_asks_for(
     with subscribe(node.tcp_port, channel.topic) as client:
         receive(client)
         until(lambda: channel.connections)
-        (connection,) = node._rospy.publisher(channel.topic).connections
+        (connection,) = node.latest_run.rospy.publisher(channel.topic).connections
         assert is_without_delay(connection.socket)
 
 

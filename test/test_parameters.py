@@ -9,7 +9,7 @@ import pytest
 import rosgraph
 
 from conftest import TIMEOUT, InProcessMaster, Mailbox
-from pharos import BlockNode, Master, MasterUnreachableError, NodeStoppedError, running
+from pharos import BlockNode, Master, MasterUnreachableError, NodeStoppedError, node_registry
 from pharos.private_rospy.instance import PrivateRospy
 from programs import run
 from test_survival import mortal_master, until  # noqa: F401 (a fixture)
@@ -24,7 +24,7 @@ def create(master, name='/robot1/driver', **kwargs):
 @pytest.fixture(autouse=True)
 def no_parameters_left(ros_master):
     yield
-    running.stop_all()
+    node_registry.stop_all()
     forget_all(ros_master.url)
 
 
@@ -511,4 +511,4 @@ def test_a_master_that_is_away_is_named(monkeypatch):
     ):
         with pytest.raises(MasterUnreachableError, match=ros_master.url):
             use()
-    running.stop_all()
+    node_registry.stop_all()

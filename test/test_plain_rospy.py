@@ -22,7 +22,7 @@ NUMBERS = std_msgs.msg.Float64MultiArray
 def create(master, name, **kwargs):
     """A node whose plain subscriptions connect in process even where no channel is beside them."""
     node = master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
-    node._rospy.connections.takes_plain_callbacks = True
+    node.latest_run.rospy.connections.takes_plain_callbacks = True
     return node
 
 

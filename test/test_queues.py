@@ -99,7 +99,7 @@ def test_what_comes_through_tcpros_is_bounded_by_bytes_too(master):
     received = create(master, '/receiver', Small, delegate=gate).interested_in('/remote', NUMBERS)
     message = received.message_class
     received.offer(message())
-    received.node._dispatcher.schedule(received._tcpros)
+    received.node.latest_run.dispatcher.schedule(received._tcpros)
     assert gate.entered.wait(TIMEOUT)
     for _ in range(10):
         received.offer(message(data=(1.0,) * (MEGABYTE // 8)))

@@ -119,8 +119,11 @@ def screen(capfd):
 
 def attempts(node):
     """A list that grows with each connection of the node that is refused."""
-    made, refused = [], node._rospy.refusals.publisher_refused
-    node._rospy.refusals.publisher_refused = lambda *args: (refused(*args), made.append(args))
+    made, refused = [], node.latest_run.rospy.refusals.publisher_refused
+    node.latest_run.rospy.refusals.publisher_refused = lambda *args: (
+        refused(*args),
+        made.append(args),
+    )
     return made
 
 
@@ -313,7 +316,7 @@ def test_a_channel_that_is_opened_while_its_node_connects_hears_the_publisher(
 ):
     """The subscription is connected already, but the link was made without the channel."""
     node, sender, mailbox = create(master, '/near'), create(master, '/far'), Mailbox()
-    node._rospy.connections.takes_plain_callbacks = True
+    node.latest_run.rospy.connections.takes_plain_callbacks = True
     match, opened = Link.match_receivers, []
 
     def match_and_open(self):
@@ -323,7 +326,7 @@ def test_a_channel_that_is_opened_while_its_node_connects_hears_the_publisher(
                 threading.Thread(target=lambda: node.interested_in(topic, STRING, delegate=mailbox))
             )
             opened[0].start()
-            until(lambda: len(node._rospy.subscriber(topic).callbacks) == 2)
+            until(lambda: len(node.latest_run.rospy.subscriber(topic).callbacks) == 2)
         return new
 
     monkeypatch.setattr(Link, 'match_receivers', match_and_open)
@@ -386,7 +389,9 @@ def test_a_crowd_of_refusals_is_remembered_within_bounds(master, topic, monkeypa
     monkeypatch.setattr(refusals, 'REMEMBERED', 3)
     node = create(master, '/near')
     node.output_channel(topic, INT32)
-    publisher = node._rospy.publisher(topic)
+    publisher = node.latest_run.rospy.publisher(topic)
     for number in range(10):
-        node._rospy.refusals.subscriber_refused(publisher, '/far_%d' % number, 'words', 'line')
-    assert node._rospy.refusals.subscribers(topic) == ['/far_7', '/far_8', '/far_9']
+        node.latest_run.rospy.refusals.subscriber_refused(
+            publisher, '/far_%d' % number, 'words', 'line'
+        )
+    assert node.latest_run.rospy.refusals.subscribers(topic) == ['/far_7', '/far_8', '/far_9']

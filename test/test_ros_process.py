@@ -146,8 +146,8 @@ def test_lines_go_to_a_nodes_log(master, package):
         '/rosout', 'rosgraph_msgs/Log'
     )
     node = master.create(BlockNode, named='/starter')
-    while not node._rospy.publisher('/rosout').get_num_connections():
-        node._rospy.ended.wait(0.01)
+    while not node.latest_run.rospy.publisher('/rosout').get_num_connections():
+        node.latest_run.rospy.ended.wait(0.01)
     with master.run(
         'fake_robot', program(package, 'grumble', 'echo first; echo second >&2'), on_line=node.log
     ):

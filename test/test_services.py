@@ -250,7 +250,9 @@ def test_a_service_is_the_newest_nodes_that_offers_it_and_the_olders_again_when_
     def look_again():
         for node in newer, older:
             if node.is_running:
-                node._rospy.repair(master.system_state(), False)  # as the watcher does every second
+                node.latest_run.rospy.repair(
+                    master.system_state(), False
+                )  # as the watcher does every second
         return call_here(master, '/taken').message
 
     older, newer = create(master, '/older'), create(master, '/newer')

@@ -32,7 +32,7 @@ def wait_for(event):
 def ready_in_wait():
     """Tell when the main thread waits in something of ours; before that, it runs code of its own."""
     def tell():
-        while not pharos.signals._waiting:
+        while not pharos.signals._waits:
             threading.Event().wait(0.001)
         ready()
     threading.Thread(target=tell, daemon=True).start()
@@ -314,7 +314,7 @@ CAREFUL_ENDS = {
     **WAITS,
     'plain code': 'ready(); wait_for(threading.Event())',
     'its own with block': 'with me: ready(); wait_for(threading.Event())',
-    'a stop by itself': 'threading.Thread(target=lambda: (me._rospy.ended.wait(), ready())).start(); me.stop()',
+    'a stop by itself': 'threading.Thread(target=lambda: (me.latest_run.rospy.ended.wait(), ready())).start(); me.stop()',
     'a stop of a soul': 'me.fork(lambda me: (ready(), me.stop())); pharos.spin()',
 }
 
@@ -329,7 +329,9 @@ def test_an_overridden_stop_runs_once_to_its_end(program, with_signal, end):
 
 
 def test_an_overridden_stop_runs_to_its_end_when_the_program_ends(program):
-    running = program(CAREFUL + 'me.fork(lambda me: me.stop()); me._rospy.ended.wait(); ready()')
+    running = program(
+        CAREFUL + 'me.fork(lambda me: me.stop()); me.latest_run.rospy.ended.wait(); ready()'
+    )
     assert running.process.wait(60) == 0
     printed = running.read_to_the_end().split('\n')  # by lines: a traceback may show the code, too
     assert (printed.count('begun'), printed.count('ended')) == (1, 1)
@@ -360,7 +362,7 @@ def test_a_second_ctrl_c_while_the_nodes_stop_does_no_harm(program):
 me = node(soul=lambda me: threading.Event().wait(60))
 me.stop_timeout = 0.5
 me.fork()
-threading.Thread(target=lambda: (me._rospy.ended.wait(), print('stopping', flush=True)), daemon=True).start()
+threading.Thread(target=lambda: (me.latest_run.rospy.ended.wait(), print('stopping', flush=True)), daemon=True).start()
 ready_in_wait()
 pharos.spin()
 """
@@ -378,7 +380,7 @@ def test_signals_while_the_program_ends_cut_nothing_off(program, with_signal, bu
     running = program(
         f"""
 def goes_on():
-    while not pharos.signals._held:    # the main thread may be on its way to the end still
+    while not pharos.signals._holds:    # the main thread may be on its way to the end still
         threading.Event().wait(0.001)
     print('stopping', flush=True)
     wait_for(go_on)
@@ -386,9 +388,9 @@ def goes_on():
 go_on = threading.Event()
 me = node()
 me.ros.on_shutdown(goes_on)
-pharos.running.at_end(lambda: print('other ended', flush=True))
+pharos.node_registry.at_end(lambda: print('other ended', flush=True))
 def go():
-    while not (pharos.signals._held and pharos.signals._held[-1].came):
+    while not (pharos.signals._holds and pharos.signals._holds[-1].came):
         threading.Event().wait(0.001)
     print('kept', flush=True)
     go_on.set()
@@ -412,8 +414,8 @@ ready()
 def test_what_else_is_to_end_with_the_program_does_though_one_cannot(program):
     running = program(
         """
-pharos.running.at_end(lambda: print('other ended', flush=True))
-pharos.running.at_end(lambda: 1 / 0)
+pharos.node_registry.at_end(lambda: print('other ended', flush=True))
+pharos.node_registry.at_end(lambda: 1 / 0)
 ready()
 """
     )

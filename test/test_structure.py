@@ -15,7 +15,7 @@ SCRIPTS = sorted(path for path in (ROOT.parent.parent / 'scripts').iterdir() if 
 ROSPYS_INSIDE = re.compile(
     r'rospy\.impl|rospy\.(core|topics|names)\._|_topic_manager|protocol_handlers'
 )
-LINE_LIMIT = 440
+LINE_LIMIT = 460
 ROOMS_BELOW = 'pharos.private_rospy', 'pharos.intraprocess', 'pharos.messages'
 
 EXPORTS = """

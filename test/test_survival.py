@@ -9,7 +9,7 @@ import pytest
 
 import pharos
 from conftest import TIMEOUT, Mailbox
-from pharos import BlockNode, Master, running, watcher
+from pharos import BlockNode, Master, node_registry, watcher
 from programs import until
 
 
@@ -45,7 +45,7 @@ def mortal_master(monkeypatch):
 
     master = MortalMaster()
     yield master
-    running.stop_all()
+    node_registry.stop_all()
     master.end()
 
 
@@ -175,7 +175,7 @@ def test_a_node_stops_while_it_publishes_receives_and_calls(master):
 def test_a_publisher_that_once_answers_nonsense_is_asked_again(master):
     node = create(master, '/node')
     node.interested_in('/survival/nonsense', 'std_msgs/String', delegate=Mailbox())
-    handler = node._rospy.lifetime.xmlrpc.handler
+    handler = node.latest_run.rospy.lifetime.xmlrpc.handler
     asked, proceed = threading.Semaphore(0), threading.Event()
 
     def request_topic(caller_id, topic, protocols):

@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from conftest import TIMEOUT
-from pharos import BlockNode, ExternalNode, Lifecycle, watcher
+from pharos import BlockNode, ExternalNode, Lifecycle, node_registry, watcher
 from pharos.private_rospy import registration
 from programs import Program, forget_parameters, until
 
@@ -24,8 +24,8 @@ def create(master, **settings):
 
 
 def wait_for_stop(node):
-    with node._changing:
-        assert node._changing.wait_for(lambda: node.lifecycle is Lifecycle.STOPPED, TIMEOUT)
+    with node_registry.changed:
+        assert node_registry.changed.wait_for(lambda: node.lifecycle is Lifecycle.STOPPED, TIMEOUT)
 
 
 def check_it_stays(master, topic):

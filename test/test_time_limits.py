@@ -86,7 +86,7 @@ def bad(master):
     bad.node = bad.master.create(BlockNode, named='/limited', domain='127.0.0.1')
     yield bad
     bad.mood, bad.hangs_after = 'good', None
-    pharos.running.stop_all()
+    pharos.node_registry.stop_all()
     bad.leave()
 
 

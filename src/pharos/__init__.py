@@ -16,7 +16,7 @@ from pharos.errors import (
 )
 from pharos.external_node import ExternalNode
 from pharos.failures import Failure
-from pharos.life import Lifecycle
+from pharos.run import Lifecycle
 from pharos.master import Master
 from pharos.messages import (
     define_message,
@@ -27,7 +27,7 @@ from pharos.messages import (
 from pharos.node import BlockNode, Node
 from pharos.parameter import Parameter
 from pharos.ros_process import RosProcess
-from pharos.running import spin
+from pharos.node_registry import spin
 from pharos.service import Service
 from pharos.topic import Topic
 from pharos.transcript import Transcript

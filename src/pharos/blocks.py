@@ -1,11 +1,7 @@
-"""Blocks: the callables that a node is made of, and the souls among them that run in threads of
-their own."""
+"""Blocks: the callables that a node is made of."""
 import functools
 import inspect
-import threading
 
-from pharos import running
-from pharos.errors import NodeStoppedError
 from pharos.signals import code_of, is_from_signal
 
 _ASYNC = inspect.CO_COROUTINE | inspect.CO_ITERABLE_COROUTINE | inspect.CO_ASYNC_GENERATOR
@@ -91,62 +87,3 @@ def name_of(block):
     """How logs name a block."""
     name = attempt(lambda: getattr(block, '__qualname__', None) or repr(block))
     return text_of(name or f'a {type(block).__name__}')
-
-
-class Souls:
-    """The souls of one node that run: in threads of their own, or in a thread of the user's."""
-
-    def __init__(self, node):
-        self._node = node
-        self._threads = set()
-        self._here = threading.local()  # .depth: how many souls of the node run in this thread
-
-    def run(self, block, present):
-        """Run a soul in this thread; an exception in it is reported and ends nothing else.
-
-        :param present: ``present()`` is the soul as it is then, to be run in its place again
-        """
-        self._here.depth = self._depth() + 1
-        try:
-            with self._node._live_rospy().interrupts_waits():
-                return block(self._node)
-        except BaseException as error:
-            self._node._report(
-                error, block, 'soul', again=lambda nothing: self.run(present(), present)
-            )
-            return None
-        finally:
-            self._here.depth -= 1
-
-    def fork(self, block, present, name, start_thread):
-        """Run a soul in a thread of its own, and return the thread."""
-        known = threading.Event()
-
-        def run():
-            known.wait()
-            try:
-                self.run(block, present)
-            finally:
-                self._threads.discard(threading.current_thread())
-
-        thread = start_thread(run, name=name)
-        self._threads.add(thread)
-        known.set()
-        return thread
-
-    def end(self, timeout):
-        """Wait for all but this thread's, up to ``timeout`` seconds; returns the threads that went
-        on."""
-        threads = [
-            thread for thread in tuple(self._threads) if thread is not threading.current_thread()
-        ]
-        running.join(threads, timeout)
-        return [thread for thread in threads if thread.is_alive()]
-
-    def end_here(self):
-        """End the soul that runs in this thread, if one does."""
-        if self._depth():
-            raise NodeStoppedError(f'{self._node.name} stops, and this soul with it')
-
-    def _depth(self):
-        return getattr(self._here, 'depth', 0)

@@ -42,10 +42,14 @@ class _Channel:
     def _begin(self, *arguments):
         """Open it for the first time; where that fails, nothing is left behind."""
         try:
-            self._open(*arguments)
+            self.open(*arguments)
         except BaseException:
             self.close()
             raise
+
+    @property
+    def _rospy(self):
+        return self.node.latest_run.rospy
 
     @property
     def type(self):
@@ -55,7 +59,7 @@ class _Channel:
     @property
     def connections(self):
         """``[(peer node name, transport)]``, transport being 'INTRAPROCESS' or 'TCPROS'."""
-        return self.node._rospy.connections.of(self._endpoint) if self.is_open else []
+        return self._rospy.connections.of(self._endpoint) if self.is_open else []
 
     @property
     def is_open(self):
@@ -69,7 +73,7 @@ class _Channel:
         if one does, and one that does not end within the node's :attr:`stop_timeout`.
         """
         self.closed = True  # where it is only just being opened, it is closed right after that
-        self.node._forget_channel(self)
+        self.node.latest_run.forget(self)
         self._release()
 
     def _release(self):
@@ -82,11 +86,11 @@ class _Channel:
     def _opened(self, endpoint):
         """The channel is open, unless a delegate or another thread has closed it meanwhile."""
         self._endpoint = endpoint
-        self.node._remember_channel(self)
+        self.node.latest_run.remember(self)
         if self.closed:
             self.close()
 
-    def _stopped(self):
+    def node_stopped(self):
         """The node stops, and its rospy closes all endpoints."""
         self._endpoint = None
 
@@ -124,21 +128,22 @@ class InputChannel(_Channel):
         self.delegate = delegate
         self.inline = inline
         self.shared = shared
-        self.from_ = None if from_ is None else str(node._name_of(from_))
+        self.from_ = None if from_ is None else str(node.latest_run.resolve_peer(from_))
         self.received = 0
         self._size = copier.copier_for(message_class).size
         self.dropped = 0  # how many messages, the oldest first, while the node was slower
         self._dropping = threading.Lock()  # held to change that
         self._begin()
 
-    def _open(self):
-        dispatcher = self.node._dispatcher
+    def open(self):
+        """Register with rospy, also after a restart of the node."""
+        dispatcher = self.node.latest_run.dispatcher
         if not self.inline:
             dispatcher.need_thread()
         self._tcpros = Inbox(self, dispatcher) if self.inline else SocketInbox(self, dispatcher)
         # rospy's queue_size would drop without counting; the inbox has ours
         self._opened(
-            self.node._rospy.connections.subscribe(
+            self._rospy.connections.subscribe(
                 self,
                 self.offer,
                 self.node.connect_timeout,
@@ -149,13 +154,13 @@ class InputChannel(_Channel):
         dispatcher.run()  # what came latched
 
     def _unregister(self, endpoint):
-        self.node._rospy.connections.unsubscribe(self, endpoint)
-        self.node._dispatcher.wait_for_delegate(self.node.stop_timeout)
+        self._rospy.connections.unsubscribe(self, endpoint)
+        self.node.latest_run.dispatcher.wait_for_delegate(self.node.stop_timeout)
 
     def _subscribe_as(self, message_class):
         """Take another class than it was opened with, of which nothing has come."""
         self._release()
-        self.node._forget_channel(self)
+        self.node.latest_run.forget(self)
         self.message_class, self._size = message_class, copier.copier_for(message_class).size
         self._begin()
 
@@ -163,7 +168,7 @@ class InputChannel(_Channel):
     def refused(self):
         """How many publishers the channel cannot hear, for they publish another type; see the
         node's errors."""
-        return self.node._rospy.refusals.count(self.topic) if self.is_open else 0
+        return self._rospy.refusals.count(self.topic) if self.is_open else 0
 
     @property
     def delegate(self):
@@ -175,10 +180,9 @@ class InputChannel(_Channel):
     def delegate(self, block):
         self._delegate = check_delegate(block)
 
-    def _run_again(self, message):
+    def run_again(self, message):
         """Run the delegate, as it is now, on a message, when no other of the node runs."""
-        self.node._live_rospy()
-        self.node._dispatcher.run_in_turn(lambda: self._run(message))
+        self.node.current_run.dispatcher.run_in_turn(lambda: self._run(message))
 
     def _run(self, message):
         if self._present_delegate is None:
@@ -190,7 +194,7 @@ class InputChannel(_Channel):
         try:
             block(message, self)
         except BaseException as error:
-            self.node._report(error, block, 'delegate', self, message)
+            self.node.latest_run.report(error, block, 'delegate', self, message)
 
     @property
     def _present_delegate(self):
@@ -200,7 +204,7 @@ class InputChannel(_Channel):
 
     def open_inbox(self, thaw, header):
         """An inbox for what a node of this process sends."""
-        return Inbox(self, self.node._dispatcher, thaw, header)
+        return Inbox(self, self.node.latest_run.dispatcher, thaw, header)
 
     def deliver(self, message, header):
         """Run the delegate."""
@@ -209,7 +213,7 @@ class InputChannel(_Channel):
         self.received += 1
         block = self._delegate
         if block is None:
-            block = self.node._delegate
+            block = self.node.delegate
             if block is None:
                 return
         if header is not None:
@@ -217,11 +221,11 @@ class InputChannel(_Channel):
         try:
             block(message, self)
         except BaseException as error:
-            self.node._report(error, block, 'delegate', self, message)
+            self.node.latest_run.report(error, block, 'delegate', self, message)
 
     def report(self, error):
         """A message could not be made for the delegate."""
-        self.node._report(error, self._present_delegate, 'delegate', self)
+        self.node.latest_run.report(error, self._present_delegate, 'delegate', self)
 
     def count_dropped(self):
         """A message was dropped."""
@@ -249,7 +253,7 @@ class InputChannel(_Channel):
         header, endpoint = message._connection_header, self._endpoint
         if not suits(self.message_class, header['md5sum']):
             if endpoint is not None:
-                self.node._rospy.refusals.message_refused(endpoint.impl, self.message_class, header)
+                self._rospy.refusals.message_refused(endpoint.impl, self.message_class, header)
             return None
         own = self.message_class().deserialize(copier.serialized(message))
         own._connection_header = message._connection_header
@@ -273,12 +277,13 @@ class OutputChannel(_Channel):
         self._fanout = _ClosedFanout
         self._begin(connect_timeout)
 
-    def _open(self, connect_timeout=None):
+    def open(self, connect_timeout=None):
+        """Register with rospy, and wait for the subscribers that the master knows."""
         timeout = self.node.connect_timeout if connect_timeout is None else connect_timeout
         deadline = time.monotonic() + timeout
         self._opener, self._connected = threading.current_thread(), threading.Event()
         try:
-            endpoint, self._fanout = self.node._rospy.connections.advertise(
+            endpoint, self._fanout = self._rospy.connections.advertise(
                 self.topic,
                 self.message_class,
                 self._latch,
@@ -312,7 +317,7 @@ class OutputChannel(_Channel):
         if message.__class__ is not self.message_class:
             self._check_type(message)
         if to is not None:
-            to = str(self.node._name_of(to))
+            to = str(self.node.latest_run.resolve_peer(to))
             self._check_is_there(to)
         try:
             is_sent = self._fanout.publish(message, self._latch, to)
@@ -325,7 +330,7 @@ class OutputChannel(_Channel):
         """Raise UnknownNodeError if a message for that node alone has nowhere to go, since there is
         no such node."""
         endpoint = self._endpoint
-        if endpoint is None or self.node._rospy.connections.reaches(endpoint, name):
+        if endpoint is None or self._rospy.connections.reaches(endpoint, name):
             return
         with time_limit(self.node.connect_timeout):
             self.node.master.uri_of(name)
@@ -350,7 +355,7 @@ class OutputChannel(_Channel):
 
     def _explain(self, error, message):
         """Raise our error for one that publishing raised."""
-        if not self.is_open or self.node._rospy.connections.is_closed(self._endpoint):
+        if not self.is_open or self._rospy.connections.is_closed(self._endpoint):
             raise NodeStoppedError(
                 f'the channel of {self.node.name} on {self.topic} is closed: open another with'
                 ' output_channel()'
@@ -360,7 +365,7 @@ class OutputChannel(_Channel):
 
     def _unregister(self, endpoint):
         self._fanout = _ClosedFanout
-        self.node._rospy.connections.unadvertise(endpoint, self._latch)
+        self._rospy.connections.unadvertise(endpoint, self._latch)
 
     def send(self, block=None, *, to=None, **fields):
         """Fill a fresh message with ``block(message)`` and by keywords, publish it, and return
@@ -390,14 +395,14 @@ class OutputChannel(_Channel):
         """
         timeout = check_limit('timeout', timeout)
         if self.is_open:
-            self.node._rospy.wait_until(
+            self._rospy.wait_until(
                 lambda: len(self.connections) >= count or not self.is_open, timeout
             )
-        self.node._end_soul()
+        self.node.latest_run.end_soul()
         return self.is_open and len(self.connections) >= count
 
-    def _stopped(self):
-        super()._stopped()
+    def node_stopped(self):
+        super().node_stopped()
         self._fanout = _ClosedFanout
 
 

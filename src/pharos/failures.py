@@ -1,10 +1,12 @@
 """What blocks raised: kept, counted, told once, and run again."""
 import collections
-import collections.abc
+import pdb
 import sys
 import threading
 import time
 import traceback
+from types import TracebackType
+from typing import Any, Callable, Counter, Dict, List, Optional, Sequence, Tuple
 
 import genpy
 
@@ -18,6 +20,8 @@ TEXTS = 3  # texts of failures at one place that are told; then the 10th, 100th 
 PLACES = 1000  # at which failures are counted
 TEXT_LIMIT = 2000  # characters of the text of an exception
 LARGE = 10000  # bytes of a thing that an exception without its frames may hold on to
+
+Again = Optional[Callable[[Any], Any]]
 
 
 class Failure:
@@ -34,42 +38,47 @@ class Failure:
     :attr:`traceback`.
     """
 
-    def __init__(self, failures, block, where, channel, place, text):
-        self.block, self.channel, self.text = block, channel, text
-        self.error = self.message = self.time = None
-        self.count = 0
-        self._failures, self._where, self._place = failures, where, place
-        self._frames = self._again = None
-        self._had_message = False
-        self._traceback = None  # the text of what was let go
+    error: BaseException
+    message: Any
+    time: float
 
-    def _happened(self, error, message, again):
-        if error is self.error:  # one raised again and again collects the frames of each time
+    def __init__(self, failures: 'Failures', block: Any, where: str, channel: Any, text: str):
+        self.block, self.channel, self.text = block, channel, text
+        self.count = 0
+        self._failures, self._where = failures, where
+        self._frames: Optional[TracebackType] = None
+        self._again: Again = None
+        self._traceback: Optional[str] = None  # the text of the frames that were let go
+
+    def happened(self, error: BaseException, message: Any, again: Again) -> None:
+        """It came once more."""
+        if self.count and error is self.error:
             _cut(error.__traceback__, self._frames)
         self.error, self.message, self._frames = error, message, error.__traceback__
         self._again, self._traceback = again, None
-        self._had_message = message is not None
         self.time = time.time()
         self.count += 1
 
-    def _let_go(self):
+    def let_go(self) -> None:
         """Keep nothing large: no message, and of the frames the text."""
-        if self._traceback is None:
+        if self.is_whole:
             self._traceback = self.traceback
-            self.message = self._frames = None
+            if self.message is not None:
+                self.message = self._again = None
+            self._frames = None
             attempt(lambda: _release(self.error))
 
     @property
-    def is_whole(self):
+    def is_whole(self) -> bool:
         """Whether its message and frames are kept still."""
         return self._traceback is None
 
     @property
-    def traceback(self):
+    def traceback(self) -> str:
         """The traceback, as text."""
-        return _formatted(self.error, self._frames) if self.is_whole else self._traceback
+        return self._traceback or _formatted(self.error, self._frames)
 
-    def retry(self):
+    def retry(self) -> bool:
         """Run the block again, as it is now, on the same message; returns whether it did not fail.
 
         A delegate, which may have been replaced since, runs when no other of its node does; other
@@ -79,101 +88,92 @@ class Failure:
         :raises PharosError: if the message has been let go, or the block cannot be run again
         """
         if self._again is None:
-            raise PharosError(f'{self._where} cannot be run again: do by hand what made it run')
-        if not self.is_whole and self._had_message:
             raise PharosError(
-                f'{self._where} cannot be run again: messages are kept of the newest '
-                f'{WHOLE} failures of a node only; retry() one of those'
+                f'{self._where} cannot be run again: messages are kept of the newest {WHOLE}'
+                ' failures of a node only, and what is no block of a node has none: retry() one of'
+                ' those, or do by hand what made it run'
             )
-        return self._failures._retry(self)
+        return self._failures.run_again(self._again, self.message)
 
-    def debug(self):
+    def debug(self) -> None:
         """Look at the frames in which it was raised: ``pdb.post_mortem``.
 
         :raises PharosError: if they have been let go
         """
         if self._frames is None:
             raise PharosError(
-                f'the frames of this failure of {self._where} are gone: they are kept '
-                f'of the newest {WHOLE} failures of a node only; debug() one of those, '
-                'or read its .traceback'
+                f'the frames of this failure of {self._where} are gone: they are kept of the'
+                f' newest {WHOLE} failures of a node only; debug() one of those, or read its'
+                ' .traceback'
             )
-        import pdb  # only here: it is slow to import
-
         pdb.post_mortem(self._frames)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         times = f', {self.count} times' if self.count > 1 else ''
         return f'<Failure of {self._where}: {type(self.error).__name__}: {self.text}{times}>'
 
 
-class Errors(collections.abc.Sequence):
-    """The exceptions of failures, the newest last.
-
-    Who has seen to them may ``pop`` or ``clear`` them.
-    """
-
-    def __init__(self, failures):
-        self._failures = failures
-
-    def __getitem__(self, index):
-        return [failure.error for failure in self._failures.all()][index]
-
-    def __len__(self):
-        return len(self._failures.all())
-
-    def __iter__(self):
-        return iter(self[:])
-
-    def pop(self, index=-1):
-        """Take one of them out, the newest by default, and return it."""
-        failure = self._failures.all()[index]
-        self._failures.forget(failure)
-        return failure.error
-
-    def clear(self):
-        """Take all of them out."""
-        for failure in self._failures.all():
-            self._failures.forget(failure)
-
-    def __repr__(self):
-        return repr(self[:])
-
-
-class Failures:
-    """The failures of the blocks of one node, or of something else that runs blocks; for any
+class Failures(Sequence[BaseException]):
+    """What the blocks of one node raised, or those of something else that runs blocks; for any
     thread.
+
+    It is the sequence of the exceptions, the newest last. Who has seen to them may ``pop`` or
+    ``clear`` them. :attr:`total` counts all failures, identical ones and those taken out too.
 
     :param tell: called as ``tell(line, details)`` for those that are worth it; what it raises
         changes nothing
     """
 
-    def __init__(self, tell):
+    def __init__(self, tell: Callable[[str, str], Any]) -> None:
         self._tell = tell
         # an RLock: what is freed, or shown as text, may run code of the user's
         self._lock = threading.RLock()
-        self._kept = {}  # (place, text) -> Failure, the newest last
-        self._first = None
-        self._times = collections.Counter()  # place -> how many failures there were at it
-        self._texts = collections.Counter()  # place -> of how many texts of them was told
+        # (place, text) -> what failed there, the newest last
+        self._kept: Dict[Tuple[Any, str], Failure] = {}
+        self._first: Any = None  # the key of the first
+        self._times: Counter[Any] = collections.Counter()  # place -> failures at it
+        self._texts: Counter[Any] = collections.Counter()  # place -> texts of them that were told
         self._retrying = threading.local()  # .failed: whether what the thread runs again has
-        self.count = 0  # of all failures, identical ones too
-        self.errors = Errors(self)
+        self.total = 0
 
-    def all(self):
+    def __getitem__(self, index: Any) -> Any:
+        return [failure.error for failure in self.all()][index]
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def __repr__(self) -> str:
+        return repr(self[:])
+
+    def all(self) -> List[Failure]:
         """The failures that are kept, the newest last."""
         with self._lock:
             return list(self._kept.values())
 
-    def forget(self, failure):
-        """Somebody has seen to it."""
+    def pop(self, index: int = -1) -> BaseException:
+        """Take an exception out, the newest by default, and return it: it was seen to."""
         with self._lock:
-            self._kept.pop((failure._place, failure.text), None)
-            del self._times[failure._place], self._texts[failure._place]
-            if failure is self._first:
+            key = list(self._kept)[index]
+            del self._times[key[0]], self._texts[key[0]]
+            if key == self._first:
                 self._first = None
+            return self._kept.pop(key).error
 
-    def report(self, error, block, where, channel=None, message=None, again=None):
+    def clear(self) -> None:
+        """Take all of them out."""
+        with self._lock:
+            while self._kept:
+                self.pop()
+
+    def report(
+        self,
+        error: BaseException,
+        block: Any,
+        where: str,
+        channel: Any = None,
+        message: Any = None,
+        again: Again = None,
+    ) -> None:
         """Keep a failure of a block, and tell of it if it is new.
 
         Raises nothing but what a signal raises.
@@ -185,76 +185,70 @@ class Failures:
             raise error
         attempt(lambda: self._report(error, block, where, channel, message, again))
 
-    def _report(self, error, block, where, channel, message, again):
+    def _report(
+        self,
+        error: BaseException,
+        block: Any,
+        where: str,
+        channel: Any,
+        message: Any,
+        again: Again,
+    ) -> None:
         text, frames = _brief(text_of(error)), error.__traceback__
+        raised_at = [(frame.f_code.co_filename, line) for frame, line in traceback.walk_tb(frames)]
         # The code tells a block from the one that it replaces, typed anew at the prompt perhaps,
         # but not two closures. Not the channel itself, which may be closed, and should not be kept
         # for being counted.
-        place = where, attempt(lambda: code_of(block)), id(channel), type(error), _raised_at(frames)
+        code = attempt(lambda: code_of(block))
+        place = where, code, id(channel), type(error), tuple(raised_at[-1:])
         with self._lock:
             failure = self._kept.pop((place, text), None)
-            is_new = failure is None
-            if is_new:
-                failure = Failure(self, block, where, channel, place, text)
-            if self._first is None:
-                self._first = failure
+            is_told = failure is None and self._texts[place] < TEXTS
+            if failure is None:
+                failure = Failure(self, block, where, channel, text)
             self._kept[place, text] = failure
-            failure._happened(error, message, again)
+            failure.happened(error, message, again)
+            self._times[place] += 1
+            self._texts[place] += is_told
+            times = self._times[place]
             self._make_room()
-            self.count += 1
-            times, is_told = self._count_at(place, is_new)
+            self.total += 1
         if getattr(self._retrying, 'failed', None) is not None:
             self._retrying.failed = is_told = True
-        raised = f'{where} raised {type(error).__name__}'
+        raised = f'{where} raised {type(error).__name__}: {text}'
         if is_told:
             # what nobody raised has no traceback but its text, which is in the line
             has_more = frames or error.__cause__ or error.__context__
-            self._tell(f'{raised}: {text}', _formatted(error, frames) if has_more else '')
+            self._tell(raised, _formatted(error, frames) if has_more else '')
         elif times >= 10 and str(times).strip('0') == '1':
             different = '' if failure.count == times else ', with different texts'
-            self._tell(f'{raised}: {text}, {times} times by now{different}', '')
+            self._tell(f'{raised}, {times} times by now{different}', '')
 
-    def _count_at(self, place, is_new):
-        """Count a failure; returns how many there were at its place, and whether it is to be
-        told."""
-        self._times[place] += 1
-        is_told = is_new and self._texts[place] < TEXTS
-        if is_told:
-            self._texts[place] += 1
+    def _make_room(self) -> None:
+        """Let go what is large but of the newest; of too many, one of those that are most alike."""
+        kept = list(self._kept)
+        self._first = self._first or kept[0]
+        if len(kept) > WHOLE:
+            self._kept[kept[-WHOLE - 1]].let_go()
+        if len(kept) > KEPT:
+            others = [key for key in kept if key != self._first]
+            (crowded, _), *_ = collections.Counter(place for place, _ in others).most_common(1)
+            del self._kept[next(key for key in others if key[0] == crowded)]
         if len(self._times) > PLACES:
             oldest = next(iter(self._times))
             del self._times[oldest], self._texts[oldest]
-        return self._times[place], is_told
 
-    def _make_room(self):
-        """Let go what is large but of the newest; of too many, one of those that are most alike."""
-        kept = list(self._kept.values())
-        if len(kept) > WHOLE:
-            kept[-WHOLE - 1]._let_go()
-        if len(kept) > KEPT:
-            kept.remove(self._first)
-            crowded, _ = collections.Counter(failure._place for failure in kept).most_common(1)[0]
-            oldest = next(failure for failure in kept if failure._place == crowded)
-            del self._kept[crowded, oldest.text]
-
-    def _retry(self, failure):
+    def run_again(self, again: Callable[[Any], Any], message: Any) -> bool:
+        """Run a block again by ``again(message)``; returns whether it did not fail."""
         before, self._retrying.failed = getattr(self._retrying, 'failed', None), False
         try:
-            failure._again(failure.message)
+            again(message)
             return not self._retrying.failed
         finally:
             self._retrying.failed = before
 
 
-def _raised_at(frames):
-    """Which line raised it: (file, number)."""
-    raised_at = None
-    for frame, line in traceback.walk_tb(frames):
-        raised_at = frame.f_code.co_filename, line
-    return raised_at
-
-
-def _formatted(error, frames):
+def _formatted(error: BaseException, frames: Optional[TracebackType]) -> str:
     """A traceback as text."""
     lines = attempt(lambda: traceback.format_exception(type(error), error, frames))
     if lines is None:  # its __str__, or that of its cause, raises what traceback does not expect
@@ -262,20 +256,21 @@ def _formatted(error, frames):
     return _brief(''.join(lines), 10 * TEXT_LIMIT)
 
 
-def _brief(text, limit=TEXT_LIMIT):
+def _brief(text: str, limit: int = TEXT_LIMIT) -> str:
     """The text, without its middle where it is too long."""
     return text if len(text) <= limit else f'{text[:limit // 2]} ... {text[-limit // 2:]}'
 
 
-def _cut(frames, before):
-    """Take the frames of the times before out of a traceback."""
+def _cut(frames: Optional[TracebackType], before: Optional[TracebackType]) -> None:
+    """Take the frames of the times before out of the traceback of an exception that is raised again
+    and again: it collects them."""
     while frames is not None and frames.tb_next is not before:
         frames = frames.tb_next
     if frames is not None:
         frames.tb_next = None
 
 
-def _release(error):
+def _release(error: BaseException) -> None:
     """Have an exception hold on to nothing large: frames, causes, and what it was made of."""
     set_attribute = BaseException.__setattr__  # that of its class may refuse
     for name in '__traceback__', '__cause__', '__context__':
@@ -290,7 +285,7 @@ def _release(error):
             error.object = error.object[:0]
 
 
-def _small(value):
+def _small(value: Any) -> Any:
     """The value, or what it was where it is large."""
     if isinstance(value, genpy.Message):
         return f'<{value._type}>'

@@ -22,7 +22,7 @@ def wait_for_known_subscribers(channel: 'OutputChannel', timeout: float, deadlin
     :param timeout: seconds that it may take
     :param deadline: when these are over, by ``time.monotonic()``
     """
-    node, rospy = channel.node, channel.node._rospy
+    node, rospy = channel.node, channel.node.latest_run.rospy
     missing = rospy.connections.known_subscribers(channel.topic)
     if missing is None:  # not always: a large graph's state takes long to read
         try:
@@ -34,7 +34,7 @@ def wait_for_known_subscribers(channel: 'OutputChannel', timeout: float, deadlin
     def connected() -> bool:
         missing.difference_update(name for name, _ in channel.connections)
         missing.difference_update(
-            other.name for other in node.master.local_nodes() if other._is_ending()
+            other.name for other in node.master.local_nodes() if other.latest_run.is_ending
         )
         missing.difference_update(rospy.refusals.subscribers(channel.topic))
         return not missing or not channel.is_open
@@ -51,7 +51,7 @@ def wait_for_known_subscribers(channel: 'OutputChannel', timeout: float, deadlin
 
 def _tell_who_is_late(channel: 'OutputChannel', names: Set[str], timeout: float) -> None:
     """Say in the log, once for each topic, which subscribers may miss the first message."""
-    node, told = channel.node, channel.node._rospy.connections.told_late
+    node, told = channel.node, channel.node.latest_run.rospy.connections.told_late
     if channel.topic not in told:
         told.add(channel.topic)
         node.log(

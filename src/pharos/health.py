@@ -54,9 +54,9 @@ def health_of(node, ask):
         reachable_since=watcher_of(node.master).reachable_since if is_running else None,
         connections=dict(collections.Counter(transports)),
         dropped=sum(getattr(channel, 'dropped', 0) for channel in channels),
-        errors=node._failures.count,
-        threads=node._rospy.thread_count if node._rospy else 0,
-        refused=node._rospy.refusals.count() if is_running else 0,
+        errors=node.errors.total,
+        threads=node.latest_run.rospy.thread_count if node.latest_run else 0,
+        refused=node.latest_run.rospy.refusals.count() if is_running else 0,
     )
 
 

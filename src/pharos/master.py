@@ -15,17 +15,17 @@ from typing import (
 import rosgraph
 from rosgraph.rosenv import ROS_MASTER_URI
 
-from pharos import embedded_master, node as nodes_of_ours, ros_process, running
+from pharos import embedded_master, node as nodes_of_ours, node_registry, ros_process
 from pharos.blocks import check_block
 from pharos.errors import PharosError, UnknownNodeError, suggest
 from pharos.external_node import ExternalNode
-from pharos.life import Lifecycle
 from pharos.master_calls import MasterCalls
 from pharos.parameters import Parameters
 from pharos.private_rospy.addresses import check_port, check_url
 from pharos.private_rospy.names import check_name, global_name
 from pharos.private_rospy.proxies import MARGIN, time_limit
 from pharos.ros_process import RosProcess
+from pharos.run import Lifecycle
 from pharos.seconds import check_limit
 from pharos.service import Service
 from pharos.topic import Topic
@@ -76,7 +76,7 @@ class Master(MasterCalls):
         child, url = embedded_master.start(check_port('port', port))
         master = cls(url)
         master._child = child
-        running.at_end(master.stop)  # the child would end by itself, but perhaps after us
+        node_registry.at_end(master.stop)  # the child would end by itself, but perhaps after us
         return master
 
     def stop(self) -> None:
@@ -88,9 +88,9 @@ class Master(MasterCalls):
             raise PharosError(
                 f'{self} is not embedded in this program: stop it where it was started'
             )
-        running.not_at_end(self.stop)
+        node_registry.not_at_end(self.stop)
         for node in self.local_nodes():
-            node._stop_for_others()
+            node_registry.stop(node)
         if self._child.returncode is None:
             embedded_master.end(self._child)
 
@@ -163,7 +163,7 @@ class Master(MasterCalls):
                     'super().start() before anything else'
                 )
         except BaseException:
-            node._stop_for_others()
+            node_registry.stop(node)
             raise
         return node
 
@@ -292,7 +292,7 @@ class Master(MasterCalls):
 
     def local_nodes(self) -> List[nodes_of_ours.Node]:
         """The nodes of this process at this master."""
-        return [node for node in running.nodes() if node.master == self]
+        return [node for node in node_registry.nodes() if node.master == self]
 
     def topics(self) -> List[Topic]:
         """All topics that somebody publishes on or is interested in."""

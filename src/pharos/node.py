@@ -1,24 +1,29 @@
 """Nodes: real ROS nodes of this process, written with blocks."""
+import contextlib
 import threading
+from typing import TYPE_CHECKING, Any, Callable, Iterator, List, Optional
 
-from pharos import messages
-from pharos.blocks import attempt, check_block, check_delegate, check_soul, name_of
-from pharos.errors import MessageTypeError, NodeStoppedError, PharosError
-from pharos.external_node import ExternalNode
-from pharos.failures import Failures
+from pharos import node_registry, signals
+from pharos.blocks import attempt, check_block, check_delegate, check_runs, check_soul
+from pharos.errors import NodeStoppedError, PharosError
+from pharos.failures import Failure, Failures
 from pharos.health import health_of
-from pharos.life import Life
 from pharos.offered_service import OfferedService
 from pharos.parameter import Parameter
 from pharos.private_rospy.process_rospy import rospy
-from pharos.private_rospy.names import Resolved, check_name
 from pharos.private_rospy.settings import Settings
+from pharos.run import Lifecycle, Run
 from pharos.seconds import check_seconds
 from pharos.topic import QUEUE_SIZE, Topic
 from pharos.transcript import Transcript
 
+if TYPE_CHECKING:
+    from pharos.master import Master
 
-class Node(Life):
+Block = Optional[Callable[..., Any]]
+
+
+class Node:
     """A ROS node of this process: made by :meth:`Master.create`, subclassed to override
     :meth:`start` and :meth:`stop`.
 
@@ -33,14 +38,28 @@ class Node(Life):
     ``create``.
     """
 
-    def __init__(self):
+    #: seconds that a topic's first message waits for the subscribers the master knows
+    connect_timeout = 2.0
+    #: bytes of messages, about, that wait for a slow receiver for each publisher, or one message
+    queue_bytes = 64 << 20
+    #: whether any host may ask it to stop, not only this one and the master's
+    allow_remote_shutdown = False
+    #: seconds that :meth:`stop` waits for souls, and for messages under way
+    stop_timeout = 2.0
+
+    #: the run of the present start, or the last one; None before the first start
+    latest_run: Optional[Run] = None
+    #: whether a start opens again what the last run had; a start() of one's own opens it itself
+    _reopens = True
+
+    def __init__(self) -> None:
         if '_settings' not in vars(self):
             name = type(self).__name__
             raise TypeError(
                 f'a node is made by a master: Master().create({name}, named=...), not {name}()'
             )
 
-    def __init_subclass__(cls, **kwargs):
+    def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         for name in ('soul', 'delegate'):
             if name in vars(cls) and not isinstance(vars(cls)[name], property):
@@ -48,14 +67,107 @@ class Node(Life):
                     f'{cls.__name__}.{name} would never run: each node has a {name} of its own,'
                     f' given to create() or set. Name it otherwise, and set self.{name} in start()'
                 )
+        for method in cls.start, cls.stop:
+            check_runs(method, f'{cls.__name__}.{method.__name__}')
+        cls._reopens = cls.start is Node.start
+        cls.stop = node_registry.one_stop_at_a_time(cls.stop)  # type: ignore[assignment]
 
-    def _configure(self, master, settings, soul, delegate):
-        super()._configure(master, settings)
+    def _configure(
+        self, master: 'Master', settings: Settings, soul: Block, delegate: Block
+    ) -> None:
+        self.master = master
+        self._settings = settings
+        self._errors = Failures(self._tell_failure)
         self.soul, self.delegate = soul, delegate
-        self._opening = threading.Lock()  # held to change _channels
-        self._first_sends = {}  # topic name -> the lock of the thread that opens its channel
-        self._senders = {}  # topic name, as given to send_to -> the channel that it went through
-        self._failures = Failures(self._tell_failure)
+
+    # -- life
+
+    def start(self) -> None:
+        """Register with the master. A subclass overrides this, calls ``super().start()``, then
+        makes its channels.
+
+        Runs in the thread that creates the node. A stopped node starts again, under the same name
+        and ports. Where a class has no ``start`` of its own, the channels, services and parameters
+        that it had come back too, also where a start in between was interrupted.
+
+        :raises PharosError: if the node is running already
+        :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: and the node is then as
+            it was
+        :raises NodeStoppedError: if :meth:`stop` was called meanwhile, and the node is then as it
+            was
+        """
+        with signals.held(node_registry.STOP_LIMIT):
+            run = Run(self, self._settings)
+            run.start(self._reopens)
+        run.reopen()
+
+    @node_registry.one_stop_at_a_time
+    def stop(self) -> None:
+        """End the souls, send what is under way, unregister, close the ports, end the threads.
+
+        A subclass overrides this and calls ``super().stop()``. It runs once for each start, to its
+        end, in the thread that was the first to ask for it: the program (here, a signal, its end)
+        or ROS (``rosnode kill``). Who asks meanwhile, from any thread, waits until it has ended, as
+        does the end of the program, but only until 30 s after its beginning. Called in a thread of
+        the node's own, it does not wait for what that thread runs. A node that is still starting is
+        stopped, too: its start raises NodeStoppedError.
+        """
+        self.current_run.end()
+
+    @property
+    def name(self) -> str:
+        """The node's name, as the master knows it: '/robot1/driver'."""
+        return self._settings.name
+
+    @property
+    def lifecycle(self) -> Lifecycle:
+        """A :class:`Lifecycle`."""
+        return Lifecycle.NEW if self.latest_run is None else self.latest_run.lifecycle
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the node is started and no stop has begun."""
+        return self.lifecycle is Lifecycle.RUNNING
+
+    @property
+    def current_run(self) -> Run:
+        """The :class:`~pharos.run.Run` of the present start.
+
+        :raises NodeStoppedError: if the node is not started
+        """
+        run, lifecycle = self.latest_run, self.lifecycle
+        if run is not None and lifecycle in (Lifecycle.RUNNING, Lifecycle.STOPPING):
+            return run
+        hint = ''
+        if lifecycle is Lifecycle.NEW:
+            hint = '; a start() of its own has to call super().start() before anything else'
+        raise NodeStoppedError(f'{self.name} is {lifecycle.value}: start() it first{hint}')
+
+    def __enter__(self) -> 'Node':
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self.stop()
+
+    def sleep(self, seconds: float) -> None:
+        """Wait for ``seconds`` of ROS time, or until the node stops; a soul is ended by that.
+
+        The report: ``(Delay forSeconds: 1) wait``.
+        """
+        seconds = check_seconds('a sleep', seconds)
+        run = self.current_run
+        with signals.interruptible_wait(), contextlib.suppress(rospy.ROSInterruptException):
+            run.rospy.rospy.sleep(seconds)
+        run.end_soul()
+
+    def every(self, seconds: float) -> Iterator[None]:
+        """An iterator that turns at once and then every ``seconds`` of ROS time, without drift,
+        until the node stops.
+
+        A turn that takes longer than ``seconds`` delays the next, which then comes at once.
+        """
+        seconds = check_seconds('a period', seconds, above=0)
+        return self.current_run.turns(1.0 / seconds)
 
     # -- blocks
 
@@ -86,75 +198,47 @@ class Node(Life):
     def delegate(self, block):
         self._delegate = check_delegate(block)
 
-    def execute(self):
+    def execute(self) -> Any:
         """Run the soul once, in the calling thread, and return its value.
 
         The report (listing 3.7): ``node execute``. An exception in the soul is reported (see
         :attr:`errors`) and ends only this run, which then returns None.
         """
-        self._live_rospy()
-        return self._souls.run(self._the_soul(), self._the_soul)
+        return self._soul_runner(None)()
 
-    def fork(self, block=None, name=None):
+    def fork(self, block: Block = None, name: Optional[str] = None) -> threading.Thread:
         """Run the soul, or ``block(node)``, in a thread of its own, and return the thread.
 
         The report (listing 3.8): ``[node execute] fork``. :meth:`stop` ends it at its next
-        :meth:`sleep` or turn of
-        :meth:`every`.
+        :meth:`sleep` or turn of :meth:`every`.
         """
-        present = self._the_soul if block is None else (lambda: check_soul(block))
-        return self._souls.fork(present(), present, name or 'soul', self._live_rospy().start_thread)
+        return self.current_run.fork(self._soul_runner(block), name or 'soul')
 
-    def _the_soul(self):
-        if self._soul is None:
+    def _soul_runner(self, block: Block) -> Callable[[], Any]:
+        """What runs the soul, or ``block``, as it is now; run again later, as it is then."""
+        run, soul = self.current_run, self._soul if block is None else check_soul(block)
+        if soul is None:
             raise PharosError(
                 f'{self.name} has no soul to run: give it one with soul= or node.soul ='
             )
-        return self._soul
+        return lambda: run.run_soul(soul, again=lambda nothing: self._soul_runner(block)())
 
     @property
-    def errors(self):
+    def errors(self) -> Failures:
         """The exceptions that blocks raised, the newest last: of identical ones the newest alone.
 
         100 are kept, among them the first, for it may be the cause of the others. Who has seen to
         them may ``pop`` or ``clear`` them.
         """
-        return self._failures.errors
+        return self._errors
 
     @property
-    def failures(self):
+    def failures(self) -> List[Failure]:
         """For each of :attr:`errors` its :class:`~pharos.Failure`: what failed, on what, how
         often."""
-        return self._failures.all()
+        return self._errors.all()
 
-    def _report(self, error, block, what, channel=None, message=None, again=None):
-        """Keep and tell what a block raised, which ends nothing but that run of it.
-
-        See :meth:`Failures.report`.
-        """
-        if not self.is_running and isinstance(
-            error, (NodeStoppedError, rospy.ROSInterruptException)
-        ):
-            return  # that is how the stop of a node ends its souls
-        where = f'{what} {name_of(block)} of {self.name}'
-        if channel is not None:
-            where += f' on {channel.topic}'
-            again = channel._run_again
-        self._failures.report(error, block, where, channel, message, again)
-
-    def _report_refusal(self, refusal):
-        """Keep and tell, once, that a publisher's messages do not come, for they are of another
-        type."""
-        error = MessageTypeError(
-            messages.explain_refusal(
-                self.name, refusal.topic, refusal.wanted, refusal.publisher, refusal.offered
-            )
-        )
-        self._failures.report(
-            error, None, f'connection of {self.name} to {refusal.publisher} for {refusal.topic}'
-        )
-
-    def _tell_failure(self, line, details):
+    def _tell_failure(self, line: str, details: str) -> None:
         attempt(lambda: self.log(f'{line}\n{details}' if details else line, level='error'))
         Transcript.show(line)
 
@@ -235,89 +319,32 @@ class Node(Life):
         :raises UnknownTopicError, UnknownTypeError: if there is no type
         """
         if to is not None:
-            to = self._name_of(to)
+            to = self.current_run.resolve_peer(to)
         if connect_timeout is None:
             connect_timeout = self.connect_timeout
         else:
             connect_timeout = check_seconds('connect_timeout', connect_timeout)
         if wait != 0:
             wait = check_seconds('wait', wait)
-        channel = self._senders.get(topic) if isinstance(topic, str) else None
+        run = self.current_run
+        channel = run.senders.get(topic) if isinstance(topic, str) else None
         if channel is None or not channel.is_open:
             check_block(block, 'block', ('message',))
-            bus = self._topic(topic)
-            channel = self._sending_channel(bus) or self._open_sending_channel(
-                bus, typed_as, connect_timeout, wait
-            )
-            self._senders[topic] = channel
+            channel = run.sender(self._topic(topic), typed_as, connect_timeout, wait)
+            run.senders[topic] = channel
         if typed_as not in (None, channel.message_class, channel.type):
             self._topic(topic).message_class(self, typed_as)  # refuses another type
         # another thread may be opening it just now
         channel.wait_until_connected(connect_timeout)
         return channel.send(block, to=to, **fields)
 
-    def _sending_channel(self, topic):
-        channels = [channel for channel in self.channels if channel.topic == topic.name]
-        return next((channel for channel in channels if hasattr(channel, 'publish')), None)
-
-    def _open_sending_channel(self, topic, typed_as, connect_timeout, wait):
-        """Open a channel for :meth:`send_to`; of several threads that come at once, one does, and
-        the others wait."""
-        opening = self._first_sends.setdefault(topic.name, threading.RLock())
-        limit = max(0.0, wait + connect_timeout)
-        is_mine = opening.acquire(timeout=min(limit, threading.TIMEOUT_MAX))
-        try:
-            return self._sending_channel(topic) or topic.output_channel(
-                self, typed_as, connect_timeout=connect_timeout, wait=wait
-            )
-        finally:
-            if is_mine:
-                opening.release()
-
     @property
     def channels(self):
         """The channels that the node has open."""
-        return [channel for channel in self._channels if channel.is_open]
+        return self.latest_run.channels if self.latest_run else []
 
     def _topic(self, name):
-        return Topic(self.master, self._resolve(name, 'topic'))
-
-    def _resolve(self, name, what):
-        """A name as the node means it, in its namespace and remapped, in full."""
-        resolve = self._live_rospy().rospy.resolve_name
-        name = check_name(name, what, private=True)
-        # where rospy takes what follows for a global name (ros_comm #3044)
-        return check_name(resolve('~' + name[2:] if name.startswith('~/') else name), what)
-
-    def _name_of(self, peer):
-        """The full name of a node that messages come from or go to.
-
-        :param peer: a name, Node or ExternalNode
-        :raises ValueError: if it is none of these, or of another master
-        """
-        if isinstance(peer, (Node, ExternalNode)):
-            if peer.master != self.master:
-                raise ValueError(
-                    f'{peer} is at another master than {self.name}, and nothing goes from one to'
-                    ' the other'
-                )
-            return Resolved(peer.name)
-        if isinstance(peer, Resolved):
-            return peer
-        if not isinstance(peer, str):
-            raise ValueError(f'from_= and to= are a node or its name, not {peer!r}')
-        return Resolved(self._resolve(peer, 'node'))
-
-    def _remember_channel(self, channel):
-        with self._opening:
-            if channel not in self._channels:
-                # replaced, so that others may iterate meanwhile
-                self._channels = [*self._channels, channel]
-
-    def _forget_channel(self, channel):
-        with self._opening:
-            self._channels = [other for other in self._channels if other is not channel]
-            self._senders.clear()
+        return Topic(self.master, self.current_run.resolve(name, 'topic'))
 
     # -- services, parameters, log
 
@@ -331,12 +358,12 @@ class Node(Life):
         :param typed_as: service type name, such as 'std_srvs/Empty', or class
         :raises MasterUnreachableError: if the master does not answer; nothing is left behind then
         """
-        return OfferedService(self, self._resolve(name, 'service'), typed_as, block)
+        return OfferedService(self, self.current_run.resolve(name, 'service'), typed_as, block)
 
     def parameter(self, name, initialized=None):
         """The :class:`Parameter` of that name ('~rate' is private); set to ``initialized`` where it
         has no value."""
-        return Parameter(self, self._resolve(name, 'parameter'), initialized)
+        return Parameter(self, self.current_run.resolve(name, 'parameter'), initialized)
 
     def log(self, text, level='info'):
         """Log a line on /rosout, the node's log file and the screen, with the file and line of the
@@ -348,8 +375,8 @@ class Node(Life):
             level = _LEVELS[level]
         except KeyError:
             raise ValueError(f"no log level {level!r}: there are {', '.join(_LEVELS)}") from None
-        if self._rospy is not None:
-            log = self._rospy.log
+        if self.latest_run is not None:
+            log = self.latest_run.rospy.log
             # no wrapper between: rospy looks for the caller of this method
             log('%s', (text,), {}, level=level)
 
@@ -359,19 +386,19 @@ class Node(Life):
     def ros(self):
         """The node's own rospy, whole: ``node.ros.Timer``, ``node.ros.Time.now()``. It is for this
         run of the node."""
-        return self._live_rospy().rospy
+        return self.current_run.rospy.rospy
 
     def ros_import(self, name):
         """A library written on rospy ('actionlib', 'message_filters', 'tf2_ros'), bound to this run
         of the node."""
         if not isinstance(name, str):
             raise TypeError(f"a library is given by its name, such as 'actionlib', not as {name!r}")
-        return self._live_rospy().import_library(name)
+        return self.current_run.rospy.import_library(name)
 
     @property
     def uri(self):
         """The URI of the node's XML-RPC server, None before the first start."""
-        return self._rospy and self._rospy.uri
+        return self.latest_run and self.latest_run.rospy.uri
 
     @property
     def tcp_port(self):
@@ -386,7 +413,7 @@ class Node(Life):
     @property
     def domain(self):
         """The address that the node advertises, None before the first start."""
-        return self._rospy and self._rospy.domain
+        return self.latest_run and self.latest_run.rospy.domain
 
     def health(self):
         """How the node is doing: ``registered, reachable_since, connections, dropped, errors,
@@ -399,7 +426,7 @@ class Node(Life):
     def __repr__(self):
         health = f': {health_of(self, ask=False)}' if self.is_running else ''
         return (
-            f'<{type(self).__name__} {self.name} {self._lifecycle.value},'
+            f'<{type(self).__name__} {self.name} {self.lifecycle.value},'
             f' {len(self.channels)} channels{health}>'
         )
 
@@ -425,13 +452,6 @@ def make(node_class, master, named, soul, delegate, args, kwargs, **settings):
     return node
 
 
-_LEVELS = {
-    'debug': 'debug',
-    'info': 'info',
-    'warning': 'warning',
-    'warn': 'warning',
-    'error': 'error',
-    'err': 'error',
-    'fatal': 'critical',
-    'critical': 'critical',
-}
+# names of levels -> rospy's
+_LEVELS = {level: level for level in ('debug', 'info', 'warning', 'error', 'critical')}
+_LEVELS.update(warn='warning', err='error', fatal='critical')

@@ -20,17 +20,21 @@ class OfferedService:
         self.service_class = messages.service_class(typed_as)
         self._check = services.checker(self.service_class._response_class)
         self.block = block
-        if any(other.name == name for other in node._services):
+        opened = node.current_run.opened
+        if any(isinstance(other, OfferedService) and other.name == name for other in opened):
             raise PharosError(f'{node.name} offers {name} already: close that one first')
-        self._open()
+        self.open()
 
-    def _open(self):
+    def open(self):
+        """Register with the master, also after a restart of the node."""
         with time_limit(max(REGISTER_TIMEOUT, self.node.connect_timeout)):
             self._service = services.offer(
-                self.node._live_rospy(), self.name, self.service_class, self._answer
+                self.node.current_run.rospy, self.name, self.service_class, self._answer
             )
-        if self not in self.node._services:
-            self.node._services = [*self.node._services, self]
+        self.node.latest_run.remember(self)
+
+    def node_stopped(self):
+        """The node stops, and its rospy closes all services."""
 
     @property
     def block(self):
@@ -54,7 +58,7 @@ class OfferedService:
         try:
             return self._as_response(block(request))
         except BaseException as error:
-            self.node._report(
+            self.node.latest_run.report(
                 error, block, f'service {self.name}', message=request, again=self._answer_again
             )
             why = f'{type(error).__name__}: {text_of(error)}'
@@ -100,8 +104,8 @@ class OfferedService:
 
     def close(self):
         """Offer it no longer. Harmless when done twice."""
-        if self in self.node._services:
-            self.node._services = [other for other in self.node._services if other is not self]
+        if self in self.node.latest_run.opened:
+            self.node.latest_run.forget(self)
             with time_limit(UNREGISTER_TIMEOUT):
                 self._service.shutdown('closed')
 

@@ -25,7 +25,7 @@ class Parameter:
         self._kind = type(self._initialized)
         self._blocks = []
         if self._initialized is not None:
-            watched = node._live_rospy().parameters
+            watched = node.current_run.rospy.parameters
             with node.master.reached():
                 watched.initialize(name, self._initialized)
 
@@ -39,7 +39,7 @@ class Parameter:
         return self._checked(self._get())
 
     def _get(self):
-        self.node._live_rospy()
+        self.node.current_run  # raises where it is stopped
         try:
             return self.node.master.call('getParam', self.name, caller_id=self.node.name)
         except rosgraph.MasterError:
@@ -57,7 +57,7 @@ class Parameter:
                 f'{self.name} cannot be set to None: choose a value, such as an empty text or list'
             )
         value = self._checked(carried(self.name, value))
-        watched = self.node._live_rospy().parameters
+        watched = self.node.current_run.rospy.parameters
         self.node.master.call('setParam', self.name, value, caller_id=self.node.name)
         with self.node.master.reached():
             watched.tell_of_own(self.name, value)
@@ -78,7 +78,7 @@ class Parameter:
                 f'{self.name} needs a block to run when it changes, called as block(value)'
             )
         check_block(block, 'parameter block', ('value',))
-        watched = self.node._live_rospy().parameters
+        watched = self.node.current_run.rospy.parameters
         self._blocks.append(block)
         try:
             with self.node.master.reached():
@@ -98,7 +98,7 @@ class Parameter:
                 value = self._get()  # a master says so of a deleted one, too
             block(self._checked(value))
         except BaseException as error:
-            self.node._report(
+            self.node.latest_run.report(
                 error,
                 block,
                 f'parameter {self.name}',

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 
-from pharos import running
+from pharos import node_registry
 from pharos.blocks import check_block, name_of
 from pharos.errors import UnknownNodeError
 from pharos.failures import Failures
@@ -48,7 +48,7 @@ class RosProcess:
             start_new_session=True,
         )
         self._nodes = ProcessNodes(master_url)
-        running.at_end(self.terminate)
+        node_registry.at_end(self.terminate)
         self._reader = threading.Thread(
             target=self._read, name=f'output of {command[0]}', daemon=True
         )
@@ -64,7 +64,7 @@ class RosProcess:
         self._process.wait()
         # what it left behind; not later, when its number may be another's
         self._signal(signal.SIGKILL)
-        running.not_at_end(self.terminate)
+        node_registry.not_at_end(self.terminate)
 
     def _show(self, line):
         try:
@@ -125,7 +125,7 @@ class RosProcess:
             self._signal(signal.SIGKILL)
         status = self.wait()
         self._nodes.clear()
-        running.not_at_end(self.terminate)
+        node_registry.not_at_end(self.terminate)
         return status
 
     def _look(self):

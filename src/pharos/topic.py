@@ -14,7 +14,6 @@ from pharos.errors import (
     UnknownTypeError,
     suggest,
 )
-from pharos.life import Life
 from pharos.private_rospy.proxies import MARGIN, time_limit
 from pharos.private_rospy.tcpros_connection import ask_publisher
 from pharos.seconds import check_seconds
@@ -100,7 +99,7 @@ class Topic:
         )
         if not is_first or message_class is typed_as or not messages.is_provisional(message_class):
             return InputChannel(node, self.name, message_class, **options)
-        with node._rospy.refusals.held(self.name) as refusals:
+        with node.latest_run.rospy.refusals.held(self.name) as refusals:
             channel = InputChannel(node, self.name, message_class, **options)
             self._agree_with_publishers(channel, refusals)
         return channel
@@ -139,7 +138,7 @@ class Topic:
             return self._message_class(node, typed_as, wait, receives)
 
     def _check_node(self, node):
-        if not isinstance(node, Life):
+        if not hasattr(type(node), 'current_run'):
             raise TypeError(
                 f'a channel on {self.name} is given to a node of this process, not to {node!r}'
             )
@@ -147,7 +146,7 @@ class Topic:
             raise ValueError(
                 f'{self} is at another master than {node.name}: ask that for its topic'
             )
-        node._live_rospy()
+        node.current_run  # raises where it is stopped
 
     def _message_class(self, node, typed_as, wait, receives):
         known = next(
@@ -194,8 +193,7 @@ class Topic:
 
     def _local_classes(self, type_):
         """The classes with which nodes of this process publish that type on the topic."""
-        # None: it is just being started
-        instances = [node._rospy for node in self.master.local_nodes() if node._rospy]
+        instances = [node.latest_run.rospy for node in self.master.local_nodes()]
         publishers = filter(None, (instance.publisher(self.name) for instance in instances))
         classes = [publisher.data_class for publisher in publishers]
         return [cls for cls in classes if cls._type == type_]
@@ -211,7 +209,7 @@ class Topic:
         :param refusals: a list that grows with each that comes; of those in it afterwards is to be
             told
         """
-        instance = channel.node._rospy
+        instance = channel.node.latest_run.rospy
         instance.wait_until(
             lambda: instance.connections.has_heard_from_publishers(self.name),
             channel.node.connect_timeout,
@@ -238,7 +236,7 @@ class Topic:
                     raise
             except NodeStoppedError as error:
                 raise self._stopped(node) from error
-            if node._rospy.ended.wait(POLL):  # a master tells nobody of new types
+            if node.latest_run.rospy.ended.wait(POLL):  # a master tells nobody of new types
                 raise self._stopped(node)
 
     def _stopped(self, node):

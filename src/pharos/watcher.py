@@ -164,9 +164,9 @@ class Watcher:
             self.reachable_since = time.time()
         for node in nodes:
             try:
-                node._rospy.repair(state, was_away)
+                node.latest_run.rospy.repair(state, was_away)
             except Exception as error:  # the watch over the other nodes goes on
-                node._report(error, node._rospy.repair, 'registration')
+                node.latest_run.report(error, node.latest_run.rospy.repair, 'registration')
         return _graph(state)
 
 

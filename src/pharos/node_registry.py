@@ -1,0 +1,309 @@
+"""The nodes of this process: which there are, how one is stopped, and how they end with the
+program."""
+import atexit
+import contextlib
+import functools
+import gc
+import os
+import sys
+import threading
+import time
+from typing import TYPE_CHECKING, Any, Callable, Dict, Iterable, List, NamedTuple, Optional, Tuple
+
+from pharos import signals
+from pharos.blocks import name_of
+from pharos.errors import NodeNameInUseError, PharosError
+from pharos.private_rospy import process_rospy
+from pharos.private_rospy.lifetime import SIGNAL_LATENCY
+
+if TYPE_CHECKING:
+    from pharos.node import Node
+    from pharos.run import Run
+
+#: seconds from its beginning on that anybody waits for a stop() that another thread runs
+STOP_LIMIT = 30.0
+# A stopped node's rospy is a web of cycles of 0.7 MB, which only the collector frees. It looks at
+# the running nodes, too, so it runs after as many stops as there are nodes left, and at least so
+# many:
+COLLECT_EVERY = 20
+
+
+class _Stop(NamedTuple):
+    """A stop() under way, of one run of a node."""
+
+    run: 'Run'
+    thread: int  # the identifier of the one that runs it
+    deadline: float  # by time.monotonic(), until which others wait for it
+
+
+changed = threading.Condition()  # guards the life cycles of all nodes, and what follows
+# (master, name) -> those that the master may know, in the order of their starts
+_nodes: 'Dict[Tuple[Any, str], Node]' = {}
+_stops: 'Dict[Node, _Stop]' = {}
+_waiting: 'Dict[int, Node]' = {}  # identifier of a thread -> the node for whose stop it waits
+_runs_ended = 0  # since the collector ran
+_finalizer: Any = None  # what multiprocessing runs at the end of its processes
+_others: List[Callable[[], Any]] = []  # they end what else was started: programs, masters
+
+
+def nodes() -> 'List[Node]':
+    """The nodes that start, run or stop, in the order of their starts."""
+    with changed:
+        return list(_nodes.values())
+
+
+# -- starts and stops
+
+
+def claim(run: 'Run') -> 'Optional[Run]':
+    """The run of a node starts, and the master is to know the node soon; returns its former run.
+
+    :raises PharosError: if the node is running already
+    :raises NodeNameInUseError: if another node of this process has its name at its master
+    """
+    _end_with_multiprocessing()
+    node = run.node
+    with contextlib.suppress(TimeoutError):
+        _wait_for_stop(node)  # for what an overriding stop() does last
+    with changed:
+        former, other = node.latest_run, _nodes.setdefault((node.master, node.name), node)
+        if other is not node:
+            raise NodeNameInUseError(
+                f'the node name {node.name} is taken by a {other.lifecycle.value} node of this'
+                ' process: choose another name, or stop() that node first'
+            )
+        if former is not None and not former.is_over:
+            raise PharosError(
+                f'{node.name} is {node.lifecycle.value} already: stop() it before you start it'
+                ' again'
+            )
+        node.latest_run = run
+    return former
+
+
+def discard(node: 'Node') -> None:
+    """The node has stopped, or did not come to run."""
+    with changed:
+        if _nodes.get((node.master, node.name)) is node:
+            del _nodes[node.master, node.name]
+
+
+def collect() -> None:
+    """One more run has ended: free what such leave in memory, now and then."""
+    global _runs_ended
+    with changed:
+        _runs_ended += 1
+        due = _runs_ended >= max(COLLECT_EVERY, len(_nodes))
+        if due:
+            _runs_ended = 0
+    if due:
+        gc.collect()
+
+
+def one_stop_at_a_time(method: Callable[..., Any]) -> Callable[..., Any]:
+    """A ``stop`` method that runs once for each run of its node, whoever calls it in whatever
+    thread.
+
+    Who calls it meanwhile waits for its end, for up to STOP_LIMIT seconds, but for the node's own
+    threads, which it may itself wait for. A signal does not cut it off where it runs in the main
+    thread. When it has ended, the node is stopped, also where it has raised an exception.
+    """
+
+    @functools.wraps(method)
+    def stop(node: 'Node', *args: Any, **kwargs: Any) -> Any:
+        if _is_stopped_here(node):
+            if type(node).stop is stop:
+                return None  # it has called itself, by way of others perhaps
+            return method(node, *args, **kwargs)  # super().stop()
+        with signals.held(STOP_LIMIT):
+            run = _begin_stop(node)
+            if run is None:
+                return None
+            try:
+                return method(node, *args, **kwargs)
+            finally:
+                try:
+                    run.end()  # where it did not call super().stop(), or did not get there
+                finally:
+                    with changed:
+                        del _stops[node]
+                        changed.notify_all()
+
+    return stop
+
+
+def stop(node: 'Node') -> None:
+    """Stop a node where no code of the user's asked for it, who would get what an overriding stop()
+    raises."""
+    try:
+        node.stop()
+    except BaseException as error:
+        node.errors.report(error, node.stop, f'{name_of(node.stop)} of {node.name}')
+
+
+def _begin_stop(node: 'Node') -> 'Optional[Run]':
+    """The run that this thread is to end; None where another one has done it, or there is nothing
+    to end."""
+    if node.latest_run is not None:
+        node.latest_run.cancel_start()
+    with changed:
+        run = node.latest_run
+        try:
+            is_awaited = _wait_for_stop(node)
+        except TimeoutError:
+            return None
+        if not node.is_running or is_awaited and node.latest_run is not run:
+            return None
+        run = node.latest_run
+        _stops[node] = _Stop(run, threading.get_ident(), time.monotonic() + STOP_LIMIT)
+    return run
+
+
+def _wait_for_stop(node: 'Node') -> bool:
+    """Wait until no other thread starts or stops the node; returns whether there was a stop().
+
+    :raises TimeoutError: if it has not ended in time, or this thread is one that it waits for
+    """
+    me, is_awaited = threading.get_ident(), False
+    with changed:
+        while True:
+            under_way = _stops.get(node)
+            if under_way is None or under_way.thread == me:
+                if node.latest_run is None or not node.latest_run.is_starting:
+                    return is_awaited
+                left = SIGNAL_LATENCY
+            else:
+                is_awaited = True
+                left = under_way.deadline - time.monotonic()
+            if left <= 0 or node.latest_run.is_own_thread() or _waits_for_me(node):
+                raise TimeoutError
+            _waiting[me] = node
+            try:
+                changed.wait(min(left, SIGNAL_LATENCY))
+            finally:
+                del _waiting[me]
+
+
+def _is_stopped_here(node: 'Node') -> bool:
+    under_way = _stops.get(node)
+    return under_way is not None and under_way.thread == threading.get_ident()
+
+
+def _waits_for_me(node: 'Optional[Node]') -> bool:
+    """Whether the thread that stops the node waits, perhaps by way of others, for the stop that
+    this one runs."""
+    while node in _stops:
+        if _is_stopped_here(node):
+            return True
+        node = _waiting.get(_stops[node].thread)
+    return False
+
+
+# -- all of them
+
+
+def spin() -> None:
+    """Block until every node of the process has stopped, or Ctrl-C, SIGTERM or SIGHUP, which stop
+    them.
+
+    A node whose ``stop()`` does not end within 30 s is not waited for.
+    """
+    with signals.interruptible_wait():
+        try:
+            with changed:
+                while _has_nodes_to_wait_for():
+                    changed.wait(SIGNAL_LATENCY)
+        except KeyboardInterrupt:  # the host program has a handler of its own
+            stop_all()
+
+
+def _has_nodes_to_wait_for() -> bool:
+    now, me = time.monotonic(), threading.get_ident()
+    late = [node for node, stop in _stops.items() if now >= stop.deadline]
+    stopped_elsewhere = [node for node, stop in _stops.items() if stop.thread != me]
+    return any(node not in late for node in (*_nodes.values(), *stopped_elsewhere))
+
+
+def stop_all() -> None:
+    """Stop all nodes of the process, side by side.
+
+    Returns when each has ended its ``stop()``, or after STOP_LIMIT seconds.
+    """
+    with changed:
+        # a node that has stopped may go on in an overriding stop()
+        to_stop = {node for node in (*_nodes.values(), *_stops) if not _is_stopped_here(node)}
+    threads = [
+        threading.Thread(target=stop, args=(node,), name=node.name + ' stop', daemon=True)
+        for node in to_stop
+    ]
+    for thread in threads:
+        thread.start()
+    join(threads, STOP_LIMIT)
+
+
+def join(threads: Iterable[threading.Thread], timeout: float) -> None:
+    """Wait until the threads have ended, for up to ``timeout`` seconds in all."""
+    deadline = time.monotonic() + timeout
+    for thread in threads:
+        thread.join(max(0.0, deadline - time.monotonic()))
+
+
+# -- the end of the program
+
+
+def at_end(function: Callable[[], Any]) -> None:
+    """Run ``function()`` when the program ends, after the nodes have stopped; the last that was
+    given first."""
+    _end_with_multiprocessing()
+    _others.append(function)
+
+
+def not_at_end(function: Callable[[], Any]) -> None:
+    """Do not run it then: what it ends has ended."""
+    with contextlib.suppress(ValueError):  # done already, by another thread perhaps
+        _others.remove(function)
+
+
+def _end_with_multiprocessing() -> None:
+    """Have a process of multiprocessing end as others do: one that was forked runs nothing that
+    atexit knows."""
+    global _finalizer
+    multiprocessing = sys.modules.get('multiprocessing')
+    if _finalizer is None and multiprocessing and multiprocessing.parent_process():
+        _finalizer = multiprocessing.util.Finalize(None, _end, exitpriority=0)
+
+
+def _end() -> None:
+    """The program ends, once: a signal that comes meanwhile asks for nothing more."""
+    with signals.held(STOP_LIMIT, is_end=True), contextlib.ExitStack() as others:
+        stop_all()
+        for function in _others:
+            # the last first, and each of them, whatever another one raises
+            others.callback(function)
+        _others.clear()
+
+
+def _rospy_ended_by(number: int) -> None:
+    """A signal has ended the rospy node that the program itself is; rospy passes on what we had
+    taken on before."""
+    if number not in signals.taken_on:
+        stop_all()
+
+
+def _forget() -> None:
+    """In a process that was forked: the nodes are its parent's, as are the programs, and it must
+    not end them."""
+    global changed, _finalizer
+    changed = threading.Condition()
+    _finalizer = None  # its parent's, which multiprocessing has dropped
+    former = list(_nodes.values())
+    for known in (_nodes, _stops, _waiting, _others):
+        known.clear()  # type: ignore[attr-defined]
+    for node in former:
+        node.latest_run.abandon()
+
+
+signals.serve(lambda: bool(_nodes or _others or _stops), stop_all)
+process_rospy.on_signal(_rospy_ended_by)
+atexit.register(_end)
+os.register_at_fork(after_in_child=_forget)

@@ -1,0 +1,349 @@
+"""One run of a node: all that a start makes, and its stop ends."""
+import contextlib
+import enum
+import threading
+import weakref
+from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, List, Optional, Union
+
+from pharos import messages, node_registry, signals
+from pharos.blocks import attempt, name_of
+from pharos.channel import InputChannel, OutputChannel
+from pharos.errors import MessageTypeError, NodeStoppedError
+from pharos.external_node import ExternalNode
+from pharos.intraprocess.dispatcher import Dispatcher
+from pharos.private_rospy.instance import PrivateRospy
+from pharos.private_rospy.names import Resolved, check_name
+from pharos.private_rospy.process_rospy import rospy
+from pharos.private_rospy.settings import Settings
+from pharos.topic import Topic
+from pharos.transcript import Transcript
+from pharos.watcher import watcher_of
+
+if TYPE_CHECKING:
+    from pharos.node import Node
+
+
+class Lifecycle(enum.Enum):
+    """Where a node is in its life; see :attr:`Node.lifecycle`."""
+
+    NEW = 'new'
+    STARTING = 'starting'
+    RUNNING = 'running'
+    STOPPING = 'stopping'
+    STOPPED = 'stopped'
+
+
+class Run:
+    """One run of a node, from a start to its stop; it is thrown away at the next start.
+
+    :attr:`rospy` is the node's :class:`~pharos.private_rospy.instance.PrivateRospy`,
+    :attr:`dispatcher` runs its delegates, and :attr:`opened` are the channels and services that it
+    has open, in the order of their opening.
+    """
+
+    def __init__(self, node: 'Node', settings: Settings) -> None:
+        self.node = node
+        self.lifecycle = Lifecycle.STARTING
+        self.opened: List[Any] = []
+        self.senders: Dict[str, Any] = {}  # topic name, as given to send_to -> its OutputChannel
+        # topic name -> the lock of the thread that opens a channel to send on it
+        self._opening: Dict[str, Any] = {}
+        self._settings = settings
+        self._starter: Optional[int] = threading.get_ident()  # the thread that starts the node
+        self._is_cancelled = False  # whether a stop() came while the node started
+        self._forked: 'weakref.WeakSet[threading.Thread]' = weakref.WeakSet()  # they run souls
+        self._soul_threads: List[int] = []  # identifiers of threads, once for each soul they run
+        self.rospy = PrivateRospy(settings, self._stop_for_ros, lambda: node.allow_remote_shutdown)
+        self.dispatcher = Dispatcher(self.rospy.start_thread)
+        self.rospy.on_received = self.dispatcher.run
+        self.rospy.on_failure = self._hook_failed
+        self.rospy.refusals.on_refused = self._report_refusal
+
+    # -- start and stop
+
+    def start(self, reopens: bool) -> None:
+        """Register the node with the master. On an error it is as it was, in its former run.
+
+        :param reopens: whether it is to open what the former run had, see :meth:`reopen`
+        :raises NodeStoppedError: if :meth:`cancel_start` was called meanwhile
+        """
+        former = node_registry.claim(self)
+        try:
+            self.rospy.start(self.node.connect_timeout)
+            # the same ports next time, also where any free one was asked for
+            self._settings.tcp_port = self.rospy.tcp_port
+            self._settings.xmlrpc_port = self.rospy.xmlrpc_port
+            if former and reopens:
+                self.opened = list(former.opened)
+                self.rospy.parameters.take_over(former.rospy.parameters)
+            with node_registry.changed:
+                if self._is_cancelled:
+                    raise NodeStoppedError('it is registered, and goes again')
+                self._become(Lifecycle.RUNNING)
+        except BaseException as error:
+            self.rospy.stop(0)
+            self.node.latest_run = former
+            self._become(Lifecycle.STOPPED)
+            self._raise_of_start(error, self._is_cancelled)
+        watcher_of(self.node.master).check()
+
+    def reopen(self) -> None:
+        """Open the channels and services of the former run, and tell the master of its parameters.
+
+        On an error the run ends, and the next one opens all of them.
+        """
+        try:
+            for opened in self.opened:
+                if self.lifecycle is not Lifecycle.RUNNING:
+                    raise NodeStoppedError('another thread has stopped it')
+                opened.open()
+            with self.node.master.reached():
+                self.rospy.parameters.renew()
+        except BaseException as error:
+            is_stopped = self.lifecycle is not Lifecycle.RUNNING
+            self.end()
+            self._close_opened()  # what was opened after another thread had stopped the node
+            self._raise_of_start(error, is_stopped)
+
+    def _raise_of_start(self, error: BaseException, is_stopped: bool) -> None:
+        if is_stopped and isinstance(error, Exception):
+            raise NodeStoppedError(f'{self.node.name} was stopped while it started') from error
+        raise error
+
+    def cancel_start(self) -> None:
+        """Have the start end, where the node is starting: its caller gets a NodeStoppedError."""
+        with node_registry.changed:
+            self._is_cancelled = self.is_starting
+        if self._is_cancelled:
+            self.rospy.end()
+
+    def end(self) -> None:
+        """End all that the run has, in this order: what waits, souls, the dispatcher, and then what
+        :meth:`PrivateRospy.stop` ends. Does nothing where the run has not begun, or ends already.
+        """
+        with node_registry.changed:
+            if self.lifecycle is not Lifecycle.RUNNING:
+                return
+            self._become(Lifecycle.STOPPING)
+        timeout = self.node.stop_timeout
+        try:
+            self.rospy.end()
+            ignoring = self._end_souls(timeout)
+            self.dispatcher.close()
+            left = self.rospy.stop(timeout, ignoring)
+            if left:
+                Transcript.show(
+                    f"{self.node.name} left behind threads that did not end: {', '.join(left)}"
+                )
+            self._close_opened()
+        finally:
+            self._become(Lifecycle.STOPPED)
+            node_registry.collect()
+            watcher_of(self.node.master).check()
+
+    def _end_souls(self, timeout: float) -> List[threading.Thread]:
+        """Wait for the souls, but this thread's; returns the threads of those that went on."""
+        threads = [thread for thread in self._forked if thread is not threading.current_thread()]
+        node_registry.join(threads, timeout)
+        ignoring = [thread for thread in threads if thread.is_alive()]
+        if ignoring:
+            self.node.log(
+                f"left behind, for it did not end within {timeout:g} s of the stop:"
+                f" {', '.join(thread.name for thread in ignoring)}. A soul ends by itself if it"
+                ' waits with node.sleep() or loops over node.every()',
+                level='warning',
+            )
+        return ignoring
+
+    def _close_opened(self) -> None:
+        for opened in self.opened:
+            opened.node_stopped()
+
+    def abandon(self) -> None:
+        """This is a process that was forked: the node runs in its parent, and here it is
+        stopped."""
+        self.lifecycle = Lifecycle.STOPPED
+        self._close_opened()
+        self.opened = []
+
+    def _become(self, lifecycle: Lifecycle) -> None:
+        with node_registry.changed:
+            self.lifecycle = lifecycle
+            self._starter = None
+            if lifecycle is Lifecycle.STOPPED:
+                node_registry.discard(self.node)
+            node_registry.changed.notify_all()
+
+    @property
+    def is_starting(self) -> bool:
+        """Whether the node is not registered yet."""
+        return self.lifecycle is Lifecycle.STARTING
+
+    @property
+    def is_ending(self) -> bool:
+        """Whether its stop has begun."""
+        return self.lifecycle in (Lifecycle.STOPPING, Lifecycle.STOPPED)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether it has ended."""
+        return self.lifecycle is Lifecycle.STOPPED
+
+    def is_own_thread(self) -> bool:
+        """Whether a stop() of the node may have to wait for this thread."""
+        if self.is_starting:
+            return self._starter == threading.get_ident()
+        return self.rospy.owns(threading.current_thread())
+
+    def _stop_for_ros(self, reason: str) -> None:
+        attempt(lambda: self.node.log(f'stops: {reason}'))
+        node_registry.stop(self.node)
+
+    # -- what is open
+
+    def remember(self, opened: Any) -> None:
+        """A channel or service is open from now on, also after a restart."""
+        with node_registry.changed:
+            if opened not in self.opened:
+                # replaced, so that others may iterate meanwhile
+                self.opened = [*self.opened, opened]
+
+    def forget(self, opened: Any) -> None:
+        """It was closed for good."""
+        with node_registry.changed:
+            self.opened = [other for other in self.opened if other is not opened]
+            self.senders.clear()
+
+    @property
+    def channels(self) -> List[Any]:
+        """The channels that are open."""
+        channels = (InputChannel, OutputChannel)
+        return [each for each in self.opened if isinstance(each, channels) and each.is_open]
+
+    def sender(
+        self, topic: Topic, typed_as: Any, connect_timeout: float, wait: float
+    ) -> OutputChannel:
+        """The channel for ``send_to``, opened by the first of several threads that come at once,
+        for which the others wait."""
+        opening = self._opening.setdefault(topic.name, threading.RLock())
+        limit = max(0.0, wait + connect_timeout)
+        is_mine = opening.acquire(timeout=min(limit, threading.TIMEOUT_MAX))
+        try:
+            for channel in self.channels:
+                if channel.topic == topic.name and isinstance(channel, OutputChannel):
+                    return channel
+            return topic.output_channel(
+                self.node, typed_as, connect_timeout=connect_timeout, wait=wait
+            )
+        finally:
+            if is_mine:
+                opening.release()
+
+    def resolve(self, name: str, what: str) -> str:
+        """A name as the node means it, in its namespace and remapped, in full.
+
+        :param what: what it is the name of, such as 'topic'
+        :raises ValueError: if it cannot be a name
+        """
+        name = check_name(name, what, private=True)
+        # where rospy takes what follows for a global name (ros_comm #3044)
+        name = '~' + name[2:] if name.startswith('~/') else name
+        return check_name(self.rospy.rospy.resolve_name(name), what)
+
+    def resolve_peer(self, peer: 'Union[str, Node, ExternalNode]') -> Resolved:
+        """The full name of a node that messages come from or go to.
+
+        :param peer: a name, Node or ExternalNode
+        :raises ValueError: if it is none of these, or of another master
+        """
+        if isinstance(peer, ExternalNode) or hasattr(type(peer), 'latest_run'):
+            if peer.master != self.node.master:
+                raise ValueError(
+                    f'{peer} is at another master than {self.node.name}, and nothing goes from one'
+                    ' to the other'
+                )
+            return Resolved(peer.name)
+        if isinstance(peer, Resolved):
+            return peer
+        if not isinstance(peer, str):
+            raise ValueError(f'from_= and to= are a node or its name, not {peer!r}')
+        return Resolved(self.resolve(peer, 'node'))
+
+    # -- souls
+
+    def run_soul(self, block: Callable[['Node'], Any], again: Callable[[Any], Any]) -> Any:
+        """Run a soul in this thread; an exception in it is reported and ends nothing else.
+
+        :param again: ``again(None)`` runs the soul as it is then
+        """
+        self._soul_threads.append(threading.get_ident())
+        try:
+            with self.rospy.interrupts_waits():
+                return block(self.node)
+        except BaseException as error:
+            self.report(error, block, 'soul', again=again)
+            return None
+        finally:
+            self._soul_threads.remove(threading.get_ident())
+
+    def turns(self, frequency: float) -> Iterator[None]:
+        """What :meth:`Node.every` returns; ``frequency`` in Hz."""
+        rate = self.rospy.rospy.Rate(frequency, reset=True)
+        return self._turns(rate)
+
+    def _turns(self, rate: Any) -> Iterator[None]:
+        while self.lifecycle is Lifecycle.RUNNING:
+            yield
+            with signals.interruptible_wait(), contextlib.suppress(rospy.ROSInterruptException):
+                rate.sleep()
+
+    def fork(self, run: Callable[[], Any], name: str) -> threading.Thread:
+        """Run a soul by ``run()`` in a thread of its own, and return the thread."""
+        thread: threading.Thread = self.rospy.start_thread(run, name=name)
+        self._forked.add(thread)
+        return thread
+
+    def end_soul(self) -> None:
+        """End the soul that runs in this thread, if one does and the node stops."""
+        if self.lifecycle is not Lifecycle.RUNNING and threading.get_ident() in self._soul_threads:
+            raise NodeStoppedError(f'{self.node.name} stops, and this soul with it')
+
+    # -- what goes wrong
+
+    def report(
+        self,
+        error: BaseException,
+        block: Any,
+        what: str,
+        channel: Any = None,
+        message: Any = None,
+        again: Optional[Callable[[Any], Any]] = None,
+    ) -> None:
+        """Keep and tell what a block raised, which ends nothing but that run of it.
+
+        See :meth:`Failures.report`.
+        """
+        if self.lifecycle is not Lifecycle.RUNNING and isinstance(
+            error, (NodeStoppedError, rospy.ROSInterruptException)
+        ):
+            return  # that is how the stop of a node ends its souls
+        where = f'{what} {name_of(block)} of {self.node.name}'
+        if channel is not None:
+            where += f' on {channel.topic}'
+            again = channel.run_again
+        self.node.errors.report(error, block, where, channel, message, again)
+
+    def _hook_failed(self, error: BaseException) -> None:
+        self.node.errors.report(error, None, f'a hook of on_shutdown of {self.node.name}')
+
+    def _report_refusal(self, refusal: Any) -> None:
+        """Keep and tell, once, that a publisher's messages do not come, for they are of another
+        type."""
+        name = self.node.name
+        error = MessageTypeError(
+            messages.explain_refusal(
+                name, refusal.topic, refusal.wanted, refusal.publisher, refusal.offered
+            )
+        )
+        where = f'connection of {name} to {refusal.publisher} for {refusal.topic}'
+        self.node.errors.report(error, None, where)
