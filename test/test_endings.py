@@ -18,9 +18,8 @@ from pharos import (
     node_registry,
 )
 from pharos import message_class
-from pharos.private_rospy import acceptor, lifetime, proxies
+from pharos.private_rospy import acceptor, lifetime, local_services, proxies
 from pharos.private_rospy.patches import xmlrpc_server
-from pharos.intraprocess import services
 from programs import until
 from sockets import refused_url, silent_peer
 
@@ -399,8 +398,8 @@ def waiting(master, monkeypatch):
     )
     monkeypatch.setattr('pharos.channel.OutputChannel.connections', [])
     monkeypatch.setattr(
-        'pharos.intraprocess.services.find',
-        lambda name, uri, cls, find=services.find: (
+        'pharos.private_rospy.local_services.find',
+        lambda name, uri, cls, find=local_services.find: (
             find(name, uri, cls) if name == '/sleep' else None
         ),
     )

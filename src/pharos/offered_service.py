@@ -6,7 +6,8 @@ import genpy
 from pharos import messages
 from pharos.blocks import check_block, text_of
 from pharos.errors import MessageTypeError, PharosError
-from pharos.intraprocess import services
+from pharos.intraprocess.copier import copier_for
+from pharos.private_rospy import local_services
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.proxies import time_limit
 from pharos.private_rospy.registration import REGISTER_TIMEOUT, UNREGISTER_TIMEOUT
@@ -18,7 +19,7 @@ class OfferedService:
     def __init__(self, node, name, typed_as, block):
         self.node, self.name = node, name
         self.service_class = messages.service_class(typed_as)
-        self._check = services.checker(self.service_class._response_class)
+        self._check = copier_for(self.service_class._response_class).freeze
         self.block = block
         opened = node.current_run.opened
         if any(isinstance(other, OfferedService) and other.name == name for other in opened):
@@ -28,7 +29,7 @@ class OfferedService:
     def open(self):
         """Register with the master, also after a restart of the node."""
         with time_limit(max(REGISTER_TIMEOUT, self.node.connect_timeout)):
-            self._service = services.offer(
+            self._service = local_services.offer(
                 self.node.current_run.rospy, self.name, self.service_class, self._answer
             )
         self.node.latest_run.remember(self)

@@ -15,7 +15,10 @@ from pharos.errors import (
     UnknownServiceError,
     suggest,
 )
-from pharos.intraprocess import services
+from pharos.intraprocess.copier import serialized
+from pharos.intraprocess.services import Failed
+from pharos.intraprocess.sharing import numbered
+from pharos.private_rospy import local_services
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.proxies import time_limit
 from pharos.private_rospy.lifetime import Interruption
@@ -143,11 +146,11 @@ class Service:
         self._check_definition(deadline)
         request = messages.build(self.service_class._request_class, block, fields)
         self._calls += 1
-        request = services.numbered(request, self._calls)
+        request = numbered(request, self._calls)
         waiting = Interruption()
         try:
             self.response = response = self._exchange(request, deadline)
-        except services.Failed as error:
+        except Failed as error:
             raise ServiceCallError(f'{self.name} failed: {error}') from None
         except socket.timeout as error:
             raise ServiceCallError(
@@ -203,7 +206,7 @@ class Service:
         """Send the request to where the provider is thought to be; returns the response."""
         here = self._here
         if here is None or not here.is_offered(self.uri):
-            here = self._here = services.find(self.name, self.uri, self.service_class)
+            here = self._here = local_services.find(self.name, self.uri, self.service_class)
         # what is sent by hand as another type's is left to the wire
         here = (
             here
@@ -211,7 +214,7 @@ class Service:
             else None
         )
         try:
-            data = here.freeze(request) if here else services.serialize(request)
+            data = here.freeze(request) if here else serialized(request)
         except Exception:
             messages.check_fits(request)  # tells what of it does not
             raise
@@ -231,7 +234,7 @@ class Service:
         else:
             connection.close()
         if not ok:  # roscpp gives no reason
-            raise services.Failed(answer.decode(errors='replace') or 'its provider gives no reason')
+            raise Failed(answer.decode(errors='replace') or 'its provider gives no reason')
         response = self.service_class._response_class().deserialize(answer)
         response._connection_header = connection.header
         return response
@@ -306,7 +309,7 @@ class Service:
     def _fields_of(self, type_, md5sum):
         """What can be said of the fields of a provider's type; a provider elsewhere tells its
         md5sum alone."""
-        here = services.class_of(self.name, self.uri)
+        here = local_services.class_of(self.name, self.uri)
         for known in (here, *messages.known_service_classes(type_)):
             if known is not None and known._md5sum == md5sum:
                 return messages.describe_service(known)

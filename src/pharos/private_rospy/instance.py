@@ -29,7 +29,6 @@ from pharos.private_rospy.loader import PrivateImports, Substitute
 from pharos.private_rospy.patches import tcpros_server
 from pharos.private_rospy.parameters import WatchedParameters
 from pharos.private_rospy.proxies import ServerProxy, is_time_up, time_limit
-from pharos.intraprocess.services import Workers
 from pharos.private_rospy.connections import Connections
 
 POLL = 0.001  # seconds between rospy's own looks at whether it is registered; it takes 0.1 s
@@ -60,7 +59,6 @@ class PrivateRospy:
         self.connections = Connections(self)
         self.refusals = refusals.Refusals(self)
         self.parameters = WatchedParameters(self)
-        self.workers = Workers(self.lifetime.start_thread)
         self._modules = self._load()
         self.rospy = self._modules.load('rospy')
         patches.check_applied(self._modules.modules)
@@ -191,7 +189,6 @@ class PrivateRospy:
         if not self._stopping.acquire(blocking=False):
             return []
         self.connections.close()
-        self.workers.close()
         self.parameters.close()
         core = self._modules.load('rospy.core')
         self._flush(flush_timeout)
