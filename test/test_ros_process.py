@@ -403,12 +403,15 @@ process.terminate(timeout=4)
 
 
 def test_a_program_may_be_ended_by_the_block_for_its_output(master, package):
-    ended = queue.SimpleQueue()
-    process = master.run(
-        'fake_robot',
-        program(package, 'talks', 'echo enough; sleep 1000'),
-        on_line=lambda text: ended.put((process.terminate(), process.wait())),
-    )
+    ended, started = queue.SimpleQueue(), threading.Event()
+
+    def end(text):
+        started.wait(TIMEOUT)
+        ended.put((process.terminate(), process.wait()))
+
+    talks = program(package, 'talks', 'echo enough; exec sleep 1000')
+    process = master.run('fake_robot', talks, on_line=end)
+    started.set()
     assert ended.get(timeout=TIMEOUT) == (-signal.SIGINT, -signal.SIGINT)
 
 

@@ -191,7 +191,7 @@ class Master(MasterCalls):
         if name is not None:
             mappings['__name'] = name
         arguments = [*map(str, args), *(f'{key}:={value}' for key, value in mappings.items())]
-        return ros_process.run(self.url, package, executable, arguments, on_line)
+        return ros_process.run(self, package, executable, arguments, on_line)
 
     def launch(
         self,
@@ -207,7 +207,7 @@ class Master(MasterCalls):
         :param on_line: block called as ``on_line(text)`` for each line of its output, in a thread
             of its own
         """
-        return ros_process.launch(self.url, package, file, args, on_line)
+        return ros_process.launch(self, package, file, args, on_line)
 
     # -- what is there
 

@@ -1,25 +1,39 @@
-"""ROS programs run as processes of their own."""
+"""ROS programs run as processes of their own, found and ended as rosrun and roslaunch do."""
 import collections
 import contextlib
-import glob
 import os
-import select
 import signal
 import subprocess
 import sys
 import threading
+import urllib.parse
+import xmlrpc.client
+from typing import TYPE_CHECKING, Any, Callable, Deque, Dict, Iterator, List, Optional, Set
+
+import psutil
+import rosgraph.network
+import roslib.packages
+import rospkg
+from catkin.find_in_workspaces import find_in_workspaces
 
 from pharos import node_registry
 from pharos.blocks import check_block, name_of
 from pharos.errors import UnknownNodeError
 from pharos.failures import Failures
-from pharos.process_nodes import ProcessNodes
+from pharos.private_rospy.proxies import ServerProxy
+from pharos.private_rospy.registration import COMMUNICATION_ERRORS, unregister_all
 from pharos.transcript import Transcript
+
+if TYPE_CHECKING:
+    from pharos.master import Master
 
 # What they print is wanted line by line, as on a terminal, and not in blocks of 4 KiB
 LINE_BY_LINE = {'PYTHONUNBUFFERED': '1', 'ROSCONSOLE_STDOUT_LINE_BUFFERED': '1'}
 
-KILL_TIMEOUT = 1.0  # seconds that a process may take to end when it is killed
+KILL_TIMEOUT = 1.0  # seconds that processes may take to end when they are killed
+ANSWER_TIMEOUT = 1.0  # seconds that the master or a node may take to answer
+
+Block = Callable[[str], Any]
 
 
 class RosProcess:
@@ -29,17 +43,18 @@ class RosProcess:
     What the program has started ends with it.
     """
 
-    def __init__(self, command, master_url, on_line=None):
+    def __init__(
+        self, command: List[str], master: 'Master', on_line: Optional[Block] = None
+    ) -> None:
         self.command = command
         self._on_line = check_block(on_line, 'on_line', ('text',))
         self._failures = Failures(lambda line, details: Transcript.show(line))
-        self._lines = collections.deque(maxlen=10000)
-        environ = {**LINE_BY_LINE, **os.environ, 'ROS_MASTER_URI': master_url}
+        self._lines: Deque[str] = collections.deque(maxlen=10000)
         # a session of its own, so that what it starts ends with it, and Ctrl-C is the program's to
         # handle
         self._process = subprocess.Popen(
             command,
-            env=environ,
+            env={**LINE_BY_LINE, **os.environ, 'ROS_MASTER_URI': master.url},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -47,14 +62,15 @@ class RosProcess:
             errors='replace',
             start_new_session=True,
         )
-        self._nodes = ProcessNodes(master_url)
+        self._nodes = _Nodes(master)
         node_registry.at_end(self.terminate)
         self._reader = threading.Thread(
             target=self._read, name=f'output of {command[0]}', daemon=True
         )
         self._reader.start()
 
-    def _read(self):
+    def _read(self) -> None:
+        assert self._process.stdout
         with self._process.stdout as output:
             for line in output:
                 line = line.rstrip('\n')
@@ -66,7 +82,7 @@ class RosProcess:
         self._signal(signal.SIGKILL)
         node_registry.not_at_end(self.terminate)
 
-    def _show(self, line):
+    def _show(self, line: str) -> None:
         try:
             self._on_line(line)
         except BaseException as error:  # the program's output goes on
@@ -74,20 +90,20 @@ class RosProcess:
             self._failures.report(error, self._on_line, where, message=line)
 
     @property
-    def pid(self):
+    def pid(self) -> int:
         """Its process id."""
         return self._process.pid
 
     @property
-    def output(self):
+    def output(self) -> str:
         """What it has printed so far, standard output and errors together."""
         return '\n'.join(self._lines)
 
-    def poll(self):
+    def poll(self) -> Optional[int]:
         """Its exit status, None while it runs."""
         return self._process.poll()
 
-    def wait(self, timeout=None):
+    def wait(self, timeout: Optional[float] = None) -> int:
         """Wait until it ends; returns its exit status.
 
         :raises subprocess.TimeoutExpired: after ``timeout`` seconds
@@ -97,7 +113,7 @@ class RosProcess:
             self._reader.join(1.0)
         return status
 
-    def terminate(self, timeout=5.0):
+    def terminate(self, timeout: float = 5.0) -> int:
         """Ask it, and what it has started, to end, and end them after ``timeout`` seconds; returns
         its exit status.
 
@@ -107,20 +123,19 @@ class RosProcess:
         also where Ctrl-C has cut it off.
         """
         if self.poll() is None:
-            numbers = [signal.SIGINT, signal.SIGTERM]
             started = self._look()
-            if self._nodes.shut_down():
-                numbers.insert(0, None)
-            for number in numbers:
-                if number is not None:
-                    started += self._look()  # roslaunch may have started some again
+            has_nodes = self._nodes.shut_down()
+            share = timeout / (3 if has_nodes else 2)
+            if not (has_nodes and self._ends_within(share)):
+                for number in (signal.SIGINT, signal.SIGTERM):
+                    started |= self._look()  # roslaunch may have started some again
                     self._signal(number)
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    self._process.wait(timeout / len(numbers))
-                    break
+                    if self._ends_within(share):
+                        break
             for process in started:
-                with process:
+                with contextlib.suppress(psutil.Error):  # it has ended
                     process.kill()
+            psutil.wait_procs(started, KILL_TIMEOUT)
         if self._reader.is_alive():  # else it has done so
             self._signal(signal.SIGKILL)
         status = self.wait()
@@ -128,67 +143,146 @@ class RosProcess:
         node_registry.not_at_end(self.terminate)
         return status
 
-    def _look(self):
+    def _ends_within(self, seconds: float) -> bool:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(seconds)
+        return self.poll() is not None
+
+    def _look(self) -> Set[psutil.Process]:
         """See where the nodes are; returns what the program has started. roslaunch gives each a
         session of its own."""
-        started = _descendants(self.pid)
-        self._nodes.look([self.pid, *(process.pid for process in started)])
-        return started
-
-    def _signal(self, number):
         try:
-            os.killpg(self.pid, number)
-        except ProcessLookupError:
-            pass  # all of them have ended
+            program = psutil.Process(self.pid)
+            started = program.children(recursive=True)
+        except psutil.NoSuchProcess:
+            return set()
+        self._nodes.look([program, *started])
+        return set(started)
 
-    def __enter__(self):
+    def _signal(self, number: int) -> None:
+        with contextlib.suppress(ProcessLookupError):  # all of them have ended
+            os.killpg(self.pid, number)
+
+    def __enter__(self) -> 'RosProcess':
         return self
 
-    def __exit__(self, *error):
+    def __exit__(self, *error: object) -> None:
         self.terminate()
 
-    def __repr__(self):
-        return '<RosProcess %s, %s>' % (
-            ' '.join(self.command),
-            'pid %d' % self.pid if self.poll() is None else 'ended with %d' % self.poll(),
-        )
+    def __repr__(self) -> str:
+        status = self.poll()
+        state = f'pid {self.pid}' if status is None else f'ended with {status}'
+        return f"<RosProcess {' '.join(self.command)}, {state}>"
 
 
-def run(master_url, package, executable, args, on_line=None):
+class _Nodes:
+    """The nodes at one master that run in given processes, known by the ports on which these listen.
+
+    Not those of which ``getPid`` says so: on another host, the number is another process's.
+    """
+
+    def __init__(self, master: 'Master') -> None:
+        self._master = master
+        self._ports: Set[int] = set()
+
+    def look(self, processes: List[psutil.Process]) -> None:
+        """See on which ports the processes listen, which cannot be seen of one that has ended."""
+        for process in processes:
+            with contextlib.suppress(psutil.Error):  # it has ended, or is another user's
+                # psutil 6 calls it otherwise
+                connections = getattr(process, 'net_connections', None) or process.connections
+                self._ports.update(
+                    connection.laddr.port
+                    for connection in connections('tcp')
+                    if connection.status == psutil.CONN_LISTEN
+                )
+
+    def shut_down(self) -> bool:
+        """Ask the nodes to end, as ``rosnode kill`` does; returns whether there are any."""
+        found = self._registered()
+        for uri in found.values():
+            # some end before their answer is through
+            with contextlib.suppress(*COMMUNICATION_ERRORS):
+                ServerProxy(uri, ANSWER_TIMEOUT).shutdown('/pharos', 'its program is to end')
+        return bool(found)
+
+    def clear(self) -> None:
+        """Unregister those that are dead, as ``rosnode cleanup`` does, which asks at a terminal
+        whether to, and the master of the environment."""
+        for name, uri in self._registered().items():
+            with contextlib.suppress(rosgraph.MasterException, *COMMUNICATION_ERRORS):
+                try:
+                    ServerProxy(uri, ANSWER_TIMEOUT).getPid('/pharos')
+                except ConnectionRefusedError:
+                    unregister_all(self._master.api(name, ANSWER_TIMEOUT), name, uri)
+
+    def _registered(self) -> Dict[str, str]:
+        """``{name: URI}`` of the nodes at the ports that were seen."""
+        if not self._ports:
+            return {}
+        try:
+            api = self._master.api(timeout=ANSWER_TIMEOUT)
+            names = sorted(
+                {name for kind in api.getSystemState() for _, users in kind for name in users}
+            )
+            calls = xmlrpc.client.MultiCall(api.handle)
+            for name in names:
+                calls.lookupNode('/pharos', name)
+            uris = [uri for _, _, uri in calls()]
+        except (rosgraph.MasterException, *COMMUNICATION_ERRORS):
+            return {}  # there is no master to clear anything away from
+        return {name: uri for name, uri in zip(names, uris) if uri and self._is_ours(uri)}
+
+    def _is_ours(self, uri: str) -> bool:
+        address = urllib.parse.urlsplit(uri)
+        try:
+            port = address.port
+        except ValueError:  # the master takes any number from anybody
+            return False
+        return port in self._ports and rosgraph.network.is_local_address(address.hostname)
+
+
+def run(
+    master: 'Master',
+    package: str,
+    executable: str,
+    args: List[str],
+    on_line: Optional[Block] = None,
+) -> RosProcess:
     """Start a program as ``rosrun`` would, at the master given.
 
     :raises UnknownNodeError: if there is no such package or program
     """
-    paths = _find(package, executable)
+    with _known(package):
+        paths = _find(package, executable)
     if not paths:
         raise UnknownNodeError(
             f'the ROS package {package} has no program {executable!r}: see what it has with rosrun'
             f' {package} <Tab>'
         )
-    return RosProcess([paths[0], *args], master_url, on_line)
+    return RosProcess([paths[0], *args], master, on_line)
 
 
-def _find(package, executable):
+def _find(package: str, executable: str) -> List[str]:
     """The paths of a program, as rosrun looks it up."""
-    import roslib.packages  # only here: they are slow to import
-    import rospkg
-    from catkin.find_in_workspaces import find_in_workspaces
-
     try:
-        return roslib.packages.find_node(package, executable)
+        return list(roslib.packages.find_node(package, executable))
     except rospkg.ResourceNotFound:
         # Debian's topic_tools and others have no package.xml, but catkin knows their folder
         folders = find_in_workspaces(['libexec'], project=package)
         if not folders:
-            raise UnknownNodeError(
-                f'no ROS package {package!r} on ROS_PACKAGE_PATH: install it, or source its'
-                ' workspace\'s setup.bash'
-            ) from None
+            raise
         paths = [os.path.join(folder, executable) for folder in folders]
         return [path for path in paths if os.access(path, os.X_OK)]
 
 
-def launch(master_url, package, file, args, on_line=None):
+def launch(
+    master: 'Master',
+    package: str,
+    file: str,
+    args: Dict[str, object],
+    on_line: Optional[Block] = None,
+) -> RosProcess:
     """Start a launch file as ``roslaunch`` would, at the master given.
 
     A process of its own, although roslaunch has a Python API: that works in the main thread alone,
@@ -196,67 +290,24 @@ def launch(master_url, package, file, args, on_line=None):
 
     :raises UnknownNodeError: if there is no such package or launch file
     """
-    import roslib.packages
-    import rospkg
-
-    try:
+    with _known(package):
         found = roslib.packages.find_resource(package, file)
+    if not found:
+        raise UnknownNodeError(
+            f'the ROS package {package} has no launch file {file!r}: is it spelt so, and installed?'
+        )
+    roslaunch = [sys.executable, '-c', 'import roslaunch; roslaunch.main()', '--skip-log-check']
+    arguments = [f'{name}:={value}' for name, value in args.items()]
+    return RosProcess([*roslaunch, found[0], *arguments], master, on_line)
+
+
+@contextlib.contextmanager
+def _known(package: str) -> Iterator[None]:
+    """Say what to do where there is no such package."""
+    try:
+        yield
     except rospkg.ResourceNotFound:
         raise UnknownNodeError(
             f'no ROS package {package!r} on ROS_PACKAGE_PATH: install it, or source its'
             ' workspace\'s setup.bash'
         ) from None
-    if not found:
-        raise UnknownNodeError(
-            f'the ROS package {package} has no launch file {file!r}: is it spelt so, and installed?'
-        )
-    command = [
-        sys.executable,
-        '-c',
-        'import roslaunch; roslaunch.main()',
-        '--skip-log-check',
-        found[0],
-    ]
-    return RosProcess([*command, *('%s:=%s' % arg for arg in args.items())], master_url, on_line)
-
-
-class _Started:
-    """A process that a program has started, held by a descriptor: its number may be another's
-    later."""
-
-    def __init__(self, pid):
-        self.pid = pid
-        self._descriptor = os.pidfd_open(pid)
-
-    def kill(self):
-        """End it, if it has not ended."""
-        try:
-            signal.pidfd_send_signal(self._descriptor, signal.SIGKILL)
-        except ProcessLookupError:
-            pass
-        end = select.poll()
-        end.register(self._descriptor, select.POLLIN)
-        end.poll(1000 * KILL_TIMEOUT)
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        os.close(self._descriptor)
-
-
-def _descendants(pid):
-    """What the process has started, and those in turn, as :class:`_Started`."""
-    children = collections.defaultdict(list)
-    for stat in glob.glob('/proc/[0-9]*/stat'):
-        with contextlib.suppress(OSError), open(stat) as file:  # it may end meanwhile
-            number, _, rest = file.read().partition(' (')
-            children[int(rest.rpartition(') ')[2].split()[1])].append(int(number))
-    found, left = [], [pid]
-    while left:
-        started = children[left.pop()]
-        left += started
-        for child in started:
-            with contextlib.suppress(OSError):
-                found.append(_Started(child))
-    return found
