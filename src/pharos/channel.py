@@ -168,7 +168,7 @@ class InputChannel(_Channel):
     def refused(self):
         """How many publishers the channel cannot hear, for they publish another type; see the
         node's errors."""
-        return self._rospy.refusals.count(self.topic) if self.is_open else 0
+        return len(self._rospy.refusals.of(self.topic)) if self.is_open else 0
 
     @property
     def delegate(self):

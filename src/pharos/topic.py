@@ -99,9 +99,9 @@ class Topic:
         )
         if not is_first or message_class is typed_as or not messages.is_provisional(message_class):
             return InputChannel(node, self.name, message_class, **options)
-        with node.latest_run.rospy.refusals.held(self.name) as refusals:
+        with node.latest_run.rospy.refusals.held(self.name):
             channel = InputChannel(node, self.name, message_class, **options)
-            self._agree_with_publishers(channel, refusals)
+            self._agree_with_publishers(channel)
         return channel
 
     def output_channel(
@@ -198,16 +198,13 @@ class Topic:
         classes = [publisher.data_class for publisher in publishers]
         return [cls for cls in classes if cls._type == type_]
 
-    def _agree_with_publishers(self, channel, refusals):
+    def _agree_with_publishers(self, channel):
         """Have an input channel take the definition of a publisher elsewhere, where none suits it
         as it is.
 
         A publisher that is only asked for its definition takes that for a subscriber, and sends to
         nobody. So the channel subscribes with the definition that is known here, and one who
         refuses is believed.
-
-        :param refusals: a list that grows with each that comes; of those in it afterwards is to be
-            told
         """
         instance = channel.node.latest_run.rospy
         instance.wait_until(
@@ -216,13 +213,12 @@ class Topic:
         )
         if instance.connections.hears(self.name):
             return
-        for refusal in list(refusals):
+        for refusal in instance.refusals.of(self.name):
             if refusal.offered.get('type') == channel.type:
                 try:
                     cls = messages.class_of_header(refusal.offered)
                 except PharosError:
                     continue  # it is told as one that cannot be heard
-                refusals.clear()  # those whom this does not suit either refuse again
                 channel._subscribe_as(cls)
                 return
 

@@ -62,6 +62,9 @@ class PrivateRospy:
         self._modules = self._load()
         self.rospy = self._modules.load('rospy')
         patches.check_applied(self._modules.modules)
+        # rospy's own registries of Publishers and Subscribers, and of Services
+        self.topics = self.rospy.impl.registration.get_topic_manager()
+        self.service_manager = self.rospy.impl.registration.get_service_manager()
 
     def _load(self):
         lifetime, logging_module = self.lifetime, logs.private_logging()
@@ -204,7 +207,7 @@ class PrivateRospy:
     def _flush(self, timeout):
         """Wait until what the node published is with the sockets, up to ``timeout`` seconds."""
         deadline = time.monotonic() + timeout
-        for publisher in list(self._topic_manager().pubs.values()):
+        for publisher in list(self.topics.pubs.values()):
             for connection in list(publisher.connections):
                 if hasattr(connection, 'flush'):
                     connection.flush(deadline - time.monotonic())
@@ -219,12 +222,10 @@ class PrivateRospy:
     def repair(self, state, was_away):
         """Register with the master what it has forgotten; see :func:`.registration.repair`. Raises
         nothing."""
-        handler = self.lifetime.xmlrpc.handler
-        if handler is None or self.ended.is_set():
+        if self.handler is None or self.ended.is_set():
             return
         try:
-            services = self._modules.load('rospy.impl.registration').get_service_manager()
-            if registration.repair(self, handler, self._topic_manager(), services, state, was_away):
+            if registration.repair(self, state, was_away):
                 self.rospy.logwarn(
                     'the master %s had forgotten %s: registered again',
                     self.settings.master_url,
@@ -235,9 +236,6 @@ class PrivateRospy:
             self.rospy.logdebug(
                 'cannot register with the master %s: %s', self.settings.master_url, error
             )
-
-    def _topic_manager(self):
-        return self._modules.load('rospy.impl.registration').get_topic_manager()
 
     # -- what the facade needs of rospy's inside
 
@@ -299,11 +297,11 @@ class PrivateRospy:
 
     def publisher(self, topic):
         """rospy's _PublisherImpl of the topic, None if there is none."""
-        return self._topic_manager().get_publisher_impl(topic)
+        return self.topics.get_publisher_impl(topic)
 
     def subscriber(self, topic):
         """rospy's _SubscriberImpl of the topic, None if there is none."""
-        return self._topic_manager().get_subscriber_impl(topic)
+        return self.topics.get_subscriber_impl(topic)
 
     @property
     def services(self):

@@ -10,9 +10,8 @@ from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.tcpros_connection import publisher_header
 
 TIMEOUT = 1.0  # seconds in which a publisher that refused says what it publishes
-REMEMBERED = (
-    1000  # refusals of a node on each side; beyond, the oldest is told again when it is repeated
-)
+# refusals of a topic on each side; beyond, the oldest is told again when it is repeated
+REMEMBERED = 1000
 
 
 class Refusal(NamedTuple):
@@ -27,8 +26,8 @@ class Refusal(NamedTuple):
 class Refusals:
     """What the node of one :class:`~.instance.PrivateRospy` cannot hear, and who cannot hear it.
 
-    Peers try again whenever the master names them a publisher, so that each refusal is remembered,
-    for as long as the subscription or the publisher is there, or until the two do connect.
+    Peers try again whenever the master names them a publisher, so each refusal is remembered, with
+    rospy's _SubscriberImpl or _PublisherImpl that it is of, until the two do connect.
 
     :attr:`on_refused` is called with each :class:`Refusal` that is new.
     """
@@ -36,10 +35,7 @@ class Refusals:
     def __init__(self, instance):
         self._instance = instance
         self._lock = threading.Lock()
-        # (topic, URI) -> (rospy's subscription, what was said, the Refusal once it is known)
-        self._publishers = {}
-        self._subscribers = {}  # (topic, node name) -> (rospy's publisher, what was said)
-        self._held = {}  # topic -> the refusals of which is not told yet
+        self._held = []  # topics of whose refusals is not told yet
         self.on_refused = lambda refusal: None
 
     # -- who cannot be heard
@@ -52,40 +48,36 @@ class Refusals:
             type
         :param wanted: the message class, where it is not the subscription's
         """
-        wanted = wanted or subscription.data_class
-        key = subscription.resolved_name, uri
+        topic, wanted = subscription.resolved_name, wanted or subscription.data_class
         with self._lock:
-            if self._publishers.get(key, ())[:2] == (subscription, said):
+            if subscription.refused.get(uri, (None,))[0] == said:
                 return
-            _remember(self._publishers, key, (subscription, said, None))
+            _remember(subscription.refused, uri, (said, None))
         header = ask()
         if header is None or header.get('md5sum') == wanted._md5sum:
-            self.publisher_connected(*key)  # it has gone, or changed its mind
+            subscription.refused.pop(uri, None)  # it has gone, or changed its mind
             return
-        refusal = Refusal(key[0], header.get('callerid', uri), wanted, header)
+        refusal = Refusal(topic, header.get('callerid', uri), wanted, header)
         with self._lock:
-            self._publishers[key] = subscription, said, refusal
-            held = self._held.get(key[0])
-            if held is not None:
-                held.append(refusal)
+            subscription.refused[uri] = said, refusal
+            is_held = topic in self._held
         publishing.notify()
-        if held is None:
+        if not is_held:
             self.on_refused(refusal)
 
     @contextlib.contextmanager
     def held(self, topic):
-        """Tell of the refusals of a topic only afterwards, and of those that are left then in the
-        list that it gives."""
-        held = []
+        """Within this, nothing is told of the refusals of a topic; afterwards, of those that are
+        left then."""
         with self._lock:
-            self._held[topic] = held
+            self._held.append(topic)
         try:
-            yield held
+            yield
         finally:
             with self._lock:
-                if self._held.get(topic) is held:
-                    del self._held[topic]
-            for refusal in held:
+                self._held.remove(topic)
+                left = self.of(topic)
+            for refusal in left:
                 self.on_refused(refusal)
 
     def message_refused(self, subscription, wanted, header):
@@ -94,14 +86,10 @@ class Refusals:
 
         :param header: the message's ``_connection_header``
         """
-        uri = next(
-            (
-                connection.endpoint_id
-                for connection in subscription.connections or ()
-                if getattr(connection, 'callerid_pub', None) == header['callerid']
-            ),
-            header['callerid'],
-        )
+        uri = header['callerid']
+        for connection in subscription.connections or ():
+            if getattr(connection, 'callerid_pub', None) == header['callerid']:
+                uri = connection.endpoint_id
         self.header_refused(subscription, uri, wanted, header)
 
     def header_refused(self, subscription, uri, wanted, header):
@@ -112,32 +100,34 @@ class Refusals:
 
     def publisher_connected(self, topic, uri):
         """Nothing is wrong with it now."""
-        with self._lock:
-            self._publishers.pop((topic, uri), None)
+        subscription = self._instance.subscriber(topic)
+        if subscription is not None:
+            subscription.refused.pop(uri, None)
+
+    def publishers_changed(self, subscription):
+        """The master has named the publishers that there are: forget the others.
+
+        Its word of one in this process takes its time.
+        """
+        for uri in subscription.refused.keys() - set(subscription.publishers):
+            local = self._instance.connections.local_node_at(uri)
+            if local is None or local.publisher(subscription.resolved_name) is None:
+                subscription.refused.pop(uri, None)
 
     def refuses(self, topic, uri):
         """Whether the node cannot hear the publisher at that URI."""
-        with self._lock:
-            subscription, _, refusal = self._publishers.get((topic, uri), (None, None, None))
-        return refusal is not None and self._is_there(topic, uri, subscription)
+        subscription = self._instance.subscriber(topic)
+        return subscription is not None and subscription.refused.get(uri, (0, None))[1] is not None
 
-    def count(self, topic=None):
-        """How many publishers, of one topic or of all, the node cannot hear."""
-        with self._lock:
-            keys = list(self._publishers)
-        return sum(self.refuses(*key) for key in keys if topic in (None, key[0]))
+    def of(self, topic):
+        """The Refusal of each publisher of the topic that the node cannot hear."""
+        subscription = self._instance.subscriber(topic)
+        entries = list(subscription.refused.values()) if subscription else []
+        return [refusal for _, refusal in entries if refusal is not None]
 
-    def _is_there(self, topic, uri, subscription):
-        """Whether both ends are there still."""
-        if self._instance.subscriber(topic) is not subscription:
-            return False
-        neighbour = self._instance.connections.local_node_at(uri)
-        # the master's word of a publisher of this process takes its time
-        return (
-            uri in subscription.publishers
-            or neighbour is not None
-            and neighbour.publisher(topic) is not None
-        )
+    def count(self):
+        """How many publishers, of all topics, the node cannot hear."""
+        return sum(len(self.of(topic)) for topic, _ in self._instance.topics.get_subscriptions())
 
     # -- who cannot hear
 
@@ -146,28 +136,23 @@ class Refusals:
 
         :param publisher: rospy's _PublisherImpl
         """
-        key, entry = (publisher.resolved_name, name), (publisher, said)
         with self._lock:
-            is_new = self._subscribers.get(key) != entry
-            _remember(self._subscribers, key, entry)
+            is_new = publisher.refused.get(name) != said
+            _remember(publisher.refused, name, said)
         publishing.notify()
         if is_new:
             self._instance.warn(line)
 
     def subscriber_connected(self, topic, name):
         """Nothing is wrong with it now."""
-        with self._lock:
-            self._subscribers.pop((topic, name), None)
+        publisher = self._instance.publisher(topic)
+        if publisher is not None:
+            publisher.refused.pop(name, None)
 
     def subscribers(self, topic):
         """Names of the nodes that cannot hear what this one publishes on the topic."""
         publisher = self._instance.publisher(topic)
-        with self._lock:
-            return [
-                key[1]
-                for key, (refusing, _) in self._subscribers.items()
-                if key[0] == topic and refusing is publisher
-            ]
+        return list(publisher.refused) if publisher else []
 
 
 def _remember(entries, key, entry):
@@ -199,11 +184,8 @@ def check_md5sum(connection, wanted):
 
 def examine(instance, connection, topic, uri):
     """Find out why rospy's connection to the publisher at that URI failed."""
-    header, subscription, address = (
-        connection.header,
-        instance.subscriber(topic),
-        connection.dest_address,
-    )
+    header, subscription = connection.header, instance.subscriber(topic)
+    address = connection.dest_address
     if subscription is None or 'error' not in (header or ()) or instance.ended.is_set():
         return
     known = header if 'md5sum' in header else None

@@ -3,6 +3,7 @@ import http.client
 import threading
 import xml.parsers.expat
 import xmlrpc.client
+from typing import Callable, NamedTuple
 
 import rosgraph
 
@@ -102,17 +103,15 @@ def claim_name(master_url, name, timeout):
 def unregister_all(master, name, uri):
     """Remove the registrations of a node that is gone; rosnode's own function asks the
     environment's master."""
-    publishers, subscribers, services = master.getSystemState()
-    for names, unregister in (publishers, master.unregisterPublisher), (
-        subscribers,
-        master.unregisterSubscriber,
-    ):
-        for topic, nodes in names:
+
+    def unregister_service(service, _):
+        master.unregisterService(service, master.lookupService(service))
+
+    unregistering = master.unregisterPublisher, master.unregisterSubscriber, unregister_service
+    for users, unregister in zip(master.getSystemState(), unregistering):
+        for topic, nodes in users:
             if name in nodes:
                 unregister(topic, uri)
-    for service, nodes in services:
-        if name in nodes:
-            master.unregisterService(service, master.lookupService(service))
 
 
 def _belongs_to_another(master, name, uri):
@@ -123,70 +122,88 @@ def _belongs_to_another(master, name, uri):
         return False
 
 
-def repair(instance, handler, topics, services, state, was_away):
+class _Kind(NamedTuple):
+    """What a node registers of one kind, and what the master knows of that."""
+
+    ours: Callable  # ours() returns [(name, type or URI of a service)]
+    theirs: dict  # {name: [node names]}
+    register: Callable
+    unregister: Callable
+    uri: str  # with which it is unregistered
+
+    def lost(self, node):
+        """What the master does not know of the node.
+
+        A service that another node offers by now is that node's, as in ROS: both would take it back
+        for ever.
+        """
+        return [
+            (name, value)
+            for name, value in self.ours()
+            if not self.theirs.get(name)
+            or self.uri == node.uri
+            and node.name not in self.theirs[name]
+        ]
+
+    def repair(self, node, was_away):
+        """Make the master know what the node has, and where it was away, what it has not any
+        more."""
+        is_subscribing = self.ours == node.topics.get_subscriptions
+        for name, value in self.ours() if was_away and is_subscribing else self.lost(node):
+            publishers = self.register(name, value, node.uri)
+            if node.ended.is_set() or name not in dict(self.ours()):
+                self.unregister(name, self.uri)  # closed while we registered it
+            elif is_subscribing:
+                node.handler.reg_man.publisher_update(name, publishers)
+        if was_away:
+            ours = dict(self.ours())
+            for name, nodes in self.theirs.items():
+                if node.name in nodes and name not in ours:
+                    self.unregister(name, self.uri)
+
+
+def repair(node, state, was_away):
     """Register again what the master has forgotten of a node: a restarted one knows nothing,
     another a part.
 
+    :param node: a PrivateRospy
     :param state: ``(publishers, subscribers, services)`` of the master, each ``{name: [node
         names]}``
     :param was_away: whether the master was out of reach: what it had to say of publishers then is
         asked for again, and what the node closed then is unregistered
     :returns: whether it had forgotten the node altogether
     """
-    name, uri, master = (
-        instance.name,
-        instance.uri,
-        master_api(instance.settings.master_url, instance.name),
-    )
-    kinds = [
-        (topics.get_publications, state[0], master.registerPublisher, master.unregisterPublisher),
-        (
-            topics.get_subscriptions,
-            state[1],
+    master = master_api(node.settings.master_url, node.name)
+    publishers, subscribers, services = state
+    get_services = node.service_manager.get_services
+    service_uri = next((uri for _, uri in get_services()), None)  # one for all of them
+    kinds = (
+        _Kind(
+            node.topics.get_publications,
+            publishers,
+            master.registerPublisher,
+            master.unregisterPublisher,
+            node.uri,
+        ),
+        _Kind(
+            node.topics.get_subscriptions,
+            subscribers,
             master.registerSubscriber,
             master.unregisterSubscriber,
+            node.uri,
         ),
-    ]
+        _Kind(
+            get_services, services, master.registerService, master.unregisterService, service_uri
+        ),
+    )
     # every node offers this from its start on; a channel may have been opened with a restarted
     # master already
-    forgotten = name not in state[2].get(instance.rospy.resolve_name('~get_loggers'), ())
-    # A service that another node offers by now is that node's, as in ROS; both would take it back
-    # for ever.
-    lost_services = [
-        (service, service_uri)
-        for service, service_uri in services.get_services()
-        if not state[2].get(service)
-    ]
-    offered = [
-        (topics.get_publications(), state[0]),
-        (topics.get_subscriptions(), state[1]),
-        (lost_services, state[2]),
-    ]
-    is_whole = all(name in theirs.get(each, ()) for ours, theirs in offered for each, _ in ours)
-    if not is_whole and _belongs_to_another(master, name, uri):
+    is_forgotten = node.name not in services.get(node.rospy.resolve_name('~get_loggers'), ())
+    if any(kind.lost(node) for kind in kinds) and _belongs_to_another(master, node.name, node.uri):
         # To register again would take the name back, and end the newer node.
-        instance.has_lost_name = True
-        instance.request_stop('another node has taken its name')
+        node.has_lost_name = True
+        node.request_stop('another node has taken its name')
         return False
-    for ours, theirs, register, unregister in kinds:
-        for topic, type_ in ours():
-            if name not in theirs.get(topic, ()) or was_away and ours == topics.get_subscriptions:
-                publishers = register(topic, type_, uri)
-                if instance.ended.is_set() or topic not in dict(ours()):
-                    unregister(topic, uri)  # closed while we registered it
-                elif ours == topics.get_subscriptions:
-                    handler.reg_man.publisher_update(topic, publishers)
-        if was_away:
-            for topic, nodes in theirs.items():
-                if name in nodes and topic not in dict(ours()):
-                    unregister(topic, uri)
-    for service, service_uri in lost_services:
-        master.registerService(service, service_uri, uri)
-        if instance.ended.is_set() or services.get_service(service) is None:
-            master.unregisterService(service, service_uri)
-    if was_away:
-        for service, nodes in state[2].items():
-            if name in nodes and services.get_service(service) is None:
-                # one URI for all of them
-                master.unregisterService(service, services.get_services()[0][1])
-    return forgotten
+    for kind in kinds:
+        kind.repair(node, was_away)
+    return is_forgotten

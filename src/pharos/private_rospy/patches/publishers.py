@@ -25,6 +25,7 @@ def init_publisher(self, name, data_class, *, original, module):
     is_log = self.resolved_name == '/rosout'
     # of all Publishers of rospy on the topic; each OutputChannel has its own
     self.own_latch = StartupLogBuffer() if is_log else Latch()
+    self.refused = {}  # name of each subscriber that was refused -> what was said
 
 
 @patch(

@@ -62,6 +62,7 @@ def publisher_update(self, resolved_name, uris, *, node, original):
     if subscriber is not None:
         subscriber.publishers = uris
         subscriber.out_of_reach.intersection_update(uris)
+        node.refusals.publishers_changed(subscriber)
     original(self, resolved_name, uris)
 
 

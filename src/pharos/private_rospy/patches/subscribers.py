@@ -24,6 +24,7 @@ def init_subscriber(self, name, data_class, *, original):
     self.publishers = ()  # URIs, as the master last said
     # those of them that the last attempt to connect to has not reached
     self.out_of_reach = set()
+    self.refused = {}  # URI of each that was refused -> what was said, the Refusal once it is known
 
 
 @patch(
