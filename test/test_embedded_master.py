@@ -49,7 +49,7 @@ def test_rosout_agg_gets_each_line_once(embedded):
     )
     speaker = embedded.create(BlockNode, named='/speaker')
     while not any(name == '/rosout' for name, _ in speaker_connections(speaker)):
-        speaker._rospy.ended.wait(0.01)
+        speaker.latest_run.rospy.ended.wait(0.01)
     for number in range(10):
         speaker.log('line %d' % number)
     speaker.log('the end')

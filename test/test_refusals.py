@@ -370,17 +370,17 @@ def test_a_subscriber_of_another_type_is_warned_of_once_and_not_waited_for(
             assert topic in line and '/far' in line and STRING in line and INT32 in line
         # another one, for which the master is asked
         in_time(lambda: sender.output_channel(topic, INT32))
-        assert sender._rospy.refusals.subscribers(topic) == ['/far']
+        assert sender.latest_run.rospy.refusals.subscribers(topic) == ['/far']
 
 
 def test_a_subscriber_that_has_changed_its_type_is_waited_for_again(master, topic):
     sender, receiver, mailbox = create(master, '/near'), create(master, '/far'), Mailbox()
     wrong = receiver.interested_in(topic, STRING)
     sender.output_channel(topic, INT32)
-    assert sender._rospy.refusals.subscribers(topic) == ['/far']
+    assert sender.latest_run.rospy.refusals.subscribers(topic) == ['/far']
     wrong.close()
     receiver.interested_in(topic, INT32, delegate=mailbox)
-    assert sender._rospy.refusals.subscribers(topic) == []
+    assert sender.latest_run.rospy.refusals.subscribers(topic) == []
     sender.send_to(topic, data=7)
     assert mailbox.get().data == 7
 
