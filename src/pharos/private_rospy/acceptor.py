@@ -38,7 +38,6 @@ class Acceptor:
         self._kind, self._node = kind, node
         self._changed = threading.Condition()  # guards all below; notified when a handshake ends
         self._handshakes = {}  # socket -> since when; the longest first
-        self._threads = 0
         self._is_crowded = False  # and the log says so
         self._rejections = collections.deque(maxlen=REJECTION_LINES)  # when the last were logged
         self._not_logged = 0  # since then
@@ -66,21 +65,12 @@ class Acceptor:
             keep_alive(sock)
             self._node.track_socket(sock)
             self.start_handshake(sock)
-            self._let_in(sock, address, serve)
-
-    def _let_in(self, sock, address, serve):
-        with self._changed:
-            self._threads += 1
-            # those that are served, or are closed and do not know it yet
-            is_full = self._threads > 2 * CLIENTS
-        try:
-            if is_full:
-                raise RuntimeError(f'{2 * CLIENTS} {self._kind} clients are being served')
-            self._node.start_thread(self._serve, (sock, address, serve), self._kind)
-        except RuntimeError as error:  # Python's own, where the system gives no more threads
-            self._leave(sock)
-            self._log_crowd(error)
-            sock.close()
+            try:
+                self._node.start_thread(self._serve, (sock, address, serve), self._kind)
+            except RuntimeError as error:  # the system gives no more threads
+                self.finish_handshake(sock)
+                sock.close()
+                self._log_crowd(error)
 
     def _serve(self, sock, address, serve):
         try:
@@ -89,12 +79,7 @@ class Acceptor:
             sock.close()
             self.reject(sock, address, error)
         finally:
-            self._leave(sock)
-
-    def _leave(self, sock):
-        self.finish_handshake(sock)
-        with self._changed:
-            self._threads -= 1
+            self.finish_handshake(sock)
 
     def start_handshake(self, sock):
         """The client is to say something now."""
@@ -128,10 +113,9 @@ class Acceptor:
                 return
             logged.append(now)
             not_logged, self._not_logged = self._not_logged, 0
-        line = '%s client %s:%s refused: %s' % (self._kind, *address[:2], brief(why))
-        if not_logged:
-            line += f' (and {not_logged} more before, which were too many for the log)'
-        self._node.warn(line)
+        more = f' (and {not_logged} more before, too many for the log)' if not_logged else ''
+        host, port, *_ = address
+        self._node.warn(f'{self._kind} client {host}:{port} refused: {brief(why)}{more}')
 
     def _make_room(self, wait):
         while True:
@@ -139,24 +123,23 @@ class Acceptor:
                 if len(self._handshakes) < CLIENTS:
                     return
                 left = GRACE - (time.monotonic() - next(iter(self._handshakes.values())))
+                if left > 0 and not wait:
+                    return
                 if left > 0:
-                    if not wait:
-                        return
                     self._changed.wait(left)
                     continue
             self._close_longest(f'{CLIENTS} {self._kind} clients say nothing')
 
     def _close_longest(self, why):
         with self._changed:
-            longest = next(iter(self._handshakes), None)
-            if longest is not None:
+            for longest in self._handshakes:
                 del self._handshakes[longest]
                 shutdown_socket(longest)  # its thread wakes
+                break
         self._log_crowd(why)
 
     def _log_crowd(self, why):
-        with self._changed:
-            is_logged, self._is_crowded = self._is_crowded, True
+        is_logged, self._is_crowded = self._is_crowded, True
         if not is_logged and not self._node.ended.is_set():
             self._node.warn(
                 f'{why}: those that said nothing for longest are closed, to let others in'

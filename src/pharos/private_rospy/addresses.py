@@ -9,7 +9,8 @@ import urllib.parse
 import rosgraph.network
 from rosgraph.rosenv import ROS_HOSTNAME, ROS_IP
 
-_HOST = re.compile(r'\w([\w.-]*\w)?\.?', re.ASCII)  # Docker's names have underscores
+_HOST = re.compile(r'\w(?:[\w.-]*\w)?\.?', re.ASCII)  # Docker's names have underscores
+_URL = re.compile(rf'http://({_HOST.pattern}|\[[^]]+\]):(\d{{1,9}})/?', re.ASCII | re.IGNORECASE)
 # '5' is one of the first, multicast and broadcast are the others
 _UNREACHABLE = [
     ipaddress.ip_network(network)
@@ -30,20 +31,11 @@ def check_url(url, source=''):
 
     :param source: the variable of the environment that it comes from, if it does
     """
-    try:
-        parts = urllib.parse.urlsplit(url) if isinstance(url, str) else None
-        if (
-            parts
-            and parts.scheme == 'http'
-            and parts.path in ('', '/')
-            and not parts.query + parts.fragment
-        ):
-            host, port = parts.hostname, parts.port
-            is_host = host and _HOST.fullmatch(host) or _is_ipv6(host)
-            if is_host and port and '@' not in parts.netloc:
-                return f'http://[{host}]:{port}/' if ':' in host else f'http://{host}:{port}/'
-    except ValueError:
-        pass  # the port is no number, for example
+    match = _URL.fullmatch(url) if isinstance(url, str) else None
+    if match and 0 < int(match[2]) <= 65535:
+        host = match[1].lower()
+        if not host.startswith('[') or _is_ipv6(host[1:-1]):
+            return f'http://{host}:{int(match[2])}/'
     where = f'{source} is {url!r}, which' if source else repr(url)
     raise ValueError(
         f'{where} is not the URL of a ROS master: it looks like http://127.0.0.1:11311/'
@@ -85,13 +77,13 @@ def check_environment(environ):
 
     Takes empty variables away: rosgraph takes them for an answer, and that for none.
     """
+    given = None
     for variable in ROS_HOSTNAME, ROS_IP:
         if not environ.get(variable):
             environ.pop(variable, None)
-    for variable in ROS_HOSTNAME, ROS_IP:
-        if variable in environ:
-            return check_domain(variable, environ[variable])
-    return None
+        elif given is None:
+            given = check_domain(variable, environ[variable])
+    return given
 
 
 def default_domain():
@@ -124,10 +116,9 @@ def is_same_master(url, other):
 @functools.lru_cache(maxsize=1000)
 def _of_master(host):
     """The addresses of a host; this one has a master at all of its own."""
-    found = addresses_of(host)
     # a client that connects to 0.0.0.0 or :: connects here
     own_names = ['localhost', socket.gethostname(), '0.0.0.0', '::']
-    here = set()
+    found, here = addresses_of(host), set()
     for own in own_names + rosgraph.network.get_local_addresses():
         with contextlib.suppress(OSError, UnicodeError):
             here |= addresses_of(own)

@@ -38,8 +38,9 @@ def private_logging():
     module.getLoggerClass = lambda: manager.loggerClass
     # fileConfig clears these two lists, the process's own if they were shared
     module._handlers, module._handlerList = weakref.WeakValueDictionary(), []
-    # It would log a traceback for each message that cannot be read, whoever sent it.
-    manager.getLogger('rospy.msg').setLevel(logging.CRITICAL)
+    # They log a traceback for each message or call that cannot be read, whoever sent it.
+    for name in 'rospy.msg', 'rospy.impl.masterslave':
+        manager.getLogger(name).setLevel(logging.CRITICAL)
     return module
 
 

@@ -42,40 +42,31 @@ class Settings:
         self.tcp_port = check_port('tcp_port', tcp_port)
         self.xmlrpc_port = check_port('xmlrpc_port', xmlrpc_port)
         arguments = [] if argv is None else argv
-        for_all, for_one = mappings_for(arguments, check_name(name, 'node').rpartition('/')[2])
+        own_base = check_name(name, 'node').rpartition('/')[2]
+        for_all, for_one = mappings_for(arguments, own_base)
         mappings = {**for_all, **for_one}
-        self.environ = dict(os.environ)
-        self.environ[ROS_MASTER_URI] = master_url
+        self.environ = {**os.environ, ROS_MASTER_URI: master_url}
         self._set_domain(domain, mappings)
-        is_named_there = self._set_name(name, arguments, for_all, for_one)
-        self.environ[ROS_NAMESPACE] = self.namespace.rstrip('/') or '/'
+        given = mappings.get('__ns')
+        if given is None and '__log' in for_all:
+            # roslaunch, which knows the node by its own idea of the namespace
+            given = self.environ.get(ROS_NAMESPACE, '/')
+        namespace = _namespace(name, given)
+        base = for_one.get('__name', own_base)
+        if '__name' in for_all:
+            if '__name' not in for_one and takes_name(master_url, arguments, namespace + base):
+                base = for_all['__name']
+                if given is not None:
+                    namespace = _namespace('', given)
+            else:
+                mappings.pop('__log', None)  # roslaunch has named this file after the other node
+        self.base_name = check_name(base, 'node', base=True)
+        self.name = check_name(namespace + base, 'node', limit=NODE_LIMIT)
+        self.environ[ROS_NAMESPACE] = namespace.rstrip('/') or '/'
         for left in '__master', '__ns', '__name':  # the settings say this
             mappings.pop(left, None)
-        if '__name' in for_all and not is_named_there:
-            mappings.pop('__log', None)  # roslaunch has named this file after the other node
         self.argv = [self.base_name, *map(rosgraph.names.REMAP.join, mappings.items())]
-        check_private_parameters(self.argv)
-
-    def _set_name(self, name, arguments, for_all, for_one):
-        """Find the node's name; returns whether it is the ``__name`` that is given for all."""
-        given = {**for_all, **for_one}.get('__ns')
-        # roslaunch, which knows the node by its own idea of the namespace
-        if given is None and '__log' in for_all:
-            given = self.environ.get(ROS_NAMESPACE, '/')
-        self.namespace = _namespace(name, given)
-        base = for_one.get('__name', name.rpartition('/')[2])
-        is_named_there = (
-            '__name' in for_all
-            and '__name' not in for_one
-            and takes_name(self.master_url, arguments, self.namespace + base)
-        )
-        if is_named_there:
-            base = for_all['__name']
-            if given is not None:
-                self.namespace = _namespace('', given)
-        self.base_name = check_name(base, 'node', base=True)
-        self.name = check_name(self.namespace + base, 'node', limit=NODE_LIMIT)
-        return is_named_there
+        _check_private_parameters(self.argv)
 
     def _set_domain(self, domain, mappings):
         """Have rosgraph find the address to advertise, which is checked."""
@@ -94,15 +85,15 @@ def _namespace(name, given):
     """The namespace of a node of that name, with a closing slash: its own, within the one given."""
     if given is None:
         given = '/' if name.startswith('/') else os.environ.get(ROS_NAMESPACE, '/')
-    given = given if given.strip('/') else '/'
-    if given != '/':
+    if given.strip('/'):
         check_name(given, 'namespace')
-    return rosgraph.names.make_global_ns(
-        rosgraph.names.ns_join(given, name.lstrip('/').rpartition('/')[0])
-    )
+    else:
+        given = '/'
+    inner = name.lstrip('/').rpartition('/')[0]
+    return rosgraph.names.make_global_ns(rosgraph.names.ns_join(given, inner))
 
 
-def check_private_parameters(arguments):
+def _check_private_parameters(arguments):
     """Raise ValueError for the value of a private parameter that the server cannot hold, or that is
     no YAML.
 

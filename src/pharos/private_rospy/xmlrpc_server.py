@@ -135,23 +135,17 @@ def caller():
 
 
 def ends_of_call():
-    """The IP addresses, the client's and ours, of the call that this thread answers; None if it
-    answers none."""
-    if not hasattr(_thread, 'handler'):
-        return None
+    """The IP addresses, the client's and ours, of the call that this thread answers."""
     ends = caller().client_address, caller().connection.getsockname()
     return [address.partition('%')[0].replace('::ffff:', '') for address, *_ in ends]
 
 
 def is_call_from_nearby(master_url):
     """Whether the call that this thread answers comes from this host, or that of the master."""
-    ends = ends_of_call()
-    if ends is None or ends[0] == ends[1]:
+    client, here = map(ipaddress.ip_address, ends_of_call())
+    if client == here or client.is_loopback:
         return True
-    client = ipaddress.ip_address(ends[0])
     try:
-        return client.is_loopback or client in addresses_of(
-            urllib.parse.urlsplit(master_url).hostname
-        )
+        return client in addresses_of(urllib.parse.urlsplit(master_url).hostname)
     except OSError:  # the name has no address, or none that can be found now
         return False

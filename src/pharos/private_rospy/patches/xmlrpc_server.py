@@ -1,7 +1,6 @@
 """A node's XML-RPC server: its requests have limits, its log says who was refused, and it ends."""
 from pharos.private_rospy.acceptor import BACKLOG, Acceptor, brief
 from pharos.private_rospy.lifetime import shutdown_socket
-from pharos.private_rospy.loader import Substitute
 from pharos.private_rospy.patches.table import addition, patch, substitute
 from pharos.private_rospy.xmlrpc_server import REFUSED, RequestHandler, caller
 
@@ -57,11 +56,11 @@ def shutdown(self, reason, *, node):
     'XmlRpcHandler._dispatch',
     'does not say whose the calls were that it refused',
 )
-def dispatch(self, method, params, *, node):
+def dispatch(self, method, params):
     """Called by the standard library's server; logs the calls that are refused, and whose they are.
 
-    A call that ROS's slave API answers with an error is the caller's affair: peers come too late,
-    or try.
+    A call that ROS's slave API answers with another error is the caller's affair: peers come too
+    late, or try.
     """
     client = caller()
     try:
@@ -71,20 +70,7 @@ def dispatch(self, method, params, *, node):
     except Exception as error:
         client.log_rejection(f'call of {brief(method)}: {error}')
         raise
-    if type(answer) is tuple and answer[0] < 1:
-        text = f'call of {method}: {answer[1]}'
-        if answer[1].startswith(REFUSED):
-            client.log_rejection(text.replace(REFUSED, '', 1))
-        else:
-            node.debug('XML-RPC client %s:%s: %s' % (*client.client_address[:2], brief(text)))
+    code, text, *_ = answer if isinstance(answer, tuple) else (1, '')
+    if code < 1 and text.startswith(REFUSED):
+        client.log_rejection(f'call of {method}: {text[len(REFUSED):]}')
     return answer
-
-
-@substitute(
-    'rospy.impl.masterslave',
-    '_logger',
-    'logs tracebacks of calls with wrong arguments, and not whose they were',
-)
-def slave_api_logger(*, original):
-    """A logger whose errors are for those who look for errors: the server logs the calls."""
-    return Substitute(original, error=original.debug)
