@@ -25,6 +25,7 @@ import pharos  # noqa: E402
 from pharos import node_registry  # noqa: E402
 from pharos.private_rospy.local_link import PROTOCOL  # noqa: E402
 
+collect_ignore = ['programs']  # run by tests, and no tests of this package
 TIMEOUT = 20.0  # seconds; a bound on waits for events, never reached in a test that passes
 #: of a test that serializes a numpy_msg
 serializes_numpy = pytest.mark.skipif(

@@ -1,0 +1,63 @@
+"""pharos.testing, as those use it who test nodes of their own."""
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+
+from programs import ROOT, TIMEOUT
+
+ROBOT = ROOT / 'test' / 'programs' / 'robot'
+TOLD = {
+    'test_leaves_a_node': r'left running: /forgotten; stop\(\) them',
+    'test_leaves_a_thread': 'left behind: thread forgotten',
+    'test_leaves_a_registration': 'left behind: /forgotten publishes /topic',
+    'test_does_not_look_at_a_failure': 'ValueError: nothing was said',
+}
+
+
+def run_tests(folder):
+    """Run pytest there, as a process of its own; returns its status and what it printed."""
+    environ = {**os.environ, 'PYTHONPATH': str(ROOT / 'src')}
+    environ.pop('PYTEST_ADDOPTS', None)
+    command = [sys.executable, '-m', 'pytest', '-q', '-p', 'no:cacheprovider', '--rootdir', folder]
+    ended = subprocess.run(
+        [*command, '-W', 'error::pytest.PytestWarning', folder],
+        env=environ,
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=2 * TIMEOUT,
+        check=False,
+    )
+    return ended.returncode, ended.stdout
+
+
+def test_a_package_tests_its_nodes_with_it():
+    """Those of its tests that are in order pass; the others fail for what they leave or overlook."""
+    status, printed = run_tests(ROBOT)
+    assert status == pytest.ExitCode.TESTS_FAILED, printed
+    for name, told in TOLD.items():
+        section = re.search(
+            rf'_ ERROR at teardown of {name} _(.*?)(\n_____|\Z)', printed, re.DOTALL
+        )
+        assert section and re.search(told, section[1]), (name, printed)
+    assert re.search(r'9 passed, 4 errors', printed), printed
+
+
+def test_it_is_a_plugin(tmp_path):
+    (tmp_path / 'conftest.py').write_text("pytest_plugins = ['pharos.testing']\n")
+    test = 'def test_it(master, mailbox, create_node, expect_failures):\n    expect_failures()\n'
+    (tmp_path / 'test_it.py').write_text(test)
+    status, printed = run_tests(tmp_path)
+    assert status == pytest.ExitCode.OK, printed
+
+
+def test_it_is_not_loaded_with_pharos():
+    program = "import sys, pharos; print({'pytest', 'pharos.testing'} & set(sys.modules))"
+    printed = subprocess.check_output(
+        [sys.executable, '-c', program], env={**os.environ, 'PYTHONPATH': str(ROOT / 'src')}
+    )
+    assert printed == b'set()\n'
