@@ -254,7 +254,7 @@ class Master(MasterCalls):
         """
         name, timeout = global_name(name, 'node'), check_limit('timeout', timeout)
         with time_limit(timeout):
-            node = watcher_of(self).wait_for_node(name, timeout)
+            node = self.look_until_found(lambda: self.live_node(name), timeout, name)
         if node is None:  # there was no time to look
             with time_limit(MARGIN):
                 node = self.live_node(name)

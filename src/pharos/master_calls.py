@@ -3,22 +3,23 @@ import contextlib
 import threading
 import time
 import urllib.parse
-from typing import Any, Dict, Iterator, List, Optional, Tuple, TypeVar
+from typing import Any, Callable, Dict, Iterator, List, Optional, Tuple, TypeVar
 
 import rosgraph
 
 from pharos.errors import MasterUnreachableError, NodeStoppedError
 from pharos.private_rospy.addresses import is_same_master
 from pharos.private_rospy.lifetime import Interruption
-from pharos.private_rospy.proxies import ServerProxy, interruption, master_api
+from pharos.private_rospy.proxies import MARGIN, ServerProxy, interruption, master_api, time_limit
 from pharos.private_rospy.registration import COMMUNICATION_ERRORS, PING_TIMEOUT
 from pharos.seconds import check_limit
 
 TIMEOUT = 5.0  # seconds that a question to the master may take
-POLL = 0.05  # seconds between two questions whether there is a master
+POLL = 0.05  # seconds between two looks for a master, or for a node
 
 Users = Dict[str, List[str]]  # name of a topic or service -> names of nodes
 Self = TypeVar('Self', bound='MasterCalls')
+Found = TypeVar('Found')
 
 
 class MasterCalls:
@@ -116,20 +117,33 @@ class MasterCalls:
         :raises NodeStoppedError: if the node whose soul or delegate waits stops meanwhile
         """
         timeout = check_limit('timeout', timeout)
+        with time_limit(timeout):
+            is_there = self.look_until_found(
+                lambda: self.is_reachable() or None, timeout, f'the master {self.url}'
+            )
+        if not is_there:
+            self.call('getPid', timeout=MARGIN)
+        return self
+
+    def look_until_found(
+        self, look: Callable[[], Optional[Found]], timeout: Optional[float], what: str
+    ) -> Optional[Found]:
+        """Call ``look()`` until it returns something, for there is nobody who could tell; None
+        where it has not in time.
+
+        :param timeout: seconds, None: without limit
+        :raises NodeStoppedError: if the node on whose behalf this thread waits stops meanwhile
+        """
         deadline = None if timeout is None else time.monotonic() + timeout
         woken = threading.Event()
         with Interruption(woken.set) as stop:
             while True:
-                left = TIMEOUT if deadline is None else deadline - time.monotonic()
-                try:
-                    self.call('getPid', timeout=min(TIMEOUT, max(left, 0.1)))
-                    return self
-                except MasterUnreachableError:
-                    if left <= 0:
-                        raise
-                woken.wait(POLL)  # there is nobody yet who could tell
+                found = look()
+                if found is not None or deadline is not None and time.monotonic() >= deadline:
+                    return found
+                woken.wait(POLL)
                 if stop.came:
-                    raise NodeStoppedError(f'the node that waited for the master {self.url} stops')
+                    raise NodeStoppedError(f'the node that waited for {what} stops')
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, MasterCalls) and is_same_master(self.url, other.url)
