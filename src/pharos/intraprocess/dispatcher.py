@@ -23,8 +23,8 @@ COURTESY = 1e-3
 class Runnable(Protocol):
     """What a dispatcher runs: an inbox."""
 
-    def run_next(self) -> None:
-        """Deliver the oldest message, if there is one; raises nothing."""
+    def run_next(self) -> bool:
+        """Deliver the oldest message, if there is one; returns whether there was, and raises nothing."""
 
 
 class Dispatcher:

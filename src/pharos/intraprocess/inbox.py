@@ -60,14 +60,13 @@ class Inbox:
         'dispatcher',
         'inline',
         'shared',
-        'taken',
         '_thaw',
         '_header',
         '_queue',
         '_limit',
         '_schedule',
         '_is_scheduled',
-        '_taken_at_last_yield',
+        '_has_taken',
         '_last_yield',
         '_sizes',
         '_put_bytes',
@@ -85,13 +84,12 @@ class Inbox:
         self.inline, self.shared = receiver.inline, receiver.shared
         if receiver.shared:  # a shared message is marked with the header when it is put
             thaw = header = None
-        self.taken = 0
         self._thaw, self._header = thaw, header
         self._queue: Deque[Any] = collections.deque()
         self._limit = receiver.queue_size
         self._schedule = dispatcher.inline.append if self.inline else dispatcher.scheduled.append
         self._is_scheduled = False
-        self._taken_at_last_yield = -1
+        self._has_taken = True  # since a publisher yielded
         self._last_yield = 0.0
         # of the large messages in the queue, and for a moment of one more
         self._sizes: Deque[int] = collections.deque()
@@ -143,24 +141,21 @@ class Inbox:
 
     def _let_receiver_run(self) -> None:
         """A publisher that never lets go of the interpreter would starve the receiver."""
-        if (
-            self._taken_at_last_yield != self.taken
-            or time.perf_counter() - self._last_yield > STARVATION_INTERVAL
-        ):
-            self._taken_at_last_yield = self.taken
+        if self._has_taken or time.perf_counter() - self._last_yield > STARVATION_INTERVAL:
+            self._has_taken = False
             time.sleep(1e-6)
             self._last_yield = time.perf_counter()
 
-    def run_next(self) -> None:
-        """Deliver the oldest message, if there is one still."""
+    def run_next(self) -> bool:
+        """Deliver the oldest message, if there is one still; returns whether there was."""
         # before looking at the queue: what is put from now on schedules the inbox itself
         self._is_scheduled = False
         queue = self._queue
         try:
             value = queue.popleft()
         except IndexError:
-            return
-        self.taken += 1
+            return False
+        self._has_taken = True
         if self._sizes:
             self._taken_bytes += self._sizes.popleft()
         if queue and not self._is_scheduled:
@@ -171,8 +166,9 @@ class Inbox:
                 value = self._thaw(value)
             except BaseException as error:
                 self.receiver.report(error)
-                return
+                return True
         self.receiver.deliver(value, self._header)
+        return True
 
     def close(self) -> None:
         """Nothing more is put; what waits is delivered still."""
@@ -194,17 +190,17 @@ class SocketInbox(Inbox):
         self._schedule = dispatcher.schedule
         self._streak = 0  # how many times in a row it was fast, FAST_STREAK at the most
 
-    def run_next(self) -> None:
-        taken, begin = self.taken, time.perf_counter()
-        super().run_next()
-        if self.taken == taken:
-            return
+    def run_next(self) -> bool:
+        begin = time.perf_counter()
+        if not super().run_next():
+            return False
         if time.perf_counter() - begin >= FAST_CALLBACK:
             self._streak, self._schedule = 0, self.dispatcher.schedule
         elif self._streak < FAST_STREAK:
             self._streak += 1
             if self._streak == FAST_STREAK:
                 self._schedule = self.dispatcher.inline.append
+        return True
 
 
 class ThreadedInbox(Inbox):
