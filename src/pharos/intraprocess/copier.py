@@ -13,7 +13,7 @@ The work is done by two functions generated for each class, as genpy generates i
     def freeze_fields(message):
         header_0 = message.header
         frame_id_7 = header_0.frame_id
-        if type(frame_id_7) is not str or not frame_id_7.isascii(): frame_id_7 = text(frame_id_7)
+        if type(frame_id_7) is not str or not frame_id_7.isascii(): frame_id_7 = check_text(frame_id_7)
         point_8 = message.point
         x_10 = point_8.x
         ...
@@ -34,21 +34,22 @@ shared as it is. A message with anything else in it is serialized: what is froze
 the errors are the wire's own. So is every message of a class that genpy did not make in the usual
 way (AnyMsg, numpy_msg, one written by hand).
 """
-import functools
 import io
 import itertools
 import struct
-import sys
-from typing import Any, Callable, NamedTuple, Optional, Tuple, Union
+from typing import Any, Callable, Dict, Iterator, List, NamedTuple, Optional, Tuple, Type, Union
 
 import genpy
 from genmsg.msgs import parse_type
-from genpy.base import SIMPLE_TYPES_DICT as STRUCT_CODES  # primitive type -> its code on the wire
 
+from pharos.intraprocess.conversions import (
+    ARRIVAL_CODES,
+    CONVERSIONS,
+    STRUCT_CODES,
+    NeedsSerializer,
+)
 from pharos.messages import nested_class
 
-# genpy sends a bool as a number: 7 goes out, True arrives
-ARRIVAL_CODES = {**STRUCT_CODES, 'bool': '?'}
 #: what is kept of a message until receivers get theirs
 Frozen = Union[Tuple[Any, ...], bytes]
 SMALL = 64  # bytes that a message is taken to have beside its texts and arrays
@@ -59,19 +60,23 @@ class Copier(NamedTuple):
     """The functions that copy the messages of one class. Where it is always serialized, two of them
     are missing."""
 
-    freeze: Callable  # message -> tuple or bytes; raises what message.serialize() raises
-    thaw: Callable  # tuple or bytes -> fresh message
+    freeze: Callable[
+        [Any], 'Frozen'
+    ]  # message -> tuple or bytes; raises what message.serialize() raises
+    thaw: Callable[['Frozen'], Any]  # tuple or bytes -> fresh message
     # message -> about how many bytes it has on the wire; None: always a few
-    size: Optional[Callable]
+    size: Optional[Callable[[Any], int]]
     # message -> tuple; raises where freeze would serialize
-    freeze_fields: Optional[Callable] = None
-    thaw_fields: Optional[Callable] = None  # tuple -> message, its times not canonized
+    freeze_fields: Optional[Callable[[Any], Tuple[Any, ...]]] = None
+    thaw_fields: Optional[
+        Callable[[Tuple[Any, ...]], Any]
+    ] = None  # tuple -> message, its times not canonized
     source: str = ''  # of all but the first two, to be read when debugging
 
 
-def copier_for(cls):
+def copier_for(cls: Any) -> Copier:
     """The Copier of a message class, made at the first call."""
-    copier = vars(cls).get('_pharos_copier')
+    copier: Optional[Copier] = vars(cls).get('_pharos_copier')
     if copier is None:
         try:
             copier = _generate(cls)
@@ -83,119 +88,36 @@ def copier_for(cls):
     return copier
 
 
-def thawer(publisher_cls, receiver_cls):
+def thawer(publisher_cls: Any, receiver_cls: Any) -> Callable[[Frozen], Any]:
     """The function that thaws, as a receiver_cls, what the copier of publisher_cls has frozen."""
     copier = copier_for(publisher_cls)
     if receiver_cls is publisher_cls:
         return copier.thaw
 
-    def thaw_as_receiver(frozen):
-        data = frozen if type(frozen) is bytes else serialized(copier.thaw_fields(frozen))
-        return receiver_cls().deserialize(data)
+    def thaw_as_receiver(frozen: Frozen) -> Any:
+        if not isinstance(frozen, bytes):
+            assert copier.thaw_fields  # only these make tuples
+            frozen = serialized(copier.thaw_fields(frozen))
+        return receiver_cls().deserialize(frozen)
 
     return thaw_as_receiver
 
 
-def _estimated_size(message):
+def _estimated_size(message: genpy.Message) -> int:
     """The size of a message of any class, such as rospy's AnyMsg or one with numpy arrays."""
-    values = [getattr(message, name, None) for name in message.__slots__]
-    return SMALL + sum(
-        getattr(value, 'nbytes', None) or len(value)
-        for value in values
-        if hasattr(value, '__len__')
-    )
+    values: List[Any] = [getattr(message, name, None) for name in message.__slots__]
+    sized = [value for value in values if hasattr(value, '__len__')]
+    return SMALL + sum(getattr(value, 'nbytes', 0) or len(value) for value in sized)
 
 
-def serialized(message):
+def serialized(message: genpy.Message) -> bytes:
     """The message's bytes on the wire, without the length that precedes them there."""
     buffer = io.BytesIO()
     message.serialize(buffer)
     return buffer.getvalue()
 
 
-class Odd(Exception):
-    """Only the wire knows what to make of this. It never leaves this module."""
-
-
-def text(value):
-    """The value itself, if it is a str that UTF-8 has a form for, as it has none for a lone
-    surrogate."""
-    if type(value) is not str:
-        raise Odd
-    value.encode('utf-8')
-    return value
-
-
-def sequence(value):
-    """The value itself, if it is a list or tuple."""
-    if type(value) not in (list, tuple):
-        raise Odd
-    return value
-
-
-def octets(value):
-    """The bytes that arrive in a uint8[] or char[]."""
-    # bytes() itself would take more than the wire does, even an int.
-    return (
-        value
-        if type(value) is bytes
-        else bytes(value if type(value) is bytearray else sequence(value))
-    )
-
-
-def _numbers_of(base):
-    """The function that turns the value of an array of this primitive type into the tuple that
-    arrives."""
-    sent, arriving = STRUCT_CODES[base], ARRIVAL_CODES[base]
-
-    @functools.lru_cache(maxsize=128)
-    def structs(count):
-        return struct.Struct(f'<{count}{sent}').pack, struct.Struct(f'<{count}{arriving}').unpack
-
-    def numbers(value):
-        if type(value) in (list, tuple):
-            # a snapshot: a list could change its length between two looks at it
-            value = tuple(value)
-            if sent == 'd' and set(map(type, value)) == {float}:
-                return value
-        else:
-            value, code = _from_numpy(value)
-            if code == arriving:
-                return tuple(value)
-        pack, unpack = structs(len(value))
-        return unpack(pack(*value))
-
-    return numbers
-
-
-def _from_numpy(array):
-    """The list of a numpy array's numbers, which are plain ints or floats then, and the struct code
-    of its type."""
-    # not imported here: unless someone did, this is no array of it
-    numpy = sys.modules.get('numpy')
-    # Of other kinds, tolist() may give what the wire refuses in the array itself: an int for a
-    # datetime64.
-    if (
-        numpy is None
-        or type(array) is not numpy.ndarray
-        or array.ndim != 1
-        or array.dtype.kind not in 'iuf'
-    ):
-        raise Odd
-    return array.tolist(), array.dtype.char
-
-
-# What generated code calls; to convert an array: the function named after the type of its elements.
-_HELPERS = {'Odd': Odd, 'new': object.__new__, 'text': text, 'sequence': sequence}
-_HELPERS.update((base + '_array', _numbers_of(base)) for base in STRUCT_CODES)
-_HELPERS.update(
-    string_array=lambda value: tuple(map(text, sequence(value))),
-    uint8_array=octets,
-    char_array=octets,
-)
-
-
-def _generate(cls):
+def _generate(cls: Any) -> Copier:
     """The Copier of a class that genpy made; any exception for another."""
     writer = _Writer()
     writer.add_object(cls, 'message')
@@ -220,8 +142,8 @@ def _generate(cls):
             'def size(message):',
             f'    return {size}',
             '',
-            # each of these again with all of it in one function: a message that comes alone meets
-            # cold caches
+            # Each of these again with all of it in one function: one call, and fewer cache misses
+            # where messages come rarely.
             'def freeze(message):',
             '    if type(message) is cls:',
             '        try:',
@@ -242,18 +164,18 @@ def _generate(cls):
     return Copier(
         scope['freeze'],
         scope['thaw'],
-        size and scope['size'],
+        scope['size'] if size else None,
         scope['freeze_fields'],
         scope['thaw_fields'],
         source,
     )
 
 
-def _indented(lines):
+def _indented(lines: List[str]) -> List[str]:
     return ['    ' + line for line in lines]
 
 
-def _fields(cls):
+def _fields(cls: Any) -> List[Tuple[str, str]]:
     """The (name, type) pairs of a class that genpy made, or of Time or Duration."""
     if cls in (genpy.Time, genpy.Duration):
         # as genmsg has it; their _slot_types say int32 for both
@@ -267,7 +189,7 @@ def _fields(cls):
         or cls.__bases__ != (genpy.Message,)
         or len(cls.__slots__) != len(cls._slot_types)
     ):
-        raise Odd
+        raise NeedsSerializer
     return list(zip(cls.__slots__, cls._slot_types))
 
 
@@ -278,18 +200,19 @@ class _Writer:
     frozen tuple.
     """
 
-    def __init__(self):
-        self.scope = dict(_HELPERS)  # the globals of the generated code
+    def __init__(self) -> None:
+        self.scope: Dict[str, Any] = dict(CONVERSIONS)  # the globals of the generated code
         self._count = itertools.count()
-        self._reads = []  # lines of freeze_fields
-        self._builds = []  # lines of thaw_fields
-        self._values = []  # the variables in the frozen tuple
-        self._floats = []  # those of them that are float64
-        self._numbers = []  # other numbers: (primitive type, where it is read, variable)
-        self._sizes = []  # expressions of size, where it varies,
+        self._reads: List[str] = []  # lines of freeze_fields
+        self._builds: List[str] = []  # lines of thaw_fields
+        self._values: List[str] = []  # the variables in the frozen tuple
+        self._floats: List[str] = []  # those of them that are float64
+        # other numbers: (primitive type, where it is read, variable)
+        self._numbers: List[Tuple[str, str, str]] = []
+        self._sizes: List[str] = []  # expressions of size, where it varies,
         self._fixed_size = SMALL  # and what does not
 
-    def add_object(self, cls, owner, path='message'):
+    def add_object(self, cls: Any, owner: str, path: str = 'message') -> None:
         """Add the fields of the object of class cls that is in the variable owner, and at that path
         in a message."""
         for name, type_name in _fields(cls):
@@ -306,7 +229,9 @@ class _Writer:
                 self._builds.append(f'{local} = {field} = new({self._refer(nested)})')
                 self.add_object(nested, local, f'{path}.{name}')
 
-    def _add_size(self, cls, base, is_array, length, path):
+    def _add_size(
+        self, cls: Any, base: str, is_array: bool, length: Optional[int], path: str
+    ) -> None:
         """Add what may make a message large: an array or a text, unless that names a frame."""
         if not is_array:
             if base == 'string' and not path.endswith('frame_id'):
@@ -322,20 +247,20 @@ class _Writer:
             else:
                 self._add_items(length, SMALL, path)
 
-    def _add_items(self, length, size, path):
+    def _add_items(self, length: Optional[int], size: int, path: str) -> None:
         """Add an array of items that have that size each; ``length`` is None where it varies."""
         if length is None:
             self._sizes.append(f'len({path}) * {size}')
         else:
             self._fixed_size += length * size
 
-    def size(self):
+    def size(self) -> Optional[str]:
         """The expression of a message's size; None: always a few bytes."""
         if not self._sizes and self._fixed_size <= FEW:
             return None
         return ' + '.join([str(self._fixed_size), *self._sizes])
 
-    def _add_scalar(self, base, field, local):
+    def _add_scalar(self, base: str, field: str, local: str) -> None:
         self._add_value(field, local, fresh=local)
         if base == 'float64':
             self._reads.append(f'{local} = {field}')
@@ -343,64 +268,67 @@ class _Writer:
         elif base == 'string':
             self._reads += [
                 f'{local} = {field}',
-                f'if type({local}) is not str or not {local}.isascii(): {local} = text({local})',
+                f'if type({local}) is not str or not {local}.isascii(): {local} = check_text({local})',
             ]
         else:
             self._numbers.append((base, field, local))
 
-    def _add_array(self, cls, base, length, field, local):
+    def _add_array(
+        self, cls: Any, base: str, length: Optional[int], field: str, local: str
+    ) -> None:
         if base in STRUCT_CODES or base == 'string':
-            self._reads.append(f'{local} = {base}_array({field})')
+            convert = f'{local} = {base}_array({local})'
+            if base in ('uint8', 'char'):
+                convert = f'if type({local}) is not bytes: {convert}'  # images are bytes
+            self._reads += [f'{local} = {field}', convert]
             self._add_value(
                 field, local, fresh=f'list({local})' if base in ('bool', 'string') else local
             )
         else:
             element = copier_for(nested_class(cls, base))
             if element.freeze_fields is None:
-                raise Odd
+                raise NeedsSerializer
             freeze, thaw = self._refer(element.freeze_fields), self._refer(element.thaw_fields)
-            self._reads.append(f'{local} = tuple(map({freeze}, sequence({field})))')
+            self._reads.append(f'{local} = tuple(map({freeze}, check_sequence({field})))')
             self._add_value(field, local, fresh=f'list(map({thaw}, {local}))')
         if length is not None:
-            self._reads.append(f'if len({local}) != {length}: raise Odd')
+            self._reads.append(f'if len({local}) != {length}: raise NeedsSerializer')
 
-    def _add_value(self, field, local, fresh):
+    def _add_value(self, field: str, local: str, fresh: str) -> None:
         self._values.append(local)
         self._builds.append(f'{field} = {fresh}')
 
-    def _unique(self, name):
+    def _unique(self, name: str) -> str:
         """A variable named after what is in it. Whatever is not ours in the generated code comes
         through here."""
         if not name.isidentifier():
-            raise Odd
+            raise NeedsSerializer
         return f'{name}_{next(self._count)}'
 
-    def _refer(self, thing):
+    def _refer(self, thing: Any) -> str:
         """A name by which the generated code can use a class or function."""
         name = self._unique(thing.__name__)
         self.scope[name] = thing
         return name
 
-    def freeze_lines(self):
+    def freeze_lines(self) -> Iterator[str]:
         """The body of freeze_fields."""
         yield from self._reads
         if self._numbers:
             bases, fields, variables = zip(*self._numbers)
-            sent, arriving = (
-                ''.join(map(codes.get, bases)) for codes in (STRUCT_CODES, ARRIVAL_CODES)
-            )
-            self.scope.update(
-                pack=struct.Struct('<' + sent).pack, unpack=struct.Struct('<' + arriving).unpack
-            )
+            sent = ''.join(STRUCT_CODES[base] for base in bases)
+            arriving = ''.join(ARRIVAL_CODES[base] for base in bases)
+            self.scope['pack'] = struct.Struct('<' + sent).pack
+            self.scope['unpack'] = struct.Struct('<' + arriving).unpack
             yield f'{", ".join(variables)}, = unpack(pack({", ".join(fields)}))'
         if self._floats:
-            floats, variables = struct.Struct(f'<{len(self._floats)}d'), ', '.join(self._floats)
+            floats, names = struct.Struct(f'<{len(self._floats)}d'), ', '.join(self._floats)
             self.scope.update(pack_floats=floats.pack, unpack_floats=floats.unpack)
             yield f'if not ({" is ".join(f"type({local})" for local in self._floats)} is float):'
-            yield f'    {variables}, = unpack_floats(pack_floats({variables}))'
+            yield f'    {names}, = unpack_floats(pack_floats({names}))'
         yield f'return ({"".join(f"{local}, " for local in self._values)})'
 
-    def thaw_lines(self, cls):
+    def thaw_lines(self, cls: Any) -> Iterator[str]:
         """The body of thaw_fields."""
         if self._values:
             yield f'{", ".join(self._values)}, = frozen'

@@ -174,18 +174,13 @@ class Fanout:
             if not (inboxes or remote or latch):
                 return False
             self._seq += 1
-            if self._has_header and message._md5sum != '*':  # AnyMsg has none
-                if sharing.Mark.is_used and sharing.is_held(message.header):
-                    message = sharing.with_own_header(message)
-                header = message.header
-                header.seq = self._seq
-                if header.frame_id is None:
-                    header.frame_id = '0'
+            if self._has_header:
+                message = self._numbered(message)
             if inboxes or latch:
                 frozen = self._freeze(message)
             data = self._sockets.serialize(message, self._seq) if remote else b''
             if latch:
-                latch.keep(frozen, to or connection and connection.endpoint_id)
+                latch.keep(frozen, connection.endpoint_id if connection else to)
                 self._latches[latch] = None
             if inboxes:
                 size = 0
@@ -195,21 +190,40 @@ class Fanout:
                     message = mark.put_on(message)
                 for inbox in inboxes:
                     inbox.put(message if inbox.shared else frozen, size)
-            woken = None
             for dispatcher in dispatchers:
                 if dispatcher.idle:
-                    dispatcher.wake()
-                    woken = dispatcher
-            if woken is not None:
-                last, self._last_wake = self._last_wake, _clock()
-                if self._last_wake - last > BURST_INTERVAL:
-                    woken.yield_gil()
+                    self._wake(dispatchers)
+                    break
             if remote:
                 self._sockets.write(data, remote)
         if runs_inline:
             for dispatcher in inline:
                 dispatcher.run()
         return True
+
+    def _numbered(self, message: Any) -> Any:
+        """The message with the next ``header.seq``, as rospy numbers messages."""
+        if message._md5sum == '*':  # AnyMsg has no header
+            return message
+        if sharing.Mark.is_used and sharing.is_held(message.header):
+            message = sharing.with_own_header(message)
+        header = message.header
+        header.seq = self._seq
+        if header.frame_id is None:
+            header.frame_id = '0'
+        return message
+
+    def _wake(self, dispatchers: List[Dispatcher]) -> None:
+        """Wake those that are idle, and let them have the interpreter, but not within a burst."""
+        woken = None
+        for dispatcher in dispatchers:
+            if dispatcher.idle:
+                dispatcher.wake()
+                woken = dispatcher
+        if woken is not None:
+            last, self._last_wake = self._last_wake, _clock()
+            if self._last_wake - last > BURST_INTERVAL:
+                woken.yield_gil()
 
     def run(self) -> None:
         """Run the delegates that are inline, without the lock, which others may wait for."""

@@ -5,17 +5,18 @@ another message with its header, would write the next ``header.seq`` and ``_conn
 what the others hold.
 """
 import copy
+from typing import Any, Dict
 
 import genpy
 
 
-class Mark(dict):
+class Mark(Dict[str, str]):
     """The ``_connection_header`` of the messages that one publisher hands over, and of their
     headers."""
 
     is_used = False  # whether there is any
 
-    def put_on(self, message):
+    def put_on(self, message: genpy.Message) -> genpy.Message:
         """Mark a message that is handed over; returns it, or a copy if it is held as another
         publisher's already."""
         Mark.is_used = True
@@ -27,12 +28,12 @@ class Mark(dict):
         return message
 
 
-def is_held(message):
+def is_held(message: Any) -> bool:
     """Whether a message or header has been handed over, so that others hold it."""
     return type(getattr(message, '_connection_header', None)) is Mark
 
 
-def with_own_header(message):
+def with_own_header(message: genpy.Message) -> genpy.Message:
     """The message, whose header others hold, with a header of its own; a copy of it if they hold
     the message, too."""
     if is_held(message):
@@ -41,7 +42,7 @@ def with_own_header(message):
     return message
 
 
-def _copied(message):
+def _copied(message: Any) -> Any:
     """A copy with the same fields, and no mark.
 
     Whoever publishes one message again and again has two made each time, and ``copy`` takes five
@@ -55,7 +56,7 @@ def _copied(message):
     return new
 
 
-def numbered(message, seq):
+def numbered(message: genpy.Message, seq: int) -> genpy.Message:
     """The message with that ``header.seq``, as rospy.msg.serialize_message numbers messages,
     services' among them.
 
