@@ -4,7 +4,7 @@ import functools
 import rosgraph
 
 from pharos.blocks import check_block
-from pharos.private_rospy.parameters import carried
+from pharos.private_rospy.parameters import as_stored
 
 
 class Parameter:
@@ -21,7 +21,7 @@ class Parameter:
     def __init__(self, node, name, initialized=None):
         self.node = node
         self.name = name
-        self._initialized = None if initialized is None else carried(name, initialized)
+        self._initialized = None if initialized is None else as_stored(name, initialized)
         self._kind = type(self._initialized)
         self._blocks = []
         if self._initialized is not None:
@@ -56,7 +56,7 @@ class Parameter:
             raise ValueError(
                 f'{self.name} cannot be set to None: choose a value, such as an empty text or list'
             )
-        value = self._checked(carried(self.name, value))
+        value = self._checked(as_stored(self.name, value))
         watched = self.node.current_run.rospy.parameters
         self.node.master.call('setParam', self.name, value, caller_id=self.node.name)
         with self.node.master.reached():

@@ -6,7 +6,7 @@ import rosgraph
 
 from pharos.errors import suggest
 from pharos.private_rospy.names import global_name
-from pharos.private_rospy.parameters import carried
+from pharos.private_rospy.parameters import as_stored
 
 if TYPE_CHECKING:
     from pharos.master import Master
@@ -26,7 +26,7 @@ class Parameters(MutableMapping):
         return self._call('getParam', self._global_or_there(name))
 
     def __setitem__(self, name: str, value: Any) -> None:
-        self._call('setParam', _global(name), carried(name, value))
+        self._call('setParam', _global(name), as_stored(name, value))
 
     def __delitem__(self, name: str) -> None:
         self._call('deleteParam', self._global_or_there(name))

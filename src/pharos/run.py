@@ -75,7 +75,7 @@ class Run:
             self._settings.xmlrpc_port = self.rospy.xmlrpc_port
             if former and reopens:
                 self.opened = list(former.opened)
-                self.rospy.parameters.take_over(former.rospy.parameters)
+                self.rospy.parameters.restore_from_previous_run(former.rospy.parameters)
             with node_registry.changed:
                 if self._is_cancelled:
                     raise NodeStoppedError('it is registered, and goes again')
@@ -193,7 +193,7 @@ class Run:
         """Whether a stop() of the node may have to wait for this thread."""
         if self.is_starting:
             return self._starter == threading.get_ident()
-        return self.rospy.owns(threading.current_thread())
+        return threading.current_thread() in self.rospy.lifetime.threads
 
     def _stop_for_ros(self, reason: str) -> None:
         attempt(lambda: self.node.log(f'stops: {reason}'))
@@ -278,7 +278,7 @@ class Run:
         """
         self._soul_threads.append(threading.get_ident())
         try:
-            with self.rospy.interrupts_waits():
+            with self.rospy.lifetime.interrupts_waits():
                 return block(self.node)
         except BaseException as error:
             self.report(error, block, 'soul', again=again)

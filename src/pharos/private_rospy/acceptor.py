@@ -63,7 +63,7 @@ class Acceptor:
                 continue  # else the client went before it was let in
             # rospy waits for ever for a service's client, or in vain for a subscriber's leaving
             keep_alive(sock)
-            self._node.track_socket(sock)
+            self._node.lifetime.track_socket(sock)
             self.start_handshake(sock)
             try:
                 self._node.start_thread(self._serve, (sock, address, serve), self._kind)

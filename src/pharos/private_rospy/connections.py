@@ -5,7 +5,7 @@ import threading
 
 from pharos.private_rospy.addresses import is_same_master
 from pharos.private_rospy.names import Resolved
-from pharos.private_rospy import publishing, registration
+from pharos.private_rospy import changes, registration
 from pharos.private_rospy.proxies import ServerProxy, time_limit
 from pharos.private_rospy.registration import REGISTER_TIMEOUT, UNREGISTER_TIMEOUT, registered
 
@@ -221,7 +221,7 @@ class Connections:
                 subscriber.out_of_reach.discard(uri)
             else:
                 subscriber.out_of_reach.add(uri)
-            publishing.notify()
+            changes.notify()
         return answer
 
     def _negotiate(self, topic, uri):

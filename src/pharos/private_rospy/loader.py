@@ -7,9 +7,8 @@ as usual, also for imports that rospy does inside functions later on.
 import builtins
 import functools
 import importlib.util
-import os
+import pathlib
 import re
-import sys
 from importlib.machinery import PathFinder
 
 from pharos.private_rospy.process_rospy import rospy
@@ -20,7 +19,7 @@ _IMPORTS_ROSPY = re.compile(rb'^\s*(import|from)\s+rospy\b', re.MULTILINE)
 _found = {}  # module name -> (spec, code), the same for all sets
 
 
-class Substitute:
+class ModuleProxy:
     """A look-alike of a module: a few names of its own, everything else the real module's."""
 
     def __init__(self, real, **own):
@@ -44,26 +43,13 @@ def _find(name, path):
 def _is_written_on_rospy(package):
     """Whether a package imports rospy in one of its files: its copy for a node must then be that
     node's own too."""
-    if package in sys.stdlib_module_names:
-        return False
     spec = PathFinder.find_spec(package)
-    if spec is None:
+    if spec is None:  # it is built into Python
         return False
-    if spec.submodule_search_locations:
-        files = [
-            entry.path
-            for folder in spec.submodule_search_locations
-            if os.path.isdir(folder)
-            for entry in os.scandir(folder)
-        ]
-    else:
-        files = [spec.origin or '']
-    return any(_IMPORTS_ROSPY.search(_read(path)) for path in files if path.endswith('.py'))
-
-
-def _read(path):
-    with open(path, 'rb') as file:
-        return file.read()
+    files = [pathlib.Path(spec.origin)] if spec.origin else []
+    for folder in spec.submodule_search_locations or ():
+        files += pathlib.Path(folder).glob('*.py')
+    return any(_IMPORTS_ROSPY.search(file.read_bytes()) for file in files if file.suffix == '.py')
 
 
 class PrivateImports:
@@ -88,10 +74,9 @@ class PrivateImports:
         self._private.add(name.partition('.')[0])
         return self._load(name)
 
-    def load_apart(self, name, path):
+    def load_single(self, name, path):
         """A private copy of one module of a package that is otherwise shared."""
-        spec, code = _find(name, path)
-        return self._run(spec, code)
+        return self._run(*_find(name, path), {})
 
     def _load(self, name):
         if name in self.modules:
@@ -101,25 +86,23 @@ class PrivateImports:
         if name in self.modules:  # the parent's code imported it
             return self.modules[name]
         if name in _SHARED:
-            module = self.modules[name] = _SHARED[name]
+            self.modules[name] = _SHARED[name]
         else:
-            module = self._run(*_find(name, parent.__path__ if parent else None), into=self.modules)
-            self._patch(module)
+            self._run(*_find(name, parent.__path__ if parent else None), self.modules)
+            self._patch(self.modules[name])
         if parent:
-            setattr(parent, leaf, module)
-        return module
+            setattr(parent, leaf, self.modules[name])
+        return self.modules[name]
 
-    def _run(self, spec, code, into=None):
-        module = importlib.util.module_from_spec(spec)
+    def _run(self, spec, code, modules):
+        """Run the code of a module, which is among ``modules`` before: rospy's import each other in
+        circles."""
+        module = modules[spec.name] = importlib.util.module_from_spec(spec)
         vars(module)['__builtins__'] = self._builtins
-        if into is not None:
-            # before its code runs: rospy's modules import each other in circles
-            into[spec.name] = module
         try:
             exec(code, vars(module))
         except BaseException:
-            if into is not None:
-                del into[spec.name]
+            del modules[spec.name]
             raise
         return module
 

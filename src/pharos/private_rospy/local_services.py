@@ -31,7 +31,7 @@ def class_of(name, uri):
 def _offered_here(name, uri):
     """The PrivateRospy and the rospy Service of that name and URI, or twice None."""
     for node in local_nodes():
-        service = node.services.get(name)
+        service = node.service_manager.map.get(name)
         if service is not None and service.uri == uri:
             return node, service
     return None, None
@@ -57,7 +57,7 @@ class RospyService(LocalService):
 
     def __init__(self, node, service, wanted):
         super().__init__(service.service_class, wanted)
-        self._node, self._service, self._offered = node, service, node.services
+        self._node, self._service, self._offered = node, service, node.service_manager.map
         self._freeze_response = copier_for(service.response_class).freeze
 
     def is_offered(self, uri):
@@ -69,7 +69,9 @@ class RospyService(LocalService):
         """What rospy's ServiceImpl._handle_request does, but for the writing."""
         service = self._service
         try:
-            response = self._node.as_response(service.handler(request), service.response_class)
+            response = self._node.rospy.impl.tcpros_service.convert_return_to_response(
+                service.handler(request), service.response_class
+            )
             service.seq += 1
             return self._freeze_response(numbered(response, service.seq))
         # the caller gets the text alone, as from elsewhere: the reason's traceback is its node's to

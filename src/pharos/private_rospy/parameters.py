@@ -15,73 +15,62 @@ class WatchedParameters:
 
     def __init__(self, instance):
         self._instance = instance
-        self._listeners = {}  # global name -> [function(value)]
+        self._watched = []  # (global name, function(value))
         self._initialized = {}  # global name -> its first value
-        # of those listened to, the outermost: of what is in them, the master tells for each
+        # of those watched, the outermost: of what is in them, the master tells for each
         self._subscribed = set()
         self.cached = set()  # global names of which rospy itself has the master tell
-        self._closed = False
-        self._lock = threading.Lock()  # guards _listeners
+        self._lock = threading.Lock()  # held to add to _watched
         self._subscribing = threading.Lock()  # guards _subscribed
 
     def may_subscribe(self):
         """Whether the master may still be asked to tell the node of a parameter."""
-        return not (self._closed or self._instance.has_lost_name)
+        return not (self._instance.ended.is_set() or self._instance.has_lost_name)
 
     def initialize(self, name, value):
         """Set the parameter where it has no value, also after a restart of the master."""
         self._set_where_missing(name, value)
         self._initialized[name] = value
 
-    def take_over(self, former):
+    def restore_from_previous_run(self, former):
         """Know what those of the node's former run knew; :meth:`renew` tells the master."""
-        self._initialized = dict(former._initialized)
-        self._listeners = {name: list(listeners) for name, listeners in former._listeners.items()}
+        self._initialized, self._watched = dict(former._initialized), list(former._watched)
 
     def renew(self):
         """Have the master know the first values, and what is watched."""
         for name, value in dict(self._initialized).items():
             self._set_where_missing(name, value)
-        with self._lock:
-            watched = sorted(self._listeners)  # namespaces before what is in them
-        for name in watched:
+        # namespaces before what is in them
+        for name in sorted({name for name, _ in self._watched}):
             self._subscribe(name)
 
     def watch(self, name, listener):
         """Call ``listener(value)`` whenever the parameter is set; once more for the same listener
         is no more."""
+        entry = name, listener
         with self._lock:
-            listeners = self._listeners.setdefault(name, [])
-            is_new = listener not in listeners
+            is_new = entry not in self._watched
             if is_new:
-                listeners.append(listener)
+                self._watched.append(entry)
         try:
             self._subscribe(name)
         except BaseException:
             if is_new:
-                self._unwatch(name, listener)
+                self._watched.remove(entry)
             raise
-
-    def _unwatch(self, name, listener):
-        with self._lock:
-            self._listeners[name].remove(listener)
-            if not self._listeners[name]:
-                del self._listeners[name]
 
     def _subscribe(self, name):
         master, uri = self._master(), self._instance.uri
         with self._subscribing:
             if not self.may_subscribe():
                 return
-            if any(_holds(other, name) for other in self._subscribed):
+            if any(_contains(other, name) for other in self._subscribed):
                 return
             master.subscribeParam(uri, name)
-            within = [other for other in self._subscribed if _holds(name, other)]
-            self._subscribed.difference_update(within)
-            self._subscribed.add(name)
-            for other in within:
-                if other not in self.cached:
-                    master.unsubscribeParam(uri, other)
+            within = {other for other in self._subscribed if _contains(name, other)}
+            self._subscribed = self._subscribed - within | {name}
+            for other in within - self.cached:
+                master.unsubscribeParam(uri, other)
 
     def _set_where_missing(self, name, value):
         master = self._master()
@@ -91,51 +80,41 @@ class WatchedParameters:
     def _master(self):
         return master_api(self._instance.settings.master_url, self._instance.name)
 
-    def put_back(self):
+    def restore_after_master_restart(self):
         """A restarted master has no parameters: set the node's private ones and first values, and
         watch again."""
-        client = self._instance.rospy.client
-        for name, value in client.load_command_line_node_params(
-            self._instance.settings.argv
-        ).items():
-            self._instance.rospy.set_param('~' + name, value)
+        rospy = self._instance.rospy
+        private = rospy.client.load_command_line_node_params(self._instance.settings.argv)
+        for name, value in private.items():
+            rospy.set_param('~' + name, value)
+        cache = rospy.impl.paramserver.get_param_server_cache()
         for name in list(self.cached):
             with contextlib.suppress(KeyError):
-                self._instance.parameter_cache.delete(
-                    name
-                )  # rospy subscribes anew when it is asked for it
+                cache.delete(name)  # rospy subscribes anew when it is asked for it
         with self._subscribing:
             self._subscribed.clear()
         self.renew()
 
     def tell_of_own(self, key, value):
         """The node itself has set a parameter, of which a master tells all but the one who sets."""
-        with self._subscribing:
-            told_by_master = isinstance(value, dict) and not any(
-                _holds(name, key) for name in self._subscribed
-            )
         # those subscribed to a part of a dict are told, whoever sets it
-        self.tell(key, value, not told_by_master)
+        is_told_by_master = isinstance(value, dict) and not any(
+            _contains(name, key) for name in tuple(self._subscribed)
+        )
+        self.tell(key, value, within=not is_told_by_master)
 
     def tell(self, key, value, within=True):
         """Tell the listeners of a parameter, and of what is around and ``within`` it; returns
         whether there are any."""
         key = '/' + key.strip('/')
-        with self._lock:
-            told = [
-                (name, list(listeners))
-                for name, listeners in self._listeners.items()
-                if _holds(name, key) or within and _holds(key, name)
-            ]
-        for name, listeners in told:
-            new = value if name == key else self._value(name)
-            for listener in listeners:
-                listener(new)
+        told = [
+            (name, listener)
+            for name, listener in tuple(self._watched)
+            if _contains(name, key) or within and _contains(key, name)
+        ]
+        for name, listener in told:
+            listener(value if name == key else self._value(name))
         return bool(told)
-
-    def close(self):
-        """Watch nothing from now on."""
-        self._closed = True
 
     def unsubscribe(self, calls):
         """Add to the calls those that end the watch: a master keeps the name of a node that does
@@ -150,7 +129,7 @@ class WatchedParameters:
             return None
 
 
-def carried(name, value):
+def as_stored(name, value):
     """The value as the parameter server brings it back: with lists for tuples.
 
     :raises ValueError: if it can hold no such value
@@ -164,6 +143,6 @@ def carried(name, value):
         ) from error
 
 
-def _holds(namespace, name):
+def _contains(namespace, name):
     """Whether ``name`` is the namespace or in it."""
     return (name + '/').startswith(namespace.rstrip('/') + '/')

@@ -5,7 +5,7 @@ import threading
 import time
 from typing import NamedTuple
 
-from pharos.private_rospy import publishing
+from pharos.private_rospy import changes
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.tcpros_connection import publisher_header
 
@@ -61,7 +61,7 @@ class Refusals:
         with self._lock:
             subscription.refused[uri] = said, refusal
             is_held = topic in self._held
-        publishing.notify()
+        changes.notify()
         if not is_held:
             self.on_refused(refusal)
 
@@ -139,7 +139,7 @@ class Refusals:
         with self._lock:
             is_new = publisher.refused.get(name) != said
             _remember(publisher.refused, name, said)
-        publishing.notify()
+        changes.notify()
         if is_new:
             self._instance.warn(line)
 

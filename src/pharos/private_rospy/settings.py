@@ -17,7 +17,7 @@ from pharos.private_rospy.addresses import (
 from pharos.private_rospy.arguments import mappings_for, takes_name
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.names import NODE_LIMIT, check_name
-from pharos.private_rospy.parameters import carried
+from pharos.private_rospy.parameters import as_stored
 
 
 class Settings:
@@ -108,4 +108,4 @@ def _check_private_parameters(arguments):
                 f' special characters in quotes ({error})'
             ) from error
         for name, value in parameters.items():
-            carried('~' + name, value)
+            as_stored('~' + name, value)

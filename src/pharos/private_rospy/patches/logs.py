@@ -1,7 +1,7 @@
 """What a node logs on the screen."""
 import contextlib
 
-from pharos.private_rospy.loader import Substitute
+from pharos.private_rospy.loader import ModuleProxy
 from pharos.private_rospy.patches.table import patch, substitute
 
 _ESCAPED = '$\0{'  # for '${', by which rosgraph's format names the parts of a line
@@ -12,7 +12,7 @@ _ESCAPED = '$\0{'  # for '${', by which rosgraph's format names the parts of a l
 )
 def default_formatter(*, original):
     """Escape what looks like a part of a line."""
-    return Substitute(
+    return ModuleProxy(
         original, format=lambda record: original.format(record).replace('${', _ESCAPED)
     )
 

@@ -7,7 +7,7 @@ import struct
 from pharos.intraprocess.fanout import ClosedError, Fanout, Latch, StartupLogBuffer
 from pharos.intraprocess.link import links_of
 from pharos.private_rospy.patches.table import addition, patch
-from pharos.private_rospy.publishing import notify
+from pharos.private_rospy.changes import notify
 from pharos.private_rospy.sender import Sender, Sockets
 
 

@@ -77,5 +77,5 @@ def shutdown(self, caller_id, msg='', *, node):
         allowed = 'only this host and the master\'s may stop it'
         return -1, f'{REFUSED}{allowed}, unless its allow_remote_shutdown is set', 0
     node.request_stop(f'{caller_id} asked for it: {msg}')
-    node.wait_until_silent(STOP_TIMEOUT)  # whoever asked finds it gone, as with rospy
+    node.lifetime.silent.wait(STOP_TIMEOUT)  # whoever asked finds it gone, as with rospy
     return 1, 'shutdown', 0

@@ -3,7 +3,7 @@ import sys
 import time
 import traceback
 
-from pharos.private_rospy.loader import Substitute
+from pharos.private_rospy.loader import ModuleProxy
 from pharos.private_rospy.patches.table import patch, substitute
 from pharos.private_rospy.process_rospy import rospy
 
@@ -11,7 +11,7 @@ from pharos.private_rospy.process_rospy import rospy
 @substitute('rospy.impl.init', 'time', 'waits in steps of 0.1 s, as long as the master takes')
 def time_of_init(*, node):
     """Wait in short steps, and not for ever."""
-    return Substitute(time, sleep=node.wait_for_registration)
+    return ModuleProxy(time, sleep=node.wait_for_registration)
 
 
 @patch(
@@ -25,13 +25,13 @@ def is_shutdown(*, node, original):
 @patch('rospy.topics', 'is_shutdown', 'keeps a soul that ends from sending its last messages')
 def is_shutdown_of_topics(*, node):
     """Hold only at the end of the stop."""
-    return node.module('rospy.core')._shutdown_flag
+    return node.rospy.core._shutdown_flag
 
 
 @substitute('rospy.core', 'traceback', 'stops half way where what a hook raised cannot be printed')
 def traceback_of_hooks(*, node):
     """Report what a hook of rospy.on_shutdown raised."""
-    return Substitute(traceback, print_exc=lambda: node.on_failure(sys.exc_info()[1]))
+    return ModuleProxy(traceback, print_exc=lambda: node.on_failure(sys.exc_info()[1]))
 
 
 @substitute(

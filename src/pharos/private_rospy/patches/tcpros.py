@@ -5,7 +5,7 @@ from pharos.private_rospy import refusals
 from pharos.private_rospy.acceptor import brief
 from pharos.private_rospy.lifetime import keep_alive
 from pharos.private_rospy.patches.table import patch
-from pharos.private_rospy.publishing import notify
+from pharos.private_rospy.changes import notify
 from pharos.private_rospy.registration import COMMUNICATION_ERRORS
 from pharos.private_rospy.tcpros_connection import CALLER_ID
 

@@ -14,7 +14,7 @@ def notify():
         _changed.notify_all()
 
 
-def wait_until(predicate, timeout, lifetime):
+def wait_until(lifetime, predicate, timeout):
     """Wait until ``predicate()``, which speaks of connections of publishers of this process, holds.
 
     :param timeout: seconds, None: no limit
