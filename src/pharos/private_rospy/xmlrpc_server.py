@@ -17,7 +17,6 @@ from pharos.private_rospy.proxies import seconds_left
 REQUEST_TIMEOUT = 30.0  # seconds from one answer until the next request has come, however slowly
 REQUEST_LIMIT = 1 << 20  # bytes of a request
 
-REFUSED = 'refused: '  # how an answer begins by which a node defends itself
 _thread = threading.local()  # .handler: the RequestHandler whose client's call it answers
 
 
@@ -60,6 +59,11 @@ class RequestHandler(xmlrpc.server.SimpleXMLRPCRequestHandler):
     def log_rejection(self, why):
         """Log what is wrong with a call of the client."""
         self.server.acceptor.log_rejection(self.client_address, why)
+
+    def refuse(self, method, why):
+        """Log that a call of the client is refused; returns the slave API's answer to it."""
+        self.log_rejection(f'call of {method}: {why}')
+        return -1, f'refused: {why}', 0
 
     def do_POST(self):
         """Called by http.server for a request whose header has come."""

@@ -4,7 +4,7 @@ import contextlib
 from pharos.private_rospy import registration
 from pharos.private_rospy.local_link import IntraprocessHandler
 from pharos.private_rospy.patches.table import patch
-from pharos.private_rospy.xmlrpc_server import REFUSED, is_call_from_nearby
+from pharos.private_rospy.xmlrpc_server import caller, is_call_from_nearby
 
 STOP_TIMEOUT = 5.0  # seconds that who asks the node to stop waits for that
 # publishers of a topic that a call may name; a thread tries to reach each of them
@@ -46,7 +46,9 @@ def _connect_topic(self, topic, pub_uri, *, node):
 def publisherUpdate(self, caller_id, topic, publishers):
     """Pass it on once."""
     if len(publishers) > PUBLISHER_LIMIT:
-        return -1, f'{REFUSED}{len(publishers)} publishers; the limit is {PUBLISHER_LIMIT}', 0
+        return caller().refuse(
+            'publisherUpdate', f'{len(publishers)} publishers; the limit is {PUBLISHER_LIMIT}'
+        )
     if self.reg_man:
         self.reg_man.publisher_update(topic, publishers)
     return 1, '', 0
@@ -74,8 +76,10 @@ def shutdown(self, caller_id, msg='', *, node):
             return 1, f'the name {node.name} is still this node\'s', 0
         node.has_lost_name = True
     elif not (node.allows_remote_shutdown() or is_call_from_nearby(self.masterUri)):
-        allowed = 'only this host and the master\'s may stop it'
-        return -1, f'{REFUSED}{allowed}, unless its allow_remote_shutdown is set', 0
+        return caller().refuse(
+            'shutdown',
+            'only this host and the master\'s may stop it, unless its allow_remote_shutdown is set',
+        )
     node.request_stop(f'{caller_id} asked for it: {msg}')
     node.lifetime.silent.wait(STOP_TIMEOUT)  # whoever asked finds it gone, as with rospy
     return 1, 'shutdown', 0

@@ -2,7 +2,7 @@
 from pharos.private_rospy.acceptor import BACKLOG, Acceptor, brief
 from pharos.private_rospy.lifetime import shutdown_socket
 from pharos.private_rospy.patches.table import addition, patch, substitute
-from pharos.private_rospy.xmlrpc_server import REFUSED, RequestHandler, caller
+from pharos.private_rospy.xmlrpc_server import RequestHandler, caller
 
 
 @substitute(
@@ -57,20 +57,15 @@ def shutdown(self, reason, *, node):
     'does not say whose the calls were that it refused',
 )
 def dispatch(self, method, params):
-    """Called by the standard library's server; logs the calls that are refused, and whose they are.
+    """Called by the standard library's server; logs what is no call, and whose it is.
 
-    A call that ROS's slave API answers with another error is the caller's affair: peers come too
-    late, or try.
+    A call that ROS's slave API answers with an error is the caller's affair: peers come too late,
+    or try.
     """
-    client = caller()
     try:
         if method.startswith('_') or not hasattr(self, method):
             raise AttributeError(f'method "{method}" is not supported')
-        answer = getattr(self, method)(*params)
+        return getattr(self, method)(*params)
     except Exception as error:
-        client.log_rejection(f'call of {brief(method)}: {error}')
+        caller().log_rejection(f'call of {brief(method)}: {error}')
         raise
-    code, text, *_ = answer if isinstance(answer, tuple) else (1, '')
-    if code < 1 and text.startswith(REFUSED):
-        client.log_rejection(f'call of {method}: {text[len(REFUSED):]}')
-    return answer
