@@ -475,7 +475,7 @@ def test_a_thread_that_is_only_just_beginning_is_not_waited_for():
     thread._started = started = StartsSlowly()
     starter, _ = in_thread(thread.start)
     assert started.reached.wait(TIMEOUT) and thread.ident is not None
-    assert life.end() == []
+    assert life.finish_shutdown() == []
     started.allowed.set()
     assert ended(starter)
 

@@ -207,7 +207,7 @@ class PrivateRospy:
             pass  # where the node's own code called that, it returned at once
         for proxy in list(core._xmlrpc_cache.values()):  # a thread that is left may add one
             proxy('close')()
-        left = self.lifetime.end(abandoned)
+        left = self.lifetime.finish_shutdown(abandoned)
         logs.close_handlers(self._logging)
         return [thread.name for thread in left]
 

@@ -97,7 +97,7 @@ class Lifetime:
         """Do not shut this socket down: its client is to hear that the node has stopped."""
         self._sockets.discard(sock)
 
-    def end(self, abandoned=()):
+    def finish_shutdown(self, abandoned=()):
         """Shut the sockets down, and wait for the threads but those that are ``abandoned``.
 
         :returns: the threads that did not end in time

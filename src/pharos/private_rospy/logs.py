@@ -17,10 +17,7 @@ def private_logging():
     """A module that looks like ``logging`` and shares nothing with it but its classes and
     functions."""
     module = types.ModuleType('logging')
-    vars(module).update(
-        {name: value for name, value in vars(logging).items() if not name.startswith('__')}
-    )
-    module.__path__ = logging.__path__
+    vars(module).update(vars(logging))
 
     class Logger(logging.Logger):
         """``logging.Logger`` with a root and a manager of its own."""
