@@ -1,78 +1,78 @@
 """Classes made from the text of a definition, as genpy would have written them to a file.
 
 The text may come from the network, so it never reaches genpy's code generator: that sees checked
-field names, primitive types, and names of our own making for the types nested. The caller holds a
-lock: the generator's state is global.
-"""
+field names, primitive types, and names of our own making for the types nested. genpy.dynamic is not
+used: it makes a new class per call, makes sys.path longer, and leaves files behind for a bad text.
 
+The caller holds a lock: the generator's state is global.
+"""
 import re
 import reprlib
 import types
+from typing import Any, Dict, List, Tuple
 
 import genmsg
 from genmsg.msgs import bare_msg_type, is_builtin
 
-from pharos.messages import lookup
 from pharos.errors import UnknownTypeError
+from pharos.messages import lookup
+from pharos.messages.fields import MessageClass, nested_classes
 from pharos.messages.lookup import MAX_TEXT, NAME
-from pharos.messages.fields import nested_classes
 
 MAX_DEPTH = 64  # types nested in one another
 # of a type and those it nests, counted wherever they occur: genpy writes code for each, 4 s for all
 MAX_FIELDS = 10000
 MAX_ELEMENTS = 1 << 24  # that a new message holds in its arrays of fixed length
 
-_FIELD_TYPE = re.compile(r'(%s/)?%s(\[[0-9]{0,9}\])?' % (NAME.pattern, NAME.pattern))
+_FIELD_TYPE = re.compile(rf'({NAME.pattern}/)?{NAME.pattern}(\[[0-9]{{0,9}}\])?')
 _NESTED = re.compile(r'(?:\A|\n)=+[ \t]*\nMSG:(.*)')
 
-_made = {}  # classes made here, by what they are made of
+_made: Dict[Tuple[Any, ...], type] = {}  # classes made here, by what they are made of
 
 
-def make(kind, type_, text):
-    """Return the class for a definition; ``kind`` is 'msg' or 'srv'."""
+def make(kind: str, type_: str, text: str) -> Any:
+    """The class for a definition.
+
+    :param kind: 'msg' or 'srv'
+    :raises UnknownTypeError: if the text cannot be read, or Python can have no class for it
+    """
     context, spec, parts = _read(kind, type_, text)
-    sizes = {}
+    sizes: Dict[str, Tuple[int, int]] = {}
     for part in parts:
         _measure(part, context, sizes, ())
-    if (
-        sum(fields for fields, _ in sizes.values()) > MAX_FIELDS
-        or max(n for _, n in sizes.values()) > MAX_ELEMENTS
-    ):
+    fields, elements = zip(*sizes.values())
+    if sum(fields) > MAX_FIELDS or max(elements) > MAX_ELEMENTS:
         raise UnknownTypeError(
             f'{type_} has more than {MAX_FIELDS} fields or {MAX_ELEMENTS} elements in all: use '
             'fewer, or arrays of variable length'
         )
-    installed = lookup.installed(kind, type_)
-    request_and_response = getattr(installed, '_request_class', None), getattr(
-        installed, '_response_class', None
-    )
-    classes = _generate(
-        context, sizes, {part.full_name: cls for part, cls in zip(parts, request_and_response)}
-    )
     if kind == 'msg':
-        return classes[type_]
-    request, response = (classes[part.full_name] for part in parts)
-    if (request, response) == request_and_response:
+        return _generate(context, list(sizes), {})[type_]
+    installed: Any = lookup.installed(kind, type_)
+    own = getattr(installed, '_request_class', None), getattr(installed, '_response_class', None)
+    names = [part.full_name for part in parts]
+    classes = _generate(context, list(sizes), dict(zip(names, own)))
+    request, response = (classes[name] for name in names)
+    if (request, response) == own:
         return installed
     if (request, response) not in _made:
         genmsg.msg_loader.load_depends(context, spec, {})
-        _made[request, response] = type(
-            spec.short_name,
-            (),
-            {
-                '_type': type_,
-                '_md5sum': genmsg.compute_md5(context, spec),
-                '_request_class': request,
-                '_response_class': response,
-                '__module__': spec.package + '.srv',
-            },
-        )
+        attributes = {
+            '_type': type_,
+            '_md5sum': genmsg.compute_md5(context, spec),
+            '_request_class': request,
+            '_response_class': response,
+            '__module__': spec.package + '.srv',
+        }
+        _made[request, response] = type(spec.short_name, (), attributes)
     return _made[request, response]
 
 
-def _read(kind, type_, text):
-    """Parse a definition with all that it nests: return genmsg's context, spec, and the specs of
-    its parts."""
+def _read(
+    kind: str, type_: str, text: str
+) -> Tuple[genmsg.MsgContext, Any, Tuple[genmsg.MsgSpec, ...]]:
+    """Parse a definition with all that it nests: genmsg's context, spec, and the specs of its
+    parts."""
     context = genmsg.MsgContext.create_default()
     texts = split(type_, text)
     spec, parts = _parse(kind, type_, texts[type_], context)
@@ -84,63 +84,46 @@ def _read(kind, type_, text):
             continue
         if nested not in texts:
             try:
-                known = lookup.find('msg', nested)
+                known: Any = lookup.find('msg', nested)
             except UnknownTypeError as error:
                 raise UnknownTypeError(f'{user} has a field of an {error}') from error
-            texts = {
-                **split(nested, known if isinstance(known, str) else known._full_text),
-                **texts,
-            }
-        pending += [
-            (nested, field_type)
-            for field_type in _parse('msg', nested, texts[nested], context)[0].types
-        ]
+            known_text = known if isinstance(known, str) else known._full_text
+            texts = {**split(nested, known_text), **texts}
+        nested_spec, _ = _parse('msg', nested, texts[nested], context)
+        pending += [(nested, field_type) for field_type in nested_spec.types]
     return context, spec, parts
 
 
-def split(type_, text):
-    """Return the texts of a definition, by type, with those nested in it."""
+def split(type_: str, text: Any) -> Dict[str, str]:
+    """The texts of a definition, by type, with those nested in it.
+
+    :raises UnknownTypeError: if it is no str or too long, or what is nested has no name
+    """
     if not isinstance(text, str) or len(text) > MAX_TEXT:
         raise UnknownTypeError(
             f'{type_}: its definition must be a str of at most {MAX_TEXT} characters'
         )
     # genpy.dynamic does the same with Header's former package
-    own, *nested = _NESTED.split(
-        text.replace('\r\n', '\n').replace('roslib/Header', 'std_msgs/Header')
-    )
+    text = text.replace('\r\n', '\n').replace('roslib/Header', 'std_msgs/Header')
+    own, *nested = _NESTED.split(text)
     texts = {name.strip(): nested_text[1:] for name, nested_text in zip(nested[::2], nested[1::2])}
     for name in texts:
         lookup.check_name('msg', name)
     return {**texts, type_: own}
 
 
-def _parse(kind, type_, text, context):
-    load = (
-        genmsg.msg_loader.load_msg_from_string
-        if kind == 'msg'
-        else genmsg.msg_loader.load_srv_from_string
-    )
-
-    def parse(text, context):
-        spec = load(context, text, type_)
-        parts = (spec,) if kind == 'msg' else (spec.request, spec.response)
-        for part in parts:
-            for name in part.names + [constant.name for constant in part.constants]:
-                if not NAME.fullmatch(name):
-                    raise genmsg.InvalidMsgSpec(f'{name!r} is not a name')
-            for field_type in part.types:
-                if not _FIELD_TYPE.fullmatch(field_type):
-                    raise genmsg.InvalidMsgSpec(f'{field_type!r} is not a type')
-        return spec, parts
-
+def _parse(
+    kind: str, type_: str, text: str, context: genmsg.MsgContext
+) -> Tuple[Any, Tuple[genmsg.MsgSpec, ...]]:
+    """The spec of a text, and of its parts: itself, or a service's request and response."""
     try:
-        return parse(text, context)
+        return _load(kind, type_, text, context)
     except Exception as error:
         # genmsg does not say where: the first line that cannot stand alone, if there is one
         reason = str(error)[:200]
         for number, line in enumerate(text.split('\n'), 1):
             try:
-                parse(line, genmsg.MsgContext())
+                _load(kind, type_, line, genmsg.MsgContext())
             except Exception as line_error:
                 reason = f'line {number}, {reprlib.repr(line)}: {str(line_error)[:200]}'
                 break
@@ -149,8 +132,36 @@ def _parse(kind, type_, text, context):
         ) from error
 
 
-def _measure(spec, context, sizes, users):
-    """Enter numbers of fields and elements into ``sizes``, by type, nested types first."""
+def _load(
+    kind: str, type_: str, text: str, context: genmsg.MsgContext
+) -> Tuple[Any, Tuple[genmsg.MsgSpec, ...]]:
+    loader = genmsg.msg_loader
+    if kind == 'msg':
+        spec = loader.load_msg_from_string(context, text, type_)
+        parts: Tuple[genmsg.MsgSpec, ...] = (spec,)
+    else:
+        spec = loader.load_srv_from_string(context, text, type_)
+        parts = spec.request, spec.response
+    for part in parts:
+        for name in part.names + [constant.name for constant in part.constants]:
+            if not NAME.fullmatch(name):
+                raise genmsg.InvalidMsgSpec(f'{name!r} is not a name')
+        for field_type in part.types:
+            if not _FIELD_TYPE.fullmatch(field_type):
+                raise genmsg.InvalidMsgSpec(f'{field_type!r} is not a type')
+    return spec, parts
+
+
+def _measure(
+    spec: genmsg.MsgSpec,
+    context: genmsg.MsgContext,
+    sizes: Dict[str, Tuple[int, int]],
+    users: Tuple[str, ...],
+) -> None:
+    """Enter numbers of fields and elements into ``sizes``, by type, nested types first.
+
+    :param users: the types that nest this one
+    """
     if spec.full_name in users or len(users) > MAX_DEPTH:
         raise UnknownTypeError(
             f'{spec.full_name} nests itself or more than {MAX_DEPTH} types: flatten its definition'
@@ -158,56 +169,59 @@ def _measure(spec, context, sizes, users):
     fields = elements = 1
     for field in spec.parsed_fields():
         if not field.is_builtin and field.base_type not in sizes:
-            _measure(
-                context.get_registered(field.base_type), context, sizes, (*users, spec.full_name)
-            )
+            nested = context.get_registered(field.base_type)
+            _measure(nested, context, sizes, (*users, spec.full_name))
         nested_fields, nested_elements = sizes.get(field.base_type, (1, 1))
         fields += nested_fields
         elements += nested_elements * (field.array_len or 1)
     sizes[spec.full_name] = fields, elements
 
 
-def _generate(context, types_, installed):
-    """Return the classes of ``types_``, nested types first: those installed if they are the same,
+def _generate(
+    context: genmsg.MsgContext, names: List[str], installed: Dict[str, Any]
+) -> Dict[str, MessageClass]:
+    """The classes of the types named, nested types first: those installed if they are the same,
     else genpy's output.
 
-    ``installed`` holds the parts of an installed service, which are not found by their names.
+    :param installed: the parts of an installed service, which are not found by their names
     """
-    aliases = {type_: f'nested/T{number}' for number, type_ in enumerate(types_)}
+    aliases = {name: f'nested/T{number}' for number, name in enumerate(names)}
     plain = genmsg.MsgContext.create_default()
     namespace = types.SimpleNamespace(msg=types.SimpleNamespace())
-    classes = {}
-    for type_, alias in aliases.items():
-        spec = context.get_registered(type_)
-        field_types = [
-            re.sub(r'[^[]+', lambda match: aliases.get(match[0], match[0]), t, count=1)
-            for t in spec.types
-        ]
-        plain.register(alias, genmsg.MsgSpec(field_types, spec.names, [], '', alias))
+    classes: Dict[str, MessageClass] = {}
+    for name, alias in aliases.items():
+        spec = context.get_registered(name)
+        plain_types = []
+        for field_type in spec.types:
+            base = bare_msg_type(field_type)
+            plain_types.append(aliases.get(base, base) + field_type[len(base) :])
+        plain.register(alias, genmsg.MsgSpec(plain_types, spec.names, [], '', alias))
         genmsg.msg_loader.load_depends(context, spec, {})
         md5sum = genmsg.compute_md5(context, spec)
         # The md5sum alone does not tell T from T[], as ROS computes it.
         nested = [classes[t] for t in map(bare_msg_type, spec.types) if t in classes]
-        key = type_, md5sum, *spec.types, *nested
-        cls = _made.get(key) or installed.get(type_) or lookup.installed('msg', type_)
-        if cls is None or key != (type_, cls._md5sum, *cls._slot_types, *nested_classes(cls)):
+        key = name, md5sum, *spec.types, *nested
+        cls: Any = _made.get(key) or installed.get(name) or lookup.installed('msg', name)
+        if cls is None or key != (name, cls._md5sum, *cls._slot_types, *nested_classes(cls)):
             cls = _made[key] = _write(spec, plain, alias, namespace)
-            cls._type, cls._md5sum, cls._slot_types = type_, md5sum, spec.types
-            cls._has_header, cls._full_text = spec.has_header(), genmsg.compute_full_text(
-                context, spec
-            )
+            cls._type, cls._md5sum, cls._slot_types = name, md5sum, spec.types
+            cls._has_header = spec.has_header()
+            cls._full_text = genmsg.compute_full_text(context, spec)
             cls._classes = classes
-        classes[type_] = cls
+        classes[name] = cls
         setattr(namespace.msg, alias[7:], cls)
     return classes
 
 
-def _write(spec, plain, alias, namespace):
-    """Return genpy's class for the message ``alias`` of ``plain``, with the name and constants of
+def _write(
+    spec: genmsg.MsgSpec, plain: genmsg.MsgContext, alias: str, namespace: types.SimpleNamespace
+) -> Any:
+    """genpy's class for the message ``alias`` of ``plain``, with the name and constants of
     ``spec``."""
-    from genpy.generator import make_python_safe, msg_generator  # not loaded by rospy
+    # rospy does not load it, and it takes 60 ms
+    from genpy.generator import make_python_safe, msg_generator
 
-    module = {'nested': namespace, '__name__': spec.package + '.msg'}
+    module: Dict[str, Any] = {'nested': namespace, '__name__': spec.package + '.msg'}
     try:
         lines = msg_generator(plain, plain.get_registered(alias), {})
         source = '\n'.join(line for line in lines if line != 'import nested.msg')

@@ -1,9 +1,13 @@
-"""Fields of messages: described, filled by name, and checked against what the wire takes."""
+"""Fields of messages: described, filled by name, and checked against what the wire takes.
 
+genpy's own check_type and fill_message_args are not used. check_type refuses a string with 'é', and
+lets 1e300 into a float32; fill_message_args puts 5 into a string, which fails when it is sent.
+"""
 import io
 import re
 import reprlib
 import struct
+from typing import Any, Callable, Dict, List, Optional, Tuple, Type
 
 import genpy
 from genmsg.msgs import bare_msg_type, is_builtin, parse_type
@@ -11,93 +15,40 @@ from genpy.base import SIMPLE_TYPES_DICT
 
 from pharos.errors import MessageTypeError, suggest
 
+MessageClass = Type[genpy.Message]
+
 _TIMES = {'time': genpy.Time, 'duration': genpy.Duration}
 # Raises where the value of a field of this type would not serialize, and is quick.
-_WRITERS = {
+_WRITERS: Dict[str, Callable[[Any], bytes]] = {
     'string': str.encode,
     **{base: struct.Struct('<' + code).pack for base, code in SIMPLE_TYPES_DICT.items()},
 }
+_WHAT_FITS = {
+    'bool': 'True or False',
+    'string': 'a str',
+    'float32': 'a number up to 3.4e38',
+    'float64': 'a number',
+}
 
 
-def describe_fields(cls):
-    """Return the fields of a message class as a text, for example ``'linear: float32, angular:
-    float32'``."""
-    return ', '.join('%s: %s' % field for field in _fields(cls)) or 'no fields'
-
-
-def build(cls, block, fields):
-    """Return a new message that ``block(message)``, if there is one, and then ``fields`` by name
-    have filled.
-
-    Raises `MessageTypeError` for a field that does not exist, for a value in ``fields`` that does
-    not fit, and for a block that returns a message of its own.
-    """
-    message = cls()
-    if block is not None:
-        try:
-            made = block(message)
-        except AttributeError as error:
-            explain(error, message)
-            raise
-        if isinstance(made, genpy.Message) and made is not message and made._type == message._type:
-            raise MessageTypeError(
-                f'the block returned another {message._type} than it was given, which is the one '
-                'that is sent: fill the fields of that'
-            )
-    return fill(message, fields) if fields else message
-
-
-def fill(message, fields):
-    """Set fields of a message by name and return the message.
-
-    A nested message may be given as a dict of those of its fields to be set. Raises
-    `MessageTypeError` for a field that does not exist or a value that would not serialize; fields
-    before it are set by then.
-    """
-    return _fill(message, fields, message._type)
-
-
-def check_fits(message):
-    """Raise `MessageTypeError`, naming field, value and what fits, if a message does not serialize.
-    Slow."""
-    try:
-        message.serialize(io.BytesIO())
-    except Exception as error:
-        # genpy lets AttributeError, OverflowError and UnicodeEncodeError escape too
-        for name, field_type in _fields(type(message)):
-            _check_value(
-                type(message), field_type, getattr(message, name, None), f'{message._type}.{name}'
-            )
-        raise MessageTypeError(
-            f'{message._type} does not serialize: {error}; '
-            f'its fields are {describe_fields(type(message))}'
-        ) from error
-
-
-def explain(error, message):
-    """Raise `MessageTypeError` if an `AttributeError` names a field that the message, or one nested
-    in it, has not."""
-    wrong = re.match(r"'(\w+)' object has no attribute '(\w+)'", str(error))
-    pending = [type(message)]
-    while wrong and pending:
-        cls = pending.pop(0)
-        if cls.__name__ == wrong[1]:
-            raise _no_field(cls, cls._type, wrong[2]) from error
-        pending += nested_classes(cls)
-
-
-def _fields(cls):
+def fields_of(cls: MessageClass) -> List[Tuple[str, str]]:
+    """The (name, type) of each field of a message class, of genpy.Time or genpy.Duration."""
     if issubclass(cls, genpy.TVal):
-        return [
-            (name, 'uint32' if issubclass(cls, genpy.Time) else 'int32')
-            for name in ('secs', 'nsecs')
-        ]
-    return zip(cls.__slots__, getattr(cls, '_slot_types', ()))  # rospy.AnyMsg has no _slot_types
+        # as genmsg has it; their _slot_types say int32 for both
+        number = 'uint32' if issubclass(cls, genpy.Time) else 'int32'
+        return [('secs', number), ('nsecs', number)]
+    # rospy.AnyMsg has no _slot_types
+    return list(zip(cls.__slots__, getattr(cls, '_slot_types', ())))
 
 
-def nested_class(cls, type_name):
-    """Return the class that a message class's own code means by the name of a type among its
-    fields.
+def describe_fields(cls: MessageClass) -> str:
+    """The fields of a message class as a text, for example ``'linear: float32, angular:
+    float32'``."""
+    return ', '.join(f'{name}: {type_}' for name, type_ in fields_of(cls)) or 'no fields'
+
+
+def nested_class(cls: MessageClass, type_name: str) -> Optional[MessageClass]:
+    """The class that a message class's own code means by the name of a type among its fields.
 
     It is not always the installed class of that name: a class made at run time nests others made
     with it. None for a class written by hand that nests what is not installed.
@@ -118,44 +69,106 @@ def nested_class(cls, type_name):
     return made_together or imported or genpy.message.get_message_class(f'{package}/{name}')
 
 
-def nested_classes(cls):
-    """Return the class of each field that holds messages, in a message class."""
-    types = [bare_msg_type(field_type) for _, field_type in _fields(cls)]
+def nested_classes(cls: MessageClass) -> List[MessageClass]:
+    """The class of each field that holds messages, in a message class."""
+    types = [bare_msg_type(field_type) for _, field_type in fields_of(cls)]
     nested = [nested_class(cls, type_) for type_ in types if not is_builtin(type_)]
     return [cls for cls in nested if cls]  # None for one of a class written by hand
 
 
-def _no_field(cls, path, name):
-    names = [field for field, _ in _fields(cls)]
+def build(
+    cls: MessageClass, block: Optional[Callable[[Any], Any]], fields: Dict[str, Any]
+) -> genpy.Message:
+    """A new message that ``block(message)``, if there is one, and then ``fields`` by name have
+    filled.
+
+    :raises MessageTypeError: for a field that does not exist, for a value in ``fields`` that does
+        not fit, and for a block that returns a message of its own
+    """
+    message = cls()
+    if block is not None:
+        try:
+            made = block(message)
+        except AttributeError as error:
+            explain(error, message)
+            raise
+        if isinstance(made, genpy.Message) and made is not message and made._type == message._type:
+            raise MessageTypeError(
+                f'the block returned another {message._type} than it was given, which is the one '
+                'that is sent: fill the fields of that'
+            )
+    return fill(message, fields) if fields else message
+
+
+def fill(message: genpy.Message, fields: Dict[str, Any]) -> genpy.Message:
+    """Set fields of a message by name; returns the message.
+
+    A nested message may be given as a dict of those of its fields to be set.
+
+    :raises MessageTypeError: for a field that does not exist or a value that would not serialize;
+        fields before it are set by then
+    """
+    return _fill(message, fields, message._type)
+
+
+def check_fits(message: genpy.Message) -> None:
+    """Raise `MessageTypeError`, naming field, value and what fits, if a message does not serialize.
+    Slow."""
+    try:
+        message.serialize(io.BytesIO())
+    except Exception as error:
+        # genpy lets AttributeError, OverflowError and UnicodeEncodeError escape too
+        cls = type(message)
+        for name, field_type in fields_of(cls):
+            _check(cls, field_type, getattr(message, name, None), f'{cls._type}.{name}')
+        raise MessageTypeError(
+            f'{cls._type} does not serialize: {error}; its fields are {describe_fields(cls)}'
+        ) from error
+
+
+def explain(error: AttributeError, message: genpy.Message) -> None:
+    """Raise `MessageTypeError` if an `AttributeError` names a field that the message, or one nested
+    in it, has not."""
+    wrong = re.match(r"'(\w+)' object has no attribute '(\w+)'", str(error))
+    pending = [type(message)]
+    while wrong and pending:
+        cls = pending.pop(0)
+        if cls.__name__ == wrong[1]:
+            raise _no_field(cls, cls._type, wrong[2]) from error
+        pending += nested_classes(cls)
+
+
+def _no_field(cls: MessageClass, path: str, name: str) -> MessageTypeError:
+    names = [field for field, _ in fields_of(cls)]
     return MessageTypeError(
         f'{path} has no field {name!r}{suggest(str(name), names)}; '
         f'its fields are {describe_fields(cls)}'
     )
 
 
-def _fill(message, fields, path):
-    field_types = dict(_fields(type(message)))
+def _fill(message: genpy.Message, fields: Dict[str, Any], path: str) -> genpy.Message:
+    cls = type(message)
+    field_types = dict(fields_of(cls))
     for name, value in fields.items():
         if name not in field_types:
-            raise _no_field(type(message), path, name)
-        field_type = field_types[name]
+            raise _no_field(cls, path, name)
+        field_type, field_path = field_types[name], f'{path}.{name}'
         try:
             _WRITERS[field_type](value)
         except Exception:  # it is no single number or string, or does not fit
-            field_path = f'{path}.{name}'
-            value = _from_dicts(
-                type(message), field_type, value, field_path, getattr(message, name)
-            )
-            _check_value(type(message), field_type, value, field_path)
+            value = _from_dicts(cls, field_type, value, field_path, getattr(message, name))
+            _check(cls, field_type, value, field_path)
         setattr(message, name, value)
     return message
 
 
-def _from_dicts(cls, field_type, value, path, present=None):
-    """Return a field's value with the dicts in it made messages; one for a single message goes into
-    the ``present``."""
+def _from_dicts(
+    cls: MessageClass, field_type: str, value: Any, path: str, present: Any = None
+) -> Any:
+    """A field's value with the dicts in it made messages; one for a single message goes into the
+    ``present``."""
     base, is_array, _ = parse_type(field_type)
-    if base in SIMPLE_TYPES_DICT or base == 'string':
+    if base in _WRITERS:
         return value
     if is_array and isinstance(value, (list, tuple)):
         return [
@@ -167,53 +180,55 @@ def _from_dicts(cls, field_type, value, path, present=None):
     return value
 
 
-def _check_value(cls, field_type, value, path):
+def _check(cls: MessageClass, field_type: str, value: Any, path: str) -> None:
     """Raise MessageTypeError unless genpy would serialize the value: the same struct and str calls
     decide."""
     base, is_array, length = parse_type(field_type)
-    code = SIMPLE_TYPES_DICT.get(base)
     try:
         if is_array:
-            length = len(value) if length is None else length
-            if code == 'B' and base != 'bool' and type(value) not in (list, tuple):
-                struct.pack(f'{length}s', value)
-            elif code:
-                struct.pack(f'<{length}{code}', *value)
-            else:
-                if len(value) != length:
-                    raise ValueError(value)
-                for index, item in enumerate(value):
-                    _check_value(cls, base, item, f'{path}[{index}]')
-        elif code:
-            struct.pack('<' + code, value)
-        elif base == 'string':
-            value.encode('utf-8')
+            _check_array(cls, base, length, value, path)
+        elif base in _WRITERS:
+            _WRITERS[base](value)
         else:
             nested = nested_class(cls, base) or type(value)
-            for name, nested_type in _fields(nested):
-                _check_value(nested, nested_type, getattr(value, name), f'{path}.{name}')
+            for name, nested_type in fields_of(nested):
+                _check(nested, nested_type, getattr(value, name), f'{path}.{name}')
     except MessageTypeError:
         raise
     except Exception as error:
-        if code and isinstance(value, (list, tuple)):
-            for index, item in enumerate(value):
-                _check_value(cls, base, item, f'{path}[{index}]')
         raise MessageTypeError(
             f'{path} = {reprlib.repr(value)} does not fit {field_type}: '
-            f'give {_what_fits(cls, field_type)}'
+            f'give {_what_fits(cls, base, is_array, length)}'
         ) from error
 
 
-def _what_fits(cls, field_type):
-    base, is_array, length = parse_type(field_type)
-    code = SIMPLE_TYPES_DICT.get(base)
+def _check_array(
+    cls: MessageClass, base: str, length: Optional[int], value: Any, path: str
+) -> None:
+    count = len(value) if length is None else length
+    if base in ('uint8', 'char') and not isinstance(value, (list, tuple)):
+        struct.pack(f'{count}s', value)
+        return
+    if base in SIMPLE_TYPES_DICT:
+        try:
+            struct.pack(f'<{count}{SIMPLE_TYPES_DICT[base]}', *value)
+            return
+        except Exception:
+            if not isinstance(value, (list, tuple)) or len(value) != count:
+                raise
+    elif len(value) != count:
+        raise ValueError(value)
+    for index, item in enumerate(value):  # which tells the one that does not fit
+        _check(cls, base, item, f'{path}[{index}]')
+
+
+def _what_fits(cls: MessageClass, base: str, is_array: bool, length: Optional[int]) -> str:
     if is_array:
         items = base if length is None else f'{length} {base}'
         return f'a list of {items}' + (' or bytes' if base in ('uint8', 'char') else '')
-    if base in ('bool', 'string', 'float32', 'float64'):
-        return {'bool': 'True or False', 'string': 'a str', 'float32': 'a number up to 3.4e38'}.get(
-            base, 'a number'
-        )
+    if base in _WHAT_FITS:
+        return _WHAT_FITS[base]
+    code = SIMPLE_TYPES_DICT.get(base)
     if code:
         bits = 8 * struct.calcsize(code) - code.islower()
         return f'an integer from {-2 ** bits if code.islower() else 0} to {2 ** bits - 1}'

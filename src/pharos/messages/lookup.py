@@ -1,11 +1,13 @@
 """Where the types of messages and services are known: found before, installed, in files, or shipped
 for turtlesim."""
-
+import contextlib
 import importlib.util
 import os
+import pathlib
 import re
 import reprlib
 import sys
+from typing import Any, Dict, List, Optional, Set, Tuple, Union
 
 import genpy
 import rospkg
@@ -18,12 +20,15 @@ NAME = re.compile('[A-Za-z][A-Za-z0-9_]{0,127}')
 _TYPE = re.compile(f'{NAME.pattern}/{NAME.pattern}')
 _KINDS = {'msg': 'message', 'srv': 'service'}
 
-found = {}  # (kind, type): class answered before or defined, so that two asks give the same one
+Known = Union[type, str]  # the class of a type, or the text of its definition
+Key = Tuple[str, str]  # 'msg' or 'srv', and the type
+
+found: Dict[Key, type] = {}  # answered before or defined, so that two asks give the same one
 # keys of found that no package here has: to a subscriber, a live publisher knows better
-provisional = set()
+provisional: Set[Key] = set()
 
 
-def check_name(kind, type_):
+def check_name(kind: str, type_: Any) -> None:
     """Raise UnknownTypeError unless it can be the name of a type, such as 'std_msgs/String'."""
     if not isinstance(type_, str) or not _TYPE.fullmatch(type_):
         hint = _near_types(kind, str(type_)[:99])
@@ -33,16 +38,17 @@ def check_name(kind, type_):
         )
 
 
-def find(kind, type_, must=True):
-    """Return the class of a type or, where it has none yet, the text of its definition."""
-    for look in _LOOKS:
-        known = look(kind, type_)
-        if known is not None:
-            if look is _shipped:
-                provisional.add((kind, type_))
-            return known
-    if not must:
-        return None
+def find(kind: str, type_: str) -> Known:
+    """The class of a type or, where it has none yet, the text of its definition.
+
+    :raises UnknownTypeError: if it is not known here
+    """
+    known = found.get((kind, type_)) or installed(kind, type_) or file_text(kind, type_)
+    if known is not None:
+        return known
+    if type_ in DEFINITIONS[kind]:
+        provisional.add((kind, type_))
+        return DEFINITIONS[kind][type_]
     package, _, name = type_.partition('/')
     define = 'define_message' if kind == 'msg' else 'define_service'
     raise UnknownTypeError(
@@ -53,22 +59,23 @@ def find(kind, type_, must=True):
     )
 
 
-def everywhere(kind, type_):
-    """Return each class of a type, and each text of its definition, that is here."""
+def everywhere(kind: str, type_: str) -> List[Known]:
+    """Each class of a type, and each text of its definition, that is here."""
     try:
         check_name(kind, type_)
-        everything = [look(kind, type_) for look in _LOOKS]
+        everything = (
+            found.get((kind, type_)),
+            installed(kind, type_),
+            file_text(kind, type_),
+            DEFINITIONS[kind].get(type_),
+        )
     except UnknownTypeError:
         return []
     return [known for known in everything if known is not None]
 
 
-def _found_before(kind, type_):
-    return found.get((kind, type_))
-
-
-def installed(kind, type_):
-    """Return the class that an installed Python package has for a type, None if there is none."""
+def installed(kind: str, type_: str) -> Optional[type]:
+    """The class that an installed Python package has for a type, None if there is none."""
     package = type_.partition('/')[0]
     if f'{package}.{kind}' not in sys.modules:
         # The name may come from the network: import no module that is not a package of messages.
@@ -88,44 +95,27 @@ def installed(kind, type_):
         ) from error
 
 
-def file_text(kind, type_):
-    """Return the text of the type's file on ROS_PACKAGE_PATH, None if there is none."""
+def file_text(kind: str, type_: str) -> Optional[str]:
+    """The text of the type's file on ROS_PACKAGE_PATH, None if there is none."""
     package, _, name = type_.partition('/')
-    try:
+    # a package.xml that rospkg cannot parse must not hide the types given at run time
+    with contextlib.suppress(Exception):
         path = os.path.join(rospkg.RosPack().get_path(package), kind, f'{name}.{kind}')
         with open(path, encoding='utf-8', errors='replace') as file:
             return file.read(MAX_TEXT + 1)
-    except Exception:
-        # a package.xml that rospkg cannot parse must not hide the types given at run time
-        return None
+    return None
 
 
-def _shipped(kind, type_):
-    return DEFINITIONS[kind].get(type_)
-
-
-_LOOKS = _found_before, installed, file_text, _shipped
-
-
-def _near_types(kind, type_):
-    """Return a hint at types with the same last name or one that differs by a slip."""
-    import glob  # rospy does not load it, and most programs never come here
-
-    rospack = rospkg.RosPack()
-    folders = [os.path.join(glob.escape(folder), '*', kind, '_[A-Za-z]*.py') for folder in sys.path]
-    try:
-        folders += [
-            os.path.join(glob.escape(rospack.get_path(name)), kind, '*.' + kind)
-            for name in rospack.list()
-        ]
-    except Exception:  # as in file_text
-        pass
-    paths = [
-        os.path.splitext(path)[0].split(os.sep) for folder in folders for path in glob.iglob(folder)
+def _near_types(kind: str, type_: str) -> str:
+    """A hint at types with the same last name or one that differs by a slip."""
+    files = [
+        file for folder in sys.path for file in pathlib.Path(folder).glob(f'*/{kind}/_[A-Za-z]*.py')
     ]
-    names = {f"{path[-3]}/{path[-1].lstrip('_')}" for path in paths}
-    names.update(
-        DEFINITIONS[kind], (known for known_kind, known in list(found) if known_kind == kind)
-    )
+    with contextlib.suppress(Exception):  # as in file_text
+        rospack = rospkg.RosPack()
+        for package in rospack.list():
+            files += pathlib.Path(rospack.get_path(package)).glob(f'{kind}/*.{kind}')
+    names = {f"{file.parts[-3]}/{file.stem.lstrip('_')}" for file in files}
+    names.update(DEFINITIONS[kind], (type_ for known_kind, type_ in [*found] if known_kind == kind))
     last = '/' + type_.rpartition('/')[2]
     return suggest(type_, names, sorted(name for name in names if name.endswith(last))[:3])
