@@ -390,7 +390,7 @@ me = node()
 me.ros.on_shutdown(goes_on)
 pharos.node_registry.at_end(lambda: print('other ended', flush=True))
 def go():
-    while not (pharos.signals._holds and pharos.signals._holds[-1].came):
+    while pharos.signals._kept is None:
         threading.Event().wait(0.001)
     print('kept', flush=True)
     go_on.set()

@@ -21,8 +21,6 @@ PLACES = 1000  # at which failures are counted
 TEXT_LIMIT = 2000  # characters of the text of an exception
 LARGE = 10000  # bytes of a thing that an exception without its frames may hold on to
 
-Again = Optional[Callable[[Any], Any]]
-
 
 class Failure:
     """A failure of a block, as often as it came: one of :attr:`Node.failures`.
@@ -38,26 +36,39 @@ class Failure:
     :attr:`traceback`.
     """
 
-    error: BaseException
-    message: Any
-    time: float
-
-    def __init__(self, failures: 'Failures', block: Any, where: str, channel: Any, text: str):
-        self.block, self.channel, self.text = block, channel, text
-        self.count = 0
-        self._failures, self._where = failures, where
-        self._frames: Optional[TracebackType] = None
-        self._again: Again = None
+    def __init__(
+        self,
+        error: BaseException,
+        block: Any,
+        where: str,
+        channel: Any = None,
+        message: Any = None,
+        again: Optional[Callable[[Any], Any]] = None,
+    ) -> None:
+        self.error, self.block, self.channel, self.message = error, block, channel, message
+        self.where, self.text = where, _brief(text_of(error))
+        self.count, self.time = 1, time.time()
+        self.kept_by: Any = None  # the Failures
+        self._again = again
+        self._frames = error.__traceback__
         self._traceback: Optional[str] = None  # the text of the frames that were let go
 
-    def happened(self, error: BaseException, message: Any, again: Again) -> None:
-        """It came once more."""
-        if self.count and error is self.error:
-            _cut(error.__traceback__, self._frames)
-        self.error, self.message, self._frames = error, message, error.__traceback__
-        self._again, self._traceback = again, None
-        self.time = time.time()
-        self.count += 1
+    def place(self) -> Any:
+        """What is the same of failures at one place, which differ in the text alone."""
+        lines = [
+            (frame.f_code.co_filename, line) for frame, line in traceback.walk_tb(self._frames)
+        ]
+        # The code tells a block from the one that it replaces, typed anew at the prompt perhaps,
+        # but not two closures. Not the channel itself, which may be closed, and should not be kept
+        # for being counted.
+        code = attempt(lambda: code_of(self.block))
+        return self.where, code, id(self.channel), type(self.error), tuple(lines[-1:])
+
+    def happened_again(self, last: 'Failure') -> None:
+        """It came once more: ``last`` is that time."""
+        if last.error is self.error:
+            _cut(last._frames, self._frames)
+        vars(self).update(vars(last), count=self.count + 1)
 
     def let_go(self) -> None:
         """Keep nothing large: no message, and of the frames the text."""
@@ -75,8 +86,16 @@ class Failure:
 
     @property
     def traceback(self) -> str:
-        """The traceback, as text."""
-        return self._traceback or _formatted(self.error, self._frames)
+        """The traceback, as text; empty where nobody raised the exception."""
+        if self._traceback is not None:
+            return self._traceback
+        error, frames = self.error, self._frames
+        lines = attempt(lambda: traceback.format_exception(type(error), error, frames))
+        if (
+            lines is None
+        ):  # its __str__, or that of its cause, raises what traceback does not expect
+            lines = attempt(lambda: traceback.format_tb(frames), [])
+        return _brief(''.join(lines), 10 * TEXT_LIMIT)
 
     def retry(self) -> bool:
         """Run the block again, as it is now, on the same message; returns whether it did not fail.
@@ -89,11 +108,17 @@ class Failure:
         """
         if self._again is None:
             raise PharosError(
-                f'{self._where} cannot be run again: messages are kept of the newest {WHOLE}'
+                f'{self.where} cannot be run again: messages are kept of the newest {WHOLE}'
                 ' failures of a node only, and what is no block of a node has none: retry() one of'
                 ' those, or do by hand what made it run'
             )
-        return self._failures.run_again(self._again, self.message)
+        retrying = self.kept_by.retrying
+        before, retrying.failed = getattr(retrying, 'failed', None), False
+        try:
+            self._again(self.message)
+            return not retrying.failed
+        finally:
+            retrying.failed = before
 
     def debug(self) -> None:
         """Look at the frames in which it was raised: ``pdb.post_mortem``.
@@ -102,7 +127,7 @@ class Failure:
         """
         if self._frames is None:
             raise PharosError(
-                f'the frames of this failure of {self._where} are gone: they are kept of the'
+                f'the frames of this failure of {self.where} are gone: they are kept of the'
                 f' newest {WHOLE} failures of a node only; debug() one of those, or read its'
                 ' .traceback'
             )
@@ -110,7 +135,7 @@ class Failure:
 
     def __repr__(self) -> str:
         times = f', {self.count} times' if self.count > 1 else ''
-        return f'<Failure of {self._where}: {type(self.error).__name__}: {self.text}{times}>'
+        return f'<Failure of {self.where}: {type(self.error).__name__}: {self.text}{times}>'
 
 
 class Failures(Sequence[BaseException]):
@@ -133,7 +158,7 @@ class Failures(Sequence[BaseException]):
         self._first: Any = None  # the key of the first
         self._times: Counter[Any] = collections.Counter()  # place -> failures at it
         self._texts: Counter[Any] = collections.Counter()  # place -> texts of them that were told
-        self._retrying = threading.local()  # .failed: whether what the thread runs again has
+        self.retrying = threading.local()  # .failed: whether what the thread runs again has
         self.total = 0
 
     def __getitem__(self, index: Any) -> Any:
@@ -166,94 +191,60 @@ class Failures(Sequence[BaseException]):
                 self.pop()
 
     def report(
-        self,
-        error: BaseException,
-        block: Any,
-        where: str,
-        channel: Any = None,
-        message: Any = None,
-        again: Again = None,
+        self, error: BaseException, block: Any, where: str, *details: Any, **more: Any
     ) -> None:
         """Keep a failure of a block, and tell of it if it is new.
 
         Raises nothing but what a signal raises.
 
         :param where: how it is told, such as 'delegate on_pose of /node on /pose'
+        :param channel: where the message came from
+        :param message: what the block was run on
         :param again: ``again(message)`` runs the block as it is then, and reports what it raises
         """
         if is_from_signal(error):
             raise error
-        attempt(lambda: self._report(error, block, where, channel, message, again))
+        attempt(lambda: self._keep(Failure(error, block, where, *details, **more)))
 
-    def _report(
-        self,
-        error: BaseException,
-        block: Any,
-        where: str,
-        channel: Any,
-        message: Any,
-        again: Again,
-    ) -> None:
-        text, frames = _brief(text_of(error)), error.__traceback__
-        raised_at = [(frame.f_code.co_filename, line) for frame, line in traceback.walk_tb(frames)]
-        # The code tells a block from the one that it replaces, typed anew at the prompt perhaps,
-        # but not two closures. Not the channel itself, which may be closed, and should not be kept
-        # for being counted.
-        code = attempt(lambda: code_of(block))
-        place = where, code, id(channel), type(error), tuple(raised_at[-1:])
+    def _keep(self, failure: Failure) -> None:
+        place, text = key = failure.place(), failure.text
+        failure.kept_by = self
         with self._lock:
-            failure = self._kept.pop((place, text), None)
-            is_told = failure is None and self._texts[place] < TEXTS
-            if failure is None:
-                failure = Failure(self, block, where, channel, text)
-            self._kept[place, text] = failure
-            failure.happened(error, message, again)
+            known = self._kept.pop(key, None)
+            is_told = known is None and self._texts[place] < TEXTS
+            if known is not None:
+                known.happened_again(failure)
+            self._kept[key] = known or failure
             self._times[place] += 1
             self._texts[place] += is_told
-            times = self._times[place]
+            times, count = self._times[place], self._kept[key].count
             self._make_room()
             self.total += 1
-        if getattr(self._retrying, 'failed', None) is not None:
-            self._retrying.failed = is_told = True
-        raised = f'{where} raised {type(error).__name__}: {text}'
+        if getattr(self.retrying, 'failed', None) is not None:
+            self.retrying.failed = is_told = True
+        error = failure.error
+        raised = f'{failure.where} raised {type(error).__name__}: {text}'
         if is_told:
             # what nobody raised has no traceback but its text, which is in the line
-            has_more = frames or error.__cause__ or error.__context__
-            self._tell(raised, _formatted(error, frames) if has_more else '')
+            has_more = error.__traceback__ or error.__cause__ or error.__context__
+            self._tell(raised, failure.traceback if has_more else '')
         elif times >= 10 and str(times).strip('0') == '1':
-            different = '' if failure.count == times else ', with different texts'
+            different = '' if count == times else ', with different texts'
             self._tell(f'{raised}, {times} times by now{different}', '')
 
     def _make_room(self) -> None:
         """Let go what is large but of the newest; of too many, one of those that are most alike."""
-        kept = list(self._kept)
-        self._first = self._first or kept[0]
-        if len(kept) > WHOLE:
-            self._kept[kept[-WHOLE - 1]].let_go()
-        if len(kept) > KEPT:
-            others = [key for key in kept if key != self._first]
-            (crowded, _), *_ = collections.Counter(place for place, _ in others).most_common(1)
-            del self._kept[next(key for key in others if key[0] == crowded)]
+        keys = list(self._kept)
+        self._first = self._first or keys[0]
+        if len(keys) > WHOLE:
+            self._kept[keys[-WHOLE - 1]].let_go()
+        if len(keys) > KEPT:
+            keys.remove(self._first)
+            (crowded, _), *_ = collections.Counter(place for place, _ in keys).most_common(1)
+            del self._kept[next(key for key in keys if key[0] == crowded)]
         if len(self._times) > PLACES:
             oldest = next(iter(self._times))
             del self._times[oldest], self._texts[oldest]
-
-    def run_again(self, again: Callable[[Any], Any], message: Any) -> bool:
-        """Run a block again by ``again(message)``; returns whether it did not fail."""
-        before, self._retrying.failed = getattr(self._retrying, 'failed', None), False
-        try:
-            again(message)
-            return not self._retrying.failed
-        finally:
-            self._retrying.failed = before
-
-
-def _formatted(error: BaseException, frames: Optional[TracebackType]) -> str:
-    """A traceback as text."""
-    lines = attempt(lambda: traceback.format_exception(type(error), error, frames))
-    if lines is None:  # its __str__, or that of its cause, raises what traceback does not expect
-        lines = attempt(lambda: traceback.format_tb(frames), [])
-    return _brief(''.join(lines), 10 * TEXT_LIMIT)
 
 
 def _brief(text: str, limit: int = TEXT_LIMIT) -> str:

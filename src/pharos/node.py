@@ -96,7 +96,7 @@ class Node:
         :raises NodeStoppedError: if :meth:`stop` was called meanwhile, and the node is then as it
             was
         """
-        with signals.held(node_registry.STOP_LIMIT):
+        with signals.held():
             run = Run(self, self._settings)
             run.start(self._reopens)
         run.reopen()

@@ -115,7 +115,7 @@ def one_stop_at_a_time(method: Callable[..., Any]) -> Callable[..., Any]:
             if type(node).stop is stop:
                 return None  # it has called itself, by way of others perhaps
             return method(node, *args, **kwargs)  # super().stop()
-        with signals.held(STOP_LIMIT):
+        with signals.held():
             run = _begin_stop(node)
             if run is None:
                 return None
@@ -275,7 +275,7 @@ def _end_with_multiprocessing() -> None:
 
 def _end() -> None:
     """The program ends, once: a signal that comes meanwhile asks for nothing more."""
-    with signals.held(STOP_LIMIT, is_end=True), contextlib.ExitStack() as others:
+    with signals.held(is_end=True), contextlib.ExitStack() as others:
         stop_all()
         for function in _others:
             # the last first, and each of them, whatever another one raises

@@ -8,8 +8,10 @@ import time
 import traceback
 import _thread
 from types import CodeType
-from typing import Any, Callable, Iterator, List, Optional, Set
+from typing import Any, Callable, Iterator, Optional, Set
 
+#: seconds for which a start, a stop or the end of the program is not cut off by signals
+HOLD_LIMIT = 30.0
 _DEFAULTS = {
     signal.SIGINT: signal.default_int_handler,
     signal.SIGTERM: signal.SIG_DFL,
@@ -26,23 +28,9 @@ taken_on: Set[int] = set()
 _is_needed: Callable[[], bool] = bool  # see :func:`serve`
 _stop_all: Callable[[], Any] = bool
 _waits = 0  # how deep the main thread is in waits of ours, which end with the nodes
-_holds: 'List[_Hold]' = []  # one for each start and stop that the main thread runs
-
-
-class _Hold:
-    """A stretch of the main thread's work that no signal may cut off, for up to ``limit`` seconds
-    after it came."""
-
-    def __init__(self, limit: float) -> None:
-        self._limit = limit
-        self.came: Optional[int] = None  # the first signal
-        self._deadline = 0.0
-
-    def keep(self, number: int) -> bool:
-        """Keep a signal for the end; returns whether it waits until then."""
-        if self.came is None:
-            self.came, self._deadline = number, time.monotonic() + self._limit
-        return time.monotonic() < self._deadline
+_holds = 0  # how deep it is in starts and stops
+_kept: Optional[int] = None  # the first signal that came in one of them
+_deadline = 0.0  # by time.monotonic(), until which it is kept
 
 
 def is_from_signal(error: BaseException) -> bool:
@@ -107,30 +95,39 @@ def interruptible_wait() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def held(limit: float, is_end: bool = False) -> Iterator[None]:
+def held(is_end: bool = False) -> Iterator[None]:
     """Within this, a signal raises nothing in the main thread, and afterwards what it would have
-    raised.
+    raised; but a second one does at once, HOLD_LIMIT seconds later.
 
     A start or a stop that is torn up half way leaves registrations behind, and the end of the
     program programs, too.
 
-    :param limit: seconds after which a second signal raises all the same
     :param is_end: whether it is the end of the program, so that there is nothing to raise
         afterwards
     """
+    global _holds, _kept
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     _take_on(*_DEFAULTS)
-    hold = _Hold(limit)
-    _holds.append(hold)
+    _holds += 1
     try:
         yield
     finally:
-        if hold in _holds:  # else the process was forked in it
-            _holds.remove(hold)
-        if hold.came is not None and not is_end:
-            _raise(hold.came)
+        _holds = max(0, _holds - 1)  # 0 where the process was forked in it
+        if _kept is not None and not _holds:
+            number, _kept = _kept, None
+            if not is_end:
+                _raise(number)
+
+
+def _is_held(number: int) -> bool:
+    """Keep a signal for the end of what no signal may cut off; returns whether it waits until
+    then."""
+    global _kept, _deadline
+    if _holds and _kept is None:
+        _kept, _deadline = number, time.monotonic() + HOLD_LIMIT
+    return bool(_holds) and time.monotonic() < _deadline
 
 
 def _on_signal(number: int, frame: Any) -> None:
@@ -139,7 +136,7 @@ def _on_signal(number: int, frame: Any) -> None:
         return
     if number == signal.SIGINT and hasattr(sys, 'ps1'):
         # at the prompt, it ends the line that runs or is typed, and not what goes on beside it
-        if not (_holds and _holds[-1].keep(number)):
+        if not _is_held(number):
             raise _exception(number)
         return
     # Not here, nor in a Thread, whose start takes a lock: the main thread may hold any lock just
@@ -151,7 +148,7 @@ def _on_signal(number: int, frame: Any) -> None:
 def _raise(number: int) -> None:
     """End what the main thread does, if it does not end by itself, at once or when the hold
     ends."""
-    if not (_holds and _holds[-1].keep(number) or _waits):
+    if not (_is_held(number) or _waits):
         raise _exception(number)
 
 
@@ -173,9 +170,9 @@ def _do_default(number: int, frame: Any) -> None:
 
 def _forget() -> None:
     """In a process that was forked: it begins anew."""
-    global _waits
-    _waits = 0
-    _holds.clear()
+    global _waits, _holds, _kept
+    _waits = _holds = 0
+    _kept = None
 
 
 os.register_at_fork(after_in_child=_forget)
