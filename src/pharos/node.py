@@ -96,10 +96,7 @@ class Node:
         :raises NodeStoppedError: if :meth:`stop` was called meanwhile, and the node is then as it
             was
         """
-        with signals.held():
-            run = Run(self, self._settings)
-            run.start(self._reopens)
-        run.reopen()
+        Run(self, self._settings).start(self._reopens)
 
     @node_registry.one_stop_at_a_time
     def stop(self) -> None:

@@ -8,7 +8,7 @@ import os
 import sys
 import threading
 import time
-from typing import TYPE_CHECKING, Any, Callable, Dict, Iterable, List, NamedTuple, Optional, Tuple
+from typing import TYPE_CHECKING, Any, Callable, Dict, Iterable, List, Optional, Set, Tuple
 
 from pharos import signals
 from pharos.blocks import name_of
@@ -28,18 +28,12 @@ STOP_LIMIT = 30.0
 COLLECT_EVERY = 20
 
 
-class _Stop(NamedTuple):
-    """A stop() under way, of one run of a node."""
-
-    run: 'Run'
-    thread: int  # the identifier of the one that runs it
-    deadline: float  # by time.monotonic(), until which others wait for it
-
-
 changed = threading.Condition()  # guards the life cycles of all nodes, and what follows
 # (master, name) -> those that the master may know, in the order of their starts
 _nodes: 'Dict[Tuple[Any, str], Node]' = {}
-_stops: 'Dict[Node, _Stop]' = {}
+# node -> the identifier of the thread that runs its stop(), and the time.monotonic() until which
+# others wait for that
+_stops: 'Dict[Node, Tuple[int, float]]' = {}
 _waiting: 'Dict[int, Node]' = {}  # identifier of a thread -> the node for whose stop it waits
 _runs_ended = 0  # since the collector ran
 _finalizer: Any = None  # what multiprocessing runs at the end of its processes
@@ -154,9 +148,8 @@ def _begin_stop(node: 'Node') -> 'Optional[Run]':
             return None
         if not node.is_running or is_awaited and node.latest_run is not run:
             return None
-        run = node.latest_run
-        _stops[node] = _Stop(run, threading.get_ident(), time.monotonic() + STOP_LIMIT)
-    return run
+        _stops[node] = threading.get_ident(), time.monotonic() + STOP_LIMIT
+        return node.latest_run
 
 
 def _wait_for_stop(node: 'Node') -> bool:
@@ -167,26 +160,23 @@ def _wait_for_stop(node: 'Node') -> bool:
     me, is_awaited = threading.get_ident(), False
     with changed:
         while True:
-            under_way = _stops.get(node)
-            if under_way is None or under_way.thread == me:
-                if node.latest_run is None or not node.latest_run.is_starting:
-                    return is_awaited
-                left = SIGNAL_LATENCY
-            else:
-                is_awaited = True
-                left = under_way.deadline - time.monotonic()
-            if left <= 0 or node.latest_run.is_own_thread() or _waits_for_me(node):
+            run = node.latest_run
+            thread, deadline = _stops.get(node, (me, float('inf')))
+            if thread == me and not (run and run.is_starting):
+                return is_awaited
+            is_awaited = is_awaited or thread != me
+            if time.monotonic() >= deadline or run.is_own_thread() or _waits_for_me(node):
                 raise TimeoutError
             _waiting[me] = node
             try:
-                changed.wait(min(left, SIGNAL_LATENCY))
+                changed.wait(SIGNAL_LATENCY)
             finally:
                 del _waiting[me]
 
 
 def _is_stopped_here(node: 'Node') -> bool:
-    under_way = _stops.get(node)
-    return under_way is not None and under_way.thread == threading.get_ident()
+    thread, _ = _stops.get(node, (None, 0))
+    return thread == threading.get_ident()
 
 
 def _waits_for_me(node: 'Optional[Node]') -> bool:
@@ -195,7 +185,7 @@ def _waits_for_me(node: 'Optional[Node]') -> bool:
     while node in _stops:
         if _is_stopped_here(node):
             return True
-        node = _waiting.get(_stops[node].thread)
+        node = _waiting.get(_stops[node][0])
     return False
 
 
@@ -218,10 +208,15 @@ def spin() -> None:
 
 
 def _has_nodes_to_wait_for() -> bool:
-    now, me = time.monotonic(), threading.get_ident()
-    late = [node for node, stop in _stops.items() if now >= stop.deadline]
-    stopped_elsewhere = [node for node, stop in _stops.items() if stop.thread != me]
-    return any(node not in late for node in (*_nodes.values(), *stopped_elsewhere))
+    now = time.monotonic()
+    late = [node for node, (_, deadline) in _stops.items() if now >= deadline]
+    return any(node not in late for node in _not_stopped_here())
+
+
+def _not_stopped_here() -> 'Set[Node]':
+    """The nodes that run, or that another thread stops: one that has stopped may be in an
+    overriding stop() still."""
+    return {node for node in (*_nodes.values(), *_stops) if not _is_stopped_here(node)}
 
 
 def stop_all() -> None:
@@ -230,12 +225,10 @@ def stop_all() -> None:
     Returns when each has ended its ``stop()``, or after STOP_LIMIT seconds.
     """
     with changed:
-        # a node that has stopped may go on in an overriding stop()
-        to_stop = {node for node in (*_nodes.values(), *_stops) if not _is_stopped_here(node)}
-    threads = [
-        threading.Thread(target=stop, args=(node,), name=node.name + ' stop', daemon=True)
-        for node in to_stop
-    ]
+        threads = [
+            threading.Thread(target=stop, args=(node,), name=node.name + ' stop', daemon=True)
+            for node in _not_stopped_here()
+        ]
     for thread in threads:
         thread.start()
     join(threads, STOP_LIMIT)

@@ -62,64 +62,66 @@ class Run:
     # -- start and stop
 
     def start(self, reopens: bool) -> None:
-        """Register the node with the master. On an error it is as it was, in its former run.
+        """Register the node with the master, and open again what its former run had.
 
-        :param reopens: whether it is to open what the former run had, see :meth:`reopen`
-        :raises NodeStoppedError: if :meth:`cancel_start` was called meanwhile
+        Where it cannot be registered, it is as it was, in its former run. Where something cannot be
+        opened, the run ends, and the next one opens all of it.
+
+        :param reopens: whether there is anything to open again
+        :raises NodeStoppedError: if the node was stopped meanwhile
         """
-        former = node_registry.claim(self)
+        former: Optional[Run] = None
         try:
-            self.rospy.start(self.node.connect_timeout)
-            # the same ports next time, also where any free one was asked for
-            self._settings.tcp_port = self.rospy.tcp_port
-            self._settings.xmlrpc_port = self.rospy.xmlrpc_port
-            if former and reopens:
-                self.opened = list(former.opened)
-                self.rospy.parameters.restore_from_previous_run(former.rospy.parameters)
-            with node_registry.changed:
-                if self._is_cancelled:
-                    raise NodeStoppedError('it is registered, and goes again')
-                self._become(Lifecycle.RUNNING)
-        except BaseException as error:
-            self.rospy.stop(0)
-            self.node.latest_run = former
-            self._become(Lifecycle.STOPPED)
-            self._raise_of_start(error, self._is_cancelled)
-        watcher_of(self.node.master).check()
-
-    def reopen(self) -> None:
-        """Open the channels and services of the former run, and tell the master of its parameters.
-
-        On an error the run ends, and the next one opens all of them.
-        """
-        try:
+            with signals.held():
+                former = node_registry.claim(self)
+                self.rospy.start(self.node.connect_timeout)
+                if former and reopens:
+                    self.opened = list(former.opened)
+                    self.rospy.parameters.restore_from_previous_run(former.rospy.parameters)
+                with node_registry.changed:
+                    self._check_not_stopped()
+                    self._become(Lifecycle.RUNNING)
+                # the same ports next time, also where any free one was asked for
+                self._settings.tcp_port = self.rospy.tcp_port
+                self._settings.xmlrpc_port = self.rospy.xmlrpc_port
+            watcher_of(self.node.master).check()
             for opened in self.opened:
-                if self.lifecycle is not Lifecycle.RUNNING:
-                    raise NodeStoppedError('another thread has stopped it')
+                self._check_not_stopped()
                 opened.open()
             with self.node.master.reached():
                 self.rospy.parameters.renew()
         except BaseException as error:
-            is_stopped = self.lifecycle is not Lifecycle.RUNNING
+            if self.node.latest_run is not self:
+                raise  # it could not be claimed
+            is_stopped = self._is_cancelled or self.is_ending
+            if self.is_starting:
+                self.rospy.stop(0)
+                self.node.latest_run = former
+                self._become(Lifecycle.STOPPED)
             self.end()
             self._close_opened()  # what was opened after another thread had stopped the node
-            self._raise_of_start(error, is_stopped)
+            if is_stopped and isinstance(error, Exception):
+                raise NodeStoppedError(f'{self.node.name} was stopped while it started') from error
+            raise
 
-    def _raise_of_start(self, error: BaseException, is_stopped: bool) -> None:
-        if is_stopped and isinstance(error, Exception):
-            raise NodeStoppedError(f'{self.node.name} was stopped while it started') from error
-        raise error
+    def _check_not_stopped(self) -> None:
+        if self._is_cancelled or self.is_ending:
+            raise NodeStoppedError('another thread has stopped it')
 
     def cancel_start(self) -> None:
         """Have the start end, where the node is starting: its caller gets a NodeStoppedError."""
         with node_registry.changed:
-            self._is_cancelled = self.is_starting
-        if self._is_cancelled:
-            self.rospy.end()
+            if not self.is_starting:
+                return
+            self._is_cancelled = True
+        self.rospy.end()
 
     def end(self) -> None:
-        """End all that the run has, in this order: what waits, souls, the dispatcher, and then what
-        :meth:`PrivateRospy.stop` ends. Does nothing where the run has not begun, or ends already.
+        """End all that the run has, unless it ends already.
+
+        In this order: what waits, souls (for up to the node's stop_timeout), delegates, and what
+        :meth:`PrivateRospy.stop` ends: links, services, watched parameters, messages under way (for
+        up to stop_timeout), registrations, servers, sockets, threads.
         """
         with node_registry.changed:
             if self.lifecycle is not Lifecycle.RUNNING:
