@@ -123,13 +123,16 @@ def registrations(master: Master) -> Dict[str, Set[str]]:
 
 
 @contextlib.contextmanager
-def nothing_left(master: Master, timeout: Optional[float] = None) -> Iterator[None]:
+def nothing_left(
+    master: Master, timeout: Optional[float] = None, may_stay: str = '(?!)'
+) -> Iterator[None]:
     """A block that leaves behind neither a node of this process, nor a registration at the master,
     nor a thread that it did not find.
 
     Fails the test otherwise, and says what is left; nodes that are left are stopped.
 
     :param timeout: seconds in which what is about to end may do so, None: :data:`TIMEOUT`
+    :param may_stay: regular expression for the names of threads that may stay; by default none may
     """
     threads, known = set(threading.enumerate()), registrations(master)
     yield
@@ -146,7 +149,11 @@ def nothing_left(master: Master, timeout: Optional[float] = None) -> Iterator[No
                 for name, own in registrations(master).items()
                 for what in sorted(own - known.get(name, set()))
             ),
-            *(f'thread {thread.name}' for thread in set(threading.enumerate()) - threads),
+            *(
+                f'thread {thread.name}'
+                for thread in set(threading.enumerate()) - threads
+                if not re.search(may_stay, thread.name)
+            ),
         ]
 
     with contextlib.suppress(TimeoutError):
