@@ -2,6 +2,7 @@
 import contextlib
 import socket
 import time
+from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, List, Optional
 
 import genpy
 import rosgraph
@@ -22,8 +23,11 @@ from pharos.private_rospy import local_services
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.proxies import time_limit
 from pharos.private_rospy.lifetime import Interruption
-from pharos.seconds import check_limit
 from pharos.private_rospy.tcpros_connection import TcprosConnection
+from pharos.seconds import check_limit
+
+if TYPE_CHECKING:
+    from pharos.master import Master
 
 TIMEOUT = 5.0  # seconds in which the master, and a provider asked for its type, must answer
 
@@ -37,53 +41,54 @@ class Service:
         service = master.lookup_service('/clear', caller_id='/myID'); service.call()
 
     :attr:`type` and :attr:`md5sum` are found by asking the provider. A call sends the md5sum of the
-        definition that
-    fills the request, so that the provider refuses one of another layout; a ``md5sum`` set by hand
-    is sent instead, until it is set to None. :attr:`response` is the last call's. May be called
-    from several threads at once.
+    definition that fills the request, so that the provider refuses one of another layout; a
+    ``md5sum`` set by hand is sent instead, until it is set to None. :attr:`response` is the last
+    call's. May be called from several threads at once.
     """
 
-    def __init__(self, master, name, caller_id, persistent=False):
-        self.master, self.name, self.caller_id, self.persistent = (
-            master,
-            name,
-            caller_id,
-            persistent,
-        )
-        self.uri = self.type = self.response = self._found_md5sum = self._md5sum_by_hand = None
+    def __init__(
+        self, master: 'Master', name: str, caller_id: str, persistent: bool = False
+    ) -> None:
+        self.master = master
+        self.name = name
+        self.caller_id = caller_id
+        self.persistent = persistent
+        self.response: Any = None
+        self.uri = ''
         self._calls = 0
-        self._class = None
-        self._here = None  # the provider, where it is a node of this process
-        self._idle = []  # persistent connections that nobody uses just now
+        self._class: Any = None
+        self._local: Any = None  # the provider, where it is a node of this process
+        self._idle: List[TcprosConnection] = []  # persistent, and nobody uses them just now
+        self._md5sum_by_hand: Optional[str] = None
         self._look_up(None)
         header = self._ask()
-        self.type, self._found_md5sum = header.get('type'), header.get('md5sum')
+        self.type = header.get('type')
+        self._found_md5sum = header.get('md5sum')
 
-    def _look_up(self, deadline):
+    def _look_up(self, deadline: Optional[float]) -> str:
         """Find the provider, which may have moved; returns its URI."""
         with time_limit(None if deadline is None else deadline - time.monotonic()):
             try:
                 self.uri = self.master.call('lookupService', self.name, caller_id=self.caller_id)
             except rosgraph.MasterError:
+                hint = suggest(self.name, self.master.services())
                 raise UnknownServiceError(
-                    f'no node of {self.master.url} offers the service'
-                    f' {self.name}{suggest(self.name, self.master.services())}: see'
+                    f'no node of {self.master.url} offers the service {self.name}{hint}: see'
                     ' rosservice list'
                 ) from None
         return self.uri
 
-    def _ask(self, deadline=None):
+    def _ask(self, deadline: Optional[float] = None) -> Dict[str, str]:
         """The provider's own description of the service: the header that it answers a probe with.
 
         As ``rosservice.get_service_headers`` asks for it, which hides why there is none, and waits
         for ever for a provider that sends a byte every four seconds.
         """
         limit, waiting = time.monotonic() + TIMEOUT, Interruption()
+        if deadline is not None:
+            limit = min(limit, deadline)
         try:
-            connection = self._connect(
-                {**self._header('*'), 'probe': '1'},
-                limit if deadline is None else min(limit, deadline),
-            )
+            connection = self._connect({**self._header('*'), 'probe': '1'}, limit)
         except OSError as error:
             self._check_awaited(waiting, error)
             raise ServiceCallError(
@@ -99,12 +104,12 @@ class Service:
         return connection.header
 
     @property
-    def md5sum(self):
+    def md5sum(self) -> Optional[str]:
         """The provider's md5sum, or the one set by hand; setting it to None takes that back."""
         return self._found_md5sum if self._md5sum_by_hand is None else self._md5sum_by_hand
 
     @md5sum.setter
-    def md5sum(self, md5sum):
+    def md5sum(self, md5sum: Optional[str]) -> None:
         if not isinstance(md5sum, (str, type(None))):
             raise ValueError(
                 f'the md5sum of {self.name} is a text such as {self._found_md5sum!r}, not'
@@ -114,7 +119,7 @@ class Service:
         self._md5sum_by_hand = md5sum
 
     @property
-    def service_class(self):
+    def service_class(self) -> Any:
         """The service class of its type, as it is defined here.
 
         :raises UnknownTypeError: if there is no definition of it here
@@ -123,7 +128,13 @@ class Service:
             self._class = messages.service_class(self.type)
         return self._class
 
-    def call(self, block=None, *, timeout=None, **fields):
+    def call(
+        self,
+        block: Optional[Callable[[Any], Any]] = None,
+        *,
+        timeout: Optional[float] = None,
+        **fields: Any,
+    ) -> Any:
         """Call the service: ``block(request)`` and keywords fill the request. Returns the response.
 
         A service of a node of this process is called without a socket: without ``timeout`` in this
@@ -165,64 +176,55 @@ class Service:
             ) from error
         return response  # not self.response, which is another thread's by now
 
-    def _check_definition(self, deadline):
+    def _check_definition(self, deadline: Optional[float]) -> None:
         """Refuse a definition that is not the provider's, before anybody wonders which fields a
         request has."""
-        if self._md5sum_by_hand is not None or self._found_md5sum in (
-            None,
-            '*',
-            self.service_class._md5sum,
-        ):
+        ours = self.service_class._md5sum
+        if self._md5sum_by_hand is not None or self._found_md5sum in (None, '*', ours):
             return
         self._look_up(deadline)
         header = self._ask(deadline)  # it may have been built anew since it was looked up
-        if header.get('md5sum') != self.service_class._md5sum:
+        if header.get('md5sum') != ours:
             raise self._type_error(header)
-        self._found_md5sum = header['md5sum']
+        self._found_md5sum = ours
 
-    def _check_awaited(self, waiting, error):
+    def _check_awaited(self, waiting: Interruption, error: Exception) -> None:
         """Raise NodeStoppedError where a connection broke because the node that waits stops."""
         if waiting.came:
             raise NodeStoppedError(f'the node that waited for {self.name} stops') from error
 
-    def _exchange(self, request, deadline):
+    def _exchange(self, request: genpy.Message, deadline: Optional[float]) -> genpy.Message:
         """Send the request to the provider, and where that has gone, to where it is now; returns
         the response."""
         uri = self.uri
         try:
             return self._send(request, deadline)
-        except ConnectionRefusedError:
+        except (ConnectionRefusedError, _HandshakeRefused) as error:
             if self._look_up(deadline) == uri:
-                raise
-        except _NotShakenHands as error:
-            if self._look_up(deadline) == uri:
-                raise self._refused(error, deadline) from error
+                raise self._refused(error, deadline)
         try:
             return self._send(request, deadline)
-        except _NotShakenHands as error:
-            raise self._refused(error, deadline) from error
+        except _HandshakeRefused as error:
+            raise self._refused(error, deadline)
 
-    def _send(self, request, deadline):
+    def _send(self, request: genpy.Message, deadline: Optional[float]) -> genpy.Message:
         """Send the request to where the provider is thought to be; returns the response."""
-        here = self._here
-        if here is None or not here.is_offered(self.uri):
-            here = self._here = local_services.find(self.name, self.uri, self.service_class)
+        local = self._local
+        if local is None or not local.is_offered(self.uri):
+            local = self._local = local_services.find(self.name, self.uri, self.service_class)
         # what is sent by hand as another type's is left to the wire
-        here = (
-            here
-            if here and here.md5sum == self._md5sum_sent == self.service_class._md5sum
-            else None
-        )
+        if local and not (local.md5sum == self._md5sum_sent == self.service_class._md5sum):
+            local = None
         try:
-            data = here.freeze(request) if here else serialized(request)
+            data = local.freeze(request) if local else serialized(request)
         except Exception:
             messages.check_fits(request)  # tells what of it does not
             raise
-        if here:
-            return here.call(data, self._header(self._md5sum_sent), deadline)
+        if local:
+            return local.call(data, self._header(self._md5sum_sent), deadline)
         return self._send_over_tcp(data, deadline)
 
-    def _send_over_tcp(self, data, deadline):
+    def _send_over_tcp(self, data: bytes, deadline: Optional[float]) -> genpy.Message:
         connection = self._connection(deadline)
         try:
             ok, answer = connection.exchange(data, deadline)
@@ -240,16 +242,17 @@ class Service:
         return response
 
     @property
-    def _md5sum_sent(self):
-        return self.service_class._md5sum if self._md5sum_by_hand is None else self._md5sum_by_hand
+    def _md5sum_sent(self) -> str:
+        by_hand = self._md5sum_by_hand
+        return self.service_class._md5sum if by_hand is None else by_hand
 
-    def _header(self, md5sum):
+    def _header(self, md5sum: str) -> Dict[str, str]:
         header = {'service': self.name, 'md5sum': md5sum, 'callerid': self.caller_id}
         if self.persistent:
             header['persistent'] = '1'
         return header
 
-    def _connection(self, deadline):
+    def _connection(self, deadline: Optional[float]) -> TcprosConnection:
         """An idle connection that lives, or a new one."""
         header = self._header(self._md5sum_sent)
         for connection in self._take_idle():
@@ -260,33 +263,39 @@ class Service:
         connection = self._connect(header, deadline)
         if 'error' in connection.header:
             connection.close()
-            raise _NotShakenHands(connection.header['error'])
+            raise _HandshakeRefused(connection.header['error'])
         return connection
 
-    def _take_idle(self):
+    def _take_idle(self) -> Iterator[TcprosConnection]:
         with contextlib.suppress(IndexError):  # another thread has taken the last one
             while True:
                 yield self._idle.pop()
 
-    def _connect(self, header, deadline):
+    def _connect(self, header: Dict[str, str], deadline: Optional[float]) -> TcprosConnection:
         return TcprosConnection(rospy.parse_rosrpc_uri(self.uri), header, deadline)
 
-    def _refused(self, error, deadline):
+    def _refused(self, error: Exception, deadline: Optional[float]) -> Exception:
         """The error of a provider that refuses, by what it says of itself now."""
+        if isinstance(error, ConnectionRefusedError):
+            return error
         header = self._ask(deadline)
         if header.get('md5sum') == self._md5sum_sent:
-            return ServiceCallError(
+            refused: Exception = ServiceCallError(
                 f'the provider of {self.name} at {self.uri} refused the call: {error}'
             )
-        return self._type_error(header)
+        else:
+            refused = self._type_error(header)
+        refused.__cause__ = error
+        return refused
 
-    def _type_error(self, header):
+    def _type_error(self, header: Dict[str, str]) -> ServiceTypeError:
         """The error of a provider whose type is another than what is sent.
 
         The report: the "error message provides all information about the service including the
         md5sum".
         """
-        type_, md5sum, by_hand = header.get('type'), header.get('md5sum'), self._md5sum_by_hand
+        type_, md5sum = header.get('type', ''), header.get('md5sum', '')
+        by_hand = self._md5sum_by_hand
         theirs = f'{type_} with md5sum {md5sum} ({self._fields_of(type_, md5sum)})'
         if by_hand is not None:
             return ServiceTypeError(
@@ -299,31 +308,31 @@ class Service:
                 f' type {theirs}: it was {self.type} when it was looked up: look it up again'
             )
         ours = self.service_class
-        self._class = self._here = None  # the right definition may come, and is sought then
+        self._class = self._local = None  # the right definition may come, and is sought then
         return ServiceTypeError(
             f'{self.name} is of type {theirs}, but {type_} is defined here with md5sum'
             f' {ours._md5sum} ({messages.describe_service(ours)}), so nothing was sent: have'
             f' both sides use the same {type_.rpartition("/")[2]}.srv'
         )
 
-    def _fields_of(self, type_, md5sum):
+    def _fields_of(self, type_: str, md5sum: str) -> str:
         """What can be said of the fields of a provider's type; a provider elsewhere tells its
         md5sum alone."""
-        here = local_services.class_of(self.name, self.uri)
-        for known in (here, *messages.known_service_classes(type_)):
+        local = local_services.class_of(self.name, self.uri)
+        for known in (local, *messages.known_service_classes(type_)):
             if known is not None and known._md5sum == md5sum:
                 return messages.describe_service(known)
         return 'its fields are not known here'
 
-    def close(self):
+    def close(self) -> None:
         """Close the connections of a persistent service; a later call opens them again."""
         for connection in self._take_idle():
             connection.close()
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f'<Service {self.name} {self.type} at {self.uri}>'
 
 
-class _NotShakenHands(Exception):
+class _HandshakeRefused(Exception):
     """Refused in the handshake: the md5sum does not fit, or another node is at the provider's old
     address by now."""
