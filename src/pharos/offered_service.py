@@ -10,7 +10,7 @@ from pharos.intraprocess.copier import copier_for
 from pharos.private_rospy import local_services
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.proxies import time_limit
-from pharos.private_rospy.registration import REGISTER_TIMEOUT, UNREGISTER_TIMEOUT
+from pharos.private_rospy.registration import UNREGISTER_TIMEOUT
 
 
 class OfferedService:
@@ -28,10 +28,13 @@ class OfferedService:
 
     def open(self):
         """Register with the master, also after a restart of the node."""
-        with time_limit(max(REGISTER_TIMEOUT, self.node.connect_timeout)):
-            self._service = local_services.offer(
-                self.node.current_run.rospy, self.name, self.service_class, self._answer
-            )
+        self._service = local_services.offer(
+            self.node.current_run.rospy,
+            self.name,
+            self.service_class,
+            self._answer,
+            self.node.connect_timeout,
+        )
         self.node.latest_run.remember(self)
 
     def node_stopped(self):

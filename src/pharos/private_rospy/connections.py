@@ -7,7 +7,7 @@ from pharos.private_rospy.addresses import is_same_master
 from pharos.private_rospy.names import Resolved
 from pharos.private_rospy import changes, registration
 from pharos.private_rospy.proxies import ServerProxy, time_limit
-from pharos.private_rospy.registration import REGISTER_TIMEOUT, UNREGISTER_TIMEOUT, registered
+from pharos.private_rospy.registration import UNREGISTER_TIMEOUT, registered
 
 _running = {}  # URI -> the PrivateRospy that runs there, in this process
 
@@ -20,17 +20,14 @@ def local_nodes():
 class Connections:
     """The channels of one :class:`~.instance.PrivateRospy`."""
 
-    takes_plain_callbacks = (
-        False  # whether subscriptions without any channel connect in process, too
-    )
+    takes_plain_callbacks = False  # whether subscriptions without any channel connect here, too
 
-    def __init__(self, instance):
-        self._instance = instance
+    def __init__(self, node):
+        self._node = node
         self._receivers = {}  # topic -> those that :meth:`subscribe` has connected to it
         self._lock = threading.Lock()  # held to change that
-        self.subscribers_at_registration = (
-            {}
-        )  # topic -> URIs, of which the master told a new publisher
+        # topic -> URIs, of which the master told a new publisher
+        self.subscribers_at_registration = {}
         # topics of which the log says that subscribers did not connect in time
         self.told_late = set()
         # (topic, URI) of each publisher just being connected to -> whether somebody asked again
@@ -38,12 +35,12 @@ class Connections:
 
     def open(self):
         """The node runs: its neighbours may connect to it."""
-        _running[self._instance.uri] = self._instance
+        _running[self._node.uri] = self._node
 
     def close(self):
         """The node stops."""
-        if _running.get(self._instance.uri) is self._instance:
-            del _running[self._instance.uri]
+        if _running.get(self._node.uri) is self._node:
+            del _running[self._node.uri]
 
     # -- channels
 
@@ -62,13 +59,13 @@ class Connections:
             self._receivers[topic] = (*self.receivers_on(topic), receiver)
         endpoint = None
         try:
-            with time_limit(max(REGISTER_TIMEOUT, timeout)):
-                endpoint = registered(
-                    lambda: self._instance.rospy.Subscriber(
-                        Resolved(topic), receiver.message_class, offer, **options
-                    ),
-                    _unregister,
-                )
+            endpoint = registered(
+                lambda: self._node.rospy.Subscriber(
+                    Resolved(topic), receiver.message_class, offer, **options
+                ),
+                _unregister,
+                timeout,
+            )
             self._connect(topic, timeout)
         except BaseException:
             self._forget(receiver)
@@ -81,8 +78,8 @@ class Connections:
         publishers = [other for other in self._neighbours() if other.publisher(topic)]
         for other in publishers:
             self.connect(topic, other.uri)
-        name, refuses = self._instance.name, self._instance.refusals.refuses
-        self._instance.wait_until(
+        name, refuses = self._node.name, self._node.refusals.refuses
+        self._node.wait_until(
             lambda: all(
                 other.connections.sends_to(name, topic) or refuses(topic, other.uri)
                 for other in publishers
@@ -111,13 +108,13 @@ class Connections:
         :param queue_bytes: that wait for a slow subscriber elsewhere
         :raises MasterUnreachableError: if it cannot be registered
         """
-        with time_limit(max(REGISTER_TIMEOUT, timeout)):
-            endpoint = registered(
-                lambda: self._instance.rospy.Publisher(
-                    Resolved(topic), message_class, latch=latch is not None, **options
-                ),
-                _unregister,
-            )
+        endpoint = registered(
+            lambda: self._node.rospy.Publisher(
+                Resolved(topic), message_class, latch=latch is not None, **options
+            ),
+            _unregister,
+            timeout,
+        )
         fanout = endpoint.impl.fanout
         endpoint.impl.queue_bytes = queue_bytes
         if latch is not None:
@@ -125,7 +122,7 @@ class Connections:
             fanout.run()
         for other in self._neighbours():
             if other.subscriber(topic):
-                other.connections.connect(topic, self._instance.uri)
+                other.connections.connect(topic, self._node.uri)
         return endpoint, fanout
 
     def known_subscribers(self, topic):
@@ -154,15 +151,13 @@ class Connections:
         topic = endpoint.impl
         if topic is None:
             return []
-        if endpoint.reg_type == 'pub':
-            connections, ended = topic.fanout.connections, _has_left
-        else:
-            # a subscriber's thread sees the end by itself
-            connections, ended = (topic.connections, _is_done)
+        is_publisher = endpoint.reg_type == 'pub'
+        connections = topic.fanout.connections if is_publisher else topic.connections
         return [
             (_peer(connection), connection.transport_type)
             for connection in connections
-            if not ended(connection)
+            # a subscriber's thread sees the end by itself
+            if not (connection.done or is_publisher and _has_left(connection))
         ]
 
     @staticmethod
@@ -215,7 +210,7 @@ class Connections:
                 again = self._connecting.pop(key) and answer[0] != 1
                 if again:
                     self._connecting[key] = False
-        subscriber = self._instance.subscriber(topic)
+        subscriber = self._node.subscriber(topic)
         if subscriber is not None:
             if answer[0] == 1:
                 subscriber.out_of_reach.discard(uri)
@@ -227,9 +222,9 @@ class Connections:
     def _negotiate(self, topic, uri):
         """What rospy's ROSHandler._connect_topic does, for as long as the node is interested."""
         while True:
-            handler, subscriber = self._instance.handler, self._instance.subscriber(topic)
-            if handler is None or subscriber is None or self._instance.ended.is_set():
-                return 0, f'{self._instance.name} or its interest in {topic} ends', 0
+            handler, subscriber = self._node.handler, self._node.subscriber(topic)
+            if handler is None or subscriber is None or self._node.ended.is_set():
+                return 0, f'{self._node.name} or its interest in {topic} ends', 0
             if subscriber.has_connection(uri):
                 return 1, f'connected to {uri} already', 0
             transports = [
@@ -239,14 +234,12 @@ class Connections:
             ]
             offered = [each for transport in transports for each in transport.get_supported()]
             try:
-                code, text, chosen = ServerProxy(uri).requestTopic(
-                    self._instance.name, topic, offered
-                )
+                code, text, chosen = ServerProxy(uri).requestTopic(self._node.name, topic, offered)
                 break
             except ConnectionRefusedError as error:
                 return 0, str(error), 0
             except Exception:  # whatever it answered
-                self._instance.ended.wait(registration.RETRY_DELAY)
+                self._node.ended.wait(registration.RETRY_DELAY)
             if uri not in subscriber.publishers:
                 return 0, f'the master knows no publisher of {topic} at {uri}', 0
         if code <= 0:
@@ -256,28 +249,28 @@ class Connections:
                 try:
                     return transport.create_transport(topic, uri, chosen)
                 except AttributeError:  # rospy's, where there is no subscription any more
-                    return 0, f'the interest of {self._instance.name} in {topic} ends', 0
+                    return 0, f'the interest of {self._node.name} in {topic} ends', 0
         return 0, f'{uri} chose {chosen}, which was not offered', 0
 
     def sends_to(self, name, topic):
         """Whether the node, if it publishes on the topic at all, is connected to the subscriber of
         that name."""
-        publisher = self._instance.publisher(topic)
+        publisher = self._node.publisher(topic)
         return publisher is None or any(
             connection.endpoint_id == name for connection in publisher.fanout.connections
         )
 
     def hears(self, topic):
         """Whether the node is connected to a publisher that suits it."""
-        subscriber = self._instance.subscriber(topic)
+        subscriber = self._node.subscriber(topic)
         return any(
-            connection.transport_type == 'INTRAPROCESS' or hasattr(connection, 'is_heard')
+            getattr(connection, 'is_heard', False)
             for connection in (subscriber and subscriber.connections or ())
         )
 
     def has_heard_from_publishers(self, topic):
         """Whether it is, or none of those that the master has named will suit it."""
-        subscriber, refuses = self._instance.subscriber(topic), self._instance.refusals.refuses
+        subscriber, refuses = self._node.subscriber(topic), self._node.refusals.refuses
         return (
             subscriber is None
             or self.hears(topic)
@@ -294,7 +287,7 @@ class Connections:
 
     def _neighbours(self):
         """The nodes of this process at the same master, this one among them."""
-        master = self._instance.settings.master_url
+        master = self._node.settings.master_url
         return [
             other for other in local_nodes() if is_same_master(other.settings.master_url, master)
         ]
@@ -309,14 +302,10 @@ def _unregister(endpoint):
         endpoint.unregister()
 
 
-def _is_done(connection):
-    return connection.done
-
-
 def _has_left(connection):
-    """Whether a publisher's connection is done, or its subscriber has closed it."""
-    if connection.done or connection.transport_type != 'TCPROS':
-        return connection.done
+    """Whether the subscriber at the other end of a publisher's connection has closed it."""
+    if connection.transport_type != 'TCPROS':
+        return False
     poll = select.poll()
     try:
         poll.register(connection.socket, select.POLLRDHUP)

@@ -79,7 +79,7 @@ class PrivateRospy:
             registries.get_topic_manager(),
             registries.get_service_manager(),
         )
-        #: publisher(topic): rospy's _PublisherImpl, None if there is none; subscriber(topic) likewise
+        #: publisher(topic), subscriber(topic): rospy's _PublisherImpl or _SubscriberImpl, or None
         self.publisher = self.topics.get_publisher_impl
         self.subscriber = self.topics.get_subscriber_impl
 

@@ -134,6 +134,7 @@ class _End(rospy.impl.transport.Transport):
 
     transport_type = 'INTRAPROCESS'
     latch = None  # those who come late get latched messages from the link
+    is_heard = True  # its publisher is of the right type
 
     def __init__(self, link, direction, topic, peer):
         super().__init__(direction, topic)

@@ -37,14 +37,16 @@ def _offered_here(name, uri):
     return None, None
 
 
-def offer(node, name, service_class, answer):
+def offer(node, name, service_class, answer, timeout):
     """A rospy Service of that node.
 
+    :param timeout: seconds that the master may take
     :raises MasterUnreachableError: if it cannot be registered
     """
     return registered(
         lambda: node.rospy.Service(Resolved(name), service_class, answer),
         lambda service: service.shutdown('it is not registered'),
+        timeout,
     )
 
 

@@ -13,8 +13,8 @@ class WatchedParameters:
     """The parameters that one :class:`~.instance.PrivateRospy` watches, or has given a first
     value."""
 
-    def __init__(self, instance):
-        self._instance = instance
+    def __init__(self, node):
+        self._node = node
         self._watched = []  # (global name, function(value))
         self._initialized = {}  # global name -> its first value
         # of those watched, the outermost: of what is in them, the master tells for each
@@ -25,7 +25,7 @@ class WatchedParameters:
 
     def may_subscribe(self):
         """Whether the master may still be asked to tell the node of a parameter."""
-        return not (self._instance.ended.is_set() or self._instance.has_lost_name)
+        return not (self._node.ended.is_set() or self._node.has_lost_name)
 
     def initialize(self, name, value):
         """Set the parameter where it has no value, also after a restart of the master."""
@@ -60,7 +60,7 @@ class WatchedParameters:
             raise
 
     def _subscribe(self, name):
-        master, uri = self._master(), self._instance.uri
+        master, uri = self._master(), self._node.uri
         with self._subscribing:
             if not self.may_subscribe():
                 return
@@ -78,13 +78,13 @@ class WatchedParameters:
             master.setParam(name, value)
 
     def _master(self):
-        return master_api(self._instance.settings.master_url, self._instance.name)
+        return master_api(self._node.settings.master_url, self._node.name)
 
     def restore_after_master_restart(self):
         """A restarted master has no parameters: set the node's private ones and first values, and
         watch again."""
-        rospy = self._instance.rospy
-        private = rospy.client.load_command_line_node_params(self._instance.settings.argv)
+        rospy = self._node.rospy
+        private = rospy.client.load_command_line_node_params(self._node.settings.argv)
         for name, value in private.items():
             rospy.set_param('~' + name, value)
         cache = rospy.impl.paramserver.get_param_server_cache()
@@ -120,7 +120,7 @@ class WatchedParameters:
         """Add to the calls those that end the watch: a master keeps the name of a node that does
         not."""
         for name in self._subscribed | self.cached:
-            calls.unsubscribeParam(self._instance.name, self._instance.uri, name)
+            calls.unsubscribeParam(self._node.name, self._node.uri, name)
 
     def _value(self, name):
         try:

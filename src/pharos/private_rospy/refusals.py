@@ -32,8 +32,8 @@ class Refusals:
     :attr:`on_refused` is called with each :class:`Refusal` that is new.
     """
 
-    def __init__(self, instance):
-        self._instance = instance
+    def __init__(self, node):
+        self._node = node
         self._lock = threading.Lock()
         self._held = []  # topics of whose refusals is not told yet
         self.on_refused = lambda refusal: None
@@ -100,7 +100,7 @@ class Refusals:
 
     def publisher_connected(self, topic, uri):
         """Nothing is wrong with it now."""
-        subscription = self._instance.subscriber(topic)
+        subscription = self._node.subscriber(topic)
         if subscription is not None:
             subscription.refused.pop(uri, None)
 
@@ -110,24 +110,24 @@ class Refusals:
         Its word of one in this process takes its time.
         """
         for uri in subscription.refused.keys() - set(subscription.publishers):
-            local = self._instance.connections.local_node_at(uri)
+            local = self._node.connections.local_node_at(uri)
             if local is None or local.publisher(subscription.resolved_name) is None:
                 subscription.refused.pop(uri, None)
 
     def refuses(self, topic, uri):
         """Whether the node cannot hear the publisher at that URI."""
-        subscription = self._instance.subscriber(topic)
+        subscription = self._node.subscriber(topic)
         return subscription is not None and subscription.refused.get(uri, (0, None))[1] is not None
 
     def of(self, topic):
         """The Refusal of each publisher of the topic that the node cannot hear."""
-        subscription = self._instance.subscriber(topic)
+        subscription = self._node.subscriber(topic)
         entries = list(subscription.refused.values()) if subscription else []
         return [refusal for _, refusal in entries if refusal is not None]
 
     def count(self):
         """How many publishers, of all topics, the node cannot hear."""
-        return sum(len(self.of(topic)) for topic, _ in self._instance.topics.get_subscriptions())
+        return sum(len(self.of(topic)) for topic, _ in self._node.topics.get_subscriptions())
 
     # -- who cannot hear
 
@@ -141,17 +141,17 @@ class Refusals:
             _remember(publisher.refused, name, said)
         changes.notify()
         if is_new:
-            self._instance.warn(line)
+            self._node.warn(line)
 
     def subscriber_connected(self, topic, name):
         """Nothing is wrong with it now."""
-        publisher = self._instance.publisher(topic)
+        publisher = self._node.publisher(topic)
         if publisher is not None:
             publisher.refused.pop(name, None)
 
     def subscribers(self, topic):
         """Names of the nodes that cannot hear what this one publishes on the topic."""
-        publisher = self._instance.publisher(topic)
+        publisher = self._node.publisher(topic)
         return list(publisher.refused) if publisher else []
 
 
@@ -182,14 +182,14 @@ def check_md5sum(connection, wanted):
         raise rospy.exceptions.TransportInitError(connection.header['error'])
 
 
-def examine(instance, connection, topic, uri):
+def examine(node, connection, topic, uri):
     """Find out why rospy's connection to the publisher at that URI failed."""
-    header, subscription = connection.header, instance.subscriber(topic)
+    header, subscription = connection.header, node.subscriber(topic)
     address = connection.dest_address
-    if subscription is None or 'error' not in (header or ()) or instance.ended.is_set():
+    if subscription is None or 'error' not in (header or ()) or node.ended.is_set():
         return
     known = header if 'md5sum' in header else None
-    instance.refusals.publisher_refused(
+    node.refusals.publisher_refused(
         subscription, uri, header['error'], lambda: known or _ask(address, topic)
     )
 

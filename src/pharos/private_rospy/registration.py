@@ -8,14 +8,13 @@ from typing import Callable, NamedTuple
 import rosgraph
 
 from pharos.errors import MasterUnreachableError, NodeNameInUseError
-from pharos.private_rospy.proxies import ServerProxy, master_api
+from pharos.private_rospy.proxies import ServerProxy, master_api, time_limit
 
 PING_TIMEOUT = 1.0  # seconds in which a running node answers getPid
 REGISTER_TIMEOUT = 1.0  # seconds that the master has at least, to register what is opened
 UNREGISTER_TIMEOUT = 2.0  # seconds that it has, to unregister what is closed or stops
-RETRY_DELAY = (
-    2.0  # seconds between attempts to reach a publisher, for as long as the master knows it
-)
+# seconds between attempts to reach a publisher, for as long as the master knows it
+RETRY_DELAY = 2.0
 # the last where something answers that does not speak XML-RPC
 COMMUNICATION_ERRORS = (
     OSError,
@@ -26,21 +25,23 @@ COMMUNICATION_ERRORS = (
 _attempt = threading.local()  # .failure: of what this thread registers, where it waits for that
 
 
-def registered(make, undo):
+def registered(make, undo, timeout):
     """What ``make()`` returns, a rospy Publisher, Subscriber or Service that is registered with the
     master.
 
     rospy itself does not say that it could not register one: whoever uses it plainly gets one that
     the watcher registers when the master is back, and a line in the log.
 
+    :param timeout: seconds that the master may take
     :raises MasterUnreachableError: where that failed; ``undo(what was made)`` has been called
     """
     _attempt.failure = None
     try:
-        made = make()
-        if _attempt.failure is not None:
-            undo(made)
-            raise _attempt.failure
+        with time_limit(max(REGISTER_TIMEOUT, timeout)):
+            made = make()
+            if _attempt.failure is not None:
+                undo(made)
+                raise _attempt.failure
         return made
     finally:
         del _attempt.failure

@@ -2,7 +2,6 @@
 import contextlib
 import io
 import ipaddress
-import socket
 import threading
 import time
 import urllib.parse
