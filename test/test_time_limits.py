@@ -10,7 +10,8 @@ import pytest
 import pharos
 from conftest import TIMEOUT
 from pharos import BlockNode, Master
-from pharos.private_rospy.proxies import ServerProxy, time_limit
+from pharos.private_rospy.deadlines import time_limit
+from pharos.private_rospy.proxies import ServerProxy
 from sockets import refused_url
 
 STRING = 'std_msgs/String'

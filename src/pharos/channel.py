@@ -13,7 +13,7 @@ from pharos.errors import MessageTypeError, NodeStoppedError, PharosError
 from pharos.intraprocess import copier
 from pharos.private_rospy.refusals import suits
 from pharos.intraprocess.fanout import Latch
-from pharos.private_rospy.proxies import time_limit
+from pharos.private_rospy.deadlines import time_limit
 from pharos.seconds import check_limit
 
 # bytes read from a socket at once; rospy's 64 KiB let subscribers of images fall behind

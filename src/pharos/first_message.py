@@ -3,7 +3,7 @@ import time
 from typing import TYPE_CHECKING, Set
 
 from pharos.errors import MasterUnreachableError
-from pharos.private_rospy.proxies import time_limit
+from pharos.private_rospy.deadlines import time_limit
 from pharos.private_rospy.registration import REGISTER_TIMEOUT
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from pharos.master_calls import MasterCalls
 from pharos.parameters import Parameters
 from pharos.private_rospy.addresses import check_port, check_url
 from pharos.private_rospy.names import check_name, global_name
-from pharos.private_rospy.proxies import MARGIN, time_limit
+from pharos.private_rospy.deadlines import MARGIN, time_limit
 from pharos.ros_process import RosProcess
 from pharos.run import Lifecycle
 from pharos.seconds import check_limit

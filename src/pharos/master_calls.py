@@ -10,7 +10,8 @@ import rosgraph
 from pharos.errors import MasterUnreachableError, NodeStoppedError
 from pharos.private_rospy.addresses import is_same_master
 from pharos.private_rospy.lifetime import Interruption
-from pharos.private_rospy.proxies import MARGIN, ServerProxy, interruption, master_api, time_limit
+from pharos.private_rospy.deadlines import MARGIN, time_limit
+from pharos.private_rospy.proxies import ServerProxy, interruption, master_api
 from pharos.private_rospy.registration import COMMUNICATION_ERRORS, PING_TIMEOUT
 from pharos.seconds import check_limit
 

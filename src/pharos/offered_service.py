@@ -9,7 +9,7 @@ from pharos.errors import MessageTypeError, PharosError
 from pharos.intraprocess.copier import copier_for
 from pharos.private_rospy import local_services
 from pharos.private_rospy.process_rospy import rospy
-from pharos.private_rospy.proxies import time_limit
+from pharos.private_rospy.deadlines import time_limit
 from pharos.private_rospy.registration import UNREGISTER_TIMEOUT
 
 

@@ -21,7 +21,7 @@ from pharos.intraprocess.services import Failed
 from pharos.intraprocess.sharing import numbered
 from pharos.private_rospy import local_services
 from pharos.private_rospy.process_rospy import rospy
-from pharos.private_rospy.proxies import time_limit
+from pharos.private_rospy.deadlines import time_limit
 from pharos.private_rospy.lifetime import Interruption
 from pharos.private_rospy.tcpros_connection import TcprosConnection
 from pharos.seconds import check_limit

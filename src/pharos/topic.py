@@ -14,7 +14,7 @@ from pharos.errors import (
     UnknownTypeError,
     suggest,
 )
-from pharos.private_rospy.proxies import MARGIN, time_limit
+from pharos.private_rospy.deadlines import MARGIN, time_limit
 from pharos.private_rospy.tcpros_connection import ask_publisher
 from pharos.seconds import check_seconds
 

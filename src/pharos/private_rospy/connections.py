@@ -6,7 +6,8 @@ import threading
 from pharos.private_rospy.addresses import is_same_master
 from pharos.private_rospy.names import Resolved
 from pharos.private_rospy import changes, registration
-from pharos.private_rospy.proxies import ServerProxy, time_limit
+from pharos.private_rospy.deadlines import time_limit
+from pharos.private_rospy.proxies import ServerProxy
 from pharos.private_rospy.registration import UNREGISTER_TIMEOUT, registered
 
 _running = {}  # URI -> the PrivateRospy that runs there, in this process

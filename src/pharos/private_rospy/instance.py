@@ -28,7 +28,8 @@ from pharos.private_rospy.lifetime import Lifetime
 from pharos.private_rospy.loader import ModuleProxy, PrivateImports
 from pharos.private_rospy.patches import tcpros_server
 from pharos.private_rospy.parameters import WatchedParameters
-from pharos.private_rospy.proxies import ServerProxy, is_time_up, time_limit
+from pharos.private_rospy.deadlines import is_time_up, time_limit
+from pharos.private_rospy.proxies import ServerProxy
 from pharos.private_rospy.connections import Connections
 
 POLL = 0.001  # seconds between rospy's own looks at whether it is registered; it takes 0.1 s

@@ -1,64 +1,15 @@
 """XML-RPC proxies with a time limit: the standard library's wait for ever for a peer that does not
 answer."""
-import contextlib
 import http.client
-import math
 import socket
-import threading
-import time
 import xmlrpc.client
 
 import rosgraph
 
+from pharos.private_rospy.deadlines import deadline_in, seconds_left
 from pharos.private_rospy.lifetime import Interruption, shutdown_socket
 
 TIMEOUT = 10.0  # seconds for one call, where nothing else is said
-# seconds beyond a time limit, to tell a master that does not answer from what did not come
-MARGIN = 0.5
-
-
-class _ThreadLimit(threading.local):
-    deadline = math.inf  # by which all calls of this thread are to end, by time.monotonic()
-
-
-_limits = _ThreadLimit()
-
-
-@contextlib.contextmanager
-def time_limit(seconds):
-    """Within this, all calls of this thread end by then, together: no user's code is to run in it.
-
-    :param seconds: None: no limit
-    """
-    before = _limits.deadline
-    if seconds is not None:
-        _limits.deadline = deadline_in(max(0.0, seconds))
-    try:
-        yield
-    finally:
-        _limits.deadline = before
-
-
-def deadline_in(seconds):
-    """The time, by ``time.monotonic()``, in so many seconds, or when the :func:`time_limit` of this
-    thread is over."""
-    return min(time.monotonic() + seconds, _limits.deadline)
-
-
-def is_time_up():
-    """Whether the :func:`time_limit` of this thread is over."""
-    return time.monotonic() >= _limits.deadline
-
-
-def seconds_left(deadline):
-    """The seconds until that time, by ``time.monotonic()``.
-
-    :raises socket.timeout: if it is over
-    """
-    left = deadline - time.monotonic()
-    if left <= 0:
-        raise socket.timeout('timed out')
-    return left
 
 
 class _Limits:

@@ -8,7 +8,8 @@ from typing import Callable, NamedTuple
 import rosgraph
 
 from pharos.errors import MasterUnreachableError, NodeNameInUseError
-from pharos.private_rospy.proxies import ServerProxy, master_api, time_limit
+from pharos.private_rospy.deadlines import time_limit
+from pharos.private_rospy.proxies import ServerProxy, master_api
 
 PING_TIMEOUT = 1.0  # seconds in which a running node answers getPid
 REGISTER_TIMEOUT = 1.0  # seconds that the master has at least, to register what is opened

@@ -4,14 +4,15 @@ rospy's ServiceProxy has none and asks the environment's master, and nothing in 
 publisher for its message definition, so the exchange is ours; the coding of the handshake is
 rosgraph's.
 """
+import io
 import socket
 import struct
-import time
 
 import rosgraph.network
 
+from pharos.private_rospy.deadlines import DeadlineReader, deadline_in, seconds_left
 from pharos.private_rospy.lifetime import Interruption, keep_alive, shutdown_socket
-from pharos.private_rospy.proxies import ServerProxy, deadline_in
+from pharos.private_rospy.proxies import ServerProxy
 from pharos.private_rospy.registration import COMMUNICATION_ERRORS
 
 TIMEOUT = 2.0  # seconds that one publisher may take to say what it publishes
@@ -33,9 +34,8 @@ class TcprosConnection:
 
     def __init__(self, address, header, deadline):
         self.sent = header
-        self._deadline = deadline
-        self._received = bytearray()
-        self._socket = socket.create_connection(address, self._left())
+        self._socket = socket.create_connection(address, seconds_left(deadline))
+        self._file = io.BufferedReader(DeadlineReader(self._socket, deadline))
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             # an answer may take any time, while its host is there
@@ -55,9 +55,9 @@ class TcprosConnection:
     def exchange(self, request, deadline):
         """Send a serialized request to a service; returns ``(ok, serialized response or error
         text)``."""
-        self._deadline = deadline
+        self._file.raw.deadline = deadline
         with Interruption(lambda: shutdown_socket(self._socket)):
-            self._socket.settimeout(self._left())
+            self._socket.settimeout(seconds_left(deadline))
             self._socket.sendall(struct.pack('<I', len(request)) + request)
             ok = self._read(1) != b'\0'
             return ok, self._read_sized(self._read(4), _LIMIT)
@@ -69,20 +69,15 @@ class TcprosConnection:
         return self._read(size)
 
     def _read(self, size):
-        while len(self._received) < size:
-            self._socket.settimeout(self._left())
-            try:
-                data = self._socket.recv(min(1 << 20, max(4096, size - len(self._received))))
-            except TimeoutError as error:
-                if error.errno is None:  # our time limit
-                    raise
-                raise ConnectionError(f'its host has gone: {error.strerror}') from error
-            if not data:
-                raise ConnectionError('closed after %d of %d bytes' % (len(self._received), size))
-            self._received += data
-        result = bytes(self._received[:size])
-        del self._received[:size]
-        return result
+        try:
+            data = self._file.read(size)
+        except TimeoutError as error:
+            if error.errno is None:  # our time limit
+                raise
+            raise ConnectionError(f'its host has gone: {error.strerror}') from error
+        if len(data) < size:
+            raise ConnectionError(f'closed after {len(data)} of {size} bytes')
+        return data
 
     def is_alive(self):
         """Whether the peer has not closed an idle connection."""
@@ -98,14 +93,6 @@ class TcprosConnection:
     def close(self):
         """Close it."""
         self._socket.close()
-
-    def _left(self):
-        if self._deadline is None:
-            return None
-        left = self._deadline - time.monotonic()
-        if left <= 0:
-            raise socket.timeout('time is up')
-        return left
 
 
 def ask_publisher(uri, topic):

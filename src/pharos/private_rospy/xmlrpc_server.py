@@ -11,7 +11,7 @@ import xmlrpc.server
 
 from pharos.private_rospy.acceptor import brief
 from pharos.private_rospy.addresses import addresses_of
-from pharos.private_rospy.proxies import seconds_left
+from pharos.private_rospy.deadlines import DeadlineReader
 
 REQUEST_TIMEOUT = 30.0  # seconds from one answer until the next request has come, however slowly
 REQUEST_LIMIT = 1 << 20  # bytes of a request
@@ -32,7 +32,7 @@ class RequestHandler(xmlrpc.server.SimpleXMLRPCRequestHandler):
     def setup(self):
         """Called by socketserver."""
         super().setup()
-        self.rfile = io.BufferedReader(_Reader(self.connection))
+        self.rfile = io.BufferedReader(DeadlineReader(self.connection))
 
     def finish(self):
         """Called by socketserver."""
@@ -102,22 +102,6 @@ class RequestHandler(xmlrpc.server.SimpleXMLRPCRequestHandler):
         self.end_headers()
         self.wfile.write(answer)
         self.is_answered = True
-
-
-class _Reader(io.RawIOBase):
-    """What a client sends, until the deadline of its request."""
-
-    def __init__(self, sock):
-        super().__init__()
-        self._socket = sock
-        self.deadline = 0.0  # by time.monotonic()
-
-    def readable(self):
-        return True
-
-    def readinto(self, buffer):
-        self._socket.settimeout(seconds_left(self.deadline))
-        return self._socket.recv_into(buffer)
 
 
 def _refuse_document_type(body):

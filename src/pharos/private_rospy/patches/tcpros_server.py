@@ -8,11 +8,11 @@ import time
 
 from pharos.intraprocess.sharing import numbered
 from pharos.private_rospy.acceptor import BACKLOG, Acceptor, brief
+from pharos.private_rospy.deadlines import seconds_left
 from pharos.private_rospy.lifetime import shutdown_socket
 from pharos.private_rospy.names import NAME_LIMIT
 from pharos.private_rospy.patches.table import patch, substitute
 from pharos.private_rospy.process_rospy import rospy
-from pharos.private_rospy.proxies import seconds_left
 
 HANDSHAKE_TIMEOUT = 5.0  # seconds for the whole handshake, however slowly it comes
 HANDSHAKE_LIMIT = 1 << 20  # bytes of a connection header; real ones hold a message definition
