@@ -155,16 +155,7 @@ class Master(MasterCalls):
             xmlrpc_port=xmlrpc_port,
             argv=argv,
         )
-        try:
-            node.start()
-            if node.lifecycle is Lifecycle.NEW:
-                raise PharosError(
-                    f'{node.name} did not start: {node_class.__name__}.start() has to call '
-                    'super().start() before anything else'
-                )
-        except BaseException:
-            node_registry.stop(node)
-            raise
+        _start(node)
         return node
 
     def run(
@@ -324,3 +315,16 @@ class Master(MasterCalls):
 
     def __repr__(self) -> str:
         return f'<Master {self.url}>'
+
+
+def _start(node: nodes_of_ours.Node) -> None:
+    try:
+        node.start()
+        if node.lifecycle is Lifecycle.NEW:
+            raise PharosError(
+                f'{node.name} did not start: {type(node).__name__}.start() has to call '
+                'super().start() before anything else'
+            )
+    except BaseException:
+        node_registry.stop(node)
+        raise

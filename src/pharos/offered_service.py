@@ -1,5 +1,6 @@
 """Services that a node offers."""
 import contextlib
+from typing import TYPE_CHECKING, Any, Callable, Union
 
 import genpy
 
@@ -12,12 +13,18 @@ from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.deadlines import time_limit
 from pharos.private_rospy.registration import UNREGISTER_TIMEOUT
 
+if TYPE_CHECKING:
+    from pharos.node import Node
+
+Block = Callable[[Any], Any]
+
 
 class OfferedService:
     """A service of a node; made by :meth:`Node.serve`."""
 
-    def __init__(self, node, name, typed_as, block):
-        self.node, self.name = node, name
+    def __init__(self, node: 'Node', name: str, typed_as: Union[str, type], block: Block) -> None:
+        self.node = node
+        self.name = name
         self.service_class = messages.service_class(typed_as)
         self._check = copier_for(self.service_class._response_class).freeze
         self.block = block
@@ -26,7 +33,7 @@ class OfferedService:
             raise PharosError(f'{node.name} offers {name} already: close that one first')
         self.open()
 
-    def open(self):
+    def open(self) -> None:
         """Register with the master, also after a restart of the node."""
         self._service = local_services.offer(
             self.node.current_run.rospy,
@@ -37,27 +44,27 @@ class OfferedService:
         )
         self.node.latest_run.remember(self)
 
-    def node_stopped(self):
+    def node_stopped(self) -> None:
         """The node stops, and its rospy closes all services."""
 
     @property
-    def block(self):
+    def block(self) -> Block:
         """The block that answers, called as ``block(request)``; may be replaced, and takes effect
         with the next call."""
         return self._block
 
     @block.setter
-    def block(self, block):
+    def block(self, block: Block) -> None:
         if block is None:
             raise TypeError(f'{self.name} needs a block that answers, called as block(request)')
         self._block = check_block(block, 'service block', ('request',))
 
     @property
-    def type(self):
+    def type(self) -> str:
         """The type name, such as 'std_srvs/Empty'."""
-        return self.service_class._type
+        return str(self.service_class._type)
 
-    def _answer(self, request):
+    def _answer(self, request: genpy.Message) -> genpy.Message:
         block = self.block
         try:
             return self._as_response(block(request))
@@ -68,11 +75,11 @@ class OfferedService:
             why = f'{type(error).__name__}: {text_of(error)}'
             raise rospy.ServiceException(why) from error
 
-    def _answer_again(self, request):
+    def _answer_again(self, request: genpy.Message) -> None:
         with contextlib.suppress(rospy.ServiceException):  # it is reported
             self._answer(request)
 
-    def _as_response(self, value):
+    def _as_response(self, value: Any) -> genpy.Message:
         """The response that the block meant: itself, its fields by name or in their order, or its
         only field."""
         response = self.service_class._response_class
@@ -100,18 +107,18 @@ class OfferedService:
             return messages.fill(response(), dict(zip(names, value)))
         if len(names) == 1 and value is not None:
             return messages.fill(response(), {names[0]: value})
+        or_field = ' or its only field' if len(names) == 1 else ''
         raise TypeError(
-            f"the block of {self.name} must return a response, a dict, tuple or list of its fields"
-            f" ({messages.describe_fields(response)}){' or its only field' if len(response.__slots__) == 1 else ''};"
-            f" it returned {value!r}"
+            f'the block of {self.name} must return a response, a dict, tuple or list of its fields'
+            f' ({messages.describe_fields(response)}){or_field}; it returned {value!r}'
         )
 
-    def close(self):
+    def close(self) -> None:
         """Offer it no longer. Harmless when done twice."""
         if self in self.node.latest_run.opened:
             self.node.latest_run.forget(self)
             with time_limit(UNREGISTER_TIMEOUT):
                 self._service.shutdown('closed')
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f'<OfferedService {self.name} {self.type} of {self.node.name}>'

@@ -1,10 +1,16 @@
 """Parameters of the parameter server, bound to a node both ways."""
 import functools
+from typing import TYPE_CHECKING, Any, Callable, List
 
 import rosgraph
 
 from pharos.blocks import check_block
 from pharos.private_rospy.parameters import as_stored
+
+if TYPE_CHECKING:
+    from pharos.node import Node
+
+Block = Callable[[Any], Any]
 
 
 class Parameter:
@@ -18,19 +24,19 @@ class Parameter:
     master, after which the parameter has its initial value again.
     """
 
-    def __init__(self, node, name, initialized=None):
+    def __init__(self, node: 'Node', name: str, initialized: Any = None) -> None:
         self.node = node
         self.name = name
         self._initialized = None if initialized is None else as_stored(name, initialized)
         self._kind = type(self._initialized)
-        self._blocks = []
+        self._blocks: List[Block] = []
         if self._initialized is not None:
             watched = node.current_run.rospy.parameters
             with node.master.reached():
                 watched.initialize(name, self._initialized)
 
     @property
-    def value(self):
+    def value(self) -> Any:
         """Its value on the parameter server now; None where it has none.
 
         :raises ValueError: if somebody has set it to a value of another type
@@ -38,14 +44,14 @@ class Parameter:
         """
         return self._checked(self._get())
 
-    def _get(self):
+    def _get(self) -> Any:
         self.node.current_run  # raises where it is stopped
         try:
             return self.node.master.call('getParam', self.name, caller_id=self.node.name)
         except rosgraph.MasterError:
             return None
 
-    def set(self, value):
+    def set(self, value: Any) -> None:
         """Set it on the parameter server.
 
         :raises ValueError: if it was initialized with a value of another type, or the server can
@@ -62,14 +68,13 @@ class Parameter:
         with self.node.master.reached():
             watched.tell_of_own(self.name, value)
 
-    def on_change(self, block):
+    def on_change(self, block: Block) -> Block:
         """Run ``block(value)`` whenever somebody sets the parameter, by :meth:`set` this node too;
         returns the block.
 
         It gets None when the parameter is deleted. It runs in a thread of the node's XML-RPC
-        server, or where
-        :meth:`set` is called. An exception in it is reported as a delegate's, as is a value of
-            another type.
+        server, or where :meth:`set` is called. An exception in it is reported as a delegate's, as
+        is a value of another type.
 
         :raises MasterUnreachableError: if there is no answer; the block is not run then
         """
@@ -88,11 +93,11 @@ class Parameter:
             raise
         return block
 
-    def _changed(self, value):
+    def _changed(self, value: Any) -> None:
         for block in tuple(self._blocks):
             self._run(block, value)
 
-    def _run(self, block, value):
+    def _run(self, block: Block, value: Any) -> None:
         try:
             if value == {}:
                 value = self._get()  # a master says so of a deleted one, too
@@ -106,7 +111,7 @@ class Parameter:
                 again=functools.partial(self._run, block),
             )
 
-    def _checked(self, value):
+    def _checked(self, value: Any) -> Any:
         if value is None or self._kind in (type(None), type(value)):
             return value
         if self._kind is float and type(value) is int:
@@ -116,5 +121,5 @@ class Parameter:
             ' initialize it with None to allow any type'
         )
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f'<Parameter {self.name} of {self.node.name}>'

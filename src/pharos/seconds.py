@@ -1,13 +1,14 @@
 """Time limits and periods as users give them."""
 import math
 import numbers
+from typing import Any, Optional
 
 import genpy
 
 LONGEST = 2.0e6  # seconds; sockets and locks take no more than 24 days at once, and no infinity
 
 
-def check_seconds(what, seconds, above=-math.inf):
+def check_seconds(what: str, seconds: Any, above: float = -math.inf) -> float:
     """``seconds`` as a number that everything that waits can take; one beyond LONGEST, or infinity,
     as LONGEST.
 
@@ -22,6 +23,6 @@ def check_seconds(what, seconds, above=-math.inf):
     return float(max(-LONGEST, min(value, LONGEST)))
 
 
-def check_limit(what, seconds):
+def check_limit(what: str, seconds: Any) -> Optional[float]:
     """A time limit as of :func:`check_seconds`; None, which is no limit, is None."""
     return None if seconds is None else check_seconds(what, seconds)

@@ -48,7 +48,7 @@ from pharos.intraprocess.conversions import (
     STRUCT_CODES,
     NeedsSerializer,
 )
-from pharos.messages import nested_class
+from pharos.messages import fields_of, nested_class
 
 #: what is kept of a message until receivers get theirs
 Frozen = Union[Tuple[Any, ...], bytes]
@@ -177,20 +177,16 @@ def _indented(lines: List[str]) -> List[str]:
 
 def _fields(cls: Any) -> List[Tuple[str, str]]:
     """The (name, type) pairs of a class that genpy made, or of Time or Duration."""
-    if cls in (genpy.Time, genpy.Duration):
-        # as genmsg has it; their _slot_types say int32 for both
-        number = 'uint32' if cls is genpy.Time else 'int32'
-        return [('secs', number), ('nsecs', number)]
     # A numpy_msg derives from another message, AnyMsg has no types: neither serializes as its
     # fields would say.
     made_by_genpy = {'__slots__', '_slot_types', 'serialize', 'serialize_numpy'} <= vars(cls).keys()
-    if (
+    if cls not in (genpy.Time, genpy.Duration) and (
         not made_by_genpy
         or cls.__bases__ != (genpy.Message,)
         or len(cls.__slots__) != len(cls._slot_types)
     ):
         raise NeedsSerializer
-    return list(zip(cls.__slots__, cls._slot_types))
+    return fields_of(cls)
 
 
 class _Writer:

@@ -22,6 +22,7 @@ from pharos.messages.fields import (
     check_fits,
     describe_fields,
     explain,
+    fields_of,
     fill,
     nested_class,
 )
@@ -43,6 +44,7 @@ __all__ = [
     'describe_service',
     'explain',
     'explain_refusal',
+    'fields_of',
     'fill',
     'is_provisional',
     'known_service_classes',
