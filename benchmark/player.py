@@ -14,7 +14,6 @@ Stamps are kept beside the messages, which carry an index into them: reading a c
 what is serialized.
 """
 import argparse
-import array
 import json
 import mmap
 import os

@@ -4,11 +4,9 @@ import ctypes
 import json
 import os
 import pathlib
-import shutil
 import signal
 import subprocess
 import sys
-import time
 from typing import List, NamedTuple
 
 from player import STAMPS

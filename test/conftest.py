@@ -22,7 +22,7 @@ import pytest  # noqa: E402
 import rosmaster.master  # noqa: E402
 
 import pharos  # noqa: E402
-from pharos import node_registry  # noqa: E402
+from pharos import node_registry, watcher  # noqa: E402
 from pharos.private_rospy.local_link import PROTOCOL  # noqa: E402
 
 collect_ignore = ['programs']  # run by tests, and no tests of this package
@@ -102,6 +102,31 @@ def master(ros_master, monkeypatch):
 @pytest.fixture
 def mailbox():
     return Mailbox()
+
+
+@pytest.fixture
+def mortal_master(monkeypatch):
+    """A master that a test may end and start again at the same URL."""
+    monkeypatch.setattr(watcher, 'PERIOD', 0.1)
+
+    class MortalMaster:
+        def __init__(self):
+            self._embedded = pharos.Master.embedded()
+            self.url = self._embedded.url
+            monkeypatch.setenv('ROS_MASTER_URI', self.url)
+
+        def end(self):
+            """kill -9"""
+            self._embedded._child.kill()
+            self._embedded._child.wait()
+
+        def come_back(self):
+            self._embedded = pharos.Master.embedded(port=int(self.url.rsplit(':', 1)[1].strip('/')))
+
+    master = MortalMaster()
+    yield master
+    node_registry.stop_all()
+    master.end()
 
 
 @pytest.fixture

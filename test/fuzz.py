@@ -114,9 +114,10 @@ class Fuzz:
                     body + body,
                 ]
             )
-        head = [
-            f"{some.choice(['POST'] * 20 + ['GET', 'PUT', 'post', ''])} {some.choice(['/'] * 10 + ['/RPC2', '/nothing', '*', ''])} {some.choice(['HTTP/1.1'] * 10 + ['HTTP/1.0', 'HTTP/9.9', 'HTTP', ''])}"
-        ]
+        method = some.choice(['POST'] * 20 + ['GET', 'PUT', 'post', ''])
+        path = some.choice(['/'] * 10 + ['/RPC2', '/nothing', '*', ''])
+        version = some.choice(['HTTP/1.1'] * 10 + ['HTTP/1.0', 'HTTP/9.9', 'HTTP', ''])
+        head = [f'{method} {path} {version}']
         if some.random() < 0.95:
             length = some.choice(
                 [str(len(body))] * 15

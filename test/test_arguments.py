@@ -233,9 +233,7 @@ def launch(master, tmp_path, monkeypatch):
     def run(text):
         write(folder / 'launch' / 'test.launch', text)
         seen, lines = {}, Mailbox()
-        with master.launch(
-            'two_in_one', 'test.launch', on_line=lambda line: lines(line, None)
-        ) as process:
+        with master.launch('two_in_one', 'test.launch', on_line=lambda line: lines(line, None)):
             while True:
                 words = lines.get().split()
                 if words[:1] == ['SEEN']:

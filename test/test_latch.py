@@ -4,7 +4,7 @@ import rospy
 import std_msgs.msg
 
 import pharos
-from conftest import TIMEOUT, InProcessMaster, Mailbox, speak_tcpros_only
+from conftest import InProcessMaster, Mailbox, speak_tcpros_only
 from pharos import BlockNode, Master
 from programs import Program, until
 

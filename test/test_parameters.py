@@ -11,8 +11,7 @@ import rosgraph
 from conftest import TIMEOUT, InProcessMaster, Mailbox
 from pharos import BlockNode, Master, MasterUnreachableError, NodeStoppedError, node_registry
 from pharos.private_rospy.instance import PrivateRospy
-from programs import run
-from test_survival import mortal_master, until  # noqa: F401 (a fixture)
+from programs import run, until
 
 PRIVATE = '/robot1/driver/rate'
 
@@ -452,7 +451,7 @@ def test_a_parameter_needs_a_running_node_and_goes_on_with_the_next_run(master):
 
 @pytest.mark.parametrize('known_again', [False, True], ids=['unknown', 'known_again'])
 def test_values_and_watches_are_back_after_a_restart_of_the_master(
-    mortal_master, monkeypatch, known_again  # noqa: F811
+    mortal_master, monkeypatch, known_again
 ):
     """Also where the node opens a channel with the new master before anybody notices that it is
     new."""

@@ -17,7 +17,6 @@ from pharos.private_rospy import refusals
 from pharos.intraprocess.link import Link
 from programs import Program, until
 from test_graph_types import Publisher
-from test_survival import mortal_master  # noqa: F401 (a fixture)
 
 STRING, INT32 = 'std_msgs/String', 'std_msgs/Int32'
 MD5SUM = {STRING: '992ce8a1687cec8c8bd883ec73ca41d1', INT32: 'da5909fbe378aeaf85e547e830cc1bb7'}
@@ -191,9 +190,7 @@ def test_who_is_refused_and_tries_again_does_not_tell_again(master, topic, publi
 
 
 @pytest.mark.parametrize('publishing', [rospy_peer, publisher_here])
-def test_a_master_that_has_restarted_is_no_reason_to_tell_again(
-    mortal_master, topic, publishing
-):  # noqa: F811
+def test_a_master_that_has_restarted_is_no_reason_to_tell_again(mortal_master, topic, publishing):
     node = create(pharos.Master(mortal_master.url), '/near')
     node.interested_in(topic, STRING)
     with publishing(mortal_master.url, topic, INT32, 'int32 data'):

@@ -426,7 +426,8 @@ def test_a_program_that_ended_long_ago_is_not_signalled_again(master, package, m
 
 LAUNCH = """<launch>
   <arg name="who" /><arg name="text" default="hello" />
-  <node name="$(arg who)" pkg="fake_robot" type="talker" output="screen"><param name="text" value="$(arg text)" /></node>
+  <node name="$(arg who)" pkg="fake_robot" type="talker" output="screen">
+    <param name="text" value="$(arg text)" /></node>
   <node name="second" pkg="fake_robot" type="talker"><remap from="talk" to="talk2" /></node>
 </launch>"""
 

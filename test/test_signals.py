@@ -314,7 +314,10 @@ CAREFUL_ENDS = {
     **WAITS,
     'plain code': 'ready(); wait_for(threading.Event())',
     'its own with block': 'with me: ready(); wait_for(threading.Event())',
-    'a stop by itself': 'threading.Thread(target=lambda: (me.latest_run.rospy.ended.wait(), ready())).start(); me.stop()',
+    'a stop by itself': (
+        'threading.Thread(target=lambda: (me.latest_run.rospy.ended.wait(), ready())).start(); '
+        'me.stop()'
+    ),
     'a stop of a soul': 'me.fork(lambda me: (ready(), me.stop())); pharos.spin()',
 }
 

@@ -45,8 +45,8 @@ ROSPYS_INSIDE = re.compile(
 )
 
 EXPORTS = """
-    Master Node BlockNode Lifecycle ExternalNode Topic InputChannel OutputChannel Service Parameter Transcript RosProcess
-    Failure message_class service_class define_message define_service spin __version__
+    Master Node BlockNode Lifecycle ExternalNode Topic InputChannel OutputChannel Service Parameter Transcript
+    RosProcess Failure message_class service_class define_message define_service spin __version__
     PharosError MasterUnreachableError NodeNameInUseError PortInUseError UnknownNodeError UnknownTopicError
     UnknownTypeError MessageTypeError UnknownServiceError ServiceTypeError ServiceCallError NodeStoppedError
 """.split()

@@ -9,7 +9,7 @@ import pytest
 
 import pharos
 from conftest import TIMEOUT, Mailbox
-from pharos import BlockNode, Master, node_registry, watcher
+from pharos import BlockNode, Master
 from programs import until
 
 
@@ -22,31 +22,6 @@ def registrations(master, name):
         sorted(topic for topic, nodes in kind.items() if name in nodes)
         for kind in master.system_state()
     ]
-
-
-@pytest.fixture
-def mortal_master(monkeypatch):
-    """A master that a test may end and start again at the same URL."""
-    monkeypatch.setattr(watcher, 'PERIOD', 0.1)
-
-    class MortalMaster:
-        def __init__(self):
-            self._embedded = Master.embedded()
-            self.url = self._embedded.url
-            monkeypatch.setenv('ROS_MASTER_URI', self.url)
-
-        def end(self):
-            """kill -9"""
-            self._embedded._child.kill()
-            self._embedded._child.wait()
-
-        def come_back(self):
-            self._embedded = Master.embedded(port=int(self.url.rsplit(':', 1)[1].strip('/')))
-
-    master = MortalMaster()
-    yield master
-    node_registry.stop_all()
-    master.end()
 
 
 # -- the master restarts

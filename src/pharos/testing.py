@@ -25,7 +25,7 @@ from typing import Any, Callable, Dict, Iterable, Iterator, List, Optional, Set,
 
 import pytest
 
-from pharos import BlockNode, Failure, InputChannel, Master, Node
+from pharos import Failure, InputChannel, Master, Node
 
 TIMEOUT = 30.0  # seconds; a bound on waits for events, which a test that passes never reaches
 POLL = 0.01  # seconds between two looks at what tells nobody of its change

@@ -37,7 +37,7 @@ way (AnyMsg, numpy_msg, one written by hand).
 import io
 import itertools
 import struct
-from typing import Any, Callable, Dict, Iterator, List, NamedTuple, Optional, Tuple, Type, Union
+from typing import Any, Callable, Dict, Iterator, List, NamedTuple, Optional, Tuple, Union
 
 import genpy
 from genmsg.msgs import parse_type

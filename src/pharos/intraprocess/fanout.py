@@ -6,7 +6,6 @@ from typing import (
     Dict,
     Iterable,
     List,
-    NamedTuple,
     Optional,
     Protocol,
     Tuple,
