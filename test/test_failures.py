@@ -22,6 +22,20 @@ class OfMyOwn(BaseException):
     """Derived from no Exception, as nothing should be but often is."""
 
 
+class HasEverything(Exception):
+    """Answers for any attribute, as errors do that carry the details of a device."""
+
+    def __getattr__(self, name):
+        return name
+
+
+class LacksEverything(Exception):
+    """Raises what no one expects for any attribute."""
+
+    def __getattr__(self, name):
+        raise KeyError(name)
+
+
 OUTCASTS = [
     SystemExit,
     KeyboardInterrupt,
@@ -65,17 +79,20 @@ def dead_threads(monkeypatch):
 # -- whatever it raises, no thread and no caller ends
 
 
+RAISED = [*OUTCASTS, HasEverything, LacksEverything]
+
+
 @pytest.mark.parametrize('inline', [False, True])
 def test_a_delegate_may_raise_anything(master, transcript, inline):
-    block = Raising(*[outcast('out') for outcast in OUTCASTS])
+    block = Raising(*[outcast('out') for outcast in RAISED])
     node = create(master, delegate=block)
     node.interested_in('/failing', 'std_msgs/Int32', inline=inline)
-    for number in range(len(OUTCASTS) + 1):
+    for number in range(len(RAISED) + 1):
         create(master, '/sender%d' % number).send_to('/failing', data=number)
-    assert block.taken.get().data == len(OUTCASTS)
-    assert classes_of(node.errors) == OUTCASTS
+    assert block.taken.get().data == len(RAISED)
+    assert classes_of(node.errors) == RAISED
     assert [line.split(' raised ')[1] for line in transcript] == [
-        outcast.__name__ + ': out' for outcast in OUTCASTS
+        outcast.__name__ + ': out' for outcast in RAISED
     ]
 
 

@@ -1,5 +1,7 @@
 """Ctrl-C, SIGTERM and SIGHUP, which stop the nodes where the program has no handlers of its own."""
 import contextlib
+import itertools
+import logging
 import os
 import signal
 import sys
@@ -7,11 +9,13 @@ import threading
 import time
 import traceback
 import _thread
-from types import CodeType
+from types import CodeType, FrameType
 from typing import Any, Callable, Iterator, Optional, Set
 
-#: seconds for which a start, a stop or the end of the program is not cut off by signals
-HOLD_LIMIT = 30.0
+import rosgraph
+
+from pharos.private_rospy.process_rospy import rospy
+
 _DEFAULTS = {
     signal.SIGINT: signal.default_int_handler,
     signal.SIGTERM: signal.SIG_DFL,
@@ -22,15 +26,84 @@ _DEFAULTS = {
 #: keep the frames of the program, and what is in them, until Python takes its modules apart.
 _MARK = '_pharos_signal'
 
+HOLD_LIMIT = 30.0  # seconds after which a signal cuts off even a start or a stop
+PATIENCE = 1.0  # seconds, likewise, for other calls of ours, from the end of the nodes on
+REMINDER = 0.01  # seconds between two looks at whether the main thread can be cut off
+#: where code is that may hold a lock just now which the nodes need to stop, and Python to end
+_OURS = tuple(
+    os.path.join(os.path.dirname(file), '')
+    for file in (__file__, rosgraph.__file__, rospy.__file__, logging.__file__)
+)
+_PYTHONS = os.path.dirname(os.__file__), '<frozen '
+
 #: signals that have come to be ours, perhaps by way of a handler that the program has set since
 taken_on: Set[int] = set()
 
 _is_needed: Callable[[], bool] = bool  # see :func:`serve`
 _stop_all: Callable[[], Any] = bool
 _waits = 0  # how deep the main thread is in waits of ours, which end with the nodes
-_holds = 0  # how deep it is in starts and stops
-_kept: Optional[int] = None  # the first signal that came in one of them
-_deadline = 0.0  # by time.monotonic(), until which it is kept
+_holds = 0  # how many starts and stops, within one another, the main thread runs
+_coming: 'Optional[_Signal]' = None  # has come, and not yet ended what the main thread does
+_is_reminded = False  # whether the next signal is a reminder of that one
+
+
+class _Signal:
+    """A signal that ends what the main thread does as soon as that can be cut off.
+
+    Torn up at any moment, a call of ours leaves a registration behind, or a lock held for ever.
+    """
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        # at the prompt, it ends the line that runs or is typed, and not what goes on beside it
+        self.is_at_prompt = number == signal.SIGINT and hasattr(sys, 'ps1')
+        self._came = time.monotonic()
+        self._stopped = self._came if self.is_at_prompt else None  # when the nodes had
+
+    def stop_nodes(self) -> None:
+        """Stop all nodes; afterwards, the main thread is waited for no longer than PATIENCE."""
+        _stop_all()
+        self._stopped = time.monotonic()
+
+    def remind(self) -> None:
+        """Have the main thread's handler look again and again, until it has raised an exception."""
+        global _is_reminded
+        main_thread = threading.main_thread().ident
+        while _coming is self and signal.getsignal(self.number) is _on_signal:
+            _is_reminded = True
+            signal.pthread_kill(main_thread, self.number)  # type: ignore[arg-type]
+            time.sleep(REMINDER)
+
+    def may_cut_off(self, frame: Optional[FrameType]) -> bool:
+        """Whether the main thread, which is at that frame, can be cut off there."""
+        now = time.monotonic()
+        if _holds:
+            return now - self._came > HOLD_LIMIT
+        if _waits or not _runs_ours(frame):
+            return True
+        if self._stopped is None:
+            return False
+        return now - self._stopped > PATIENCE or not _runs_ours(_without_pythons(frame), 1)
+
+
+def _runs_ours(frame: Optional[FrameType], depth: Optional[int] = None) -> bool:
+    """Whether code of ours is among the frame and its callers, or the first ``depth`` of them."""
+    frames = itertools.islice(_with_callers(frame), depth)
+    return any(each.f_code.co_filename.startswith(_OURS) for each in frames)
+
+
+def _without_pythons(frame: Optional[FrameType]) -> Optional[FrameType]:
+    """The innermost frame that is not in Python's own library, but for what of that is ours."""
+    for each in _with_callers(frame):
+        if _runs_ours(each, 1) or not each.f_code.co_filename.startswith(_PYTHONS):
+            return each
+    return None
+
+
+def _with_callers(frame: Optional[FrameType]) -> Iterator[FrameType]:
+    while frame is not None:
+        yield frame
+        frame = frame.f_back
 
 
 def is_from_signal(error: BaseException) -> bool:
@@ -38,7 +111,8 @@ def is_from_signal(error: BaseException) -> bool:
 
     What the program's own handlers of signals raise in the main thread is for who installed them.
     """
-    if hasattr(error, _MARK):
+    # not by hasattr: the exception may have a __getattr__ of its own
+    if _MARK in object.__getattribute__(error, '__dict__'):
         return True
     if threading.current_thread() is not threading.main_thread():
         return False
@@ -97,15 +171,15 @@ def interruptible_wait() -> Iterator[None]:
 @contextlib.contextmanager
 def held(is_end: bool = False) -> Iterator[None]:
     """Within this, a signal raises nothing in the main thread, and afterwards what it would have
-    raised; but a second one does at once, HOLD_LIMIT seconds later.
+    raised.
 
     A start or a stop that is torn up half way leaves registrations behind, and the end of the
-    program programs, too.
+    program programs, too. After HOLD_LIMIT seconds it is cut off all the same.
 
     :param is_end: whether it is the end of the program, so that there is nothing to raise
         afterwards
     """
-    global _holds, _kept
+    global _coming, _holds
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -114,41 +188,34 @@ def held(is_end: bool = False) -> Iterator[None]:
     try:
         yield
     finally:
-        _holds = max(0, _holds - 1)  # 0 where the process was forked in it
-        if _kept is not None and not _holds:
-            number, _kept = _kept, None
+        _holds = max(0, _holds - 1)  # 0: the process was forked in it
+        coming = _coming
+        if coming is not None and not _holds and not _waits:
+            _coming = None
             if not is_end:
-                _raise(number)
+                raise _exception(coming.number)
 
 
-def _is_held(number: int) -> bool:
-    """Keep a signal for the end of what no signal may cut off; returns whether it waits until
-    then."""
-    global _kept, _deadline
-    if _holds and _kept is None:
-        _kept, _deadline = number, time.monotonic() + HOLD_LIMIT
-    return bool(_holds) and time.monotonic() < _deadline
-
-
-def _on_signal(number: int, frame: Any) -> None:
-    if not (_holds or _is_needed()):
-        _do_default(number, frame)
-        return
-    if number == signal.SIGINT and hasattr(sys, 'ps1'):
-        # at the prompt, it ends the line that runs or is typed, and not what goes on beside it
-        if not _is_held(number):
-            raise _exception(number)
-        return
-    # Not here, nor in a Thread, whose start takes a lock: the main thread may hold any lock just
-    # now.
-    _thread.start_new_thread(_stop_all, ())
-    _raise(number)
-
-
-def _raise(number: int) -> None:
-    """End what the main thread does, if it does not end by itself, at once or when the hold
-    ends."""
-    if not (_is_held(number) or _waits):
+def _on_signal(number: int, frame: Optional[FrameType]) -> None:
+    global _coming, _is_reminded
+    is_reminder, _is_reminded = _is_reminded, False
+    if _coming is None:
+        if is_reminder:
+            return
+        if not (_holds or _is_needed()):
+            _do_default(number, frame)
+            return
+        coming = _Signal(number)
+        # Not here, nor in a Thread, whose start takes a lock: the main thread may hold any lock
+        # just now.
+        if not coming.is_at_prompt:
+            _thread.start_new_thread(coming.stop_nodes, ())
+            if _waits and not _holds:
+                return  # the wait ends with the nodes
+        _coming = coming
+        _thread.start_new_thread(coming.remind, ())
+    if _coming.may_cut_off(frame):
+        number, _coming = _coming.number, None
         raise _exception(number)
 
 
@@ -170,9 +237,9 @@ def _do_default(number: int, frame: Any) -> None:
 
 def _forget() -> None:
     """In a process that was forked: it begins anew."""
-    global _waits, _holds, _kept
+    global _waits, _holds, _coming, _is_reminded
     _waits = _holds = 0
-    _kept = None
+    _coming, _is_reminded = None, False
 
 
 os.register_at_fork(after_in_child=_forget)
