@@ -279,9 +279,10 @@ def test_a_full_queue_drops_the_oldest_and_counts(master, transport):
         assert [message.data for message in mailbox.take(4)] == [0, 7, 8, 9]
         assert (received.received, received.dropped) == (4, 6)
     else:
-        received._tcpros.put(sent.message_class(1))
+        offer = received._endpoint.callback
+        offer._inbox.put(sent.message_class(1))
         for number in range(2, 6):
-            received.offer(sent.message_class(number))
+            offer(sent.message_class(number))
         release.set()
         assert [message.data for message in mailbox.take(4)] == [0, 3, 4, 5]
         assert (received.received, received.dropped) == (4, 2)

@@ -98,11 +98,12 @@ def test_what_comes_through_tcpros_is_bounded_by_bytes_too(master):
     gate = Gate()
     received = create(master, '/receiver', Small, delegate=gate).interested_in('/remote', NUMBERS)
     message = received.message_class
-    received.offer(message())
-    received.node.latest_run.dispatcher.schedule(received._tcpros)
+    offer = received._endpoint.callback
+    offer(message())
+    received.node.latest_run.dispatcher.schedule(offer._inbox)
     assert gate.entered.wait(TIMEOUT)
     for _ in range(10):
-        received.offer(message(data=(1.0,) * (MEGABYTE // 8)))
+        offer(message(data=(1.0,) * (MEGABYTE // 8)))
     assert received.dropped == 7
     gate.opened.set()
 

@@ -2,30 +2,37 @@
 import collections
 import threading
 import time
+from typing import TYPE_CHECKING, Any, Callable, Dict, List, NoReturn, Optional, Set, Tuple, Type
 
 import genpy
 
-from pharos import messages
-from pharos import first_message
+from pharos import first_message, messages
 from pharos.blocks import check_block, check_delegate, check_runs
-from pharos.intraprocess.inbox import Inbox, SocketInbox
 from pharos.errors import MessageTypeError, NodeStoppedError, PharosError
-from pharos.intraprocess import copier
-from pharos.private_rospy.refusals import suits
+from pharos.intraprocess.copier import copier_for
 from pharos.intraprocess.fanout import Latch
+from pharos.intraprocess.inbox import Inbox, SocketInbox
 from pharos.private_rospy.deadlines import time_limit
 from pharos.seconds import check_limit
 
+if TYPE_CHECKING:
+    from pharos.node import Node
+    from pharos.run import Run
+
+Block = Callable[..., Any]
 # bytes read from a socket at once; rospy's 64 KiB let subscribers of images fall behind
 BUFFER_SIZE = 1 << 20
 
 
-class _Channel:
-    """What the two ends have in common."""
+class Channel:
+    """What the two ends have in common.
 
-    refused = 0
+    Its node opens it, again after a restart, and forgets it when it is closed.
+    """
 
-    def __init__(self, node, topic, message_class, queue_size):
+    def __init__(
+        self, node: 'Node', topic: str, message_class: Type[genpy.Message], queue_size: int
+    ) -> None:
         if isinstance(queue_size, bool) or not isinstance(queue_size, int) or queue_size < 1:
             raise ValueError(
                 f'queue_size must be a number of messages, 1 or more, not {queue_size!r}'
@@ -35,71 +42,91 @@ class _Channel:
         self.message_class = message_class
         self.queue_size, self.queue_bytes = queue_size, node.queue_bytes
         self.closed = False  # whether close() was called
-        self._endpoint = None  # rospy's Publisher or Subscriber while the channel is open
+        self._endpoint: Any = None  # rospy's Publisher or Subscriber while the channel is open
         # guards the above against two threads that close it, and what a subclass has
         self._lock = threading.Lock()
 
-    def _begin(self, *arguments):
+    def open(self) -> None:
+        """Register with rospy, also after a restart of the node."""
+        raise NotImplementedError
+
+    def _unregister(self, endpoint: Any) -> None:
+        raise NotImplementedError
+
+    def _begin(self) -> None:
         """Open it for the first time; where that fails, nothing is left behind."""
         try:
-            self.open(*arguments)
+            self.open()
         except BaseException:
             self.close()
             raise
 
     @property
-    def _rospy(self):
-        return self.node.latest_run.rospy
+    def _run(self) -> 'Run':
+        run = self.node.latest_run
+        assert run  # who has channels has been started
+        return run
 
     @property
-    def type(self):
+    def _rospy(self) -> Any:
+        return self._run.rospy
+
+    @property
+    def type(self) -> str:
         """The type name, such as 'turtlesim/Velocity'."""
-        return self.message_class._type
+        return str(self.message_class._type)
 
     @property
-    def connections(self):
+    def connections(self) -> List[Tuple[str, str]]:
         """``[(peer node name, transport)]``, transport being 'INTRAPROCESS' or 'TCPROS'."""
-        return self._rospy.connections.of(self._endpoint) if self.is_open else []
+        peers: List[Tuple[str, str]] = []
+        if self.is_open:
+            peers = self._rospy.connections.of(self._endpoint)
+        return peers
 
     @property
-    def is_open(self):
+    def is_open(self) -> bool:
         """Whether it is neither closed nor its node stopped."""
         return self._endpoint is not None
 
-    def close(self):
+    def close(self) -> None:
         """End it: the node no longer publishes, or is interested. Harmless when done twice.
 
         When it returns, no delegate runs for the channel any more; but for the one that calls it,
         if one does, and one that does not end within the node's :attr:`stop_timeout`.
         """
         self.closed = True  # where it is only just being opened, it is closed right after that
-        self.node.latest_run.forget(self)
+        self._run.forget(self)
         self._release()
 
-    def _release(self):
+    def _release(self) -> None:
         """Give rospy's Publisher or Subscriber back, if there is one."""
         with self._lock:
             endpoint, self._endpoint = self._endpoint, None
         if endpoint is not None:
             self._unregister(endpoint)
 
-    def _opened(self, endpoint):
+    def _opened(self, endpoint: Any) -> None:
         """The channel is open, unless a delegate or another thread has closed it meanwhile."""
         self._endpoint = endpoint
-        self.node.latest_run.remember(self)
+        self._run.remember(self)
         if self.closed:
             self.close()
 
-    def node_stopped(self):
+    def node_stopped(self) -> None:
         """The node stops, and its rospy closes all endpoints."""
         self._endpoint = None
 
-    def __repr__(self):
+    @property
+    def refused(self) -> int:
+        """How many of the other end the channel cannot hear."""
+        return 0
+
+    def __repr__(self) -> str:
         counts = collections.Counter(transport for _, transport in self.connections)
-        if self.refused:
-            counts['refused'] = self.refused
+        counts['refused'] += self.refused
         state = ', '.join(
-            '%d %s' % (count, transport) for transport, count in sorted(counts.items())
+            f'{count} {transport}' for transport, count in sorted(counts.items()) if count
         )
         return (
             f"<{type(self).__name__} {self.topic} {self.type} of {self.node.name}:"
@@ -107,45 +134,44 @@ class _Channel:
         )
 
 
-class InputChannel(_Channel):
+class InputChannel(Channel):
     """The end at which a node receives: made by :meth:`Node.interested_in`.
 
-    :attr:`received` counts the messages that the node has taken from the channel.
+    :attr:`received` counts the messages that the node has taken from the channel, :attr:`dropped`
+    those dropped, the oldest first, because the node was slower than they came.
     """
 
     def __init__(
         self,
-        node,
-        topic,
-        message_class,
-        delegate=None,
-        queue_size=1,
-        inline=False,
-        shared=False,
-        from_=None,
-    ):
+        node: 'Node',
+        topic: str,
+        message_class: Type[genpy.Message],
+        delegate: Optional[Block] = None,
+        queue_size: int = 1,
+        inline: bool = False,
+        shared: bool = False,
+        from_: Any = None,
+    ) -> None:
         super().__init__(node, topic, message_class, queue_size)
         self.delegate = delegate
         self.inline = inline
         self.shared = shared
-        self.from_ = None if from_ is None else str(node.latest_run.resolve_peer(from_))
+        self.from_ = None if from_ is None else str(self._run.resolve_peer(from_))
         self.received = 0
-        self._size = copier.copier_for(message_class).size
-        self.dropped = 0  # how many messages, the oldest first, while the node was slower
+        self.dropped = 0
         self._dropping = threading.Lock()  # held to change that
         self._begin()
 
-    def open(self):
-        """Register with rospy, also after a restart of the node."""
-        dispatcher = self.node.latest_run.dispatcher
+    def open(self) -> None:
+        dispatcher = self._run.dispatcher
         if not self.inline:
             dispatcher.need_thread()
-        self._tcpros = Inbox(self, dispatcher) if self.inline else SocketInbox(self, dispatcher)
+        inbox = Inbox(self, dispatcher) if self.inline else SocketInbox(self, dispatcher)
         # rospy's queue_size would drop without counting; the inbox has ours
         self._opened(
             self._rospy.connections.subscribe(
                 self,
-                self.offer,
+                inbox,
                 self.node.connect_timeout,
                 tcp_nodelay=True,
                 buff_size=BUFFER_SIZE,
@@ -153,60 +179,66 @@ class InputChannel(_Channel):
         )
         dispatcher.run()  # what came latched
 
-    def _unregister(self, endpoint):
+    def _unregister(self, endpoint: Any) -> None:
         self._rospy.connections.unsubscribe(self, endpoint)
-        self.node.latest_run.dispatcher.wait_for_delegate(self.node.stop_timeout)
+        self._run.dispatcher.wait_for_delegate(self.node.stop_timeout)
 
-    def _subscribe_as(self, message_class):
+    def subscribe_as(self, message_class: Type[genpy.Message]) -> None:
         """Take another class than it was opened with, of which nothing has come."""
         self._release()
-        self.node.latest_run.forget(self)
-        self.message_class, self._size = message_class, copier.copier_for(message_class).size
+        self._run.forget(self)
+        self.message_class = message_class
         self._begin()
 
     @property
-    def refused(self):
+    def refused(self) -> int:
         """How many publishers the channel cannot hear, for they publish another type; see the
         node's errors."""
         return len(self._rospy.refusals.of(self.topic)) if self.is_open else 0
 
     @property
-    def delegate(self):
+    def delegate(self) -> Optional[Block]:
         """The channel's own block, called as ``delegate(message, channel)``; None: the node's is
         run."""
         return self._delegate
 
     @delegate.setter
-    def delegate(self, block):
-        self._delegate = check_delegate(block)
+    def delegate(self, block: Optional[Block]) -> None:
+        self._delegate: Optional[Block] = check_delegate(block)
 
-    def run_again(self, message):
-        """Run the delegate, as it is now, on a message, when no other of the node runs."""
-        self.node.current_run.dispatcher.run_in_turn(lambda: self._run(message))
+    def run_again(self, message: genpy.Message) -> None:
+        """Run the delegate, as it is now, on a message, when no other of the node runs.
 
-    def _run(self, message):
-        if self._present_delegate is None:
-            raise PharosError(
-                f'{self.topic} has no delegate any more: give {self.node.name} or its '
-                'channel one first'
-            )
-        block = self._present_delegate
+        :raises PharosError: if there is none any more
+        """
+
+        def run() -> None:
+            if self._present_delegate is None:
+                raise PharosError(
+                    f'{self.topic} has no delegate any more: give {self.node.name} or its '
+                    'channel one first'
+                )
+            self._call(self._present_delegate, message)
+
+        self.node.current_run.dispatcher.run_in_turn(run)
+
+    @property
+    def _present_delegate(self) -> Any:
+        return self.node.delegate if self._delegate is None else self._delegate
+
+    def _call(self, block: Any, message: genpy.Message) -> None:
         try:
             block(message, self)
         except BaseException as error:
-            self.node.latest_run.report(error, block, 'delegate', self, message)
-
-    @property
-    def _present_delegate(self):
-        return self.node.delegate if self._delegate is None else self._delegate
+            self._run.report(error, block, 'delegate', self, message)
 
     # -- as a pharos.intraprocess.inbox.Receiver
 
-    def open_inbox(self, thaw, header):
+    def open_inbox(self, thaw: Callable[[Any], Any], header: Dict[str, str]) -> Inbox:
         """An inbox for what a node of this process sends."""
-        return Inbox(self, self.node.latest_run.dispatcher, thaw, header)
+        return Inbox(self, self._run.dispatcher, thaw, header)
 
-    def deliver(self, message, header):
+    def deliver(self, message: genpy.Message, header: Optional[Dict[str, str]]) -> None:
         """Run the delegate."""
         if self.closed:
             return
@@ -218,68 +250,51 @@ class InputChannel(_Channel):
                 return
         if header is not None:
             message._connection_header = header
-        try:
+        try:  # as _call() does, which would be one frame more for each message
             block(message, self)
         except BaseException as error:
-            self.node.latest_run.report(error, block, 'delegate', self, message)
+            self._run.report(error, block, 'delegate', self, message)
 
-    def report(self, error):
+    def report(self, error: BaseException) -> None:
         """A message could not be made for the delegate."""
-        self.node.latest_run.report(error, self._present_delegate, 'delegate', self)
+        self._run.report(error, self._present_delegate, 'delegate', self)
 
-    def count_dropped(self):
+    def count_dropped(self) -> None:
         """A message was dropped."""
         with self._dropping:
             self.dropped += 1
 
-    def offer(self, message):
-        """Take a message from rospy, which runs the dispatcher after a batch of them."""
-        if self.from_ is None or message._connection_header.get('callerid') == self.from_:
-            if message.__class__ is not self.message_class:
-                message = self._of_own_class(message)
-                if message is None:
-                    return
-            with self._lock:  # TCPROS connections offer side by side
-                self._tcpros.put(message, self._size(message) if self._size else 0)
 
-    offer.has_own_inbox = True  # unlike other callbacks of rospy's
-
-    def _of_own_class(self, message):
-        """The message, where the first subscriber of the node, which rospy goes by, wants another
-        class: AnyMsg, say.
-
-        None where it is of another type.
-        """
-        header, endpoint = message._connection_header, self._endpoint
-        if not suits(self.message_class, header['md5sum']):
-            if endpoint is not None:
-                self._rospy.refusals.message_refused(endpoint.impl, self.message_class, header)
-            return None
-        own = self.message_class().deserialize(copier.serialized(message))
-        own._connection_header = message._connection_header
-        return own
-
-
-class OutputChannel(_Channel):
+class OutputChannel(Channel):
     """The end at which a node sends: made by :meth:`Node.output_channel`, or by the first
     ``send_to``.
 
     :attr:`sent` counts the messages published.
     """
 
-    def __init__(self, node, topic, message_class, latch=False, queue_size=1, connect_timeout=None):
+    def __init__(
+        self,
+        node: 'Node',
+        topic: str,
+        message_class: Type[genpy.Message],
+        latch: bool = False,
+        queue_size: int = 1,
+        connect_timeout: Optional[float] = None,
+    ) -> None:
         super().__init__(node, topic, message_class, queue_size)
         self.latch = latch
         self._latch = Latch() if latch else None
         self.sent = 0
-        self._uninterested = set()  # names of nodes of which the log says so
-        self._freeze = copier.copier_for(message_class).freeze
-        self._fanout = _ClosedFanout
-        self._begin(connect_timeout)
+        self._uninterested: Set[str] = set()  # names of nodes of which the log says so
+        self._freeze = copier_for(message_class).freeze
+        self._fanout: Any = _ClosedFanout
+        self._first_timeout = connect_timeout  # None: the node's, as after a restart
+        self._begin()
 
-    def open(self, connect_timeout=None):
-        """Register with rospy, and wait for the subscribers that the master knows."""
-        timeout = self.node.connect_timeout if connect_timeout is None else connect_timeout
+    def open(self) -> None:
+        timeout = self.node.connect_timeout
+        if self._first_timeout is not None:
+            timeout, self._first_timeout = self._first_timeout, None
         deadline = time.monotonic() + timeout
         self._opener, self._connected = threading.current_thread(), threading.Event()
         try:
@@ -297,7 +312,7 @@ class OutputChannel(_Channel):
         finally:
             self._connected.set()
 
-    def wait_until_connected(self, timeout):
+    def wait_until_connected(self, timeout: float) -> None:
         """Wait while another thread opens the channel and connects it to the subscribers that the
         master knows.
 
@@ -306,7 +321,7 @@ class OutputChannel(_Channel):
         if self._opener is not threading.current_thread():
             self._connected.wait(timeout)
 
-    def publish(self, message, to=None):
+    def publish(self, message: genpy.Message, to: Any = None) -> None:
         """Send ``message`` to all who are interested, or to the node ``to`` alone.
 
         :param to: a name, Node or ExternalNode; see :meth:`Node.send_to`
@@ -317,7 +332,7 @@ class OutputChannel(_Channel):
         if message.__class__ is not self.message_class:
             self._check_type(message)
         if to is not None:
-            to = str(self.node.latest_run.resolve_peer(to))
+            to = str(self._run.resolve_peer(to))
             self._check_is_there(to)
         try:
             is_sent = self._fanout.publish(message, self._latch, to)
@@ -326,7 +341,7 @@ class OutputChannel(_Channel):
         if is_sent or to is None:
             self.sent += 1
 
-    def _check_is_there(self, name):
+    def _check_is_there(self, name: str) -> None:
         """Raise UnknownNodeError if a message for that node alone has nowhere to go, since there is
         no such node."""
         endpoint = self._endpoint
@@ -342,18 +357,16 @@ class OutputChannel(_Channel):
                 level='warning',
             )
 
-    def _check_type(self, message):
-        if not isinstance(message, genpy.Message) or message._md5sum not in (
-            self.message_class._md5sum,
-            '*',
-        ):
+    def _check_type(self, message: Any) -> None:
+        allowed = self.message_class._md5sum, '*'
+        if not isinstance(message, genpy.Message) or message._md5sum not in allowed:
             raise MessageTypeError(
-                f"{self.topic} carries"
-                f" {self.type} ({messages.describe_fields(self.message_class)}), not"
-                f" {getattr(message, '_type', None) or repr(message)}"
+                f'{self.topic} carries {self.type}'
+                f' ({messages.describe_fields(self.message_class)}), not'
+                f' {getattr(message, "_type", None) or repr(message)}'
             )
 
-    def _explain(self, error, message):
+    def _explain(self, error: Exception, message: genpy.Message) -> NoReturn:
         """Raise our error for one that publishing raised."""
         if not self.is_open or self._rospy.connections.is_closed(self._endpoint):
             raise NodeStoppedError(
@@ -363,11 +376,13 @@ class OutputChannel(_Channel):
         messages.check_fits(message)
         raise MessageTypeError(f'{self.type} cannot be sent on {self.topic}: {error}') from error
 
-    def _unregister(self, endpoint):
+    def _unregister(self, endpoint: Any) -> None:
         self._fanout = _ClosedFanout
         self._rospy.connections.unadvertise(endpoint, self._latch)
 
-    def send(self, block=None, *, to=None, **fields):
+    def send(
+        self, block: Optional[Callable[[Any], Any]] = None, *, to: Any = None, **fields: Any
+    ) -> Any:
         """Fill a fresh message with ``block(message)`` and by keywords, publish it, and return
         it."""
         if block is not None:
@@ -386,7 +401,7 @@ class OutputChannel(_Channel):
         self.publish(message, to)
         return message
 
-    def wait_for_subscribers(self, count=1, timeout=None):
+    def wait_for_subscribers(self, count: int = 1, timeout: Optional[float] = None) -> bool:
         """Wait until ``count`` subscribers are connected, for up to ``timeout`` seconds (None:
         without limit).
 
@@ -398,10 +413,10 @@ class OutputChannel(_Channel):
             self._rospy.wait_until(
                 lambda: len(self.connections) >= count or not self.is_open, timeout
             )
-        self.node.latest_run.end_soul()
+        self._run.end_soul()
         return self.is_open and len(self.connections) >= count
 
-    def node_stopped(self):
+    def node_stopped(self) -> None:
         super().node_stopped()
         self._fanout = _ClosedFanout
 
@@ -409,8 +424,8 @@ class OutputChannel(_Channel):
 class _ClosedFanout:
     """What a closed channel has instead of a fan-out."""
 
-    connections = ()
+    connections: Tuple[Any, ...] = ()
 
     @staticmethod
-    def publish(*arguments):
+    def publish(*arguments: Any) -> NoReturn:
         raise NodeStoppedError('closed')

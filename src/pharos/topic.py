@@ -1,10 +1,12 @@
 """Topics: named buses, and the dispatchers that hand a node its channel."""
 import time
+from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, List, Optional, Tuple, Type, Union
 
+import genpy
 import rosgraph
 
 from pharos import messages
-from pharos.channel import InputChannel, OutputChannel
+from pharos.channel import Channel, InputChannel, OutputChannel
 from pharos.errors import (
     MasterUnreachableError,
     MessageTypeError,
@@ -18,7 +20,13 @@ from pharos.private_rospy.deadlines import MARGIN, time_limit
 from pharos.private_rospy.tcpros_connection import ask_publisher
 from pharos.seconds import check_seconds
 
+if TYPE_CHECKING:
+    from pharos.master import Master
+    from pharos.node import Node
+
 POLL = 0.05  # seconds between two looks at the master's types
+#: a type name or message class; None: what the node or the master knows
+TypedAs = Union[None, str, Type[genpy.Message]]
 QUEUE_SIZE = 1000  # messages kept for a slow receiver, where nothing else is said
 
 
@@ -30,12 +38,12 @@ class Topic:
     :meth:`Master.topic <pharos.Master.topic>` as you like.
     """
 
-    def __init__(self, master, name):
+    def __init__(self, master: 'Master', name: str) -> None:
         self.master = master
         self.name = name
 
     @property
-    def type(self):
+    def type(self) -> str:
         """The type name, such as 'turtlesim/Velocity'.
 
         :raises UnknownTopicError: if the master knows no such topic, or nobody has given its type
@@ -57,17 +65,17 @@ class Topic:
         )
 
     @property
-    def publishers(self):
+    def publishers(self) -> List[str]:
         """Names of the nodes that publish on it."""
         return self.master.system_state()[0].get(self.name, [])
 
     @property
-    def subscribers(self):
+    def subscribers(self) -> List[str]:
         """Names of the nodes that are interested in it."""
         return self.master.system_state()[1].get(self.name, [])
 
     @property
-    def channels(self):
+    def channels(self) -> List[Channel]:
         """The channels that nodes of this process have open on it."""
         return [
             channel
@@ -78,15 +86,15 @@ class Topic:
 
     def input_channel(
         self,
-        node,
-        typed_as=None,
-        delegate=None,
-        queue_size=QUEUE_SIZE,
-        inline=False,
-        shared=False,
-        from_=None,
-        wait=0,
-    ):
+        node: 'Node',
+        typed_as: TypedAs = None,
+        delegate: Optional[Callable[..., Any]] = None,
+        queue_size: int = QUEUE_SIZE,
+        inline: bool = False,
+        shared: bool = False,
+        from_: Any = None,
+        wait: float = 0,
+    ) -> InputChannel:
         """A new :class:`~pharos.InputChannel` of ``node``; see :meth:`Node.interested_in`.
 
         :raises TypeError, ValueError: if that is no node of this process, or one of another master
@@ -94,7 +102,7 @@ class Topic:
         self._check_node(node)
         is_first = all(channel.topic != self.name for channel in node.channels)
         message_class = self.message_class(node, typed_as, wait, receives=True)
-        options = dict(
+        options: Dict[str, Any] = dict(
             delegate=delegate, queue_size=queue_size, inline=inline, shared=shared, from_=from_
         )
         if not is_first or message_class is typed_as or not messages.is_provisional(message_class):
@@ -105,8 +113,14 @@ class Topic:
         return channel
 
     def output_channel(
-        self, node, typed_as=None, latch=False, queue_size=QUEUE_SIZE, connect_timeout=None, wait=0
-    ):
+        self,
+        node: 'Node',
+        typed_as: TypedAs = None,
+        latch: bool = False,
+        queue_size: int = QUEUE_SIZE,
+        connect_timeout: Optional[float] = None,
+        wait: float = 0,
+    ) -> OutputChannel:
         """A new :class:`~pharos.OutputChannel` of ``node``; see :meth:`Node.output_channel`.
 
         :raises TypeError, ValueError: as :meth:`input_channel`
@@ -121,7 +135,9 @@ class Topic:
             connect_timeout=connect_timeout,
         )
 
-    def message_class(self, node, typed_as=None, wait=0, receives=False):
+    def message_class(
+        self, node: 'Node', typed_as: TypedAs = None, wait: float = 0, receives: bool = False
+    ) -> Type[genpy.Message]:
         """The message class of the topic for ``node``: ``typed_as``, else what the node knows, else
         the master's.
 
@@ -137,7 +153,7 @@ class Topic:
         with time_limit(wait + MARGIN if wait else None):
             return self._message_class(node, typed_as, wait, receives)
 
-    def _check_node(self, node):
+    def _check_node(self, node: Any) -> None:
         if not hasattr(type(node), 'current_run'):
             raise TypeError(
                 f'a channel on {self.name} is given to a node of this process, not to {node!r}'
@@ -148,7 +164,9 @@ class Topic:
             )
         node.current_run  # raises where it is stopped
 
-    def _message_class(self, node, typed_as, wait, receives):
+    def _message_class(
+        self, node: 'Node', typed_as: TypedAs, wait: float, receives: bool
+    ) -> Type[genpy.Message]:
         known = next(
             (channel.message_class for channel in node.channels if channel.topic == self.name), None
         )
@@ -165,7 +183,7 @@ class Topic:
             )
         return asked
 
-    def _class_of(self, type_or_class, receives):
+    def _class_of(self, type_or_class: Any, receives: bool) -> Type[genpy.Message]:
         """The class of a type: known here, or as the topic's publishers define it."""
         try:
             known = messages.message_class(type_or_class)
@@ -182,7 +200,7 @@ class Topic:
             return next((cls for cls in own if cls._md5sum == known._md5sum), (own or [known])[0])
         return known
 
-    def _headers(self):
+    def _headers(self) -> Iterator[Tuple[str, Dict[str, str]]]:
         """``(node name, connection header)`` of each publisher that answers, one by one."""
         for name in self.publishers:
             try:
@@ -191,14 +209,14 @@ class Topic:
                 continue
             yield name, ask_publisher(uri, self.name)
 
-    def _local_classes(self, type_):
+    def _local_classes(self, type_: Any) -> List[Type[genpy.Message]]:
         """The classes with which nodes of this process publish that type on the topic."""
         instances = [node.latest_run.rospy for node in self.master.local_nodes()]
-        publishers = filter(None, (instance.publisher(self.name) for instance in instances))
-        classes = [publisher.data_class for publisher in publishers]
+        publishers = [instance.publisher(self.name) for instance in instances]
+        classes = [publisher.data_class for publisher in publishers if publisher]
         return [cls for cls in classes if cls._type == type_]
 
-    def _agree_with_publishers(self, channel):
+    def _agree_with_publishers(self, channel: InputChannel) -> None:
         """Have an input channel take the definition of a publisher elsewhere, where none suits it
         as it is.
 
@@ -219,10 +237,10 @@ class Topic:
                     cls = messages.class_of_header(refusal.offered)
                 except PharosError:
                     continue  # it is told as one that cannot be heard
-                channel._subscribe_as(cls)
+                channel.subscribe_as(cls)
                 return
 
-    def _class_in_time(self, node, deadline, receives):
+    def _class_in_time(self, node: 'Node', deadline: float, receives: bool) -> Type[genpy.Message]:
         """The class of the master's type, which may come until the deadline."""
         while True:
             try:
@@ -235,16 +253,16 @@ class Topic:
             if node.latest_run.rospy.ended.wait(POLL):  # a master tells nobody of new types
                 raise self._stopped(node)
 
-    def _stopped(self, node):
+    def _stopped(self, node: 'Node') -> NodeStoppedError:
         return NodeStoppedError(
             f'{node.name} stopped while it waited for the type of {self.name}: start it again first'
         )
 
-    def __eq__(self, other):
+    def __eq__(self, other: object) -> bool:
         return isinstance(other, Topic) and (self.name, self.master) == (other.name, other.master)
 
-    def __hash__(self):
+    def __hash__(self) -> int:
         return hash((self.name, self.master))
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f'<Topic {self.name} of {self.master.url}>'

@@ -9,6 +9,7 @@ from pharos.private_rospy import changes, registration
 from pharos.private_rospy.deadlines import time_limit
 from pharos.private_rospy.proxies import ServerProxy
 from pharos.private_rospy.registration import UNREGISTER_TIMEOUT, registered
+from pharos.private_rospy.socket_callback import SocketCallback
 
 _running = {}  # URI -> the PrivateRospy that runs there, in this process
 
@@ -45,24 +46,24 @@ class Connections:
 
     # -- channels
 
-    def subscribe(self, receiver, offer, timeout, **options):
+    def subscribe(self, receiver, inbox, timeout, **options):
         """rospy's Subscriber for a receiver, connected to the publishers in this process.
 
         The master's word of them takes its time.
 
         :param receiver: a :class:`pharos.intraprocess.inbox.Receiver`
-        :param offer: ``offer(message)`` takes what comes through a socket
+        :param inbox: of the receiver, for what comes through sockets
         :param timeout: seconds that all may take
         :raises MasterUnreachableError: if it cannot be registered
         """
-        topic = receiver.topic
+        topic, callback = receiver.topic, SocketCallback(receiver, inbox, self._node)
         with self._lock:
             self._receivers[topic] = (*self.receivers_on(topic), receiver)
         endpoint = None
         try:
             endpoint = registered(
                 lambda: self._node.rospy.Subscriber(
-                    Resolved(topic), receiver.message_class, offer, **options
+                    Resolved(topic), receiver.message_class, callback, **options
                 ),
                 _unregister,
                 timeout,

@@ -12,8 +12,9 @@ import uuid
 import rospy.impl.transport
 
 from pharos.intraprocess.link import Link
-from pharos.private_rospy.plain_receivers import PlainCallbacks, Statistics, has_own_inbox
+from pharos.private_rospy.plain_receivers import PlainCallbacks, Statistics
 from pharos.private_rospy.refusals import suits
+from pharos.private_rospy.socket_callback import SocketCallback
 
 PROTOCOL = None  # its name, of this process alone
 
@@ -92,7 +93,7 @@ class LocalLink(Link):
     def callback_added(self, callback):
         """The subscription has a callback more; returns the latched messages that it has missed."""
         callbacks = self._open_callbacks()
-        if callbacks is None or has_own_inbox(callback):
+        if callbacks is None or isinstance(callback, SocketCallback):
             self.publisher.receivers_changed(self)
         elif callbacks.latched is not None:
             return [callbacks.latched]

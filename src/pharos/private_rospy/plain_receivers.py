@@ -13,11 +13,6 @@ SMALL = 64  # bytes that a message is taken to have whose size is not told
 WAITING = 1000  # messages that wait to be counted by the statistics
 
 
-def has_own_inbox(callback):
-    """Whether a callback of a rospy Subscriber is a channel's, which has inboxes of its own."""
-    return getattr(callback, 'has_own_inbox', False)
-
-
 class PlainReceiver(ThreadedInbox):
     """A receiver at the end of one link that is its own inbox; see
     :class:`~pharos.intraprocess.inbox.Receiver`."""

@@ -2,7 +2,7 @@
 import traceback
 
 from pharos.intraprocess.link import links_of
-from pharos.private_rospy.plain_receivers import has_own_inbox
+from pharos.private_rospy.socket_callback import SocketCallback
 from pharos.private_rospy.patches.table import addition, patch
 from pharos.private_rospy import registration
 from pharos.signals import is_from_signal
@@ -96,12 +96,12 @@ def remove_callback(self, cb, cb_args, *, original):
 @addition('rospy.topics', '_SubscriberImpl.has_plain_callbacks', 'links ask for it')
 def has_plain_callbacks(self):
     """Whether there are callbacks that are no channels'."""
-    return not all(has_own_inbox(callback) for callback, _ in self.callbacks or ())
+    return not all(isinstance(callback, SocketCallback) for callback, _ in self.callbacks or ())
 
 
 @addition('rospy.topics', '_SubscriberImpl.run_callbacks', 'links call it')
 def run_callbacks(self, message):
     """Run the callbacks that are no channels' for a message of a link."""
     for callback, arguments in self.callbacks or ():
-        if not has_own_inbox(callback):
+        if not isinstance(callback, SocketCallback):
             self._invoke_callback(message, callback, arguments)
