@@ -9,7 +9,7 @@ globals of its own, and mends what it does badly. The way in is
 - settings, arguments, addresses, names, logs: what a node is to be called, where it is, its log.
 - registration, connections, refusals, parameters, changes: what a node has at the master, whom it
   is connected to, whom it cannot hear, and waiting for that.
-- lifetime, proxies: threads, sockets and calls that end with the node, or in time.
+- lifetime, deadlines, proxies: threads, sockets and calls that end with the node, or in time.
 - acceptor, xmlrpc_server: clients that say nothing, or nonsense.
 - local_link, plain_receivers, local_services: how rospy's topics and services take the way through
   this process; sender, tcpros_connection: through sockets.

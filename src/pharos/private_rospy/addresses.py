@@ -5,6 +5,7 @@ import ipaddress
 import re
 import socket
 import urllib.parse
+from typing import Any, MutableMapping, Optional
 
 import rosgraph.network
 from rosgraph.rosenv import ROS_HOSTNAME, ROS_IP
@@ -18,14 +19,14 @@ _UNREACHABLE = [
 ]
 
 
-def check_port(what, port):
+def check_port(what: str, port: Any) -> int:
     """``port`` if it is one, else ValueError."""
     if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port <= 65535:
         raise ValueError(f'{what} must be a port number, 0 (any free one) to 65535, not {port!r}')
     return port
 
 
-def check_url(url, source=''):
+def check_url(url: Any, source: str = '') -> str:
     """``url`` if it can be a master's, else ValueError; written as URLs should be, with a closing
     slash.
 
@@ -42,7 +43,7 @@ def check_url(url, source=''):
     )
 
 
-def check_domain(what, domain):
+def check_domain(what: str, domain: Any) -> str:
     """``domain`` if other nodes can be told to come there, else ValueError.
 
     :param what: where it comes from: the parameter of that name, or a variable of the environment
@@ -72,7 +73,7 @@ def check_domain(what, domain):
     return domain
 
 
-def check_environment(environ):
+def check_environment(environ: MutableMapping[str, str]) -> Optional[str]:
     """The address that the environment gives, None if it gives none; else ValueError.
 
     Takes empty variables away: rosgraph takes them for an answer, and that for none.
@@ -86,7 +87,7 @@ def check_environment(environ):
     return given
 
 
-def default_domain():
+def default_domain() -> str:
     """What a node says where nothing else is said: the host's name, or its address where the name
     does not resolve.
 
@@ -98,7 +99,7 @@ def default_domain():
         return rosgraph.network.get_local_address()
 
 
-def is_same_master(url, other):
+def is_same_master(url: str, other: str) -> bool:
     """Whether two URLs as of :func:`check_url` mean one address; looks host names up, once, but
     never connects."""
     if url == other:

@@ -5,6 +5,7 @@ import math
 import socket
 import threading
 import time
+from typing import Any, Iterator, Optional
 
 # seconds beyond a time limit, to tell a master that does not answer from what did not come
 MARGIN = 0.5
@@ -18,7 +19,7 @@ _limits = _ThreadLimit()
 
 
 @contextlib.contextmanager
-def time_limit(seconds):
+def time_limit(seconds: Optional[float]) -> Iterator[None]:
     """Within this, all calls of this thread end by then, together: no user's code is to run in it.
 
     :param seconds: None: no limit
@@ -32,18 +33,18 @@ def time_limit(seconds):
         _limits.deadline = before
 
 
-def deadline_in(seconds):
+def deadline_in(seconds: float) -> float:
     """The time, by ``time.monotonic()``, in so many seconds, or when the :func:`time_limit` of this
     thread is over."""
     return min(time.monotonic() + seconds, _limits.deadline)
 
 
-def is_time_up():
+def is_time_up() -> bool:
     """Whether the :func:`time_limit` of this thread is over."""
     return time.monotonic() >= _limits.deadline
 
 
-def seconds_left(deadline):
+def seconds_left(deadline: Optional[float]) -> Optional[float]:
     """The seconds until that time, by ``time.monotonic()``; None: no limit.
 
     :raises socket.timeout: if it is over
@@ -62,16 +63,16 @@ class DeadlineReader(io.RawIOBase):
     :raises socket.timeout: when that is over
     """
 
-    def __init__(self, sock, deadline=None):
+    def __init__(self, sock: socket.socket, deadline: Optional[float] = None) -> None:
         super().__init__()
         self._socket = sock
         self.deadline = deadline  # by time.monotonic(); None: no limit
 
-    def readable(self):
+    def readable(self) -> bool:
         """As of :mod:`io`."""
         return True
 
-    def readinto(self, buffer):
+    def readinto(self, buffer: Any) -> int:
         """As of :mod:`io`."""
         self._socket.settimeout(seconds_left(self.deadline))
         return self._socket.recv_into(buffer)

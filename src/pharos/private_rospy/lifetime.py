@@ -5,6 +5,7 @@ import socket
 import threading
 import time
 import weakref
+from typing import Any, Callable, Optional
 
 # A signal that the kernel gives to another thread does not end the main thread's wait, in which
 # Python would handle it.
@@ -125,7 +126,9 @@ class Interruption:
         that is wanted
     """
 
-    def __init__(self, wake=None, lifetime=None):
+    def __init__(
+        self, wake: Optional[Callable[[], Any]] = None, lifetime: Optional[Lifetime] = None
+    ) -> None:
         self.wake = wake
         self._outer = getattr(_thread, 'interruption', None)
         given = lifetime, getattr(_thread, 'lifetime', None)
@@ -134,11 +137,11 @@ class Interruption:
             self.lifetimes |= self._outer.lifetimes
 
     @property
-    def came(self):
+    def came(self) -> bool:
         """Whether the node stops."""
         return any(lifetime.ended.is_set() for lifetime in self.lifetimes)
 
-    def __enter__(self):
+    def __enter__(self) -> 'Interruption':
         _thread.interruption = self
         for lifetime in self.lifetimes:
             lifetime.interruptions.add(self)
@@ -146,13 +149,13 @@ class Interruption:
             self.wake()
         return self
 
-    def __exit__(self, *error):
+    def __exit__(self, *error: Any) -> None:
         _thread.interruption = self._outer
         for lifetime in self.lifetimes:
             lifetime.interruptions.discard(self)
 
 
-def keep_alive(sock, while_sending=False):
+def keep_alive(sock: socket.socket, while_sending: bool = False) -> None:
     """Have the connection break when its peer has silently gone, as with a cable pulled out.
 
     :param while_sending: also where something is under way to the peer, which TCP else goes on
@@ -169,7 +172,7 @@ def keep_alive(sock, while_sending=False):
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, KEEPALIVE_COUNT)
 
 
-def shutdown_socket(sock):
+def shutdown_socket(sock: socket.socket) -> None:
     """Shut a socket down: unlike ``close`` alone, this wakes a thread that waits on it."""
     with contextlib.suppress(OSError):  # not connected, or closed already
         sock.shutdown(socket.SHUT_RDWR)

@@ -3,6 +3,7 @@ answer."""
 import http.client
 import socket
 import xmlrpc.client
+from typing import Any
 
 import rosgraph
 
@@ -85,11 +86,11 @@ class _Socket(socket.socket):
 class ServerProxy(xmlrpc.client.ServerProxy):
     """``xmlrpc.client.ServerProxy`` whose calls raise an OSError after ``timeout`` seconds."""
 
-    def __init__(self, uri, timeout=TIMEOUT, **options):
+    def __init__(self, uri: str, timeout: float = TIMEOUT, **options: Any) -> None:
         super().__init__(uri, transport=_Transport(timeout), **options)
 
 
-def interruption(proxy):
+def interruption(proxy: ServerProxy) -> Interruption:
     """Within this, calls end with the node on whose behalf this thread runs.
 
     For questions alone: of what is to change something, nobody would know whether it has.
@@ -97,7 +98,7 @@ def interruption(proxy):
     return Interruption(proxy('transport').shut)
 
 
-def master_api(url, caller_id='/pharos', timeout=TIMEOUT):
+def master_api(url: str, caller_id: str = '/pharos', timeout: float = TIMEOUT) -> rosgraph.Master:
     """rosgraph's own API of the master at ``url``, with a time limit of ``timeout`` seconds a
     call."""
     api = rosgraph.Master(caller_id, master_uri=url)

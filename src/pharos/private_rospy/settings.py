@@ -4,6 +4,7 @@ rospy takes them from ``os.environ`` and ``sys.argv``; a node gets private ones,
 function need be overridden and the process's own stay untouched.
 """
 import os
+from typing import List, Optional
 
 import rosgraph.names
 from rosgraph.rosenv import ROS_HOSTNAME, ROS_IP, ROS_MASTER_URI, ROS_NAMESPACE
@@ -37,7 +38,15 @@ class Settings:
         parameter
     """
 
-    def __init__(self, name, master_url, domain=None, tcp_port=0, xmlrpc_port=0, argv=None):
+    def __init__(
+        self,
+        name: str,
+        master_url: str,
+        domain: Optional[str] = None,
+        tcp_port: int = 0,
+        xmlrpc_port: int = 0,
+        argv: Optional[List[str]] = None,
+    ) -> None:
         self.master_url = master_url
         self.tcp_port = check_port('tcp_port', tcp_port)
         self.xmlrpc_port = check_port('xmlrpc_port', xmlrpc_port)

@@ -1,4 +1,4 @@
-"""A node's TCPROS server: bound where errors can be raised, safe from bad clients, really closed."""
+"""A node's TCPROS server: bound where errors can be raised, safe from bad clients, and closed."""
 import contextlib
 import io
 import socket
