@@ -178,7 +178,9 @@ class Master(MasterCalls):
             of its own
         :raises UnknownNodeError: if there is no such package or program
         """
-        mappings = {**(remap or {}), **{'_' + key: value for key, value in (params or {}).items()}}
+        mappings: Dict[str, object] = {**(remap or {})}
+        for key, value in (params or {}).items():
+            mappings['_' + key] = value
         if name is not None:
             mappings['__name'] = name
         arguments = [*map(str, args), *(f'{key}:={value}' for key, value in mappings.items())]
@@ -245,7 +247,9 @@ class Master(MasterCalls):
         """
         name, timeout = global_name(name, 'node'), check_limit('timeout', timeout)
         with time_limit(timeout):
-            node = self.look_until_found(lambda: self.live_node(name), timeout, name)
+            node: Optional[AnyNode] = self.look_until_found(
+                lambda: self.live_node(name), timeout, name
+            )
         if node is None:  # there was no time to look
             with time_limit(MARGIN):
                 node = self.live_node(name)

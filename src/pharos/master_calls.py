@@ -20,7 +20,6 @@ POLL = 0.05  # seconds between two looks for a master, or for a node
 
 Users = Dict[str, List[str]]  # name of a topic or service -> names of nodes
 Self = TypeVar('Self', bound='MasterCalls')
-Found = TypeVar('Found')
 
 
 class MasterCalls:
@@ -74,8 +73,8 @@ class MasterCalls:
 
     def system_state(self) -> Tuple[Users, Users, Users]:
         """``(publishers, subscribers, services)``, each ``{name: [node names]}``."""
-        publishers, subscribers, services = map(dict, self.call('getSystemState'))
-        return publishers, subscribers, services
+        publishers, subscribers, services = self.call('getSystemState')
+        return dict(publishers), dict(subscribers), dict(services)
 
     def topic_types(self) -> List[Tuple[str, str]]:
         """``[(topic name, type name)]`` of all topics."""
@@ -126,9 +125,7 @@ class MasterCalls:
             self.call('getPid', timeout=MARGIN)
         return self
 
-    def look_until_found(
-        self, look: Callable[[], Optional[Found]], timeout: Optional[float], what: str
-    ) -> Optional[Found]:
+    def look_until_found(self, look: Callable[[], Any], timeout: Optional[float], what: str) -> Any:
         """Call ``look()`` until it returns something, for there is nobody who could tell; None
         where it has not in time.
 

@@ -1,6 +1,5 @@
 """The parameter server of a master as a mapping."""
-from collections.abc import MutableMapping
-from typing import TYPE_CHECKING, Any, Iterator
+from typing import TYPE_CHECKING, Any, Iterator, MutableMapping
 
 import rosgraph
 
@@ -12,7 +11,7 @@ if TYPE_CHECKING:
     from pharos.master import Master
 
 
-class Parameters(MutableMapping):
+class Parameters(MutableMapping[str, Any]):
     """``{global name: value}`` of a master's parameter server; made by :attr:`Master.parameters`.
 
     A name may be a namespace, whose value is a dict of what it holds. Iteration gives all full

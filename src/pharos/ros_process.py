@@ -228,7 +228,8 @@ class _Nodes:
             calls = xmlrpc.client.MultiCall(api.handle)
             for name in names:
                 calls.lookupNode('/pharos', name)
-            uris = [uri for _, _, uri in calls()]
+            answers: Any = calls()
+            uris = [uri for _, _, uri in answers]
         except (rosgraph.MasterException, *COMMUNICATION_ERRORS):
             return {}  # there is no master to clear anything away from
         return {name: uri for name, uri in zip(names, uris) if uri and self._is_ours(uri)}

@@ -16,8 +16,9 @@ def check_seconds(what: str, seconds: Any, above: float = -math.inf) -> float:
     :param seconds: a number, or a genpy.Duration
     :raises ValueError: if it is none, or not ``above`` that number
     """
-    value = seconds.to_sec() if isinstance(seconds, genpy.Duration) else seconds
-    if not isinstance(value, numbers.Real) or not value > above:  # no comparison holds for NaN
+    value: Any = seconds.to_sec() if isinstance(seconds, genpy.Duration) else seconds
+    is_number = isinstance(value, numbers.Real)
+    if not is_number or not value > above:  # no comparison holds for NaN
         least = '' if above == -math.inf else f' above {above:g}'
         raise ValueError(f'{what} is a number of seconds{least}, not {seconds!r}')
     return float(max(-LONGEST, min(value, LONGEST)))

@@ -62,7 +62,7 @@ class Service:
         self._md5sum_by_hand: Optional[str] = None
         self._look_up(None)
         header = self._ask()
-        self.type = header.get('type')
+        self.type: Any = header.get('type')
         self._found_md5sum = header.get('md5sum')
 
     def _look_up(self, deadline: Optional[float]) -> str:
