@@ -10,7 +10,7 @@ from pharos import first_message, messages
 from pharos.blocks import check_block, check_delegate, check_runs
 from pharos.errors import MessageTypeError, NodeStoppedError, PharosError
 from pharos.intraprocess.copier import copier_for
-from pharos.intraprocess.fanout import Latch
+from pharos.intraprocess.fanout import ClosedFanout, Latch
 from pharos.intraprocess.inbox import Inbox, SocketInbox
 from pharos.private_rospy.deadlines import time_limit
 from pharos.seconds import check_limit
@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from pharos.run import Run
 
 Block = Callable[..., Any]
-# bytes read from a socket at once; rospy's 64 KiB let subscribers of images fall behind
-BUFFER_SIZE = 1 << 20
 
 
 class Channel:
@@ -33,12 +31,11 @@ class Channel:
     def __init__(
         self, node: 'Node', topic: str, message_class: Type[genpy.Message], queue_size: int
     ) -> None:
-        if isinstance(queue_size, bool) or not isinstance(queue_size, int) or queue_size < 1:
+        if type(queue_size) is not int or queue_size < 1:
             raise ValueError(
                 f'queue_size must be a number of messages, 1 or more, not {queue_size!r}'
             )
-        self.node = node
-        self.topic = topic
+        self.node, self.topic = node, topic
         self.message_class = message_class
         self.queue_size, self.queue_bytes = queue_size, node.queue_bytes
         self.closed = False  # whether close() was called
@@ -53,10 +50,10 @@ class Channel:
     def _unregister(self, endpoint: Any) -> None:
         raise NotImplementedError
 
-    def _begin(self) -> None:
+    def _begin(self, *arguments: Any) -> None:
         """Open it for the first time; where that fails, nothing is left behind."""
         try:
-            self.open()
+            self.open(*arguments)
         except BaseException:
             self.close()
             raise
@@ -79,10 +76,7 @@ class Channel:
     @property
     def connections(self) -> List[Tuple[str, str]]:
         """``[(peer node name, transport)]``, transport being 'INTRAPROCESS' or 'TCPROS'."""
-        peers: List[Tuple[str, str]] = []
-        if self.is_open:
-            peers = self._rospy.connections.of(self._endpoint)
-        return peers
+        return list(self._rospy.connections.of(self._endpoint)) if self.is_open else []
 
     @property
     def is_open(self) -> bool:
@@ -167,16 +161,7 @@ class InputChannel(Channel):
         if not self.inline:
             dispatcher.need_thread()
         inbox = Inbox(self, dispatcher) if self.inline else SocketInbox(self, dispatcher)
-        # rospy's queue_size would drop without counting; the inbox has ours
-        self._opened(
-            self._rospy.connections.subscribe(
-                self,
-                inbox,
-                self.node.connect_timeout,
-                tcp_nodelay=True,
-                buff_size=BUFFER_SIZE,
-            )
-        )
+        self._opened(self._rospy.connections.subscribe(self, inbox, self.node.connect_timeout))
         dispatcher.run()  # what came latched
 
     def _unregister(self, endpoint: Any) -> None:
@@ -213,24 +198,22 @@ class InputChannel(Channel):
         """
 
         def run() -> None:
-            if self._present_delegate is None:
+            block = self._present_delegate
+            if block is None:
                 raise PharosError(
                     f'{self.topic} has no delegate any more: give {self.node.name} or its '
                     'channel one first'
                 )
-            self._call(self._present_delegate, message)
+            try:
+                block(message, self)
+            except BaseException as error:
+                self._run.report(error, block, 'delegate', self, message)
 
         self.node.current_run.dispatcher.run_in_turn(run)
 
     @property
     def _present_delegate(self) -> Any:
         return self.node.delegate if self._delegate is None else self._delegate
-
-    def _call(self, block: Any, message: genpy.Message) -> None:
-        try:
-            block(message, self)
-        except BaseException as error:
-            self._run.report(error, block, 'delegate', self, message)
 
     # -- as a pharos.intraprocess.inbox.Receiver
 
@@ -250,7 +233,7 @@ class InputChannel(Channel):
                 return
         if header is not None:
             message._connection_header = header
-        try:  # as _call() does, which would be one frame more for each message
+        try:
             block(message, self)
         except BaseException as error:
             self._run.report(error, block, 'delegate', self, message)
@@ -287,14 +270,11 @@ class OutputChannel(Channel):
         self.sent = 0
         self._uninterested: Set[str] = set()  # names of nodes of which the log says so
         self._freeze = copier_for(message_class).freeze
-        self._fanout: Any = _ClosedFanout
-        self._first_timeout = connect_timeout  # None: the node's, as after a restart
-        self._begin()
+        self._fanout: Any = ClosedFanout
+        self._begin(connect_timeout)
 
-    def open(self) -> None:
-        timeout = self.node.connect_timeout
-        if self._first_timeout is not None:
-            timeout, self._first_timeout = self._first_timeout, None
+    def open(self, connect_timeout: Optional[float] = None) -> None:
+        timeout = self.node.connect_timeout if connect_timeout is None else connect_timeout
         deadline = time.monotonic() + timeout
         self._opener, self._connected = threading.current_thread(), threading.Event()
         try:
@@ -303,9 +283,8 @@ class OutputChannel(Channel):
                 self.message_class,
                 self._latch,
                 timeout,
+                self.queue_size,
                 self.queue_bytes,
-                tcp_nodelay=True,
-                queue_size=self.queue_size,
             )
             self._opened(endpoint)
             first_message.wait_for_known_subscribers(self, timeout, deadline)
@@ -377,7 +356,7 @@ class OutputChannel(Channel):
         raise MessageTypeError(f'{self.type} cannot be sent on {self.topic}: {error}') from error
 
     def _unregister(self, endpoint: Any) -> None:
-        self._fanout = _ClosedFanout
+        self._fanout = ClosedFanout
         self._rospy.connections.unadvertise(endpoint, self._latch)
 
     def send(
@@ -418,14 +397,4 @@ class OutputChannel(Channel):
 
     def node_stopped(self) -> None:
         super().node_stopped()
-        self._fanout = _ClosedFanout
-
-
-class _ClosedFanout:
-    """What a closed channel has instead of a fan-out."""
-
-    connections: Tuple[Any, ...] = ()
-
-    @staticmethod
-    def publish(*arguments: Any) -> NoReturn:
-        raise NodeStoppedError('closed')
+        self._fanout = ClosedFanout

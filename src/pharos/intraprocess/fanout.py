@@ -6,6 +6,7 @@ from typing import (
     Dict,
     Iterable,
     List,
+    NoReturn,
     Optional,
     Protocol,
     Tuple,
@@ -173,20 +174,15 @@ class Fanout:
             if not (inboxes or remote or latch):
                 return False
             self._seq += 1
-            if self._has_header:
-                message = self._numbered(message)
-            if inboxes or latch:
-                frozen = self._freeze(message)
+            message = self._numbered(message) if self._has_header else message
+            frozen = self._freeze(message) if inboxes or latch else b''
             data = self._sockets.serialize(message, self._seq) if remote else b''
             if latch:
                 latch.keep(frozen, connection.endpoint_id if connection else to)
                 self._latches[latch] = None
             if inboxes:
-                size = 0
-                if self._size:
-                    size = len(frozen) if type(frozen) is bytes else self._size(message)
-                if mark:
-                    message = mark.put_on(message)
+                size = self._size_of(message, frozen) if self._size else 0
+                message = mark.put_on(message) if mark else message
                 for inbox in inboxes:
                     inbox.put(message if inbox.shared else frozen, size)
             for dispatcher in dispatchers:
@@ -195,10 +191,13 @@ class Fanout:
                     break
             if remote:
                 self._sockets.write(data, remote)
-        if runs_inline:
-            for dispatcher in inline:
-                dispatcher.run()
+        for dispatcher in inline if runs_inline else ():
+            dispatcher.run()
         return True
+
+    def _size_of(self, message: Any, frozen: Frozen) -> int:
+        assert self._size
+        return len(frozen) if type(frozen) is bytes else self._size(message)
 
     def _numbered(self, message: Any) -> Any:
         """The message with the next ``header.seq``, as rospy numbers messages."""
@@ -289,6 +288,17 @@ class Fanout:
         """Nothing is sent any more."""
         self._closed = True
         self.set_connections(())
+
+
+class ClosedFanout:
+    """What a channel that is closed has instead of a fan-out."""
+
+    connections: Tuple[Connection, ...] = ()
+
+    @staticmethod
+    def publish(*arguments: Any) -> NoReturn:
+        """Raise ClosedError."""
+        raise ClosedError('publish() through a closed channel')
 
 
 def _ways_of(connections: Iterable[Connection]) -> _Ways:

@@ -11,6 +11,9 @@ from pharos.private_rospy.proxies import ServerProxy
 from pharos.private_rospy.registration import UNREGISTER_TIMEOUT, registered
 from pharos.private_rospy.socket_callback import SocketCallback
 
+# bytes read from a socket at once; rospy's 64 KiB let subscribers of images fall behind
+BUFFER_SIZE = 1 << 20
+
 _running = {}  # URI -> the PrivateRospy that runs there, in this process
 
 
@@ -46,7 +49,7 @@ class Connections:
 
     # -- channels
 
-    def subscribe(self, receiver, inbox, timeout, **options):
+    def subscribe(self, receiver, inbox, timeout):
         """rospy's Subscriber for a receiver, connected to the publishers in this process.
 
         The master's word of them takes its time.
@@ -61,9 +64,14 @@ class Connections:
             self._receivers[topic] = (*self.receivers_on(topic), receiver)
         endpoint = None
         try:
+            # rospy's queue_size would drop without counting; the inbox has one that counts
             endpoint = registered(
                 lambda: self._node.rospy.Subscriber(
-                    Resolved(topic), receiver.message_class, callback, **options
+                    Resolved(topic),
+                    receiver.message_class,
+                    callback,
+                    tcp_nodelay=True,
+                    buff_size=BUFFER_SIZE,
                 ),
                 _unregister,
                 timeout,
@@ -100,19 +108,24 @@ class Connections:
             others = tuple(other for other in self.receivers_on(topic) if other is not receiver)
             self._receivers[topic] = others
 
-    def advertise(self, topic, message_class, latch, timeout, queue_bytes, **options):
+    def advertise(self, topic, message_class, latch, timeout, queue_size, queue_bytes):
         """rospy's Publisher, and its fan-out; subscribers in this process are told at once.
 
         rosmaster tells them in steps of 0.1 s.
 
         :param latch: the :class:`pharos.intraprocess.fanout.Latch` to go on with, None: none
         :param timeout: seconds that the master may take
-        :param queue_bytes: that wait for a slow subscriber elsewhere
+        :param queue_size: messages that wait for a slow subscriber elsewhere,
+        :param queue_bytes: and their bytes
         :raises MasterUnreachableError: if it cannot be registered
         """
         endpoint = registered(
             lambda: self._node.rospy.Publisher(
-                Resolved(topic), message_class, latch=latch is not None, **options
+                Resolved(topic),
+                message_class,
+                latch=latch is not None,
+                queue_size=queue_size,
+                tcp_nodelay=True,
             ),
             _unregister,
             timeout,
