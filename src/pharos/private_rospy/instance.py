@@ -185,8 +185,9 @@ class PrivateRospy:
         received."""
         self.lifetime.begin_shutdown()
         waiting = [self.rospy.rostime.get_rostime_cond()]  # simulated time may stand still
-        if self.handler:
-            waiting.append(self.handler.reg_man.cond)
+        handler = self.handler
+        if handler:
+            waiting.append(handler.reg_man.cond)
         for changed in waiting:
             with changed:
                 changed.notify_all()

@@ -151,12 +151,13 @@ class _Kind(NamedTuple):
         """Make the master know what the node has, and where it was away, what it has not any
         more."""
         is_subscribing = self.ours == node.topics.get_subscriptions
+        handler = node.handler
         for name, value in self.ours() if was_away and is_subscribing else self.lost(node):
             publishers = self.register(name, value, node.uri)
             if node.ended.is_set() or name not in dict(self.ours()):
                 self.unregister(name, self.uri)  # closed while we registered it
-            elif is_subscribing:
-                node.handler.reg_man.publisher_update(name, publishers)
+            elif is_subscribing and handler:
+                handler.reg_man.publisher_update(name, publishers)
         if was_away:
             ours = dict(self.ours())
             for name, nodes in self.theirs.items():

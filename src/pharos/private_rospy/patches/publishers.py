@@ -69,7 +69,13 @@ def add_connection(self, c, *, node, module):
     if link is None and self.queue_size is not None:
         c = Sender(c, self.queue_size, node.start_thread, self.queue_bytes)
     with _latched_first(self) as is_open:
-        if not (is_open and _add(self, c, link, module)):
+        with self.c_lock:
+            is_added = is_open and module._TopicImpl.add_connection(self, c)
+            if is_added:
+                # who counts the connections counts this one only when messages go through it;
+                # receivers may have come since the link was made, and have not seen it yet
+                _refresh(self, link)
+        if not is_added:
             c.close()
             return False
         self.fanout.send_latched(c)
@@ -79,19 +85,6 @@ def add_connection(self, c, *, node, module):
     notify()
     self.fanout.run()
     return True
-
-
-def _add(publisher, connection, link, module):
-    """Who counts the connections counts this one only when messages go through it."""
-    lock = publisher.c_lock
-    if lock is None:  # closed meanwhile
-        return False
-    with lock:
-        if not module._TopicImpl.add_connection(publisher, connection):
-            return False
-        # receivers may have come since the link was made, and have not seen it yet
-        _refresh(publisher, link)
-        return True
 
 
 @addition('rospy.topics', '_PublisherImpl.receivers_changed', 'links call it')
@@ -148,10 +141,7 @@ def _latched_first(publisher):
 def _refresh(publisher, link=None):
     """Have the fan-out go by the connections, and a link by the receivers, that there are; returns
     its new inboxes."""
-    lock = publisher.c_lock
-    if lock is None:  # closed meanwhile
-        return []
-    with lock:
+    with publisher.c_lock:
         new = link.match_receivers() if link else []
         publisher.fanout.set_connections(publisher.connections or ())
         return new
