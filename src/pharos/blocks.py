@@ -1,13 +1,14 @@
 """Blocks: the callables that a node is made of."""
 import functools
 import inspect
+from typing import Any, Callable, Sequence
 
 from pharos.signals import code_of, is_from_signal
 
 _ASYNC = inspect.CO_COROUTINE | inspect.CO_ITERABLE_COROUTINE | inspect.CO_ASYNC_GENERATOR
 
 
-def check_block(block, what, parameters):
+def check_block(block: Any, what: str, parameters: Sequence[str]) -> Any:
     """``block`` if it can be called with so many arguments (or is None), else TypeError that says
     how it is called."""
     if block is None:
@@ -29,7 +30,7 @@ def check_block(block, what, parameters):
     return block
 
 
-def check_runs(block, what):
+def check_runs(block: Any, what: str) -> None:
     """Raise TypeError for a function that does not run when it is called: ``async def``, or one
     with ``yield``."""
     function = block
@@ -50,12 +51,12 @@ def check_runs(block, what):
         )
 
 
-def check_delegate(block):
+def check_delegate(block: Any) -> Any:
     """``block`` if it can be a delegate (or is None), else TypeError."""
     return check_block(block, 'delegate', ('message', 'channel'))
 
 
-def check_soul(block):
+def check_soul(block: Any) -> Any:
     """``block`` if it can be a soul (or is None), else TypeError."""
     try:
         return check_block(block, 'soul', ('node',))
@@ -65,7 +66,7 @@ def check_soul(block):
         raise TypeError(f'{error}. Give {name_of(block)}, whose self is the node') from None
 
 
-def attempt(function, otherwise=None):
+def attempt(function: Callable[[], Any], otherwise: Any = None) -> Any:
     """What ``function()`` returns, or ``otherwise`` where it raises, whatever that is.
 
     A signal ends the program all the same.
@@ -78,12 +79,13 @@ def attempt(function, otherwise=None):
         return otherwise
 
 
-def text_of(thing):
+def text_of(thing: Any) -> str:
     """The text of a thing of the user's, whatever its ``__str__`` raises."""
-    return attempt(lambda: str(thing), f'<{type(thing).__name__} that cannot be shown>')
+    text: str = attempt(lambda: str(thing), f'<{type(thing).__name__} that cannot be shown>')
+    return text
 
 
-def name_of(block):
+def name_of(block: Any) -> str:
     """How logs name a block."""
     name = attempt(lambda: getattr(block, '__qualname__', None) or repr(block))
     return text_of(name or f'a {type(block).__name__}')

@@ -1,12 +1,15 @@
 """How a node is doing: see :meth:`Node.health`."""
 import collections
 import time
-from typing import Dict, NamedTuple, Optional
+from typing import TYPE_CHECKING, Dict, Iterator, NamedTuple, Optional
 
 import rosgraph
 
 from pharos.errors import MasterUnreachableError
 from pharos.watcher import watcher_of
+
+if TYPE_CHECKING:
+    from pharos.node import Node
 
 
 class Health(NamedTuple):
@@ -22,10 +25,10 @@ class Health(NamedTuple):
     threads: int  # of the node
     refused: int = 0  # publishers that its channels cannot hear, for they publish another type
 
-    def __str__(self):
+    def __str__(self) -> str:
         return ', '.join(self._parts())
 
-    def _parts(self):
+    def _parts(self) -> Iterator[str]:
         """What is to be said, one thing after the other."""
         if self.registered is not None:
             yield 'registered' if self.registered else 'not registered'
@@ -44,7 +47,7 @@ class Health(NamedTuple):
         yield f'{self.threads} threads'
 
 
-def health_of(node, ask):
+def health_of(node: 'Node', ask: bool) -> Health:
     """The :class:`Health` of a node; ``ask``: the master too, which may take its time, else
     ``registered`` is None."""
     channels, is_running = node.channels, node.is_running
@@ -60,7 +63,7 @@ def health_of(node, ask):
     )
 
 
-def _is_registered(node):
+def _is_registered(node: 'Node') -> Optional[bool]:
     try:
         return node.uri is not None and node.master.call('lookupNode', node.name) == node.uri
     except rosgraph.MasterError:

@@ -1,13 +1,16 @@
 """Nodes: real ROS nodes of this process, written with blocks."""
 import contextlib
 import threading
-from typing import TYPE_CHECKING, Any, Callable, Iterator, List, Optional
+from typing import TYPE_CHECKING, Any, Callable, Iterator, List, Optional, Type, Union
+
+import genpy
 
 from pharos import node_registry, signals
 from pharos.blocks import attempt, check_block, check_delegate, check_runs, check_soul
+from pharos.channel import InputChannel, OutputChannel
 from pharos.errors import NodeStoppedError, PharosError
 from pharos.failures import Failure, Failures
-from pharos.health import health_of
+from pharos.health import Health, health_of
 from pharos.offered_service import OfferedService
 from pharos.parameter import Parameter
 from pharos.private_rospy.process_rospy import rospy
@@ -18,9 +21,14 @@ from pharos.topic import QUEUE_SIZE, Topic
 from pharos.transcript import Transcript
 
 if TYPE_CHECKING:
+    from pharos.external_node import ExternalNode
     from pharos.master import Master
 
+    Peer = Union[str, 'Node', ExternalNode, None]
+
 Block = Optional[Callable[..., Any]]
+TypedAs = Union[str, Type[genpy.Message], None]
+Channel = Union[InputChannel, OutputChannel]
 
 
 class Node:
@@ -48,7 +56,7 @@ class Node:
     stop_timeout = 2.0
 
     #: the run of the present start, or the last one; None before the first start
-    latest_run: Optional[Run] = None
+    latest_run: Run = None  # type: ignore[assignment]
     #: whether a start opens again what the last run had; a start() of one's own opens it itself
     _reopens = True
 
@@ -164,12 +172,12 @@ class Node:
         A turn that takes longer than ``seconds`` delays the next, which then comes at once.
         """
         seconds = check_seconds('a period', seconds, above=0)
-        return self.current_run.turns(1.0 / seconds)
+        return self.current_run.turns(self.ros.Rate(1.0 / seconds, reset=True))
 
     # -- blocks
 
     @property
-    def soul(self):
+    def soul(self) -> Block:
         """The block that says what the node does, called as ``soul(node)`` by :meth:`execute` and
         :meth:`fork`.
 
@@ -178,11 +186,11 @@ class Node:
         return self._soul
 
     @soul.setter
-    def soul(self, block):
+    def soul(self, block: Block) -> None:
         self._soul = check_soul(block)
 
     @property
-    def delegate(self):
+    def delegate(self) -> Block:
         """The block run for each message received, called as ``delegate(message, channel)``.
 
         The report: ``self receiverDelegate: [:message :channel | ...]``. Delegates of a node run
@@ -192,7 +200,7 @@ class Node:
         return self._delegate
 
     @delegate.setter
-    def delegate(self, block):
+    def delegate(self, block: Block) -> None:
         self._delegate = check_delegate(block)
 
     def execute(self) -> Any:
@@ -243,15 +251,15 @@ class Node:
 
     def interested_in(
         self,
-        topic,
-        typed_as=None,
-        delegate=None,
-        queue_size=QUEUE_SIZE,
-        inline=False,
-        shared=False,
-        from_=None,
-        wait=0,
-    ):
+        topic: str,
+        typed_as: TypedAs = None,
+        delegate: Block = None,
+        queue_size: int = QUEUE_SIZE,
+        inline: bool = False,
+        shared: bool = False,
+        from_: 'Peer' = None,
+        wait: float = 0,
+    ) -> InputChannel:
         """Receive the messages of a topic from now on; returns the :class:`InputChannel`.
 
         The report (listing 3.3)::
@@ -281,7 +289,14 @@ class Node:
             self, typed_as, delegate, queue_size, inline, shared, from_, wait
         )
 
-    def output_channel(self, topic, typed_as=None, latch=False, queue_size=QUEUE_SIZE, wait=0):
+    def output_channel(
+        self,
+        topic: str,
+        typed_as: TypedAs = None,
+        latch: bool = False,
+        queue_size: int = QUEUE_SIZE,
+        wait: float = 0,
+    ) -> OutputChannel:
         """Publish on a topic from now on; returns the :class:`OutputChannel`.
 
         :param typed_as: type name or message class; None: the master's type for the topic
@@ -294,8 +309,16 @@ class Node:
         return self._topic(topic).output_channel(self, typed_as, latch, queue_size, wait=wait)
 
     def send_to(
-        self, topic, block=None, *, typed_as=None, to=None, connect_timeout=None, wait=0, **fields
-    ):
+        self,
+        topic: str,
+        block: Block = None,
+        *,
+        typed_as: TypedAs = None,
+        to: 'Peer' = None,
+        connect_timeout: Optional[float] = None,
+        wait: float = 0,
+        **fields: Any,
+    ) -> genpy.Message:
         """Send one message, filled by ``block(message)``, by keywords, or both; returns it.
 
         The report (listing 3.1)::
@@ -336,16 +359,16 @@ class Node:
         return channel.send(block, to=to, **fields)
 
     @property
-    def channels(self):
+    def channels(self) -> List[Channel]:
         """The channels that the node has open."""
         return self.latest_run.channels if self.latest_run else []
 
-    def _topic(self, name):
+    def _topic(self, name: str) -> Topic:
         return Topic(self.master, self.current_run.resolve(name, 'topic'))
 
     # -- services, parameters, log
 
-    def serve(self, name, typed_as, block):
+    def serve(self, name: str, typed_as: TypedAs, block: Callable[[Any], Any]) -> OfferedService:
         """Offer a service; returns a handle with ``close()``.
 
         ``block(request)`` runs in a thread of the caller's connection and returns a response, a
@@ -357,12 +380,12 @@ class Node:
         """
         return OfferedService(self, self.current_run.resolve(name, 'service'), typed_as, block)
 
-    def parameter(self, name, initialized=None):
+    def parameter(self, name: str, initialized: Any = None) -> Parameter:
         """The :class:`Parameter` of that name ('~rate' is private); set to ``initialized`` where it
         has no value."""
         return Parameter(self, self.current_run.resolve(name, 'parameter'), initialized)
 
-    def log(self, text, level='info'):
+    def log(self, text: str, level: str = 'info') -> None:
         """Log a line on /rosout, the node's log file and the screen, with the file and line of the
         caller.
 
@@ -380,12 +403,12 @@ class Node:
     # -- what rospy offers beyond
 
     @property
-    def ros(self):
+    def ros(self) -> Any:
         """The node's own rospy, whole: ``node.ros.Timer``, ``node.ros.Time.now()``. It is for this
         run of the node."""
         return self.current_run.rospy.rospy
 
-    def ros_import(self, name):
+    def ros_import(self, name: str) -> Any:
         """A library written on rospy ('actionlib', 'message_filters', 'tf2_ros'), bound to this run
         of the node."""
         if not isinstance(name, str):
@@ -393,26 +416,26 @@ class Node:
         return self.current_run.rospy.import_library(name)
 
     @property
-    def uri(self):
+    def uri(self) -> Optional[str]:
         """The URI of the node's XML-RPC server, None before the first start."""
-        return self.latest_run and self.latest_run.rospy.uri
+        return self.latest_run.rospy.uri if self.latest_run else None
 
     @property
-    def tcp_port(self):
+    def tcp_port(self) -> int:
         """The TCPROS port; the one asked for, before the first start."""
         return self._settings.tcp_port
 
     @property
-    def xmlrpc_port(self):
+    def xmlrpc_port(self) -> int:
         """The XML-RPC port; the one asked for, before the first start."""
         return self._settings.xmlrpc_port
 
     @property
-    def domain(self):
+    def domain(self) -> Optional[str]:
         """The address that the node advertises, None before the first start."""
-        return self.latest_run and self.latest_run.rospy.domain
+        return self.latest_run.rospy.domain if self.latest_run else None
 
-    def health(self):
+    def health(self) -> Health:
         """How the node is doing: ``registered, reachable_since, connections, dropped, errors,
         threads``, a named tuple.
 
@@ -420,7 +443,7 @@ class Node:
         """
         return health_of(self, ask=True)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         health = f': {health_of(self, ask=False)}' if self.is_running else ''
         return (
             f'<{type(self).__name__} {self.name} {self.lifecycle.value},'
@@ -439,13 +462,22 @@ class BlockNode(Node):
     """
 
 
-def make(node_class, master, named, soul, delegate, args, kwargs, **settings):
+def make(
+    node_class: Type[Node],
+    master: 'Master',
+    named: str,
+    soul: Block,
+    delegate: Block,
+    args: Any,
+    kwargs: Any,
+    **settings: Any,
+) -> Node:
     """A new node of ``node_class``, configured and not yet started."""
     if not (isinstance(node_class, type) and issubclass(node_class, Node)):
         raise TypeError(f'a node is made of a subclass of Node, or BlockNode; not {node_class!r}')
     node = node_class.__new__(node_class)
     node._configure(master, Settings(named, master.url, **settings), soul, delegate)
-    node.__init__(*args, **kwargs)
+    node.__init__(*args, **kwargs)  # type: ignore[misc]
     return node
 
 

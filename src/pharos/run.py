@@ -3,7 +3,7 @@ import contextlib
 import enum
 import threading
 import weakref
-from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, List, Optional, Union
+from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, List, Optional
 
 from pharos import messages, node_registry, signals
 from pharos.blocks import attempt, name_of
@@ -252,7 +252,7 @@ class Run:
         name = '~' + name[2:] if name.startswith('~/') else name
         return check_name(self.rospy.rospy.resolve_name(name), what)
 
-    def resolve_peer(self, peer: 'Union[str, Node, ExternalNode]') -> Resolved:
+    def resolve_peer(self, peer: Any) -> Resolved:
         """The full name of a node that messages come from or go to.
 
         :param peer: a name, Node or ExternalNode
@@ -288,12 +288,8 @@ class Run:
         finally:
             self._soul_threads.remove(threading.get_ident())
 
-    def turns(self, frequency: float) -> Iterator[None]:
-        """What :meth:`Node.every` returns; ``frequency`` in Hz."""
-        rate = self.rospy.rospy.Rate(frequency, reset=True)
-        return self._turns(rate)
-
-    def _turns(self, rate: Any) -> Iterator[None]:
+    def turns(self, rate: Any) -> Iterator[None]:
+        """What :meth:`Node.every` returns, by a Rate of rospy's."""
         while self.lifecycle is Lifecycle.RUNNING:
             yield
             with signals.interruptible_wait(), contextlib.suppress(rospy.ROSInterruptException):

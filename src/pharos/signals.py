@@ -9,7 +9,7 @@ import threading
 import time
 import traceback
 import _thread
-from types import CodeType, FrameType
+from types import FrameType
 from typing import Any, Callable, Iterator, Optional, Set
 
 import rosgraph
@@ -123,7 +123,7 @@ def is_from_signal(error: BaseException) -> bool:
     return any(frame.f_code in codes for frame, _ in traceback.walk_tb(error.__traceback__))
 
 
-def code_of(function: Any) -> Optional[CodeType]:
+def code_of(function: Any) -> Any:
     """The code object that runs when a function, or another object, is called; None if not
     Python's."""
     if hasattr(function, '__code__'):

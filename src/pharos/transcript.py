@@ -1,9 +1,12 @@
 """The Transcript: where blocks show things."""
 import sys
 import threading
+from typing import Any, Callable, Optional
 
 from pharos.blocks import attempt, check_block, name_of, text_of
 from pharos.signals import is_from_signal
+
+Receiver = Optional[Callable[[str], Any]]
 
 
 class _Transcript:
@@ -16,12 +19,12 @@ class _Transcript:
         Transcript.show(message)
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._lock = threading.RLock()  # an RLock: what receives a line may show something itself
-        self._receiver = None
+        self._receiver: Receiver = None
         self._is_failing = False  # whether the receiver has raised something
 
-    def show(self, *things):
+    def show(self, *things: Any) -> None:
         """Show one line: ``things`` as text, separated by blanks. Raises nothing.
 
         Where the receiver of :meth:`on_show` raises something, the line goes to standard output,
@@ -34,7 +37,7 @@ class _Transcript:
             if receiver is None or not self._is_taken(text, receiver):
                 attempt(lambda: _print(text))
 
-    def _is_taken(self, text, receiver):
+    def _is_taken(self, text: str, receiver: Callable[[str], Any]) -> bool:
         """Have the receiver take the line; returns whether it did."""
         try:
             receiver(text)
@@ -51,7 +54,7 @@ class _Transcript:
                 attempt(lambda: _print(why))
             return False
 
-    def on_show(self, receiver):
+    def on_show(self, receiver: Receiver) -> Receiver:
         """Send lines to ``receiver(text)`` from now on; ``None`` means standard output again.
 
         Returns the receiver so far, so that it can be put back.
@@ -62,11 +65,11 @@ class _Transcript:
             self._is_failing = False
         return before
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"<Transcript to {'standard output' if self._receiver is None else self._receiver}>"
 
 
-def _print(text):
+def _print(text: str) -> None:
     try:
         print(text, flush=True)
     except UnicodeEncodeError:  # as on a terminal that knows ASCII only
