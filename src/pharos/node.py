@@ -124,6 +124,14 @@ class Node:
         """The node's name, as the master knows it: '/robot1/driver'."""
         return self._settings.name
 
+    @name.setter
+    def name(self, value: Any) -> None:
+        raise AttributeError(
+            f'{self.name} is the name by which the master knows the node: give another one to'
+            f' create(), as named={value!r}, and what else {type(self).__name__} is called to'
+            ' another attribute'
+        )
+
     @property
     def lifecycle(self) -> Lifecycle:
         """A :class:`Lifecycle`."""

@@ -3,7 +3,7 @@ import contextlib
 import enum
 import threading
 import weakref
-from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, List, Optional
+from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, List, Optional, Tuple
 
 from pharos import messages, node_registry, signals
 from pharos.blocks import attempt, name_of
@@ -52,6 +52,7 @@ class Run:
         self._starter: Optional[int] = threading.get_ident()  # the thread that starts the node
         self._is_cancelled = False  # whether a stop() came while the node started
         self._forked: 'weakref.WeakSet[threading.Thread]' = weakref.WeakSet()  # they run souls
+        self._ignoring: List[threading.Thread] = []  # those of them that went on after the stop
         self._soul_threads: List[int] = []  # identifiers of threads, once for each soul they run
         self.rospy = PrivateRospy(settings, self._stop_for_ros, lambda: node.allow_remote_shutdown)
         self.dispatcher = Dispatcher(self.rospy.start_thread)
@@ -96,7 +97,7 @@ class Run:
             is_stopped = self._is_cancelled or self.is_ending
             if self.is_starting:
                 self.rospy.stop(0)
-                self.node.latest_run = former
+                self.node.latest_run = former  # type: ignore[assignment]
                 self._become(Lifecycle.STOPPED)
             self.end()
             self._close_opened()  # what was opened after another thread had stopped the node
@@ -117,45 +118,51 @@ class Run:
         self.rospy.end()
 
     def end(self) -> None:
-        """End all that the run has, unless it ends already.
-
-        In this order: what waits, souls (for up to the node's stop_timeout), delegates, and what
-        :meth:`PrivateRospy.stop` ends: links, services, watched parameters, messages under way (for
-        up to stop_timeout), registrations, servers, sockets, threads.
-        """
+        """End all that the run has, unless it ends already."""
         with node_registry.changed:
             if self.lifecycle is not Lifecycle.RUNNING:
                 return
             self._become(Lifecycle.STOPPING)
-        timeout = self.node.stop_timeout
         try:
-            self.rospy.end()
-            ignoring = self._end_souls(timeout)
-            self.dispatcher.close()
-            left = self.rospy.stop(timeout, ignoring)
-            if left:
-                Transcript.show(
-                    f"{self.node.name} left behind threads that did not end: {', '.join(left)}"
-                )
-            self._close_opened()
+            for end, *limit in self._ends():
+                end(*limit)
         finally:
             self._become(Lifecycle.STOPPED)
             node_registry.collect()
             watcher_of(self.node.master).check()
 
-    def _end_souls(self, timeout: float) -> List[threading.Thread]:
-        """Wait for the souls, but this thread's; returns the threads of those that went on."""
+    def _ends(self) -> List[Tuple[Any, ...]]:
+        """What a stop ends, in this order: (how, the seconds that it may take, if it takes any)."""
+        timeout = self.node.stop_timeout
+        return [
+            (self.rospy.end,),  # what waits
+            (self._end_souls, timeout),
+            (self.dispatcher.close,),
+            # links, services, watched parameters, messages under way, registrations, servers,
+            # sockets and threads
+            (self._end_rospy, timeout),
+            (self._close_opened,),
+        ]
+
+    def _end_souls(self, timeout: float) -> None:
+        """Wait for the souls, but this thread's."""
         threads = [thread for thread in self._forked if thread is not threading.current_thread()]
         node_registry.join(threads, timeout)
-        ignoring = [thread for thread in threads if thread.is_alive()]
-        if ignoring:
+        self._ignoring = [thread for thread in threads if thread.is_alive()]
+        if self._ignoring:
             self.node.log(
                 f"left behind, for it did not end within {timeout:g} s of the stop:"
-                f" {', '.join(thread.name for thread in ignoring)}. A soul ends by itself if it"
-                ' waits with node.sleep() or loops over node.every()',
+                f" {', '.join(thread.name for thread in self._ignoring)}. A soul ends by itself if"
+                ' it waits with node.sleep() or loops over node.every()',
                 level='warning',
             )
-        return ignoring
+
+    def _end_rospy(self, timeout: float) -> None:
+        left = self.rospy.stop(timeout, self._ignoring)
+        if left:
+            Transcript.show(
+                f"{self.node.name} left behind threads that did not end: {', '.join(left)}"
+            )
 
     def _close_opened(self) -> None:
         for opened in self.opened:

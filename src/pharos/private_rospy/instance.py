@@ -46,7 +46,7 @@ class PrivateRospy:
 
     def __init__(self, settings, on_stop_request, allows_remote_shutdown):
         self.settings = settings
-        self.name, self.uri = settings.name, None
+        self.name, self.uri, self.domain = settings.name, None, None
         self._on_stop_request, self.allows_remote_shutdown = on_stop_request, allows_remote_shutdown
         self._stopping = threading.Lock()
         # whether a newer node has it: what registers this one again would end that one
