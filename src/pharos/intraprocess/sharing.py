@@ -19,7 +19,8 @@ class Mark(Dict[str, str]):
     def put_on(self, message: genpy.Message) -> genpy.Message:
         """Mark a message that is handed over; returns it, or a copy if it is held as another
         publisher's already."""
-        Mark.is_used = True
+        if not Mark.is_used:  # each assignment would flush what the interpreter caches of the class
+            Mark.is_used = True
         if is_held(message) and message._connection_header != self:
             message = _copied(message)
         message._connection_header = self
