@@ -83,8 +83,10 @@ def read_ros_handshake_header(sock, b, buff_size, *, module):
     'lets one silent client keep all others from connecting (ros_comm PR #1918)',
 )
 def accept_clients(self, *, node):
-    """Let each client into a thread of its own."""
-    Acceptor('TCPROS', node).accept(self.server_sock, self.inbound_handler)
+    """Let each client into a thread of its own, until the server is shut down."""
+    # Closed by another thread, its descriptor could be another listener's when accept() gets it.
+    with self.server_sock:
+        Acceptor('TCPROS', node).accept(self.server_sock, self.inbound_handler)
 
 
 @patch(
@@ -93,11 +95,9 @@ def accept_clients(self, *, node):
     'closes the socket, which does not wake accept(), and the port stays taken',
 )
 def shutdown_server(self):
-    """Wake the thread that accepts clients, too."""
-    if not self.is_shutdown:
-        self.is_shutdown = True
-        shutdown_socket(self.server_sock)
-        self.server_sock.close()
+    """Wake the thread that accepts clients; it closes the socket."""
+    self.is_shutdown = True
+    shutdown_socket(self.server_sock)
 
 
 @patch(
