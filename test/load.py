@@ -22,16 +22,13 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Int32
 from std_srvs.srv import SetBool
 
-from pharos import BlockNode, ServiceCallError, UnknownServiceError, node_registry
-from programs import TIMEOUT, until
+from helpers import create
+from pharos.testing import TIMEOUT, until
+from pharos import ServiceCallError, UnknownServiceError, node_registry
 
 NODES, TOPICS = 100, 1000
 IMAGE_SIZE = 640 * 480 * 3
 STEP = 0.01  # seconds between two bursts of messages, where they are not sent flat out
-
-
-def create(master, name, **kwargs):
-    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
 
 
 def image(number):
@@ -112,7 +109,7 @@ class Crowd:
         sent = rounds * TOPICS
         took = time.monotonic() - begin
         dropped = sum(channel.dropped for channel in self._inputs)
-        until(lambda: sum(self._received) + dropped == sent, 'all %d messages' % sent)
+        until(lambda: sum(self._received) + dropped == sent, what='all %d messages' % sent)
         assert not any(node.errors for node in node_registry.nodes())
         return {
             'sent': sent,
@@ -162,7 +159,7 @@ class Traffic:
         for thread in threads:
             thread.join()
         assert not self._problems, '\n'.join(self._problems)
-        until(lambda: not registered(self._master, '/traffic/'), 'an empty graph')
+        until(lambda: not registered(self._master, '/traffic/'), what='an empty graph')
         return dict(self._counts)
 
     def _work(self, number, turns):

@@ -8,9 +8,9 @@ import threading
 import time
 
 import rosgraph
+from pharos.testing import TIMEOUT
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
-TIMEOUT = 60.0  # seconds; a bound on waits, never reached in a test that passes
 
 
 def script(name):
@@ -45,18 +45,9 @@ def run(master_url, *command, cwd=None):
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        timeout=TIMEOUT,
+        timeout=2 * TIMEOUT,
         check=False,
     )
-
-
-def until(condition, what='it'):
-    """Wait for what nobody tells: what another process does, or a thread of a node, or what only a
-    master knows."""
-    pause, deadline = threading.Event(), time.monotonic() + TIMEOUT
-    while not condition():
-        assert time.monotonic() < deadline, f'{what} did not come to be: {condition}'
-        pause.wait(0.01)
 
 
 def forget_parameters(master_url):

@@ -26,11 +26,12 @@ import xmlrpc.client
 
 from std_msgs.msg import String
 
+from helpers import create
+from pharos.testing import until
 import load
 from fuzz import Fuzz
-from load import create
 from pharos import Master, ServiceCallError, node_registry
-from programs import Program, environment, until
+from programs import Program, environment
 
 HERE = pathlib.Path(__file__).resolve().parent
 PATHS = f"{HERE.parent / 'src'}:{HERE}"

@@ -3,9 +3,9 @@ import uuid
 
 import pytest
 
+from helpers import create
+from pharos.testing import Mailbox
 import pharos
-from conftest import Mailbox
-from pharos import BlockNode
 from programs import ROOT
 from test_ros_process import MANIFEST, write
 
@@ -25,10 +25,6 @@ for name in '/talker', '/listener', 'left/eye', 'right/eye':
 print('SEEN all', flush=True)
 spin()
 """
-
-
-def create(master, name, **kwargs):
-    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
 
 
 @pytest.fixture
@@ -235,7 +231,7 @@ def launch(master, tmp_path, monkeypatch):
         seen, lines = {}, Mailbox()
         with master.launch('two_in_one', 'test.launch', on_line=lambda line: lines(line, None)):
             while True:
-                words = lines.get().split()
+                words = lines.next().split()
                 if words[:1] == ['SEEN']:
                     if words[1] == 'all':
                         registered = {node.name for node in master.nodes()}

@@ -4,12 +4,9 @@ from unittest import mock
 
 import pytest
 
-from conftest import Mailbox
-from pharos import BlockNode, Node, Transcript
-
-
-def create(master, name='/node', **kwargs):
-    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
+from helpers import create
+from pharos.testing import Mailbox
+from pharos import Node, Transcript
 
 
 # -- what would never run
@@ -134,7 +131,7 @@ def test_a_plain_function_around_an_async_one_is_a_block(master, mailbox):
     node = create(master, delegate=plain)
     node.interested_in('/wrapped', 'std_msgs/String')
     node.send_to('/wrapped', data='ran')
-    assert mailbox.get().data == 'ran'
+    assert mailbox.next().data == 'ran'
 
 
 # -- what is falsy, and runs all the same
@@ -161,7 +158,7 @@ def test_a_falsy_delegate_runs(master, inline):
     node.interested_in('/falsy', 'std_msgs/String', inline=inline)
     channel = node.interested_in('/falsy', 'std_msgs/String', delegate=own, inline=inline)
     node.send_to('/falsy', data='ran')
-    assert own.mailbox.get().data == nodes.mailbox.get().data == 'ran' and nodes.mailbox.empty()
+    assert own.mailbox.next().data == nodes.mailbox.next().data == 'ran' and nodes.mailbox.empty()
     assert channel.delegate is own
 
 
@@ -169,23 +166,23 @@ def test_falsy_blocks_of_other_kinds_run(master, transcript):
     soul, serves, parameter, fills, changes, line = (Falsy() for _ in range(6))
     node = create(master, soul=lambda me: pytest.fail('not this one'))
     node.fork(soul)
-    assert soul.mailbox.get() is node
+    assert soul.mailbox.next() is node
     node.soul = soul
     node.execute()
-    assert soul.mailbox.get() is node
+    assert soul.mailbox.next() is node
     node.serve('/falsy_service', 'std_srvs/Empty', serves)
     master.lookup_service('/falsy_service').call(fills)
-    assert serves.mailbox.get()._type == fills.mailbox.get()._type == 'std_srvs/EmptyRequest'
+    assert serves.mailbox.next()._type == fills.mailbox.next()._type == 'std_srvs/EmptyRequest'
     watched = node.parameter('~falsy')
     watched.on_change(parameter)
     watched.set(5)
-    assert parameter.mailbox.get() == 5
+    assert parameter.mailbox.next() == 5
     end = master.on_change(changes)
     # which says how it is used, and ends
     with master.run('topic_tools', 'relay', on_line=line) as process:
-        assert line.mailbox.get() == process.output.split('\n')[0]
+        assert line.mailbox.next() == process.output.split('\n')[0]
     create(master, '/another')
-    assert changes.mailbox.get() in ('node', 'topic', 'service')
+    assert changes.mailbox.next() in ('node', 'topic', 'service')
     end()
     assert not node.errors and not transcript
 
@@ -197,7 +194,7 @@ def test_a_falsy_receiver_of_the_transcript_runs():
         Transcript.show('shown')
     finally:
         Transcript.on_show(before)
-    assert receiver.mailbox.get() == 'shown'
+    assert receiver.mailbox.next() == 'shown'
 
 
 def test_a_falsy_node_is_known_as_a_node_of_this_process(master):

@@ -20,19 +20,16 @@ import rosnode
 import std_msgs.msg
 from rosgraph.network import encode_ros_handshake_header
 
-from conftest import TIMEOUT, Mailbox, speak_tcpros_only
+from helpers import create, speak_tcpros_only
+from pharos.testing import Mailbox, TIMEOUT, until
 from fuzz import Fuzz
 from pharos import BlockNode
 from pharos.private_rospy import acceptor, xmlrpc_server
 from pharos.private_rospy.patches import tcpros_server
-from programs import Program, until
+from programs import Program
 
 FUZZ_COUNT = int(os.environ.get('PHAROS_FUZZ_COUNT', 2500))  # bad clients; tools/soak makes it more
 STRING = std_msgs.msg.String
-
-
-def create(master, name, **kwargs):
-    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
 
 
 def connect(port):
@@ -142,13 +139,13 @@ def test_hundreds_of_silent_clients_keep_nobody_out(master, mailbox, node, warni
         speak_tcpros_only(receiver).ros.Subscriber(
             '/clients/out', STRING, lambda message: mailbox(message, None)
         )
-        assert mailbox.get().data == 'hello'
+        assert mailbox.next().data == 'hello'
         assert answers(node) and rosnode.rosnode_ping('/node', max_count=1)
         assert master.lookup_service('/clients/set').call(data=True, timeout=TIMEOUT).success
         for kind in 'TCPROS', 'XML-RPC':
             until(lambda: len(threads(node, kind)) <= acceptor.CLIENTS)
             assert len(threads(node, kind)) > 1  # some do hang there
-        assert {warnings.get(), warnings.get()} == {
+        assert {warnings.next(), warnings.next()} == {
             '%d %s clients say nothing: those that said nothing for longest are closed, to let others in'
             % (acceptor.CLIENTS, kind)
             for kind in ('TCPROS', 'XML-RPC')
@@ -188,7 +185,7 @@ def test_a_slow_handshake_ends_after_its_limit(node, warnings, monkeypatch):
         dribble(client, struct.pack('<I', 100000))
         assert is_closed(client)
         assert (
-            warnings.get()
+            warnings.next()
             == f'TCPROS client {address_of(client)} refused: no handshake within 0.3 s'
         )
     assert answers(node) and warnings.empty()
@@ -199,7 +196,7 @@ def test_a_slow_request_ends_after_its_limit(node, warnings, monkeypatch):
     with connect(node.xmlrpc_port) as client:
         dribble(client, b'POST / HTTP/1.1\r\nContent-Length: 10000\r\n\r\n')
         assert is_closed(client)
-        line = warnings.get()
+        line = warnings.next()
         assert line.startswith(f'XML-RPC client {address_of(client)} refused: Request timed out')
     assert answers(node) and warnings.empty()
 
@@ -262,7 +259,7 @@ def test_a_client_for_whom_there_is_no_thread_is_closed(node, warnings, monkeypa
         for port in node.tcp_port, node.xmlrpc_port:
             with connect(port) as client:
                 assert is_closed(client)
-    assert "can't start new thread" in warnings.get() and answers(node)
+    assert "can't start new thread" in warnings.next() and answers(node)
 
 
 def named(value):
@@ -293,7 +290,7 @@ def assert_refused_and_logged_once(node, port, kind, warnings, said, logged):
             client.sendall(said)
             client.shutdown(socket.SHUT_WR)
         assert is_closed(client)
-        line = warnings.get()
+        line = warnings.next()
         assert logged in line and line.startswith(f'{kind} client {address_of(client)} refused: ')
     assert '\n' not in line and len(line) < 500
     assert answers(node) and warnings.empty()
@@ -347,7 +344,7 @@ def test_a_caller_id_is_shown_as_it_is(node, warnings, screen):
         with connect(node.tcp_port) as other:
             other.sendall(shake(callerid=name, md5sum='0' * 32))
             is_closed(other)
-        line = warnings.get()
+        line = warnings.next()
         assert f'Client [{name}] wants topic' in line and line in screen.getvalue()
 
 
@@ -364,7 +361,7 @@ def test_a_node_whose_screen_is_closed_refuses_as_before(node, warnings):
     with connect(node.tcp_port) as client:
         client.sendall(struct.pack('<I', 0))
         assert is_closed(client)
-    assert 'no topic or service' in warnings.get() and answers(node)
+    assert 'no topic or service' in warnings.next() and answers(node)
 
 
 # -- service clients
@@ -396,7 +393,7 @@ def test_a_bad_request_of_a_service_ends_its_connection(
     with call_service(node, persistent=persistent) as client:
         client.sendall(said)
         assert is_closed(client)
-        line = warnings.get()
+        line = warnings.next()
         assert logged in line and line.startswith(f'service client {address_of(client)} refused: ')
     assert master.lookup_service('/clients/set').call(data=True).success and warnings.empty()
 
@@ -405,7 +402,7 @@ def test_a_service_client_that_leaves_without_a_request_is_logged_once(node, war
     with call_service(node) as client:
         address = address_of(client)
     assert (
-        warnings.get().startswith(f'service client {address} refused: unable to receive')
+        warnings.next().startswith(f'service client {address} refused: unable to receive')
         and warnings.empty()
     )
 
@@ -442,7 +439,7 @@ def test_service_clients_that_ask_nothing_keep_nobody_out(master, node, warnings
             clients.enter_context(call_service(node)) for _ in range(acceptor.CLIENTS + 20)
         ]
         until(ask)
-        assert '%d service clients say nothing' % acceptor.CLIENTS in warnings.get()
+        assert '%d service clients say nothing' % acceptor.CLIENTS in warnings.next()
         assert is_closed(longest)
 
 
@@ -460,7 +457,7 @@ def test_a_publisher_that_announces_4_gib_is_left_and_found_again(master, mailbo
         assert sent.wait_for_subscribers(1, TIMEOUT)
         (connection,) = other.latest_run.rospy.publisher('/clients/in').connections
         connection.write_data(said)
-        line = warnings.get()
+        line = warnings.next()
         assert logged in line and line.startswith(
             f'connection with {other.uri} for /clients/in closed: '
         )
@@ -469,7 +466,7 @@ def test_a_publisher_that_announces_4_gib_is_left_and_found_again(master, mailbo
             and sent.connections
         )
     sent.send(data='understood')
-    assert mailbox.get().data == 'understood'
+    assert mailbox.next().data == 'understood'
 
 
 # -- XML-RPC
@@ -618,7 +615,7 @@ def test_a_parameter_update_for_no_parameter_is_told_to_nobody(node):
         for key in '', 'clients/watched':
             assert proxy.paramUpdate('/test', key, 'bad')[0] == -1
         assert proxy.paramUpdate('/test', '/clients/watched', 'good') == [1, '', 0]
-    assert told.get() == 'good' and told.empty()
+    assert told.next() == 'good' and told.empty()
 
 
 def test_a_flood_of_bad_clients_does_not_fill_the_log(node, warnings, monkeypatch):
@@ -637,7 +634,7 @@ def test_a_flood_of_bad_clients_does_not_fill_the_log(node, warnings, monkeypatc
         )
         monkeypatch.setattr(acceptor, 'REJECTION_PERIOD', 0)
         refused()
-    assert 'and 5 more' in warnings.get()
+    assert 'and 5 more' in warnings.next()
 
 
 def test_a_large_call_is_answered(node, warnings):
@@ -666,7 +663,7 @@ def test_thousands_of_mutated_handshakes_and_calls_change_nothing(master, mailbo
         assert answers(node) and rosnode.rosnode_ping('/node', max_count=1)
         assert master.lookup_service('/clients/set').call(data=True).success
         create(master, '/sender').send_to('/clients/in', data='still there')
-        assert mailbox.get().data == 'still there' and not node.errors
+        assert mailbox.next().data == 'still there' and not node.errors
         until(lambda: not threads(node, 'TCPROS') and len(threads(node, 'XML-RPC')) < 5)
         until(lambda: len(threading.enumerate()) < resting + 30)
     except Exception as error:
@@ -688,7 +685,7 @@ def test_another_host_may_not_stop_a_node(node, warnings, far_client):
     with xmlrpc.client.ServerProxy(node.uri) as proxy:
         code, said, _ = proxy.shutdown('/intruder', 'go away')
         assert code == -1 and 'allow_remote_shutdown' in said
-    line = warnings.get()
+    line = warnings.next()
     assert 'XML-RPC client 127.0.0.1:' in line and 'call of shutdown: only this host' in line
     assert answers(node) and warnings.empty()
 

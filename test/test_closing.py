@@ -4,27 +4,12 @@ import threading
 
 import pytest
 
+from helpers import create, ended, in_thread
+from pharos.testing import Mailbox, TIMEOUT
 import pharos
-from conftest import TIMEOUT, Mailbox
-from pharos import BlockNode
 from pharos.messages import define_service
 
 STRING = 'std_msgs/String'
-
-
-def create(master, name, **kwargs):
-    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
-
-
-def in_thread(block, *args):
-    thread = threading.Thread(target=block, args=args, daemon=True)
-    thread.start()
-    return thread
-
-
-def ended(thread):
-    thread.join(TIMEOUT)
-    return not thread.is_alive()
 
 
 @pytest.mark.parametrize('inline', [False, True])
@@ -59,7 +44,7 @@ def test_no_delegate_runs_once_close_has_returned(master, inline):
     proceed.set()
     assert ended(thread) and ended(first)
     sender.send_to('/not_closing', typed_as=STRING, data='done')
-    assert mailbox.get().data == 'done'  # whatever was queued before has been looked at
+    assert mailbox.next().data == 'done'  # whatever was queued before has been looked at
     assert calls == called_at_return == ['0']
     assert closing.received == 1
 

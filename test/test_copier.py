@@ -28,7 +28,7 @@ from std_msgs.msg import ByteMultiArray, Empty, Float32, Float64, Header, String
 from std_msgs.msg import Bool, Duration, Float32MultiArray, Time, UInt8MultiArray
 from tf2_msgs.msg import TFMessage
 
-from conftest import serializes_numpy
+from helpers import serializes_numpy
 from pharos.intraprocess.copier import copier_for, serialized, thawer
 
 # Among the wrong values are some that numpy, or genpy on its way, warns of.

@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
+from pharos.testing import Mailbox, TIMEOUT
 import pharos
-from conftest import TIMEOUT, Mailbox
 from pharos import BlockNode, Master, PharosError, PortInUseError
 from pharos.errors import MasterUnreachableError
 from programs import Program, run
@@ -39,7 +39,7 @@ def test_nodes_of_this_process_and_others_meet_there(embedded):
         '/t', 'std_msgs/String'
     )
     with Program(embedded.url, 'rostopic', 'pub', '/t', 'std_msgs/String', 'data: from outside'):
-        assert mailbox.get().data == 'from outside'
+        assert mailbox.next().data == 'from outside'
 
 
 def test_rosout_agg_gets_each_line_once(embedded):
@@ -55,7 +55,7 @@ def test_rosout_agg_gets_each_line_once(embedded):
     speaker.log('the end')
     lines = []
     while not lines or lines[-1] != 'the end':
-        message = mailbox.get()
+        message = mailbox.next()
         if message.name == '/speaker':
             lines.append(message.msg)
     assert lines == ['line %d' % number for number in range(10)] + ['the end']

@@ -6,7 +6,8 @@ import time
 
 import pytest
 
-from conftest import TIMEOUT
+from helpers import create, ended
+from pharos.testing import TIMEOUT, until
 from pharos import (
     BlockNode,
     ExternalNode,
@@ -20,12 +21,7 @@ from pharos import (
 from pharos import message_class
 from pharos.private_rospy import acceptor, lifetime, local_services, proxies
 from pharos.private_rospy.patches import xmlrpc_server
-from programs import until
 from sockets import refused_url, silent_peer
-
-
-def create(master, name, node_class=BlockNode, **settings):
-    return master.create(node_class, named=name, domain='127.0.0.1', **settings)
 
 
 def in_thread(function, *arguments):
@@ -42,11 +38,6 @@ def in_thread(function, *arguments):
     thread = threading.Thread(target=run, daemon=True)
     thread.start()
     return thread, outcome
-
-
-def ended(thread):
-    thread.join(TIMEOUT)
-    return not thread.is_alive()
 
 
 # -- known here before the master knows it

@@ -5,13 +5,10 @@ import threading
 
 import pytest
 
+from helpers import create
 import pharos
 from pharos import BlockNode, Master
 from pharos.private_rospy.process_rospy import rospy
-
-
-def create(master, name='/node', node_class=BlockNode, **kwargs):
-    return master.create(node_class, named=name, **{'domain': '127.0.0.1', **kwargs})
 
 
 @pytest.fixture
@@ -195,7 +192,7 @@ def test_a_field_that_does_not_exist_or_does_not_fit(
     with pytest.raises(pharos.MessageTypeError, match=said):
         node.send_to('/t', block, typed_as='turtlesim/Velocity', **fields)
     node.send_to('/t', linear=2)  # and the next one goes through
-    assert not interested or mailbox.get().linear == 2.0
+    assert not interested or mailbox.next().linear == 2.0
 
 
 def test_a_value_in_a_blocks_place_is_told_how_a_block_is_called(master):

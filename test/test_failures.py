@@ -12,10 +12,11 @@ import traceback
 
 import pytest
 
+from helpers import create
+from pharos.testing import Mailbox, TIMEOUT, until
 import pharos
-from conftest import TIMEOUT, Mailbox
 from pharos import BlockNode, Transcript, failures, node_registry
-from programs import Program, run, until
+from programs import Program, run
 
 
 class OfMyOwn(BaseException):
@@ -44,10 +45,6 @@ OUTCASTS = [
     pytest.fail.Exception,
     OfMyOwn,
 ]
-
-
-def create(master, name='/node', **kwargs):
-    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
 
 
 class Raising:
@@ -89,7 +86,7 @@ def test_a_delegate_may_raise_anything(master, transcript, inline):
     node.interested_in('/failing', 'std_msgs/Int32', inline=inline)
     for number in range(len(RAISED) + 1):
         create(master, '/sender%d' % number).send_to('/failing', data=number)
-    assert block.taken.get().data == len(RAISED)
+    assert block.taken.next().data == len(RAISED)
     assert classes_of(node.errors) == RAISED
     assert [line.split(' raised ')[1] for line in transcript] == [
         outcast.__name__ + ': out' for outcast in RAISED
@@ -158,7 +155,7 @@ def test_a_parameter_block_may_raise_anything(master, transcript):
         master.parameters['/node/failing'] = number  # runs it in a thread of the XML-RPC server
         until(lambda: node.health().errors == 2 * number + 2)
     parameter.set(99)
-    assert block.taken.get() == 99
+    assert block.taken.next() == 99
     assert set(classes_of(node.errors)) == set(OUTCASTS)
 
 
@@ -176,7 +173,7 @@ def test_a_block_for_changes_may_raise_anything(master, transcript):
         events[name] = True
         create(master, name)
         until(lambda: name not in events)
-        while watched.get() != ('node', name):
+        while watched.next() != ('node', name):
             pass
     end()
     also()
@@ -188,7 +185,7 @@ def test_a_node_whose_registration_fails_leaves_the_others_watched(master, trans
     node.latest_run.rospy.repair = lambda *arguments: 1 / 0
     end = master.on_change(lambda kind, name, is_there: watched((kind, name), None))
     create(master, '/another')
-    while watched.get() != ('node', '/another'):
+    while watched.next() != ('node', '/another'):
         pass
     end()
     assert classes_of(node.errors) == [ZeroDivisionError]
@@ -268,7 +265,7 @@ def test_a_callback_of_plain_rospy_takes_nothing_from_a_channel_whatever_it_rais
     assert [message.data for message in mailbox.take(len(OUTCASTS) + 1)] == list(
         range(len(OUTCASTS) + 1)
     )
-    assert plain.taken.get().data == len(OUTCASTS) and not dead_threads
+    assert plain.taken.next().data == len(OUTCASTS) and not dead_threads
 
 
 @pytest.mark.parametrize('outcast', [SystemExit, ValueError])
@@ -283,7 +280,7 @@ def test_a_hook_of_on_shutdown_may_raise_anything(master, transcript, monkeypatc
     ) as closed:
         patched.setattr(sys, 'stderr', closed)  # where rospy would print it
         node.stop()
-    assert hook.taken.get() == 'the other' and classes_of(node.errors) == [outcast]
+    assert hook.taken.next() == 'the other' and classes_of(node.errors) == [outcast]
     assert '/node' not in [other.name for other in master.nodes()]
 
 
@@ -378,7 +375,7 @@ def test_an_error_that_cannot_be_shown_is_kept_all_the_same(master, transcript, 
     error.__cause__ = Unspeakable()
     node = create(master, delegate=fails_on_bad(mailbox, error))
     send_bad_and_good(node)
-    assert mailbox.get().data == 'good' and node.errors[0] is error
+    assert mailbox.next().data == 'good' and node.errors[0] is error
     assert f'raised {type(error).__name__}' in transcript[0]
     assert repr(node.failures)
 
@@ -386,7 +383,7 @@ def test_an_error_that_cannot_be_shown_is_kept_all_the_same(master, transcript, 
 def test_a_block_that_cannot_be_named_is_told_all_the_same(master, transcript, mailbox):
     node = create(master, delegate=UnnameableBlock(fails_on_bad(mailbox, ValueError('bad one'))))
     send_bad_and_good(node)
-    assert mailbox.get().data == 'good' and classes_of(node.errors) == [ValueError]
+    assert mailbox.next().data == 'good' and classes_of(node.errors) == [ValueError]
     assert 'UnnameableBlock' in transcript[0] and 'bad one' in transcript[0]
 
 
@@ -406,7 +403,7 @@ def test_a_log_and_a_transcript_that_fail_change_nothing(master, mailbox, capsys
             Mute, named='/mute', delegate=fails_on_bad(mailbox, ValueError('bad one'))
         )
         send_bad_and_good(node, inline)
-        assert mailbox.get().data == 'good' and classes_of(node.errors) == [ValueError]
+        assert mailbox.next().data == 'good' and classes_of(node.errors) == [ValueError]
         Transcript.show('another', Unspeakable())
     finally:
         Transcript.on_show(before)
@@ -431,7 +428,7 @@ def test_an_output_that_cannot_be_written_changes_nothing(master, mailbox, monke
         patched.setattr(sys, 'stderr', file)
         node = create(master, delegate=fails_on_bad(mailbox, ValueError('bad one')))
         send_bad_and_good(node)
-        assert mailbox.get().data == 'good' and classes_of(node.errors) == [ValueError]
+        assert mailbox.next().data == 'good' and classes_of(node.errors) == [ValueError]
         node.fork(lambda me: 1 / 0).join(TIMEOUT)
         assert classes_of(node.errors) == [ValueError, ZeroDivisionError]
         with pytest.raises((OSError, ValueError)):
@@ -458,7 +455,7 @@ def test_a_receiver_that_works_again_gets_the_lines_again(capsys):
         Transcript.show('second')
     finally:
         Transcript.on_show(before)
-    assert receiver.taken.get() == 'second'
+    assert receiver.taken.next() == 'second'
     assert capsys.readouterr().out.splitlines()[1:] == ['first']
 
 
@@ -525,7 +522,7 @@ def test_a_listener_to_the_log_that_fails_does_not_hear_of_itself_for_ever(
     node.interested_in('/rosout', 'rosgraph_msgs/Log')
     speaker = create(master, '/speaker')
     speaker.log('the last')
-    while mailbox.get().msg != 'the last':
+    while mailbox.next().msg != 'the last':
         pass
     speaker.log('one more')
     until(lambda: any('one more' in failure.text for failure in node.failures))
@@ -728,7 +725,7 @@ def test_a_delegate_is_run_again_as_it_is_now_on_the_same_message(master, transc
     node.delegate = mailbox
     assert failure.retry() is True
     assert (
-        mailbox.get_with_channel() == (failure.message, channel) and failure.message.data == 'bad'
+        mailbox.next_with_channel() == (failure.message, channel) and failure.message.data == 'bad'
     )
     assert (failure.count, channel.received) == (2, 1)
     channel.delegate = Raising(SystemExit('out'))
@@ -755,7 +752,7 @@ def test_a_delegate_is_run_again_when_no_other_runs(master, transcript, mailbox)
     retrying.start()
     assert mailbox.empty() and not ran
     go_on.set()
-    assert mailbox.get() is True and ran == ['slow', 'again']
+    assert mailbox.next() is True and ran == ['slow', 'again']
 
 
 @pytest.mark.parametrize('inline', [False, True])
@@ -771,7 +768,7 @@ def test_a_delegate_may_have_another_one_run_again(master, transcript, mailbox, 
     node.send_to('/again', data='bad')
     until(lambda: node.failures)
     node.send_to('/retry')
-    assert mailbox.get() is True and failing_once.taken.get().data == 'bad'
+    assert mailbox.next() is True and failing_once.taken.next().data == 'bad'
 
 
 def test_what_came_inline_while_a_delegate_was_run_again_is_not_left_lying(
@@ -806,10 +803,10 @@ def test_a_soul_is_run_again_as_it_is_now(master, transcript, mailbox):
     of_soul, of_fork = node.failures
     assert (
         of_soul.retry() is True
-        and mailbox.get() == 'again'
+        and mailbox.next() == 'again'
         and of_soul.message is of_soul.channel is None
     )
-    assert of_fork.retry() is True and forked.taken.get() is node and mailbox.empty()
+    assert of_fork.retry() is True and forked.taken.next() is node and mailbox.empty()
 
 
 def test_a_service_block_is_run_again_on_the_same_request(master, transcript, mailbox):
@@ -820,7 +817,7 @@ def test_a_service_block_is_run_again_on_the_same_request(master, transcript, ma
     (failure,) = node.failures
     assert failure.message.data is True and failure.retry() is False and failure.count == 2
     offered.block = lambda request: mailbox(request, None) or {'success': True}
-    assert failure.retry() is True and mailbox.get() is failure.message
+    assert failure.retry() is True and mailbox.next() is failure.message
 
 
 def test_a_parameter_block_is_run_again_on_the_same_value(master, transcript):
@@ -830,7 +827,7 @@ def test_a_parameter_block_is_run_again_on_the_same_value(master, transcript):
     parameter.set(5)
     (failure,) = node.failures
     assert failure.message == 5 and failure.block is block
-    assert failure.retry() is True and block.taken.get() == 5
+    assert failure.retry() is True and block.taken.next() == 5
     failing(node, ValueError, failures.WHOLE)
     with pytest.raises(pharos.PharosError, match='newest 5'):
         failure.retry()

@@ -8,17 +8,13 @@ import xmlrpc.server
 import pytest
 import rosgraph
 
-from conftest import TIMEOUT, Mailbox
+from helpers import create, in_thread
+from pharos.testing import Mailbox, TIMEOUT, until
 from pharos import BlockNode
 from pharos.intraprocess.link import Link
-from programs import until
 from sockets import subscribe
 
 STRING = 'std_msgs/String'
-
-
-def create(master, name, **kwargs):
-    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
 
 
 class LateSubscriber:
@@ -56,12 +52,6 @@ class LateSubscriber:
         self._rpc.shutdown()
         self._rpc.server_close()
         self._thread.join(TIMEOUT)
-
-
-def in_thread(block, *args):
-    thread = threading.Thread(target=block, args=args, daemon=True)
-    thread.start()
-    return thread
 
 
 @pytest.mark.parametrize('opens', ['send_to', 'output_channel'])
@@ -118,7 +108,7 @@ def test_the_log_names_a_subscriber_that_did_not_connect_in_time_once(master):
     node.log('the end')
     lines = []
     while 'the end' not in lines:
-        lines.append(log.get().msg)
+        lines.append(log.next().msg)
     told = [line for line in lines if 'did not connect' in line]
     assert len(told) == 1
     assert '/late' in told[0] and '/first/late' in told[0] and '0.6 s' in told[0]
@@ -171,5 +161,5 @@ def test_who_waits_for_a_subscriber_waits_until_messages_go_to_it(master, mailbo
     allowed.set()
     assert sent.wait_for_subscribers(1, TIMEOUT)
     sent.send(data='first')
-    assert mailbox.get().data == 'first'
+    assert mailbox.next().data == 'first'
     opening.join(TIMEOUT)

@@ -104,10 +104,10 @@ def test_the_end_of_a_child_leaves_its_parents_nodes_alone(master, mailbox, chil
         program.wait_for('heard first')
         assert program.wait_for('still') == 'still running True None True\n'
         if 'from the child' in child:
-            assert mailbox.get().data == 'from the child'
-            assert mailbox.get().data == 'good-bye'
+            assert mailbox.next().data == 'from the child'
+            assert mailbox.next().data == 'good-bye'
             assert '/program_child' not in [node.name for node in master.nodes()]
-        assert mailbox.get().data == 'back'
+        assert mailbox.next().data == 'back'
         program.wait_for('waiting')  # before that, Ctrl-C ends it with another status
         out.send(data='second')
         program.wait_for('heard second')

@@ -10,9 +10,10 @@ import threading
 import pytest
 import rosgraph
 
+from helpers import InProcessMaster, create
+from pharos.testing import TIMEOUT
 import pharos
-from conftest import TIMEOUT, InProcessMaster
-from pharos import BlockNode, ExternalNode, Master, UnknownNodeError, UnknownTopicError, watcher
+from pharos import ExternalNode, Master, UnknownNodeError, UnknownTopicError, watcher
 from pharos.errors import MasterUnreachableError, UnknownServiceError
 from programs import Program
 from sockets import refused_url, silent_peer
@@ -30,10 +31,6 @@ rospy.Service('~clear', std_srvs.srv.Empty, lambda request: sent.publish(rospy.g
 print(rospy.get_name(), 'is ready', flush=True)
 rospy.spin()
 """
-
-
-def create(master, name, **kwargs):
-    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
 
 
 def peer(master, name):

@@ -23,9 +23,9 @@ import yaml
 from genpy.generate_initpy import write_modules
 from genpy.generator import MsgGenerator
 
-from conftest import TIMEOUT, Mailbox
+from helpers import create
+from pharos.testing import Mailbox, TIMEOUT, until
 from pharos import (
-    BlockNode,
     Master,
     MessageTypeError,
     NodeStoppedError,
@@ -38,7 +38,7 @@ from pharos import (
 from pharos.messages import class_from_definition
 from pharos.private_rospy import tcpros_connection
 from pharos.private_rospy.tcpros_connection import publisher_header
-from programs import Program, run, until
+from programs import Program, run
 from sockets import refused_url
 
 SEPARATOR = '\n' + '=' * 80 + '\n'
@@ -171,10 +171,6 @@ pharos.spin()
 '''
 
 
-def create(master, name, **kwargs):
-    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
-
-
 def plain(value):
     """A message as VALUES has it: with dicts and lists."""
     if isinstance(value, genpy.Message):
@@ -280,6 +276,7 @@ def publishing_roscpp(master, request, tmp_path):
     'publishing',
     [publishing_rospy_peer, publishing_files_peer, publishing_rosbag_play, publishing_roscpp],
 )
+@pytest.mark.leaves('peers that the next test uses')
 def test_a_type_that_is_nowhere_here_is_received_with_all_fields_right(
     master, request, tmp_path, mailbox, publishing
 ):
@@ -287,7 +284,7 @@ def test_a_type_that_is_nowhere_here_is_received_with_all_fields_right(
     the publisher."""
     with publishing(master, request, tmp_path) as topic:
         channel = create(master, '/receiver', delegate=mailbox).interested_in(topic, wait=TIMEOUT)
-        message = mailbox.get()
+        message = mailbox.next()
     assert channel.type == SCAN
     assert plain(message) == VALUES
     assert (message.OK, message.BROKEN, message.FRAME) == (0, 7, 'base "link" # not a comment')
@@ -303,15 +300,15 @@ def test_a_type_that_is_nowhere_here_is_received_with_all_fields_right(
 
 def test_a_type_asked_for_by_name_is_the_publishers(master, rospy_peer, mailbox):
     create(master, '/receiver', delegate=mailbox).interested_in('/types/from_rospy', typed_as=SCAN)
-    assert plain(mailbox.get()) == VALUES
+    assert plain(mailbox.next()) == VALUES
 
 
 def test_nodes_that_learn_a_type_each_send_and_receive_it(master, rospy_peer, mailbox):
     receiver, sender = create(master, '/receiver', delegate=mailbox), create(master, '/sender')
     heard = receiver.interested_in('/types/from_rospy')
-    mailbox.get()
+    mailbox.next()
     sent = sender.send_to('/types/from_rospy', text='from here')
-    assert type(sent) is heard.message_class and mailbox.get().text == 'from here'
+    assert type(sent) is heard.message_class and mailbox.next().text == 'from here'
 
 
 def test_a_type_learnt_serves_its_node_after_the_publisher_has_gone(master, mailbox):
@@ -329,14 +326,14 @@ def test_a_type_learnt_serves_its_node_after_the_publisher_has_gone(master, mail
     ) as program:
         program.wait_for('published')
         node.interested_in('/types/brief')
-        assert mailbox.get().word == 'hello'
+        assert mailbox.next().word == 'hello'
     for options in {}, {'typed_as': 'brief_msgs/Word'}, {'wait': TIMEOUT}:
         node.send_to('/types/brief', word='again', **options)
-        assert mailbox.get().word == 'again'
+        assert mailbox.next().word == 'again'
     node.stop()
     node.start()
     node.send_to('/types/brief', word='after a restart')
-    assert mailbox.get().word == 'after a restart'
+    assert mailbox.next().word == 'after a restart'
 
 
 def test_without_a_type_the_masters_is_taken(master, mailbox):
@@ -346,10 +343,10 @@ def test_without_a_type_the_masters_is_taken(master, mailbox):
     with talker, Program(master.url, 'rostopic', 'echo', '/types/echoed', 'std_msgs/msg/String'):
         node = create(master, '/node', delegate=mailbox)
         assert node.interested_in('/types/installed', wait=TIMEOUT).type == 'std_msgs/Int32'
-        assert mailbox.get().data == 7
+        assert mailbox.next().data == 7
         assert (
             node.send_to('/types/installed', data=8)._type == 'std_msgs/Int32'
-            and mailbox.get().data == 8
+            and mailbox.next().data == 8
         )
 
 
@@ -396,7 +393,7 @@ def test_rosbag_records_a_type_learnt_from_the_graph_and_sent_on(
 ):
     node = create(master, '/node', delegate=mailbox)
     heard = node.interested_in('/types/from_rospy')
-    node.output_channel('/types/sent_on', heard.message_class, latch=True).publish(mailbox.get())
+    node.output_channel('/types/sent_on', heard.message_class, latch=True).publish(mailbox.next())
     type_, message = read(record(master.url, '/types/sent_on', tmp_path / 'sent_on.bag'))
     assert type_ == SCAN and plain(message) == VALUES
 
@@ -528,7 +525,7 @@ def test_the_stop_of_a_node_ends_its_wait_for_a_type(master, asked, transcript):
     node.fork(soul)
     assert asked.wait(TIMEOUT)
     node.stop()
-    error = raised.get()
+    error = raised.next()
     assert isinstance(error, NodeStoppedError) and '/types/never' in str(error)
     assert not node.errors and not transcript
 
@@ -789,7 +786,7 @@ def test_a_subscriber_takes_a_live_publishers_definition_before_one_given_or_shi
     node = create(master, '/node', delegate=mailbox)
     with publishing(master, topic, type_, 'int32 level\nint32 more\n', level=7, more=8):
         channel = node.interested_in(topic, *[type_] * typed)
-        message = mailbox.get()
+        message = mailbox.next()
     assert (message.level, message.more) == (7, 8)
     # nothing is defined for others
     assert channel.message_class is not here and message_class(type_) is here
@@ -862,7 +859,7 @@ def test_a_publisher_of_this_process_is_taken_at_its_word_too(master, mailbox):
     sender, node = create(master, '/sender'), create(master, '/node', delegate=mailbox)
     sender.output_channel(topic, other, latch=True).send(level=7)
     assert node.interested_in(topic, 'given_msgs/Reading').message_class is other
-    assert mailbox.get().level == 7
+    assert mailbox.next().level == 7
 
 
 @pytest.mark.parametrize(
@@ -937,7 +934,7 @@ def test_the_definition_that_is_taken_is_no_failure_and_those_it_does_not_suit_a
     with publishing(master, topic, 'given_msgs/Reading', 'int32 level\n', level=7):
         create(master, '/other').ros.Publisher(topic, message_class('std_msgs/Empty'), queue_size=1)
         assert describe(node.interested_in(topic, 'given_msgs/Reading')) == 'int32'
-        assert mailbox.get().level == 7
+        assert mailbox.next().level == 7
         until(lambda: node.errors)
     (error,) = node.errors
     assert '/other publishes std_msgs/Empty' in str(error)
@@ -955,7 +952,7 @@ def test_a_channel_keeps_the_class_that_it_was_opened_with(master, mailbox):
         assert (
             describe(late.interested_in(topic, 'given_msgs/Reading', delegate=mailbox)) == 'int32'
         )
-        assert mailbox.get().level == 7
+        assert mailbox.next().level == 7
         assert (
             early.interested_in(topic, 'given_msgs/Reading').message_class
             is opened.message_class

@@ -4,13 +4,9 @@ import time
 
 import pytest
 
-from conftest import TIMEOUT
-from pharos import BlockNode, Master, node_registry, watcher
-from programs import until
-
-
-def create(master, name, **settings):
-    return master.create(BlockNode, named=name, domain='127.0.0.1', **settings)
+from helpers import create
+from pharos.testing import TIMEOUT, until
+from pharos import Master, node_registry, watcher
 
 
 def test_a_healthy_node(master, mailbox):
@@ -18,7 +14,7 @@ def test_a_healthy_node(master, mailbox):
     node, peer = create(master, '/healthy'), create(master, '/peer')
     node.interested_in('/state', 'std_msgs/String', delegate=mailbox)
     peer.send_to('/state', data='well', typed_as='std_msgs/String')
-    mailbox.get()
+    mailbox.next()
     health = node.health()
     assert health.registered
     # the watcher may be that of an earlier test

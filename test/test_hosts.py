@@ -12,12 +12,11 @@ import rosgraph
 import rosgraph.network
 from catkin.find_in_workspaces import find_in_workspaces
 
+from helpers import InProcessMaster, create
+from pharos.testing import TIMEOUT, until
 import pharos
-from conftest import TIMEOUT, InProcessMaster
 from hosts import MASTER_PORT, network
-from pharos import BlockNode
 from pharos.private_rospy import registration
-from programs import until
 from sockets import listening, refused_url
 
 STRING = 'std_msgs/String'
@@ -450,10 +449,6 @@ def impatient(monkeypatch):
     monkeypatch.setattr(registration, 'RETRY_DELAY', 0.01)
 
 
-def create(master, name, **kwargs):
-    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
-
-
 @pytest.fixture
 def speaker():
     """A node at a master of its own, so that others find the way to it by their own wits."""
@@ -473,7 +468,7 @@ def test_a_publisher_whose_port_cannot_be_reached_yet_is_tried_again(
     closed = int(refused_url().rsplit(':', 1)[1].strip('/'))
     stranger('/hosts/seldom', None, closed, None, closed, closed, speaker.tcp_port)
     create(master, '/listener', delegate=mailbox).interested_in('/hosts/seldom', STRING)
-    assert mailbox.get().data == 'reached'
+    assert mailbox.next().data == 'reached'
 
 
 def test_a_publisher_is_tried_no_longer_than_the_master_knows_it(master, impatient, stranger):

@@ -8,24 +8,13 @@ import pytest
 import std_msgs.msg
 import std_srvs.srv
 
+from helpers import create, registrations
+from pharos.testing import Mailbox, TIMEOUT, until
 import pharos
-from conftest import TIMEOUT, Mailbox
-from pharos import BlockNode, Master, node_registry, watcher
+from pharos import Master, node_registry, watcher
 from pharos.private_rospy import proxies
-from programs import until
 
 STRING = 'std_msgs/String'
-
-
-def create(master, name, **kwargs):
-    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
-
-
-def registrations(master, name):
-    return [
-        sorted(topic for topic, nodes in kind.items() if name in nodes)
-        for kind in master.system_state()
-    ]
 
 
 @pytest.fixture
@@ -103,7 +92,7 @@ def test_a_second_channel_on_a_topic_needs_no_master(away, mailbox):
     other = Mailbox()
     receiver.interested_in('/interrupted/second', delegate=other)
     sender.output_channel('/interrupted/second').send(data='still')
-    assert mailbox.get().data == other.get().data == 'still'
+    assert mailbox.next().data == other.next().data == 'still'
 
 
 def test_what_plain_rospy_opens_while_the_master_is_away_is_registered_later(away):
@@ -117,7 +106,7 @@ def test_what_plain_rospy_opens_while_the_master_is_away_is_registered_later(awa
     away.come_back()
     until(lambda: publisher.get_num_connections())
     publisher.publish('found')
-    assert mailbox.get().data == 'found'
+    assert mailbox.next().data == 'found'
     until(lambda: '/interrupted/plain_service' in registrations(away, '/node')[2])
 
 
@@ -160,13 +149,13 @@ def stopped(away, mailbox):
 def assert_all_is_back(master, node, mailbox):
     peer = create(master, '/peer')
     peer.send_to('/interrupted/in', typed_as=STRING, data='hello')
-    assert mailbox.get().data == 'hello'
+    assert mailbox.next().data == 'hello'
     late = Mailbox()
     peer.interested_in('/interrupted/out', STRING, delegate=late)
-    assert late.get().data == 'kept'
+    assert late.next().data == 'kept'
     assert master.lookup_service('/interrupted/service').call(data=True).message == 'kept'
     peer.parameter('/interrupted/parameter').set(2)
-    assert node.changes.get() == 2
+    assert node.changes.next() == 2
     assert len(node.channels) == 2
 
 

@@ -3,10 +3,11 @@ import pytest
 import rospy
 import std_msgs.msg
 
+from helpers import InProcessMaster, speak_tcpros_only
+from pharos.testing import Mailbox, until
 import pharos
-from conftest import InProcessMaster, Mailbox, speak_tcpros_only
 from pharos import BlockNode, Master
-from programs import Program, until
+from programs import Program
 
 STRING = 'std_msgs/String'
 TRANSPORTS = 'INTRAPROCESS', 'TCPROS'
@@ -170,7 +171,7 @@ def test_a_late_receiver_of_one_node_gets_what_that_one_latched(master):
     mailbox = Mailbox()
     node = master.create(BlockNode, named='/late', domain='127.0.0.1', delegate=mailbox)
     node.interested_in('/latch/from', from_='/two')
-    message = mailbox.get()
+    message = mailbox.next()
     assert (message.data, message._connection_header['latching']) == ('two', '1')
     node.interested_in('/latch/from', from_='/one')
     assert texts(mailbox, 1) == ['one'] and mailbox.empty()
@@ -184,7 +185,7 @@ def test_a_shared_receiver_that_comes_late_gets_a_message_of_its_own(master):
         node = master.create(BlockNode, named=name, domain='127.0.0.1', delegate=mailbox)
         node.interested_in('/latch/shared', shared=True)
     sent.data = 'changed since'
-    one, two = first.get(), second.get()
+    one, two = first.next(), second.next()
     assert one.data == two.data == 'as it was' and one is not two
     assert (
         one._connection_header == two._connection_header

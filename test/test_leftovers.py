@@ -12,8 +12,8 @@ import weakref
 
 import pytest
 
+from pharos.testing import Mailbox
 import pharos
-from conftest import Mailbox
 from pharos import BlockNode
 from programs import environment
 

@@ -9,11 +9,10 @@ import pytest
 import std_msgs.msg
 import std_srvs.srv
 
+from pharos.testing import Mailbox, TIMEOUT, until
 import pharos
-from conftest import TIMEOUT, Mailbox
 from pharos import BlockNode, node_registry
 from pharos.private_rospy.process_rospy import rospy
-from programs import until
 
 LIBRARIES = 'message_filters', 'actionlib', 'tf2_ros'
 
@@ -75,7 +74,7 @@ def test_message_filters_bring_messages_of_the_same_time_together(pair):
             '/left', typed_as='geometry_msgs/PointStamped', header=header(seconds, 'left')
         )
     asking.send_to('/right', typed_as='geometry_msgs/PointStamped', header=header(2, 'right'))
-    left, right = matched.get()
+    left, right = matched.next()
     assert (left.header.frame_id, right.header.frame_id) == ('left', 'right')
     assert left.header.stamp == right.header.stamp == rospy.Time(2)
 
@@ -195,7 +194,7 @@ def test_a_publisher_and_a_subscriber_of_two_rospys(pair, mailbox):
     asking, serving = pair
     serving.ros.Subscriber('/plain', std_msgs.msg.String, kept_in(mailbox))
     asking.ros.Publisher('/plain', std_msgs.msg.String, latch=True, queue_size=1).publish('hello')
-    message = mailbox.get()
+    message = mailbox.next()
     assert (message.data, message._connection_header['callerid']) == ('hello', '/asking')
 
 
@@ -203,12 +202,12 @@ def test_a_plain_subscriber_hears_a_channel_and_a_channel_a_plain_publisher(pair
     asking, serving = pair
     serving.ros.Subscriber('/there', std_msgs.msg.String, kept_in(mailbox))
     asking.send_to('/there', data='to rospy', typed_as='std_msgs/String')
-    assert mailbox.get().data == 'to rospy'
+    assert mailbox.next().data == 'to rospy'
     serving.interested_in('/back', 'std_msgs/String', delegate=mailbox)
     asking.ros.Publisher('/back', std_msgs.msg.String, latch=True, queue_size=1).publish(
         'to pharos'
     )
-    assert mailbox.get().data == 'to pharos'
+    assert mailbox.next().data == 'to pharos'
 
 
 def test_a_service_proxy_calls_another_node(pair):
@@ -256,9 +255,9 @@ def test_a_rate_ends_with_its_node(pair):
         turned('end', None)
 
     threading.Thread(target=turn, daemon=True).start()
-    assert turned.get() == 'turn'
+    assert turned.next() == 'turn'
     asking.stop()
-    assert turned.get() == 'end'
+    assert turned.next() == 'end'
 
 
 def test_a_rate_keeps_its_period(pair):

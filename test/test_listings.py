@@ -10,7 +10,7 @@ import socket
 import threading
 
 import pytest
-from conftest import TIMEOUT, Mailbox
+from pharos.testing import Mailbox, TIMEOUT
 from programs import Program, forget_parameters, run, script
 
 from pharos import BlockNode, Transcript
@@ -36,7 +36,7 @@ def turtle(master):
 
 
 def next_command(node):
-    message = node.delegate.get()
+    message = node.delegate.next()
     return message.linear, message.angular
 
 
@@ -264,7 +264,7 @@ def test_a_signal_ends_a_program_with_status_0_and_leaves_nothing_of_it(
     driver = master.create(BlockNode, named='/driver')
     with Program(master.url, script(name), '__name:=program') as program:
         if name in PUBLISHERS:
-            turtle.delegate.get()
+            turtle.delegate.next()
         else:
             assert driver.output_channel(COMMANDS, 'turtlesim/Velocity').wait_for_subscribers(
                 2, TIMEOUT

@@ -13,8 +13,9 @@ import tracemalloc
 import pytest
 from sensor_msgs.msg import Image
 
-from conftest import TIMEOUT, Mailbox
-from load import CAMERA, IMAGE_SIZE, TOPICS, Busy, Viewer, camera, create, image, subscribe
+from helpers import create
+from pharos.testing import Mailbox, TIMEOUT
+from load import CAMERA, IMAGE_SIZE, TOPICS, Busy, Viewer, camera, image, subscribe
 from pharos.intraprocess import inbox
 from programs import ROOT, Program, environment
 
@@ -109,7 +110,7 @@ def test_a_receiver_that_turns_slow_gets_an_old_image_once_at_the_most(master, m
         viewer = Viewer(master, quick)
         for _ in range(inbox.FAST_STREAK):
             viewer.ask(1)
-            quick.get()
+            quick.next()
         monkeypatch.setattr(inbox, 'FAST_CALLBACK', 0.0)
         viewer.channel.delegate = busy = Busy()
         viewer.ask(COUNT)

@@ -9,14 +9,10 @@ import sys
 
 import pytest
 
+from helpers import create
+from pharos.testing import Mailbox, TIMEOUT
 import pharos
-from conftest import TIMEOUT, Mailbox
-from pharos import BlockNode
 from programs import environment
-
-
-def create(master, name, **kwargs):
-    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
 
 
 def hear(master):
@@ -35,7 +31,7 @@ def test_each_line_is_on_rosout_once_with_name_file_and_line(master):
         node.log(f'{node.name} says 100% hello', level='warn')
         line = inspect.currentframe().f_lineno - 1
         node.ros.loginfo('and through rospy')
-    heard = [lines.get() for _ in range(6)]
+    heard = [lines.next() for _ in range(6)]
     for node in nodes:
         own, through_rospy = [log for log in heard if log.name == node.name]
         assert own.msg == f'{node.name} says 100% hello' and own.level == own.WARN
@@ -54,7 +50,7 @@ def test_a_log_level_is_set_per_node(master):
     assert levels is not None
     for node in quiet, normal:
         node.log('a detail')
-    assert lines.get().name == '/normal' and lines.empty()
+    assert lines.next().name == '/normal' and lines.empty()
 
 
 def test_each_node_has_a_log_file(master):

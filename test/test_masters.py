@@ -6,18 +6,15 @@ import threading
 
 import pytest
 
+from helpers import InProcessMaster, create
+from pharos.testing import Mailbox, TIMEOUT
 import pharos
-from conftest import TIMEOUT, InProcessMaster, Mailbox
-from pharos import BlockNode, Master
+from pharos import Master
 from pharos.private_rospy import addresses
 from programs import Program, run, script
 from sockets import refused_url
 
 STRING = 'std_msgs/String'
-
-
-def create(master, name, **kwargs):
-    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
 
 
 @pytest.fixture
@@ -65,7 +62,7 @@ def test_topics_services_and_parameters_of_two_masters_do_not_mix(masters):
         )
         node.parameter('~text', initialized=text)
         node.send_to('/t', data=text)
-    assert [mailbox.get().data for mailbox in heard] == ['of one', 'of two']
+    assert [mailbox.next().data for mailbox in heard] == ['of one', 'of two']
     assert [master.lookup_service('/who').call().message for master in masters] == [
         'of one',
         'of two',
@@ -80,7 +77,7 @@ def test_each_master_has_rospy_peers_of_its_own(masters):
     with Program(masters[0].url, 'rostopic', 'pub', '/t', STRING, 'data: one'), Program(
         masters[1].url, 'rostopic', 'pub', '/t', STRING, 'data: two'
     ):
-        assert [mailbox.get().data for mailbox in heard] == ['one', 'two']
+        assert [mailbox.next().data for mailbox in heard] == ['one', 'two']
 
 
 def test_a_master_that_goes_away_leaves_the_nodes_of_another_alone(masters, mailbox):
@@ -90,7 +87,7 @@ def test_a_master_that_goes_away_leaves_the_nodes_of_another_alone(masters, mail
         listener.interested_in('/t', STRING)
     assert not node.is_running and listener.is_running
     create(masters[0], '/speaker').send_to('/t', data='still here')
-    assert mailbox.get().data == 'still here'
+    assert mailbox.next().data == 'still here'
 
 
 def test_a_block_joins_two_masters(masters):
@@ -168,7 +165,7 @@ def test_nodes_at_one_master_are_neighbours_however_it_is_spelt(spellings):
     speaker.serve('/spelt', 'std_srvs/Empty', lambda request: None)
     channel = speaker.output_channel('/spelt', STRING)
     channel.send(data='next door', to=given.node('/listener'))
-    assert heard.get().data == 'next door'
+    assert heard.next().data == 'next door'
     assert channel.connections == [('/listener', 'INTRAPROCESS')]
     assert other.topic('/spelt').channels == given.topic('/spelt').channels != []
 
@@ -289,7 +286,7 @@ def test_the_type_is_found_on_whichever_side_names_it_first(masters):
         wait_for_subscriber(masters[0], '/a_first')
         first.send_to('/a_first', linear={'x': 2})  # the first message is not lost on the way
         second.send_to('/b_first', ranges=[1, 2])
-        assert (heard[0].get().linear.x, heard[1].get().ranges) == (2, (1, 2))
+        assert (heard[0].next().linear.x, heard[1].next().ranges) == (2, (1, 2))
         listen(masters[1], '/later', name='/third')
         assert STRING in program.wait_for('/later (')
 
@@ -305,8 +302,8 @@ def test_a_latched_message_is_latched_on_the_other_side(masters):
     )
     first = listen(masters[1], '/map')
     with bridge(masters, '/map'):
-        assert first.get().data == 'the map'
-        assert listen(masters[1], '/map', name='/late').get().data == 'the map'
+        assert first.next().data == 'the map'
+        assert listen(masters[1], '/map', name='/late').next().data == 'the map'
 
 
 def test_two_bridges_to_one_robot_have_names_of_their_own(masters):
@@ -318,7 +315,7 @@ def test_two_bridges_to_one_robot_have_names_of_their_own(masters):
         speaker = create(masters[0], '/speaker')
         speaker.send_to('/one', data='1')
         speaker.send_to('/two', data='2')
-        assert [mailbox.get().data for mailbox in heard] == ['1', '2']
+        assert [mailbox.next().data for mailbox in heard] == ['1', '2']
 
 
 @pytest.mark.parametrize('with_signal', [signal.SIGINT, signal.SIGTERM])

@@ -2,10 +2,11 @@
 them."""
 import pytest
 
+from helpers import create
+from pharos.testing import Mailbox, TIMEOUT, until
 import pharos
-from conftest import TIMEOUT, Mailbox
 from pharos import BlockNode
-from programs import Program, until
+from programs import Program
 
 STRING = 'std_msgs/String'
 SWAP = ['one:=two', 'two:=one']
@@ -29,10 +30,6 @@ NO_NAMES = [
     5,
     b'/a',
 ]
-
-
-def create(master, name, **kwargs):
-    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
 
 
 @pytest.fixture
@@ -163,12 +160,12 @@ def test_swapped_topics_are_swapped(master):
     plain.interested_in('two', STRING, delegate=two)
     node.send_to('one', data='to two', typed_as=STRING)
     node.send_to('two', data='to one', typed_as=STRING)
-    assert (two.get().data, one.get().data) == ('to two', 'to one')
+    assert (two.next().data, one.next().data) == ('to two', 'to one')
     heard = Mailbox()
     channel = node.interested_in('one', STRING, delegate=heard)
     assert channel.topic == '/swapped/two'
     plain.send_to('two', data='from two', typed_as=STRING)
-    assert heard.get().data == 'from two'
+    assert heard.next().data == 'from two'
     for opened in node.channels:
         opened.close()
     publishers, subscribers, _ = master.system_state()
@@ -195,7 +192,7 @@ def test_a_chain_is_followed_one_step(master):
     latched = node.output_channel('first', STRING, latch=True)
     latched.send(data='kept')
     create(master, '/chained/late', delegate=heard).interested_in('second', STRING)
-    assert heard.get().data == 'kept'
+    assert heard.next().data == 'kept'
     with Program(master.url, 'rostopic', 'echo', '/chained/second') as echo:
         assert echo.wait_for('kept')
     latched.close()
@@ -210,18 +207,18 @@ def test_remapped_channels_survive_a_restart_and_their_masters(master):
     node.start()
     api = master.api('/again/node')
     api.unregisterSubscriber('/again/two', node.uri)  # as a master that has been restarted
-    until(lambda: master.topic('/again/two').subscribers == ['/again/node'], 'the repair')
+    until(lambda: master.topic('/again/two').subscribers == ['/again/node'], what='the repair')
     assert not master.topic('/again/one').subscribers
     assert '/again/one' in master.services() and '/again/two' not in master.services()
     create(master, '/again/plain').send_to('two', data='once', typed_as=STRING)
-    assert heard.get().data == 'once'
+    assert heard.next().data == 'once'
 
 
 def test_swapped_topics_cross_to_another_process(master):
     node, heard = create(master, '/far/node', argv=SWAP), Mailbox()
     node.interested_in('one', STRING, delegate=heard)
     with Program(master.url, 'rostopic', 'pub', '-r', '20', '/far/two', STRING, 'data: from afar'):
-        assert heard.get().data == 'from afar'
+        assert heard.next().data == 'from afar'
 
 
 def test_a_topic_given_in_full_by_its_master_is_not_remapped(master):
@@ -235,7 +232,7 @@ def test_plain_rospy_in_a_node_remaps_as_ever(master):
     create(master, '/plain/other', delegate=heard).interested_in('into', STRING)
     publisher = node.ros.Publisher('from', pharos.message_class(STRING), queue_size=1, latch=True)
     publisher.publish(data='plain')
-    assert heard.get().data == 'plain'
+    assert heard.next().data == 'plain'
     assert node.ros.resolve_name('~here') == '/plain/there'
 
 
@@ -260,7 +257,7 @@ def test_to_is_resolved_like_the_nodes_other_names(master, peer):
     node.send_to('talk', data='for the peer', to=PEERS[peer](node))
     node.send_to('talk', data='for all')
     assert [message.data for message in boxes['peer'].take(2)] == ['for the peer', 'for all']
-    assert boxes['other'].get().data == 'for all'
+    assert boxes['other'].next().data == 'for all'
 
 
 @pytest.mark.parametrize('peer', PEERS)
@@ -271,13 +268,13 @@ def test_from_is_resolved_like_the_nodes_other_names(master, mailbox, peer):
     assert channel.from_ == '/team/peer'
     create(master, '/team/other').send_to('talk', data='not this')
     master.node('/team/peer').send_to('talk', data='this')
-    assert mailbox.get().data == 'this' and mailbox.empty()
+    assert mailbox.next().data == 'this' and mailbox.empty()
 
 
 def test_a_private_name_is_that_of_a_node_below(master, mailbox):
     create(master, '/boss/worker', delegate=mailbox).interested_in('/work', STRING)
     create(master, '/boss').send_to('/work', data='do it', to='~worker')
-    assert mailbox.get().data == 'do it'
+    assert mailbox.next().data == 'do it'
 
 
 def test_from_a_node_that_is_not_there_yet(master, mailbox):
@@ -294,7 +291,7 @@ def test_from_a_node_that_is_not_there_yet(master, mailbox):
         'data: called',
         '__name:=caller',
     ):
-        assert mailbox.get().data == 'called'
+        assert mailbox.next().data == 'called'
 
 
 @pytest.mark.parametrize('to', ['/lisener', 'lisener'])
@@ -307,7 +304,7 @@ def test_to_a_node_that_is_not_there_is_an_error_and_not_counted(master, node, m
         ):
             send(data='lost', to=to)
     channel.send(data='found', to='listener')
-    assert mailbox.get().data == 'found' and mailbox.empty()
+    assert mailbox.next().data == 'found' and mailbox.empty()
     assert channel.sent == 1
 
 
@@ -320,10 +317,10 @@ def test_to_a_node_that_is_not_interested_is_said_once_and_not_counted(master, n
         channel.send(data='nowhere', to='/elsewhere')
     channel.send(data='somewhere', to='/listener')
     node.log('end')
-    assert mailbox.get().data == 'somewhere'
+    assert mailbox.next().data == 'somewhere'
     lines = []
     while not lines or lines[-1] != 'end':
-        lines.append(log.get().msg)
+        lines.append(log.next().msg)
     assert [line for line in lines if '/elsewhere' in line] == [
         '/elsewhere is not interested in /orders, or not connected yet: what /node sends to it alone goes nowhere'
     ]
@@ -333,11 +330,11 @@ def test_to_a_node_that_is_not_interested_is_said_once_and_not_counted(master, n
 def test_to_a_program_elsewhere(master, node):
     node.output_channel('/afar', STRING)  # rostopic waits for the type
     with Program(master.url, 'rostopic', 'echo', '/afar', '__name:=hearer') as echo:
-        until(lambda: master.topic('/afar').subscribers, 'the subscriber')
+        until(lambda: master.topic('/afar').subscribers, what='the subscriber')
         hearer = master.topic('/afar').subscribers[0]
         node.send_to('/afar', data='hello', to=hearer)
         assert echo.wait_for('hello')
-    until(lambda: '/afar' not in master.system_state()[1], 'its leaving')
+    until(lambda: '/afar' not in master.system_state()[1], what='its leaving')
     with pytest.raises(pharos.UnknownNodeError):
         node.send_to('/afar', data='hello', to=hearer)
 
@@ -351,6 +348,7 @@ def test_a_node_of_another_master_is_refused(master, node):
             node.interested_in('/t_of_one', STRING, from_=stranger)
 
 
+@pytest.mark.leaves('it cannot ask the master any more')
 def test_to_costs_the_master_nothing_where_the_peer_is_connected(
     master, node, mailbox, monkeypatch
 ):
@@ -359,4 +357,4 @@ def test_to_costs_the_master_nothing_where_the_peer_is_connected(
     assert channel.wait_for_subscribers(1, TIMEOUT)
     monkeypatch.setattr(pharos.Master, 'api', None)
     channel.send(data='at once', to='listener')
-    assert mailbox.get().data == 'at once'
+    assert mailbox.next().data == 'at once'

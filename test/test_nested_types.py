@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rospy.numpy_msg import numpy_msg
 
-from conftest import TIMEOUT, serializes_numpy
+from helpers import serializes_numpy
+from pharos.testing import TIMEOUT
 from pharos import BlockNode, MessageTypeError
 from pharos.messages import build, check_fits, class_from_definition, explain
 from pharos.messages import nested_class

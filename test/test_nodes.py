@@ -7,15 +7,11 @@ import xmlrpc.client
 import pytest
 import rosnode
 
+from helpers import create
+from pharos.testing import Mailbox, TIMEOUT, until
 import pharos
-from conftest import TIMEOUT, Mailbox
-from pharos import BlockNode, Node, node_registry
+from pharos import Node, node_registry
 from pharos.run import Lifecycle
-from programs import until
-
-
-def create(master, name, **kwargs):
-    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
 
 
 def registered(master):
@@ -45,7 +41,7 @@ def test_a_message_goes_from_node_to_node(master, mailbox):
     receiver = create(master, '/receiver', delegate=mailbox)
     receiver.interested_in('/chat', 'std_msgs/String')
     create(master, '/sender').send_to('/chat', data='hello')
-    message, channel = mailbox.get_with_channel()
+    message, channel = mailbox.next_with_channel()
     assert message.data == 'hello'
     assert (channel.topic, channel.type, channel.node) == ('/chat', 'std_msgs/String', receiver)
 
@@ -78,7 +74,7 @@ def test_rostopic_publishes_to_a_node(master, mailbox):
     node = create(master, '/listener', delegate=mailbox)
     node.interested_in('/from_outside', 'std_msgs/Int32')
     run('rostopic', 'pub', '-1', '/from_outside', 'std_msgs/Int32', '42')
-    assert mailbox.get().data == 42
+    assert mailbox.next().data == 42
 
 
 def test_a_roscpp_relay_passes_messages_between_two_nodes(master, mailbox):
@@ -94,7 +90,7 @@ def test_a_roscpp_relay_passes_messages_between_two_nodes(master, mailbox):
                 for _ in me.every(0.02)
             ]
         )
-        assert mailbox.get().data == 'through C++'
+        assert mailbox.next().data == 'through C++'
 
 
 def test_a_node_starts_again_under_the_same_name_and_ports(master, mailbox):
@@ -111,7 +107,7 @@ def test_a_node_starts_again_under_the_same_name_and_ports(master, mailbox):
         sender.stop()
         sender.start()  # its channels come back as well, and wait for who is interested
         sender.send_to('/ashes', data=str(turn), typed_as='std_msgs/String')
-        assert mailbox.get().data == str(turn)
+        assert mailbox.next().data == str(turn)
 
 
 def test_a_subclass_makes_its_channels_in_start(master, mailbox):
@@ -126,7 +122,7 @@ def test_a_subclass_makes_its_channels_in_start(master, mailbox):
     logger.start()
     assert len(logger.channels) == 1
     create(master, '/sender').send_to('/log_me', data='once')
-    assert mailbox.get().data == 'once' and mailbox.empty()
+    assert mailbox.next().data == 'once' and mailbox.empty()
 
 
 def test_further_keywords_go_to_the_nodes_init(master):
@@ -232,9 +228,9 @@ def test_a_soul_says_farewell(master, mailbox):
 
     driver = create(master, '/driver', soul=drive)
     driver.fork()
-    assert mailbox.get().data == 1.0
+    assert mailbox.next().data == 1.0
     driver.stop()
-    assert mailbox.get().data == 0.0 and not driver.errors
+    assert mailbox.next().data == 0.0 and not driver.errors
 
 
 def test_a_soul_that_ignores_the_stop_is_named_and_left_behind(master, capfd):
@@ -260,7 +256,7 @@ def test_an_exception_in_a_delegate_ends_only_that_run(master, transcript, mailb
     sender = create(master, '/sender')
     sender.send_to('/mixed', data='bad')
     sender.send_to('/mixed', data='good')
-    assert mailbox.get().data == 'good'
+    assert mailbox.next().data == 'good'
     assert [str(error) for error in node.errors] == ['this one is bad']
     assert (
         '/careful' in transcript[0]
@@ -314,7 +310,7 @@ def test_every_and_sleep_follow_simulated_time(master):
         # a turn that comes late does not delay those after it
         for seconds in (100, 110, 125, 130, 140):
             clock.send(clock={'secs': seconds})
-            assert turns.get() == seconds
+            assert turns.next() == seconds
         node.stop()  # time stands still, the soul ends all the same
     finally:
         master.api().deleteParam('/use_sim_time')
@@ -339,7 +335,7 @@ def test_delegates_of_a_node_run_one_at_a_time(master, mailbox):
     for number in range(50):
         for i, sender in enumerate(senders):
             sender.send_to('/lane%d' % i, data=number)
-    received = [mailbox.get_with_channel() for _ in range(200)]
+    received = [mailbox.next_with_channel() for _ in range(200)]
     assert not overlaps
     for i in range(4):
         assert [m.data for m, channel in received if channel.topic == '/lane%d' % i] == list(

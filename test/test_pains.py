@@ -17,27 +17,13 @@ import threading
 
 import pytest
 
-from conftest import TIMEOUT, Mailbox, speak_tcpros_only
-from pharos import BlockNode
+from helpers import create, speak_tcpros_only
+from pharos.testing import Mailbox, TIMEOUT, until
 from programs import ROOT, Program
 from sockets import subscribe
 
 STRING = 'std_msgs/String'
 DOCUMENT = ROOT / 'doc' / 'robustness.md'
-
-
-def create(master, name, **kwargs):
-    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
-
-
-def until(condition):
-    """Wait for what nobody tells."""
-    pause = threading.Event()
-    for _ in range(2000):
-        if condition():
-            return
-        pause.wait(0.01)
-    raise RuntimeError('it did not come to be')
 
 
 def receive(sock):
@@ -536,15 +522,15 @@ def test_a_delegate_is_not_run_beside_another(master, transport):
         until(lambda: channel.connections == [('/careful', transport)])
         # with TCPROS, such delegates are then run by the thread that reads the socket
         channel.send(data='quick')
-        began.get()
+        began.next()
     to_left.send(data='wait')
-    assert began.get().data == 'wait'
+    assert began.next().data == 'wait'
     for text in 'dropped', 'kept':
         to_right.send(data=text)
     until(lambda: right.dropped == 1)  # both have come, and neither was begun with
     assert began.empty()
     go_on.set()
-    assert began.get().data == 'kept'
+    assert began.next().data == 'kept'
 
 
 # -- the document

@@ -8,16 +8,13 @@ import xmlrpc.server
 import pytest
 import rosgraph
 
-from conftest import TIMEOUT, InProcessMaster, Mailbox
-from pharos import BlockNode, Master, MasterUnreachableError, NodeStoppedError, node_registry
+from helpers import InProcessMaster, create
+from pharos.testing import Mailbox, TIMEOUT, until
+from pharos import Master, MasterUnreachableError, NodeStoppedError, node_registry
 from pharos.private_rospy.instance import PrivateRospy
-from programs import run, until
+from programs import run
 
 PRIVATE = '/robot1/driver/rate'
-
-
-def create(master, name='/robot1/driver', **kwargs):
-    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
 
 
 @pytest.fixture(autouse=True)
@@ -54,20 +51,20 @@ class Changes:
 
     def get(self):
         """The next value."""
-        return self._mailbox.get()[1]
+        return self._mailbox.next()[1]
 
     def until_now(self):
         """``[(name, value)]`` that came until now and have not been asked for."""
         mark = next(self._marks)
         self._node.master.parameters[self._end.name] = mark
-        return list(iter(self._mailbox.get, (self._end.name, mark)))
+        return list(iter(self._mailbox.next, (self._end.name, mark)))
 
 
 # -- rosparam, the program
 
 
 def test_what_rosparam_sets_and_deletes_reaches_the_block_at_once(master):
-    rate = create(master).parameter('~rate', initialized=1.0)
+    rate = create(master, '/robot1/driver').parameter('~rate', initialized=1.0)
     changes = Changes(rate.node).of(rate)
     assert (rate.name, rate.value) == (PRIVATE, 1.0)
     for given, value in ('2.5', 2.5), ('5', 5.0):
@@ -80,7 +77,7 @@ def test_what_rosparam_sets_and_deletes_reaches_the_block_at_once(master):
 
 
 def test_what_a_node_sets_is_what_rosparam_gets(master):
-    node = create(master)
+    node = create(master, '/robot1/driver')
     node.parameter('~rate', initialized=1.0).set(2)
     node.parameter('~gains').set({'p': 0.5, 'limits': (1, 'a', True)})
     assert run(master.url, 'rosparam', 'get', PRIVATE).stdout == '2.0\n'
@@ -92,7 +89,7 @@ def test_what_a_node_sets_is_what_rosparam_gets(master):
 
 
 def test_what_rosparam_sets_to_another_type_is_reported_and_the_block_not_run(master, transcript):
-    rate = create(master).parameter('~rate', initialized=1.0)
+    rate = create(master, '/robot1/driver').parameter('~rate', initialized=1.0)
     changes = Changes(rate.node).of(rate)
     assert run(master.url, 'rosparam', 'set', PRIVATE, 'fast').returncode == 0
     assert changes.until_now() == []
@@ -138,7 +135,7 @@ def test_names_are_resolved_and_remapped(master, named, argv, asked, name):
 
 
 def test_a_name_is_not_remapped_twice(master):
-    parameter = create(master, argv=['/a:=/b', '/b:=/a']).parameter('/a')
+    parameter = create(master, '/robot1/driver', argv=['/a:=/b', '/b:=/a']).parameter('/a')
     changes = Changes(parameter.node).of(parameter)
     master.parameters['/b/part'] = 2
     assert changes.get() == parameter.value == {'part': 2}
@@ -147,7 +144,7 @@ def test_a_name_is_not_remapped_twice(master):
 @pytest.mark.parametrize('name', ['', '/', None, 5, '1rate', 'ra te', 'rate!', '~r\n', 'é'])
 def test_what_is_no_name_is_refused(master, name):
     with pytest.raises(ValueError):
-        create(master).parameter(name)
+        create(master, '/robot1/driver').parameter(name)
 
 
 # -- the first value
@@ -155,7 +152,7 @@ def test_what_is_no_name_is_refused(master, name):
 
 def test_a_parameter_without_a_value_gets_the_first_one_and_another_keeps_its_own(master):
     master.parameters['/robot1/driver/set'] = 7
-    node = create(master, argv=['_rate:=5'])
+    node = create(master, '/robot1/driver', argv=['_rate:=5'])
     assert (node.parameter('~rate', initialized=1.0).value, master.parameters[PRIVATE]) == (5.0, 5)
     assert node.parameter('~set', initialized=1).value == 7
     assert (
@@ -180,13 +177,15 @@ def test_a_parameter_without_a_value_gets_the_first_one_and_another_keeps_its_ow
     ],
 )
 def test_any_value_that_the_server_can_hold_may_be_the_first(master, value):
-    parameter = create(master).parameter('~value', initialized=value)
+    parameter = create(master, '/robot1/driver').parameter('~value', initialized=value)
     assert (parameter.value, type(parameter.value)) == (value, type(value))
     assert master.parameters[parameter.name] == value
 
 
 def test_a_value_of_another_type_that_is_there_already_is_refused_by_name(master):
-    rate = create(master, argv=['_rate:=fast']).parameter('~rate', initialized=1.0)
+    rate = create(master, '/robot1/driver', argv=['_rate:=fast']).parameter(
+        '~rate', initialized=1.0
+    )
     with pytest.raises(
         ValueError, match=f"{PRIVATE} holds float, and 'fast' is none.*None to allow any"
     ):
@@ -213,14 +212,14 @@ def test_a_value_of_another_type_that_is_there_already_is_refused_by_name(master
     ],
 )
 def test_a_value_of_another_type_is_refused_by_name(master, initialized, value):
-    parameter = create(master).parameter('~rate', initialized)
+    parameter = create(master, '/robot1/driver').parameter('~rate', initialized)
     with pytest.raises(ValueError, match=f'{PRIVATE} holds {type(initialized).__name__}'):
         parameter.set(value)
     assert parameter.value == initialized
 
 
 def test_initialized_with_none_any_value_is_taken(master):
-    parameter = create(master).parameter('~any', initialized=None)
+    parameter = create(master, '/robot1/driver').parameter('~any', initialized=None)
     changes = Changes(parameter.node).of(parameter)
     for value in 1, 'text', 2.5, True, [1, 'a'], {'a': 1}:
         parameter.set(value)
@@ -245,7 +244,7 @@ def test_initialized_with_none_any_value_is_taken(master):
     ],
 )
 def test_a_value_that_the_server_cannot_hold_is_refused_by_name(master, value):
-    parameter = create(master).parameter('~any')
+    parameter = create(master, '/robot1/driver').parameter('~any')
     with pytest.raises(ValueError, match='/robot1/driver/any cannot be'):
         parameter.set(value)
     assert parameter.value is None
@@ -264,7 +263,7 @@ def test_a_value_that_the_server_cannot_hold_is_refused_by_name(master, value):
 def gains(master):
     """A namespace and what is in it, watched by one node; ``gains.until_now()`` tells the
     changes."""
-    node = create(master)
+    node = create(master, '/robot1/driver')
     master.parameters['/gains'] = {'p': 1, 'd': {'low': 2}}
     return Changes(node).of(*map(node.parameter, ('/gains', '/gains/p', '/gains/d/low')))
 
@@ -296,7 +295,7 @@ def test_a_namespace_and_its_parts_hear_once_of_a_change_in_one_another(
 def test_a_part_hears_once_of_a_change_of_the_namespace_around_it(
     master, set_by_the_node, value, told
 ):
-    node = create(master)
+    node = create(master, '/robot1/driver')
     changes = Changes(node).of(node.parameter('/gains/p', initialized=1))
     if set_by_the_node:
         node.parameter('/gains').set(value)
@@ -318,7 +317,7 @@ def test_what_is_deleted_is_none(master, gains, name, told):
 
 
 def test_a_part_watched_before_its_namespace_is_not_told_twice(master):
-    node = create(master)
+    node = create(master, '/robot1/driver')
     changes = Changes(node).of(node.parameter('/gains/p'))
     changes.of(node.parameter('/gains'))
     master.parameters['/gains/p'] = 5
@@ -329,7 +328,7 @@ def test_a_part_watched_before_its_namespace_is_not_told_twice(master):
 
 
 def test_each_block_of_a_parameter_is_run_and_a_failing_one_alone_is_reported(master, transcript):
-    node = create(master)
+    node = create(master, '/robot1/driver')
     first, second, again = Mailbox(), Mailbox(), Mailbox()
     rate = node.parameter('~rate', 1)
     assert rate.on_change(block := lambda value: first(value, None)) is block
@@ -345,7 +344,7 @@ def test_each_block_of_a_parameter_is_run_and_a_failing_one_alone_is_reported(ma
         lambda: rate.set(3),
     ):
         set_()
-        assert first.get() == second.get() == again.get() == value
+        assert first.next() == second.next() == again.next() == value
         error = node.errors.pop()
         assert (
             isinstance(error, KeyError) and 'not with %d' % value in str(error) and not node.errors
@@ -360,7 +359,7 @@ def test_each_block_of_a_parameter_is_run_and_a_failing_one_alone_is_reported(ma
 @pytest.mark.parametrize('block', [None, 5, lambda: None, lambda value, more: None])
 def test_what_is_no_block_is_refused(master, block):
     with pytest.raises(TypeError, match='value'):
-        create(master).parameter('~rate').on_change(block)
+        create(master, '/robot1/driver').parameter('~rate').on_change(block)
 
 
 def test_two_nodes_of_one_process_watch_one_parameter(master):
@@ -379,7 +378,7 @@ def test_two_nodes_of_one_process_watch_one_parameter(master):
 
 
 def test_a_block_may_read_set_and_watch_parameters(master):
-    node = create(master)
+    node = create(master, '/robot1/driver')
     first, second = node.parameter('~first', 0), node.parameter('~second', 0)
     changes = Changes(node).of(second)
 
@@ -403,7 +402,7 @@ class _Server(socketserver.ThreadingMixIn, xmlrpc.server.SimpleXMLRPCServer):
 
 
 def test_a_master_no_longer_calls_where_a_stopped_node_was(master):
-    node = create(master)
+    node = create(master, '/robot1/driver')
     for name in '~rate', '/gains', '/gains/p':
         Changes(node).of(node.parameter(name))
     assert node.ros.get_param_cached('~rate', 1) == 1  # rospy itself subscribes here
@@ -418,14 +417,14 @@ def test_a_master_no_longer_calls_where_a_stopped_node_was(master):
         master.api(node.name).subscribeParam(node.uri, '/sentinel')
         for name in PRIVATE, '/gains', '/gains/p', '/sentinel':
             master.parameters[name] = 5
-        assert calls.get() == '/sentinel/'  # a master calls one node in order
+        assert calls.next() == '/sentinel/'  # a master calls one node in order
         server.shutdown()
         thread.join(TIMEOUT)
     master.api(node.name).unsubscribeParam(node.uri, '/sentinel')
 
 
 def test_a_parameter_needs_a_running_node_and_goes_on_with_the_next_run(master):
-    rate = create(master).parameter('~rate', 1)
+    rate = create(master, '/robot1/driver').parameter('~rate', 1)
     changes = Changes(rate.node).of(rate)
     rate.node.stop()
     for use in (
@@ -456,7 +455,7 @@ def test_values_and_watches_are_back_after_a_restart_of_the_master(
     """Also where the node opens a channel with the new master before anybody notices that it is
     new."""
     master = Master(mortal_master.url)
-    node = create(master, argv=['_given:=7'])
+    node = create(master, '/robot1/driver', argv=['_given:=7'])
     rate, gains, none = (
         node.parameter('~rate', 1.5),
         node.parameter('/gains', {'p': 1}),

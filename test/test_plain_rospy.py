@@ -9,32 +9,20 @@ import rospy
 import std_msgs.msg
 from rospy.numpy_msg import numpy_msg
 
-from conftest import TIMEOUT, Mailbox, speak_tcpros_only
-from pharos import BlockNode
+from helpers import create, ended, in_thread, speak_tcpros_only
+from pharos.testing import Mailbox, TIMEOUT, until
 from pharos.private_rospy import plain_receivers
 from pharos.private_rospy.local_link import LocalLink
-from programs import until
 
 INT, STRING, ARRAY = std_msgs.msg.Int32, std_msgs.msg.String, std_msgs.msg.UInt8MultiArray
 NUMBERS = std_msgs.msg.Float64MultiArray
 
 
-def create(master, name, **kwargs):
+def create_eager(master, name, **kwargs):
     """A node whose plain subscriptions connect in process even where no channel is beside them."""
-    node = master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
+    node = create(master, name, **kwargs)
     node.latest_run.rospy.connections.takes_plain_callbacks = True
     return node
-
-
-def in_thread(block, *args):
-    thread = threading.Thread(target=block, args=args, daemon=True)
-    thread.start()
-    return thread
-
-
-def ended(thread):
-    thread.join(TIMEOUT)
-    return not thread.is_alive()
 
 
 def listen(node, topic, message_class, **kwargs):
@@ -55,7 +43,7 @@ def link_threads(node):
 
 def test_nothing_is_lost_when_a_plain_subscriber_comes_and_goes_beside_a_channel(master, mailbox):
     """The link used to go down, and TCPROS to take its place 50 ms later."""
-    both, sender = create(master, '/both'), create(master, '/sender')
+    both, sender = create_eager(master, '/both'), create_eager(master, '/sender')
     channel = both.interested_in('/beside/numbers', INT, delegate=mailbox, queue_size=100000)
     sent = sender.output_channel('/beside/numbers', INT)
     over = threading.Event()
@@ -83,7 +71,7 @@ def test_nothing_is_lost_when_a_plain_subscriber_comes_and_goes_beside_a_channel
 
 
 def test_nothing_is_lost_when_channels_open_and_close_beside_another(master, mailbox):
-    both, sender = create(master, '/both'), create(master, '/sender')
+    both, sender = create_eager(master, '/both'), create_eager(master, '/sender')
     channel = both.interested_in('/beside/others', INT, delegate=mailbox, queue_size=100000)
     sent = sender.output_channel('/beside/others', INT)
     over = threading.Event()
@@ -107,17 +95,17 @@ def test_nothing_is_lost_when_channels_open_and_close_beside_another(master, mai
 
 def test_a_channel_gets_its_own_type_beside_a_subscriber_of_any_type(master, mailbox):
     for name, transport in ('/here', 'INTRAPROCESS'), ('/there', 'TCPROS'):
-        node = create(master, name)
+        node = create_eager(master, name)
         if transport == 'TCPROS':
             speak_tcpros_only(node)
         _, anything = listen(node, '/beside/any', rospy.AnyMsg)
         node.interested_in('/beside/any', STRING, delegate=mailbox)
-        sent = create(master, name + '_sender').output_channel('/beside/any', STRING)
+        sent = create_eager(master, name + '_sender').output_channel('/beside/any', STRING)
         assert sent.wait_for_subscribers(1, TIMEOUT)
         assert (name, transport) in sent.connections
         sent.send(data='text')
-        assert mailbox.get().data == 'text'
-        assert anything.get()._buff == b'\4\0\0\0text'
+        assert mailbox.next().data == 'text'
+        assert anything.next()._buff == b'\4\0\0\0text'
         sent.node.stop()
         node.stop()
 
@@ -128,7 +116,7 @@ def test_a_channel_gets_its_own_type_beside_a_subscriber_of_any_type(master, mai
 @pytest.fixture(params=['INTRAPROCESS', 'TCPROS'])
 def pair(request, master):
     """A node that publishes and one that subscribes, connected by the transport named."""
-    nodes = create(master, '/publisher'), create(master, '/subscriber')
+    nodes = create_eager(master, '/publisher'), create_eager(master, '/subscriber')
     if request.param == 'TCPROS':
         speak_tcpros_only(nodes[1])
     nodes[1].transport = request.param
@@ -164,7 +152,7 @@ def test_callbacks_of_one_subscription_get_the_same_message_and_it_is_their_node
     connected(publisher)
     sent = STRING('text')
     publisher.publish(sent)
-    first, second = (mailbox.get() for mailbox in mailboxes)
+    first, second = (mailbox.next() for mailbox in mailboxes)
     assert first is second
     assert first is not sent
     assert first.data == 'text'
@@ -176,7 +164,7 @@ def test_arrays_arrive_as_numpy_arrays_where_asked_for(pair):
     _, arrays = listen(subscribing, '/plain/array', numpy_msg(NUMBERS))
     connected(publisher)
     publisher.publish(data=[1, 2])
-    array = arrays.get().data
+    array = arrays.next().data
     assert (type(array).__name__, list(array)) == ('ndarray', [1, 2])
 
 
@@ -186,22 +174,22 @@ def test_a_latched_message_reaches_each_callback_that_comes_late(pair):
     publisher.publish('latched')
     for _ in range(3):
         _, mailbox = listen(subscribing, '/plain/latched', STRING)
-        message = mailbox.get()
+        message = mailbox.next()
         assert (message.data, message._connection_header['latching']) == ('latched', '1')
         assert mailbox.empty()
     # a channel beside them gets it too, once
     delegate = Mailbox()
     subscribing.interested_in('/plain/latched', STRING, delegate=delegate)
-    assert delegate.get().data == 'latched'
+    assert delegate.next().data == 'latched'
     publisher.publish('next')
-    assert delegate.get().data == 'next'
+    assert delegate.next().data == 'next'
 
 
 def test_callbacks_run_in_a_thread_for_each_connection_so_that_they_may_wait_for_each_other(
     pair, master
 ):
     publishing, subscribing = pair
-    other = create(master, '/other_publisher')
+    other = create_eager(master, '/other_publisher')
     publishers = [
         node.ros.Publisher('/plain/meet', STRING, queue_size=1) for node in (publishing, other)
     ]
@@ -252,10 +240,10 @@ def test_a_subscriber_with_a_queue_of_one_gets_the_newest(pair):
     for number in range(1, 50):
         publisher.publish(number)
     release.set()
-    assert mailbox.get().data == 0
-    following = [mailbox.get().data]
+    assert mailbox.next().data == 0
+    following = [mailbox.next().data]
     while following[-1] != 49:
-        following.append(mailbox.get().data)
+        following.append(mailbox.next().data)
     assert following == sorted(following)
     # else some may not have come yet when the callback ended
     if subscribing.transport == 'INTRAPROCESS':
@@ -359,7 +347,7 @@ def test_nobody_waits_for_a_publisher_that_waits_for_another(pair, master, comes
     assert entered.wait(TIMEOUT)
     thread.join(0.5)
     assert thread.is_alive()
-    other = create(master, '/other')
+    other = create_eager(master, '/other')
 
     def come():
         if comes == 'wait_for_message':
@@ -394,10 +382,10 @@ def test_a_callback_may_unregister_subscribe_and_publish(pair):
     listen(subscribing, '/plain/busy', ARRAY)  # so that the connection stays
     connected(publisher)
     thread = in_thread(lambda: [publisher.publish(data=bytes(1 << 20)) for _ in range(20)])
-    assert answers.get().data == 'changed'
+    assert answers.next().data == 'changed'
     assert ended(thread)
     publisher.publish(data=b'last')
-    while mailboxes[0].get().data != b'last':
+    while mailboxes[0].next().data != b'last':
         pass
 
 
@@ -416,8 +404,10 @@ def test_a_listener_greets_each_subscriber(pair):
 
 
 def test_a_link_has_a_thread_for_callbacks_only_while_there_are_some(master, mailbox):
-    node = create(master, '/subscriber')
-    publisher = create(master, '/publisher').ros.Publisher('/plain/threads', STRING, queue_size=1)
+    node = create_eager(master, '/subscriber')
+    publisher = create_eager(master, '/publisher').ros.Publisher(
+        '/plain/threads', STRING, queue_size=1
+    )
     channel = node.interested_in('/plain/threads', STRING, delegate=mailbox)
     connected(publisher)
     assert len(link_threads(node)) == 1  # the channels'
@@ -427,14 +417,14 @@ def test_a_link_has_a_thread_for_callbacks_only_while_there_are_some(master, mai
         subscriber.unregister()
     until(lambda: len(link_threads(node)) == 1)
     publisher.publish('text')
-    assert mailbox.get().data == 'text'
+    assert mailbox.next().data == 'text'
     assert channel.dropped == 0
 
 
 def test_no_thread_is_left_when_a_channel_opens_while_the_last_callback_goes(
     master, mailbox, monkeypatch
 ):
-    both, sender = create(master, '/both'), create(master, '/sender')
+    both, sender = create_eager(master, '/both'), create_eager(master, '/sender')
     channel = sender.output_channel('/threads/last', INT)
     subscriber, _ = listen(both, '/threads/last', INT)
     assert channel.wait_for_subscribers(1, TIMEOUT)
@@ -451,8 +441,10 @@ def test_no_thread_is_left_when_a_channel_opens_while_the_last_callback_goes(
 
 
 def test_a_link_that_is_closed_opens_no_thread_for_callbacks(master):
-    node = create(master, '/subscriber')
-    publisher = create(master, '/publisher').ros.Publisher('/plain/closed', STRING, queue_size=1)
+    node = create_eager(master, '/subscriber')
+    publisher = create_eager(master, '/publisher').ros.Publisher(
+        '/plain/closed', STRING, queue_size=1
+    )
     listen(node, '/plain/closed', STRING)
     connected(publisher)
     link = publisher.impl.connections[0].link
@@ -509,7 +501,9 @@ def test_what_is_put_while_another_thread_takes_is_counted():
 
 
 def test_large_messages_are_dropped_from_a_full_queue_the_oldest_first(master):
-    publishing, subscribing = create(master, '/publisher'), create(master, '/subscriber')
+    publishing, subscribing = create_eager(master, '/publisher'), create_eager(
+        master, '/subscriber'
+    )
     publisher = publishing.ros.Publisher('/plain/full', ARRAY, queue_size=2)
     entered, release, sizes = threading.Event(), threading.Event(), Mailbox()
 

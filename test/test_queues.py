@@ -5,18 +5,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from conftest import TIMEOUT, Mailbox
-from pharos import BlockNode, Node, define_message
+from helpers import create
+from pharos.testing import Mailbox, TIMEOUT
+from pharos import Node, define_message
 from pharos.intraprocess.dispatcher import Dispatcher
 from pharos.intraprocess.inbox import Inbox
 from pharos.private_rospy import sender
 
 BYTES, NUMBERS = 'std_msgs/UInt8MultiArray', 'std_msgs/Float64MultiArray'
 MEGABYTE = 1 << 20
-
-
-def create(master, name, cls=BlockNode, **kwargs):
-    return master.create(cls, named=name, domain='127.0.0.1', **kwargs)
 
 
 class Gate:

@@ -9,13 +9,14 @@ import pytest
 import rospy
 import std_msgs.msg
 
+from helpers import create
+from pharos.testing import Mailbox, TIMEOUT, until
 import pharos
-from conftest import TIMEOUT, Mailbox
-from pharos import BlockNode, MessageTypeError
+from pharos import MessageTypeError
 from pharos import messages
 from pharos.private_rospy import refusals
 from pharos.intraprocess.link import Link
-from programs import Program, until
+from programs import Program
 from test_graph_types import Publisher
 
 STRING, INT32 = 'std_msgs/String', 'std_msgs/Int32'
@@ -39,8 +40,8 @@ rospy.spin()
 numbers = itertools.count()  # the master never forgets the type of a topic
 
 
-def create(master, name, **kwargs):
-    node = master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
+def create_patient(master, name, **kwargs):
+    node = create(master, name, **kwargs)
     # what waits for a connection that never comes would not return
     node.connect_timeout = 100 * TIMEOUT
     return node
@@ -81,7 +82,7 @@ def roscpp_publisher(url, topic, type_, text):
 
 @contextlib.contextmanager
 def publisher_here(url, topic, type_, text):
-    sender = create(pharos.Master(url), '/far')
+    sender = create_patient(pharos.Master(url), '/far')
     in_time(
         lambda: sender.output_channel(
             topic, messages.class_from_definition(type_, text), latch=True
@@ -132,7 +133,7 @@ def attempts(node):
 @publishing
 @pytest.mark.parametrize('first', ['the subscriber', 'the publisher'])
 def test_a_publisher_of_another_type_is_told_once(master, topic, publishing, first, screen):
-    node = create(master, '/near')
+    node = create_patient(master, '/near')
     with contextlib.ExitStack() as there:
         if first == 'the publisher':
             there.enter_context(publishing(master.url, topic, INT32, 'int32 data'))
@@ -160,7 +161,7 @@ def test_a_publisher_of_another_type_is_told_once(master, topic, publishing, fir
 def test_a_type_that_is_defined_otherwise_there_is_told_with_both_definitions(
     master, topic, publishing
 ):
-    node = create(master, '/near')
+    node = create_patient(master, '/near')
     node.interested_in(topic, STRING)
     with publishing(master.url, topic, STRING, 'int8 data'):
         until(lambda: node.errors)
@@ -173,7 +174,7 @@ def test_a_type_that_is_defined_otherwise_there_is_told_with_both_definitions(
 
 @publishing
 def test_who_is_refused_and_tries_again_does_not_tell_again(master, topic, publishing):
-    node, mailbox = create(master, '/near'), Mailbox()
+    node, mailbox = create_patient(master, '/near'), Mailbox()
     made = attempts(node)
     node.interested_in(topic, STRING, delegate=mailbox)
     with publishing(master.url, topic, INT32, 'int32 data'):
@@ -182,7 +183,7 @@ def test_who_is_refused_and_tries_again_does_not_tell_again(master, topic, publi
         # the master tells of both publishers, and rospy tries both
         before = len(made)
         with rospy_peer(master.url, topic, STRING, 'string data', name='/right'):
-            assert mailbox.get().data == ''
+            assert mailbox.next().data == ''
             until(lambda: len(made) > before)
         assert node.health().refused == 1
     (failure,) = node.failures
@@ -191,7 +192,7 @@ def test_who_is_refused_and_tries_again_does_not_tell_again(master, topic, publi
 
 @pytest.mark.parametrize('publishing', [rospy_peer, publisher_here])
 def test_a_master_that_has_restarted_is_no_reason_to_tell_again(mortal_master, topic, publishing):
-    node = create(pharos.Master(mortal_master.url), '/near')
+    node = create_patient(pharos.Master(mortal_master.url), '/near')
     node.interested_in(topic, STRING)
     with publishing(mortal_master.url, topic, INT32, 'int32 data'):
         until(lambda: node.errors)
@@ -207,7 +208,11 @@ def test_a_master_that_has_restarted_is_no_reason_to_tell_again(mortal_master, t
 
 
 def test_what_was_right_meanwhile_is_counted_anew(master, topic):
-    node, sender, mailbox = create(master, '/near'), create(master, '/far'), Mailbox()
+    node, sender, mailbox = (
+        create_patient(master, '/near'),
+        create_patient(master, '/far'),
+        Mailbox(),
+    )
     node.interested_in(topic, STRING, delegate=mailbox)
     for turn in 1, 2:
         wrong = in_time(lambda: sender.output_channel(topic, INT32))
@@ -216,14 +221,14 @@ def test_what_was_right_meanwhile_is_counted_anew(master, topic):
         until(lambda: node.health().refused == 0)
         right = in_time(lambda: sender.output_channel(topic, STRING))
         right.send(data='right')
-        assert mailbox.get().data == 'right' and node.health().refused == 0
+        assert mailbox.next().data == 'right' and node.health().refused == 0
         right.close()
         until(lambda: not node.channels[0].connections)
 
 
 def test_each_publisher_of_another_type_is_told(master, topic):
-    node = create(master, '/near')
-    senders = [create(master, '/far_%d' % number) for number in range(5)]
+    node = create_patient(master, '/near')
+    senders = [create_patient(master, '/far_%d' % number) for number in range(5)]
     for sender in senders:
         in_time(lambda: sender.output_channel(topic, INT32))
     channel = in_time(lambda: node.interested_in(topic, STRING))
@@ -234,8 +239,8 @@ def test_each_publisher_of_another_type_is_told(master, topic):
 
 
 def test_a_subscriber_of_any_type_hears_all(master, topic):
-    node, mailbox = create(master, '/near'), Mailbox()
-    create(master, '/here').output_channel(topic, STRING, latch=True).send(data='from here')
+    node, mailbox = create_patient(master, '/near'), Mailbox()
+    create_patient(master, '/here').output_channel(topic, STRING, latch=True).send(data='from here')
     with rospy_peer(master.url, topic, INT32, 'int32 data'):
         node.interested_in(topic, rospy.AnyMsg, delegate=mailbox)
         assert sorted(message._connection_header['type'] for message in mailbox.take(2)) == [
@@ -246,8 +251,8 @@ def test_a_subscriber_of_any_type_hears_all(master, topic):
 
 
 def test_a_publisher_of_any_type_is_told_as_one(master, topic):
-    node = create(master, '/near')
-    create(master, '/far').ros.Publisher(topic, rospy.AnyMsg, queue_size=1)
+    node = create_patient(master, '/near')
+    create_patient(master, '/far').ros.Publisher(topic, rospy.AnyMsg, queue_size=1)
     in_time(lambda: node.interested_in(topic, STRING))
     until(lambda: node.errors)
     assert '/far publishes messages of any type, and is not heard: only subscribers of any' in str(
@@ -262,7 +267,7 @@ def test_a_channel_beside_a_subscriber_of_any_type_hears_its_own_type_alone(
 ):
     """rospy connects a node once to a publisher: by the md5sum of its first subscriber, which here
     is none."""
-    node, mailbox, anything = create(master, '/near'), Mailbox(), Mailbox()
+    node, mailbox, anything = create_patient(master, '/near'), Mailbox(), Mailbox()
 
     def subscribe():
         node.ros.Subscriber(topic, rospy.AnyMsg, lambda message: anything(message, None))
@@ -279,17 +284,17 @@ def test_a_channel_beside_a_subscriber_of_any_type_hears_its_own_type_alone(
                 channel for channel in master.topic(topic).channels if hasattr(channel, 'send')
             ]
             far.send(data=0)  # which, read as a string, is an empty one
-        assert anything.get()._buff == bytes(4)
+        assert anything.next()._buff == bytes(4)
         until(lambda: node.errors)
         assert f'/near wants {topic} as {STRING}' in str(node.errors[0]) and len(node.errors) == 1
         assert node.health().refused == 1
         with rospy_peer(master.url, topic, STRING, 'string data', name='/right'):
-            assert mailbox.get()._connection_header['callerid'] == '/right'
+            assert mailbox.next()._connection_header['callerid'] == '/right'
         assert mailbox.empty()
 
 
 def test_a_plain_rospy_subscriber_is_told_too(master, topic):
-    node = create(master, '/near')
+    node = create_patient(master, '/near')
     node.ros.Subscriber(topic, std_msgs.msg.String)
     with rospy_peer(master.url, topic, INT32, 'int32 data'):
         until(lambda: node.errors)
@@ -298,7 +303,7 @@ def test_a_plain_rospy_subscriber_is_told_too(master, topic):
 
 def test_a_publisher_that_refuses_for_another_reason_is_no_matter_of_types(master, topic):
     """It has just closed its topic, or another node has its address by now."""
-    node, other = create(master, '/near'), create(master, '/far')
+    node, other = create_patient(master, '/near'), create_patient(master, '/far')
     made = attempts(node)
     with Publisher(
         master, topic, STRING, name='/busy', answer=[1, '', ['TCPROS', '127.0.0.1', other.tcp_port]]
@@ -312,7 +317,11 @@ def test_a_channel_that_is_opened_while_its_node_connects_hears_the_publisher(
     master, topic, monkeypatch
 ):
     """The subscription is connected already, but the link was made without the channel."""
-    node, sender, mailbox = create(master, '/near'), create(master, '/far'), Mailbox()
+    node, sender, mailbox = (
+        create_patient(master, '/near'),
+        create_patient(master, '/far'),
+        Mailbox(),
+    )
     node.latest_run.rospy.connections.takes_plain_callbacks = True
     match, opened = Link.match_receivers, []
 
@@ -331,7 +340,7 @@ def test_a_channel_that_is_opened_while_its_node_connects_hears_the_publisher(
     channel = sender.output_channel(topic, STRING)
     opened[0].join(TIMEOUT)
     channel.send(data='heard')
-    assert mailbox.get().data == 'heard'
+    assert mailbox.next().data == 'heard'
 
 
 # -- the publisher
@@ -342,12 +351,12 @@ def test_a_channel_that_is_opened_while_its_node_connects_hears_the_publisher(
 def test_a_subscriber_of_another_type_is_warned_of_once_and_not_waited_for(
     master, topic, where, first, screen
 ):
-    sender = create(master, '/near')
+    sender = create_patient(master, '/near')
     with contextlib.ExitStack() as there:
 
         def subscribe():
             if where == 'here':
-                create(master, '/far').interested_in(topic, STRING)
+                create_patient(master, '/far').interested_in(topic, STRING)
             else:
                 there.enter_context(
                     rospy_peer(master.url, topic, STRING, 'string data', 'subscriber')
@@ -360,7 +369,7 @@ def test_a_subscriber_of_another_type_is_warned_of_once_and_not_waited_for(
             subscribe()
         until(lambda: screen('WARN'))
         # so that it tries again
-        in_time(lambda: create(master, '/other').output_channel(topic, INT32))
+        in_time(lambda: create_patient(master, '/other').output_channel(topic, INT32))
         until(lambda: len(screen('WARN')) == 2)
         mine, others = screen('WARN')
         for line in mine, others:
@@ -371,7 +380,11 @@ def test_a_subscriber_of_another_type_is_warned_of_once_and_not_waited_for(
 
 
 def test_a_subscriber_that_has_changed_its_type_is_waited_for_again(master, topic):
-    sender, receiver, mailbox = create(master, '/near'), create(master, '/far'), Mailbox()
+    sender, receiver, mailbox = (
+        create_patient(master, '/near'),
+        create_patient(master, '/far'),
+        Mailbox(),
+    )
     wrong = receiver.interested_in(topic, STRING)
     sender.output_channel(topic, INT32)
     assert sender.latest_run.rospy.refusals.subscribers(topic) == ['/far']
@@ -379,12 +392,12 @@ def test_a_subscriber_that_has_changed_its_type_is_waited_for_again(master, topi
     receiver.interested_in(topic, INT32, delegate=mailbox)
     assert sender.latest_run.rospy.refusals.subscribers(topic) == []
     sender.send_to(topic, data=7)
-    assert mailbox.get().data == 7
+    assert mailbox.next().data == 7
 
 
 def test_a_crowd_of_refusals_is_remembered_within_bounds(master, topic, monkeypatch):
     monkeypatch.setattr(refusals, 'REMEMBERED', 3)
-    node = create(master, '/near')
+    node = create_patient(master, '/near')
     node.output_channel(topic, INT32)
     publisher = node.latest_run.rospy.publisher(topic)
     for number in range(10):

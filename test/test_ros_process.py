@@ -10,7 +10,7 @@ import threading
 
 import pytest
 
-from conftest import TIMEOUT, Mailbox
+from pharos.testing import Mailbox, TIMEOUT
 from pharos import BlockNode, ExternalNode, RosProcess, UnknownNodeError
 from programs import Program
 from sockets import wait_for_end
@@ -114,7 +114,7 @@ def test_name_remappings_and_parameters_reach_it(master, package):
     with master.run(
         'fake_robot', 'talker', name='robot7', remap={'talk': '/said'}, params={'text': 'two words'}
     ):
-        assert mailbox.get().data == 'two words'
+        assert mailbox.next().data == 'two words'
         assert master.wait_for_node('/robot7', TIMEOUT).publications['/said'] == 'std_msgs/String'
         assert master.parameters.pop('/robot7/text') == 'two words'
 
@@ -158,7 +158,7 @@ def take(mailbox, name, count):
     """The next log lines of that node."""
     lines = []
     while len(lines) < count:
-        message = mailbox.get()
+        message = mailbox.next()
         if message.name == name:
             lines.append(message.msg)
     return lines
@@ -442,7 +442,7 @@ def test_a_launch_file_is_started_and_ended_with_all_its_nodes(master, package):
     with master.launch(
         'fake_robot', 'robot.launch', on_line=lines.put, who='robot7', text='two words'
     ) as process:
-        assert mailbox.get().data == 'two words'
+        assert mailbox.next().data == 'two words'
         nodes = [master.wait_for_node(name, TIMEOUT) for name in ('/robot7', '/second')]
         pids = [node.pid for node in nodes]
         while '/robot7 talks' not in lines.get(timeout=TIMEOUT):

@@ -4,8 +4,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from helpers import speak_tcpros_only
+from pharos.testing import Mailbox, TIMEOUT
 import pharos
-from conftest import TIMEOUT, Mailbox, speak_tcpros_only
 from pharos import BlockNode
 from test_copier import CLASSES, messages, told
 
@@ -18,7 +19,7 @@ def send(channel, message, mailbox):
         channel.publish(message)
     except pharos.MessageTypeError as error:
         return type(error)
-    return mailbox.get()
+    return mailbox.next()
 
 
 @pytest.mark.parametrize('message_class', CLASSES, ids=lambda cls: cls._type)

@@ -5,8 +5,8 @@ import threading
 import genpy
 import pytest
 
+from pharos.testing import TIMEOUT
 import pharos
-from conftest import TIMEOUT
 from pharos import BlockNode
 from pharos.seconds import LONGEST, check_seconds
 

@@ -8,10 +8,9 @@ import threading
 import pytest
 from hypothesis import given, settings, strategies
 
-from conftest import TIMEOUT
+from pharos.testing import TIMEOUT, until
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.sender import AT_ONCE, Sender
-from programs import until
 
 SIZES = strategies.one_of(
     strategies.integers(0, 2000),
@@ -133,7 +132,7 @@ def test_who_publishes_after_the_link_broke_is_told(size):
 
         link.leave()
         until(is_told)
-    until(lambda: senders() <= before, 'the end of the thread')
+    until(lambda: senders() <= before, what='the end of the thread')
 
 
 def test_closing_ends_the_thread_and_those_who_wait():
@@ -146,4 +145,4 @@ def test_closing_ends_the_thread_and_those_who_wait():
         link.transport.close()
         waiting.join(TIMEOUT)
         assert not waiting.is_alive()
-    until(lambda: senders() <= before, 'the end of the thread')
+    until(lambda: senders() <= before, what='the end of the thread')

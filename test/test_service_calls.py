@@ -16,11 +16,11 @@ import pytest
 import rosgraph
 import rosnode
 
+from helpers import InProcessMaster, create
+from pharos.testing import TIMEOUT, until
 import pharos
-from conftest import TIMEOUT, InProcessMaster
-from pharos import BlockNode
 from pharos import messages
-from programs import Program, environment, forget_parameters, run, script, until
+from programs import Program, environment, forget_parameters, run, script
 from sockets import wait_for_end
 
 ECHO = 'diagnostic_msgs/AddDiagnostics'  # load_namespace -> success, message
@@ -146,10 +146,6 @@ def threads_alternate():
 persistent_or_not = pytest.mark.parametrize(
     'persistent', [False, True], ids=['plain', 'persistent']
 )
-
-
-def create(master, name, **kwargs):
-    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
 
 
 def echo(request):
@@ -883,7 +879,7 @@ def test_a_delegate_calls_a_provider_elsewhere(master, there, mailbox, timeout):
         ),
     )
     node.send_to('/calls/ask', data='bob')
-    assert mailbox.get() == 'bob'
+    assert mailbox.next() == 'bob'
 
 
 @both_limits
@@ -929,7 +925,7 @@ def test_a_circle_through_a_delegate_ends_with_an_error_at_once(
 
     node.interested_in('/calls/turn', 'std_msgs/Empty', delegate=turn)
     node.send_to('/calls/turn')
-    assert 'call each other in a circle' in mailbox.get()
+    assert 'call each other in a circle' in mailbox.next()
 
 
 @pytest.mark.usefixtures('master')  # stops what is left, should this fail

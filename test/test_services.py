@@ -9,19 +9,15 @@ import pytest
 import rosgraph.network
 import std_srvs.srv
 
+from helpers import create
+from pharos.testing import TIMEOUT
 import pharos
-from conftest import TIMEOUT
-from pharos import BlockNode
 from pharos.private_rospy.process_rospy import rospy
 from programs import run
 
 SPAWN = 'turtlesim/Spawn'  # x, y, theta, name -> name
 SET_BOOL = 'std_srvs/SetBool'  # data -> success, message
 SET_BOOL_MD5SUM = std_srvs.srv.SetBool._md5sum
-
-
-def create(master, name='/provider', **kwargs):
-    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
 
 
 def call_here(master, service, /, **fields):
@@ -56,7 +52,7 @@ both_ways = pytest.mark.parametrize('call', [call_here, call_through_tcp], ids=[
     ids=['a response', 'a dict', 'a tuple', 'a list'],
 )
 def test_a_block_returns_a_response_or_its_fields(master, call, block):
-    create(master).serve('/set', SET_BOOL, block)
+    create(master, '/provider').serve('/set', SET_BOOL, block)
     response = call(master, '/set', data=True)
     assert (response.success, response.message) == (True, 'done')
 
@@ -72,32 +68,32 @@ def test_a_block_returns_a_response_or_its_fields(master, call, block):
     ids=['the field', 'a dict', 'a tuple'],
 )
 def test_a_block_returns_the_only_field(master, call, block):
-    create(master).serve('/spawn', SPAWN, block)
+    create(master, '/provider').serve('/spawn', SPAWN, block)
     assert call(master, '/spawn', name='bob').name == 'bob!'
 
 
 @both_ways
 def test_a_falsy_value_is_the_only_field_too(master, call):
-    create(master).serve('/spawn', SPAWN, lambda request: '')
+    create(master, '/provider').serve('/spawn', SPAWN, lambda request: '')
     assert call(master, '/spawn', name='bob').name == ''
 
 
 @both_ways
 @pytest.mark.parametrize('value', [None, {}, 7], ids=repr)
 def test_what_a_block_returns_as_an_empty_response_does_not_matter(master, call, value):
-    create(master).serve('/clear', 'std_srvs/Empty', lambda request: value)
+    create(master, '/provider').serve('/clear', 'std_srvs/Empty', lambda request: value)
     assert call(master, '/clear') == std_srvs.srv.EmptyResponse()
 
 
 def test_fields_that_a_dict_leaves_out_have_their_defaults(master):
-    create(master).serve('/set', SET_BOOL, lambda request: {'success': True})
+    create(master, '/provider').serve('/set', SET_BOOL, lambda request: {'success': True})
     assert call_here(master, '/set').message == ''
 
 
 @both_ways
 def test_the_block_gets_the_request(master, call):
     got = []
-    create(master).serve('/spawn', SPAWN, lambda request: got.append(request) or '')
+    create(master, '/provider').serve('/spawn', SPAWN, lambda request: got.append(request) or '')
     call(master, '/spawn', x=1.0, y=2, name='bob')
     (request,) = got
     assert (request.x, request.y, request.theta, request.name) == (1.0, 2.0, 0.0, 'bob')
@@ -119,7 +115,7 @@ def test_the_block_gets_the_request(master, call):
     ids=repr,
 )
 def test_what_does_not_fit_is_an_error_at_both_ends(master, transcript, call, value, said):
-    node = create(master)
+    node = create(master, '/provider')
     node.serve('/set', SET_BOOL, lambda request: value)
     with pytest.raises((pharos.ServiceCallError, rospy.ServiceException), match=said):
         call(master, '/set')
@@ -130,7 +126,7 @@ def test_what_does_not_fit_is_an_error_at_both_ends(master, transcript, call, va
 
 @both_ways
 def test_an_exception_in_the_block_reaches_the_caller(master, transcript, call):
-    node = create(master)
+    node = create(master, '/provider')
     offered = node.serve('/spawn', SPAWN, no_room)
     with pytest.raises(
         (pharos.ServiceCallError, rospy.ServiceException), match='RuntimeError: no room for bob'
@@ -149,7 +145,7 @@ def no_room(request):
 
 
 def test_a_failed_call_is_a_service_call_error(master, transcript):
-    create(master).serve('/fail', 'std_srvs/Empty', lambda request: 1 / 0)
+    create(master, '/provider').serve('/fail', 'std_srvs/Empty', lambda request: 1 / 0)
     service = master.lookup_service('/fail')
     with pytest.raises(pharos.ServiceCallError, match='/fail failed: .*division by zero'):
         service.call()
@@ -157,7 +153,7 @@ def test_a_failed_call_is_a_service_call_error(master, transcript):
 
 
 def test_rosservice_knows_an_offered_service(master):
-    node = create(master)
+    node = create(master, '/provider')
     node.serve('/set', SET_BOOL, lambda request: {'success': True})
     assert '/set' in run(master.url, 'rosservice', 'list').stdout.split()
     assert run(master.url, 'rosservice', 'type', '/set').stdout.strip() == SET_BOOL
@@ -170,7 +166,7 @@ def test_rosservice_knows_an_offered_service(master):
 
 
 def test_rosservice_calls_an_offered_service(master, transcript):
-    node = create(master)
+    node = create(master, '/provider')
     node.serve('/set', SET_BOOL, lambda request: {'success': request.data, 'message': 'done'})
     assert (
         run(master.url, 'rosservice', 'call', '/set', 'true').stdout
@@ -182,7 +178,7 @@ def test_rosservice_calls_an_offered_service(master, transcript):
 
 
 def test_close_ends_the_offer(master):
-    node = create(master)
+    node = create(master, '/provider')
     offered = node.serve('/clear', 'std_srvs/Empty', lambda request: None)
     service = master.lookup_service('/clear')
     offered.close()
@@ -194,7 +190,7 @@ def test_close_ends_the_offer(master):
 
 
 def test_a_node_offers_a_name_once(master):
-    node = create(master)
+    node = create(master, '/provider')
     node.serve('/clear', 'std_srvs/Empty', lambda request: None)
     with pytest.raises(
         pharos.PharosError, match='/provider offers /clear already: close that one first'
@@ -218,7 +214,7 @@ def test_names_are_resolved_in_the_nodes_namespace(master):
 @pytest.mark.parametrize('block', [None, 7, lambda: None, lambda request, more: None])
 def test_a_service_needs_a_block_of_one_argument(master, block):
     with pytest.raises(TypeError, match=r'block\(request\)'):
-        create(master).serve('/clear', 'std_srvs/Empty', block)
+        create(master, '/provider').serve('/clear', 'std_srvs/Empty', block)
     assert '/clear' not in master.services()
 
 
@@ -226,12 +222,12 @@ def test_an_unknown_service_type(master):
     with pytest.raises(
         pharos.UnknownTypeError, match="unknown service type 'std_srvs/Emty'.*did you mean"
     ):
-        create(master).serve('/clear', 'std_srvs/Emty', lambda request: None)
+        create(master, '/provider').serve('/clear', 'std_srvs/Emty', lambda request: None)
     assert '/clear' not in master.services()
 
 
 def test_services_come_back_with_their_node(master):
-    node = create(master)
+    node = create(master, '/provider')
     node.serve('/spawn', SPAWN, lambda request: request.name)
     service = master.lookup_service('/spawn')
     for name in 'ann', 'bob':
@@ -264,7 +260,7 @@ def test_a_service_is_the_newest_nodes_that_offers_it_and_the_olders_again_when_
 
 
 def test_a_closed_service_does_not_come_back(master):
-    node = create(master)
+    node = create(master, '/provider')
     node.serve('/clear', 'std_srvs/Empty', lambda request: None).close()
     node.stop()
     node.start()
@@ -275,7 +271,7 @@ def test_a_closed_service_does_not_come_back(master):
 
 
 def test_a_name_is_enough(master):
-    create(master).serve('/spawn', SPAWN, lambda request: request.name)
+    create(master, '/provider').serve('/spawn', SPAWN, lambda request: request.name)
     service = master.lookup_service('/spawn', '/me')
     assert (service.name, service.caller_id, service.type) == ('/spawn', '/me', SPAWN)
     assert service.md5sum == '0b2d2e872a8e2887d5ed626f2bf2c561' and service.uri.startswith(
@@ -286,7 +282,7 @@ def test_a_name_is_enough(master):
 
 
 def test_a_block_and_keywords_fill_the_request(master):
-    create(master).serve(
+    create(master, '/provider').serve(
         '/spawn', SPAWN, lambda request: f'{request.x:g} {request.y:g} {request.name}'
     )
 
@@ -299,7 +295,7 @@ def test_a_block_and_keywords_fill_the_request(master):
 
 
 def test_an_unknown_service_names_the_near_ones(master):
-    create(master).serve('/turtle1/teleport', 'std_srvs/Empty', lambda request: None)
+    create(master, '/provider').serve('/turtle1/teleport', 'std_srvs/Empty', lambda request: None)
     with pytest.raises(
         pharos.UnknownServiceError,
         match='offers the service /turtle1/telport.*did you mean '
@@ -323,7 +319,7 @@ def test_a_service_of_nobody_that_answers(master):
 
 
 def test_an_md5sum_by_hand_is_what_is_sent(master):
-    create(master).serve('/set', SET_BOOL, lambda request: {'success': True})
+    create(master, '/provider').serve('/set', SET_BOOL, lambda request: {'success': True})
     service = master.lookup_service('/set')
     service.md5sum = SET_BOOL_MD5SUM
     assert service.call().success
@@ -368,7 +364,7 @@ def test_an_md5sum_by_hand_is_what_is_sent(master):
 )
 def test_a_field_that_does_not_exist_or_does_not_fit(master, block, fields, said):
     called = []
-    create(master).serve('/spawn', SPAWN, lambda request: called.append(request) or '')
+    create(master, '/provider').serve('/spawn', SPAWN, lambda request: called.append(request) or '')
     with pytest.raises(pharos.MessageTypeError, match=said):
         master.lookup_service('/spawn').call(block, **fields)
     assert not called
@@ -376,7 +372,7 @@ def test_a_field_that_does_not_exist_or_does_not_fit(master, block, fields, said
 
 def test_calls_of_several_threads_do_not_wait_for_each_other(master):
     together = threading.Barrier(3)
-    create(master).serve(
+    create(master, '/provider').serve(
         '/meet', 'std_srvs/Trigger', lambda request: {'success': together.wait(TIMEOUT) >= 0}
     )
     service, answers = master.lookup_service('/meet'), []
@@ -400,7 +396,7 @@ def test_a_service_calls_its_own_node_and_itself(master, timeout):
             else inner.call(name=request.name + '!', timeout=timeout).name
         )
 
-    node = create(master)
+    node = create(master, '/provider')
     node.serve('/spawn', SPAWN, countdown)
     inner = master.lookup_service('/spawn')
     assert inner.call(name='', timeout=timeout).name == '!!!!'
@@ -508,7 +504,7 @@ def test_the_reason_of_a_provider_elsewhere_is_told(master, silent):
 
 
 def test_a_time_limit_holds_for_a_block_of_this_process(master):
-    release, node = threading.Event(), create(master)
+    release, node = threading.Event(), create(master, '/provider')
     node.serve('/wait', 'std_srvs/Trigger', lambda request: {'success': release.wait(TIMEOUT)})
     service = master.lookup_service('/wait')
     with pytest.raises(pharos.ServiceCallError, match='/wait did not answer in time'):
@@ -522,7 +518,7 @@ def test_a_time_limit_holds_for_a_block_of_this_process(master):
 
 
 def test_many_calls_leave_no_descriptor(master):
-    create(master).serve('/spawn', SPAWN, lambda request: request.name)
+    create(master, '/provider').serve('/spawn', SPAWN, lambda request: request.name)
     service = master.lookup_service('/spawn')
     service.call()
     before = descriptors()

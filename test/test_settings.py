@@ -6,13 +6,9 @@ import sys
 import pytest
 import rosgraph.network
 
-from pharos import BlockNode
+from helpers import create
 from programs import forget_parameters, run
 from sockets import listening
-
-
-def create(master, name, **kwargs):
-    return master.create(BlockNode, named=name, **{'domain': '127.0.0.1', **kwargs})
 
 
 @pytest.mark.parametrize(

@@ -1,21 +1,16 @@
 """shared=True: what others hold never changes, whoever publishes it again."""
 import pytest
 
-from conftest import Mailbox
-from pharos import BlockNode
+from helpers import create
+from pharos.testing import Mailbox, until
 from pharos.messages import define_service
-from programs import until
 
 POINT, STRING, HEADER = 'geometry_msgs/PointStamped', 'std_msgs/String', 'std_msgs/Header'
 
 
-def create(master, name, delegate=None):
-    return master.create(BlockNode, named=name, domain='127.0.0.1', delegate=delegate)
-
-
 def listener(master, name, topic, type_):
     mailbox = Mailbox()
-    create(master, name, mailbox).interested_in(topic, type_, shared=True)
+    create(master, name, delegate=mailbox).interested_in(topic, type_, shared=True)
     return mailbox
 
 
@@ -31,16 +26,16 @@ def test_a_relay_of_a_shared_message_changes_nothing_that_others_hold(master, ty
     relay = create(master, '/relay')
     out = relay.output_channel('/sharing/out', type_)
     out.send()  # so that its numbers are others
-    relayed.get()
+    relayed.next()
     relay.interested_in(
         '/sharing/in', type_, delegate=lambda message, channel: out.publish(message), shared=True
     )
     sent = create(master, '/sender').output_channel('/sharing/in', type_)
     message = sent.send()
-    held = holder.get()
+    held = holder.next()
     before = snapshot(held)
     assert held is message and before[1]['callerid'] == '/sender'
-    passed_on = relayed.get()
+    passed_on = relayed.next()
     assert snapshot(held) == before
     assert passed_on == held or type_ is POINT
     assert snapshot(passed_on) == (
@@ -58,17 +53,17 @@ def test_a_message_with_a_shared_header_gets_a_header_of_its_own(master):
     create(master, '/sender').output_channel('/sharing/points', POINT).send(
         header={'frame_id': 'here'}
     )
-    held = held_by.get()
+    held = held_by.next()
     for number in 1, 2:
         message = out.send(header=held.header)
         assert (held.header.seq, message.header.seq, message.header.frame_id) == (1, number, 'here')
-        assert others.get().header.seq == number
+        assert others.next().header.seq == number
 
 
 def test_a_shared_message_that_is_a_header_stays_as_it_is(master):
     held_by = listener(master, '/holder', '/sharing/headers', HEADER)
     create(master, '/sender').output_channel('/sharing/headers', HEADER).send(seq=7)
-    held = held_by.get()
+    held = held_by.next()
     listener(master, '/end', '/sharing/of_header', POINT)
     sent = create(master, '/relay').output_channel('/sharing/of_header', POINT).send(header=held)
     assert (held.seq, sent.header.seq) == (7, 1)
@@ -94,7 +89,7 @@ def test_a_message_without_a_header_is_handed_over_itself_as_often_as_it_is_publ
     message = channel.message_class('again')
     for _ in range(3):
         channel.publish(message)
-        assert mailbox.get() is message
+        assert mailbox.next() is message
 
 
 def test_a_publishers_own_message_is_numbered(master):
@@ -105,7 +100,7 @@ def test_a_publishers_own_message_is_numbered(master):
     message = channel.message_class()
     for number in 1, 2, 3:
         channel.publish(message)
-        assert message.header.seq == mailbox.get().header.seq == number
+        assert message.header.seq == mailbox.next().header.seq == number
 
 
 def test_a_message_that_was_shared_with_nobody_stays_the_publishers_own(master):
@@ -116,12 +111,12 @@ def test_a_message_that_was_shared_with_nobody_stays_the_publishers_own(master):
     message = channel.message_class()
     for number in 1, 2:
         channel.publish(message, to='/copies')
-        assert message.header.seq == mailbox.get().header.seq == number
+        assert message.header.seq == mailbox.next().header.seq == number
     master.node('/holder').channels[0].close()
     until(lambda: len(channel.connections) == 1)
     for number in 3, 4:
         channel.publish(message)
-        assert message.header.seq == mailbox.get().header.seq == number
+        assert message.header.seq == mailbox.next().header.seq == number
 
 
 def test_a_relay_of_a_message_that_is_ones_own_numbers_it(master):
@@ -130,7 +125,7 @@ def test_a_relay_of_a_message_that_is_ones_own_numbers_it(master):
     mailbox = Mailbox()
     create(master, '/middle', mailbox).interested_in('/sharing/copied', POINT)
     create(master, '/sender').output_channel('/sharing/copied', POINT).send()
-    message = mailbox.get()
+    message = mailbox.next()
     for number in 1, 2:
         channel.publish(message)
         assert message.header.seq == number
@@ -142,7 +137,7 @@ def test_a_service_that_answers_with_a_shared_header_leaves_it_as_it_is(master, 
     held_by = listener(master, '/holder', '/sharing/latest', POINT)
     channel = create(master, '/sender').output_channel('/sharing/latest', POINT)
     channel.send()
-    held = held_by.get()
+    held = held_by.next()
     node = create(master, '/server')
     node.serve('/sharing/service', 'sharing/Latest', lambda request: {'header': held.header})
     service = master.lookup_service('/sharing/service')

@@ -7,9 +7,9 @@ import threading
 import pytest
 import rosmaster.master_api
 
-from conftest import Mailbox
+from pharos.testing import Mailbox, TIMEOUT
 from pharos import BlockNode
-from programs import TIMEOUT, Program
+from programs import Program
 
 SIGNALS = pytest.mark.parametrize(
     'with_signal', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name
@@ -177,9 +177,9 @@ pharos.spin()
 """,
             wait_for=None,
         )
-        assert heard.get().data == 1.0
+        assert heard.next().data == 1.0
         assert running.end(with_signal) == 0
-        assert heard.get().data == 0.0
+        assert heard.next().data == 0.0
 
 
 def test_a_handler_that_the_program_had_before_is_kept(program):

@@ -7,9 +7,9 @@ import pytest
 import rosgraph
 import rospy
 
-from conftest import Mailbox, speak_tcpros_only
+from helpers import speak_tcpros_only
+from pharos.testing import Mailbox, until
 from pharos import BlockNode
-from programs import until
 
 POINT = 'geometry_msgs/PointStamped'
 TRANSPORTS = 'INTRAPROCESS', 'TCPROS'
@@ -42,9 +42,9 @@ def tell(statistics, channel, *mailboxes):
     def next_statistics():
         sent.append(channel.send(header={'stamp': channel.node.ros.Time.now() - rospy.Duration(5)}))
         for mailbox in mailboxes:
-            mailbox.get()
+            mailbox.next()
         if not statistics.empty():
-            said.append(statistics.get())
+            said.append(statistics.next())
         return any(one.delivered_msgs > 1 for one in said)
 
     until(next_statistics)
@@ -109,5 +109,5 @@ def test_without_the_parameter_there_is_nothing_to_tell(master):
         '/statistics_of/none', POINT
     )
     channel.send()
-    mailbox.get()
+    mailbox.next()
     assert not any(thread.name == '/receiver statistics' for thread in threading.enumerate())

@@ -7,21 +7,10 @@ import xmlrpc.server
 
 import pytest
 
+from helpers import create, registrations
+from pharos.testing import Mailbox, TIMEOUT, until
 import pharos
-from conftest import TIMEOUT, Mailbox
-from pharos import BlockNode, Master
-from programs import until
-
-
-def create(master, name, **kwargs):
-    return master.create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
-
-
-def registrations(master, name):
-    return [
-        sorted(topic for topic, nodes in kind.items() if name in nodes)
-        for kind in master.system_state()
-    ]
+from pharos import Master
 
 
 # -- the master restarts
@@ -41,7 +30,7 @@ def test_everything_is_registered_again_when_the_master_comes_back_empty(mortal_
     before = [registrations(master, name) for name in ('/receiver', '/sender')]
     mortal_master.end()
     sent.send(data='while the master is away')
-    assert mailbox.get().data == 'while the master is away'
+    assert mailbox.next().data == 'while the master is away'
     mortal_master.come_back()
     until(lambda: [registrations(master, name) for name in ('/receiver', '/sender')] == before)
     until(lambda: '/receiver/private' in master.parameters)
@@ -55,7 +44,7 @@ def test_everything_is_registered_again_when_the_master_comes_back_empty(mortal_
     } and mailbox.empty()
     master.lookup_service('/service').call(timeout=TIMEOUT)
     master.parameters['/receiver/watched'] = 2
-    assert changes.get() == 2
+    assert changes.next() == 2
 
 
 def test_a_node_stops_while_the_master_is_away(mortal_master):
@@ -97,7 +86,7 @@ def test_a_peer_killed_outright_is_let_go_and_found_again(master, mailbox):
     told = node.output_channel('/to_peer', 'std_msgs/String')
     for _ in range(2):
         with subprocess.Popen([sys.executable, '-c', PEER]) as peer:
-            assert mailbox.get().data == 'hello' and told.wait_for_subscribers(1, TIMEOUT)
+            assert mailbox.next().data == 'hello' and told.wait_for_subscribers(1, TIMEOUT)
             peer.kill()
         until(lambda: not heard.connections and not told.connections)
         told.send(data='into the void')

@@ -4,10 +4,11 @@ import sys
 
 import pytest
 
-from conftest import TIMEOUT
+from helpers import create
+from pharos.testing import TIMEOUT, until
 from pharos import BlockNode, ExternalNode, Lifecycle, node_registry, watcher
 from pharos.private_rospy import registration
-from programs import Program, forget_parameters, until
+from programs import Program, forget_parameters
 
 ROSPY_NODE = """
 import rospy, std_msgs.msg
@@ -17,10 +18,6 @@ print('ready', flush=True)
 rospy.spin()
 print('ended', flush=True)
 """
-
-
-def create(master, **settings):
-    return master.create(BlockNode, named='/contested', domain='127.0.0.1', **settings)
 
 
 def wait_for_stop(node):
@@ -42,7 +39,7 @@ def rospy_node(master):
 
 @pytest.mark.parametrize('logs_before', [True, False])
 def test_a_newer_node_of_rospys_stays(master, logs_before):
-    ours = create(master)
+    ours = create(master, '/contested')
     ours.output_channel('/ours', 'std_msgs/String')
     if logs_before:
         ours.log('here I am')
@@ -57,7 +54,7 @@ def test_a_newer_node_of_rospys_stays(master, logs_before):
 
 
 def test_a_newer_node_of_roscpps_stays(master):
-    ours = create(master)
+    ours = create(master, '/contested')
     with master.run(
         'topic_tools', 'relay', '/newer_takes', '/newer_gives', name='contested'
     ) as newer:
@@ -92,7 +89,7 @@ def test_a_node_that_was_not_told_notices(master, monkeypatch):
     monkeypatch.setattr(watcher, 'PERIOD', 0.05)
     # it does not obey
     monkeypatch.setattr(registration, 'name_is_anothers', lambda node: False)
-    ours = create(master)
+    ours = create(master, '/contested')
     ours.output_channel('/ours', 'std_msgs/String')
     with rospy_node(master) as newer:
         newer.wait_for('ready')

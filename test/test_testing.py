@@ -6,7 +6,8 @@ import sys
 
 import pytest
 
-from programs import ROOT, TIMEOUT
+from pharos.testing import TIMEOUT
+from programs import ROOT
 
 ROBOT = ROOT / 'test' / 'programs' / 'robot'
 TOLD = {

@@ -7,9 +7,10 @@ import sys
 import pytest
 import rosbag
 
-from conftest import TIMEOUT, InProcessMaster, Mailbox
+from helpers import InProcessMaster
+from pharos.testing import Mailbox, TIMEOUT, until
 from pharos import BlockNode, Master
-from programs import Program, run, until
+from programs import Program, run
 
 STRING = 'std_msgs/String'
 NAMES = ['/n%d' % number for number in range(10)]

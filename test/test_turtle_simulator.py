@@ -10,8 +10,8 @@ import time
 import PIL.Image
 import PIL.ImageGrab
 import pytest
-from conftest import TIMEOUT, Mailbox
 from hypothesis import given, strategies
+from pharos.testing import Mailbox, TIMEOUT
 from programs import Program, forget_parameters, run, script
 
 from pharos import BlockNode, ServiceCallError
@@ -248,7 +248,7 @@ def call(master, service, **fields):
 
 def wait_until(poses, condition):
     """The first pose that meets the condition."""
-    return next(pose for pose in iter(poses.get, None) if condition(pose))
+    return poses.wait_for(condition)
 
 
 def test_it_is_a_node_called_turtlesim_with_turtlesims_topics_services_and_parameters(
@@ -282,7 +282,7 @@ def test_it_is_a_node_called_turtlesim_with_turtlesims_topics_services_and_param
 def test_it_tells_the_pose_and_the_colour_62_and_a_half_times_a_second(simulator, client):
     poses = hear(client, '/turtle1/pose', 'turtlesim/Pose')
     colours = hear(client, '/turtle1/color_sensor', 'turtlesim/Color')
-    pose, colour = poses.get(), colours.get()
+    pose, colour = poses.next(), colours.next()
     assert (pose.x, pose.y) == (pytest.approx(5.544445, abs=1e-6),) * 2
     assert (pose.theta, pose.linear_velocity, pose.angular_velocity) == (0, 0, 0)
     assert (colour.r, colour.g, colour.b) == BACKGROUND
@@ -322,7 +322,7 @@ def test_a_wall_stops_the_turtle_with_turtlesims_warning(simulator, client):
 def test_turtles_are_spawned_and_killed(master, simulator, client):
     assert call(master, '/spawn', x=1.0, y=2.0, theta=0.5).name == 'turtle2'
     assert call(master, '/spawn', x=1.0, y=2.0, theta=0.5, name='robots/leo').name == 'robots/leo'
-    pose = hear(client, '/robots/leo/pose', 'turtlesim/Pose').get()
+    pose = hear(client, '/robots/leo/pose', 'turtlesim/Pose').next()
     assert (pose.x, pose.y, pose.theta) == (1.0, 2.0, 0.5)
     call(master, '/kill', name='turtle2')
     assert not [name for kind in master.system_state() for name in kind if 'turtle2' in name]
@@ -439,7 +439,7 @@ def test_it_follows_its_name_its_namespace_and_remappings(master, client, tmp_pa
         cwd=tmp_path,
     ) as program:
         program.wait_for('Starting turtlesim with node name /robot1/sim')
-        hear(client, '/robot1/where', 'turtlesim/Pose').get()
+        hear(client, '/robot1/where', 'turtlesim/Pose').next()
         assert '/robot1/turtle1/set_pen' in master.services()
         assert program.end() == 0
     assert not list(tmp_path.iterdir())

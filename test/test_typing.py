@@ -7,7 +7,8 @@ import sys
 
 import pytest
 
-from programs import ROOT, TIMEOUT
+from pharos.testing import TIMEOUT
+from programs import ROOT
 
 PROGRAM = ROOT / 'test' / 'programs' / 'wrong_keyword.py'
 
