@@ -18,7 +18,7 @@ import threading
 import pytest
 
 from helpers import create, speak_tcpros_only
-from pharos.testing import Mailbox, TIMEOUT, until
+from pharos.testing import TIMEOUT, Mailbox
 from programs import ROOT, Program
 from sockets import subscribe
 
@@ -39,6 +39,16 @@ def receive(sock):
         return data
 
     return exactly(*struct.unpack('<I', exactly(4)))
+
+
+def until(condition):
+    """Wait for what nobody tells, also in the programs of bare rospy, which get its source."""
+    pause = threading.Event()
+    for _ in range(2000):
+        if condition():
+            return
+        pause.wait(0.01)
+    raise RuntimeError('it did not come to be')
 
 
 def leave(sock):
