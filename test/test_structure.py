@@ -7,6 +7,8 @@ import ast
 import inspect
 import pathlib
 import re
+import subprocess
+import sys
 
 import pharos
 import structure
@@ -257,6 +259,12 @@ def test_setup_py_names_every_package(monkeypatch):
     exec((ROOT / 'setup.py').read_text(), {})
     packages = [module.name for module in MODULES if module.path.name == '__init__.py']
     assert sorted(given['packages']) == packages
+
+
+def test_the_picture_of_the_architecture_is_current():
+    tool = ROOT / 'tools' / 'architecture'
+    ended = subprocess.run([sys.executable, tool, '--check'], check=False)
+    assert ended.returncode == 0, 'run tools/architecture'
 
 
 if __name__ == '__main__':
