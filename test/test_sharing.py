@@ -72,7 +72,7 @@ def test_a_shared_message_that_is_a_header_stays_as_it_is(master):
 def test_a_message_published_twice_keeps_the_number_that_receivers_hold(master):
     mailbox = listener(master, '/holder', '/sharing/twice', POINT)
     copies = Mailbox()
-    create(master, '/other', copies).interested_in('/sharing/twice', POINT)
+    create(master, '/other', delegate=copies).interested_in('/sharing/twice', POINT)
     channel = create(master, '/sender').output_channel('/sharing/twice', POINT)
     message = channel.message_class()
     channel.publish(message)
@@ -95,7 +95,7 @@ def test_a_message_without_a_header_is_handed_over_itself_as_often_as_it_is_publ
 def test_a_publishers_own_message_is_numbered(master):
     """As in rospy, where nobody else holds it."""
     mailbox = Mailbox()
-    create(master, '/copies', mailbox).interested_in('/sharing/own', POINT)
+    create(master, '/copies', delegate=mailbox).interested_in('/sharing/own', POINT)
     channel = create(master, '/sender').output_channel('/sharing/own', POINT)
     message = channel.message_class()
     for number in 1, 2, 3:
@@ -105,7 +105,7 @@ def test_a_publishers_own_message_is_numbered(master):
 
 def test_a_message_that_was_shared_with_nobody_stays_the_publishers_own(master):
     mailbox = Mailbox()
-    create(master, '/copies', mailbox).interested_in('/sharing/alone', POINT)
+    create(master, '/copies', delegate=mailbox).interested_in('/sharing/alone', POINT)
     listener(master, '/holder', '/sharing/alone', POINT)
     channel = create(master, '/sender').output_channel('/sharing/alone', POINT)
     message = channel.message_class()
@@ -123,7 +123,7 @@ def test_a_relay_of_a_message_that_is_ones_own_numbers_it(master):
     channel = create(master, '/relay').output_channel('/sharing/relayed', POINT)
     create(master, '/end').interested_in('/sharing/relayed', POINT)
     mailbox = Mailbox()
-    create(master, '/middle', mailbox).interested_in('/sharing/copied', POINT)
+    create(master, '/middle', delegate=mailbox).interested_in('/sharing/copied', POINT)
     create(master, '/sender').output_channel('/sharing/copied', POINT).send()
     message = mailbox.next()
     for number in 1, 2:
