@@ -39,8 +39,8 @@ class MasterCalls:
     ) -> Any:
         """Call a method of :meth:`api`.
 
-        A question ends with the node on whose behalf this thread runs. A change does not: nobody
-        would know whether the master has made it.
+        A question about all that there is ends with the node on whose behalf this thread runs.
+        A call about one name does not: a node that stops may still finish what it is about.
 
         :raises MasterUnreachableError: if the master does not answer
         :raises NodeStoppedError: if the node that asks stops meanwhile
@@ -48,7 +48,7 @@ class MasterCalls:
         """
         api = self.api(caller_id, timeout)
         with self.reached():
-            if method.startswith(('set', 'delete')):
+            if args:
                 return getattr(api, method)(*args)
             with interruption(api.handle) as stop:
                 try:
