@@ -145,7 +145,7 @@ class Interruption:
         _thread.interruption = self
         for lifetime in self.lifetimes:
             lifetime.interruptions.add(self)
-        if self.came:
+        if self.came and self.wake is not None:
             self.wake()
         return self
 
@@ -165,7 +165,8 @@ def keep_alive(sock: socket.socket, while_sending: bool = False) -> None:
     with contextlib.suppress(OSError):  # closed already
         if while_sending:
             limit = KEEPALIVE_IDLE + KEEPALIVE_INTERVAL * KEEPALIVE_COUNT
-            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 1000 * limit)
+            option = socket.TCP_USER_TIMEOUT  # type: ignore[attr-defined]  # unknown to mypy 1.0
+            sock.setsockopt(socket.IPPROTO_TCP, option, 1000 * limit)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, KEEPALIVE_IDLE)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, KEEPALIVE_INTERVAL)

@@ -95,7 +95,8 @@ def interruption(proxy: ServerProxy) -> Interruption:
 
     For questions alone: of what is to change something, nobody would know whether it has.
     """
-    return Interruption(proxy('transport').shut)
+    transport: Any = proxy('transport')
+    return Interruption(transport.shut)
 
 
 def master_api(url: str, caller_id: str = '/pharos', timeout: float = TIMEOUT) -> rosgraph.Master:
