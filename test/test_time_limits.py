@@ -1,4 +1,5 @@
 """Time limits: kept whether the master answers, answers slowly, hangs, or is away."""
+import contextlib
 import http.server
 import socket
 import threading
@@ -28,7 +29,7 @@ class BadMaster:
 
     def __init__(self, url):
         self.mood, self.asked, self.hangs_after = 'good', 0, None
-        self._over = threading.Event()
+        self.over = threading.Event()
         bad = self
 
         class Handler(http.server.BaseHTTPRequestHandler):
@@ -42,7 +43,7 @@ class BadMaster:
                     or bad.hangs_after is not None
                     and bad.asked > bad.hangs_after
                 ):
-                    bad._over.wait()
+                    bad.over.wait()
                     self.close_connection = True
                     return
                 with urllib.request.urlopen(
@@ -57,7 +58,7 @@ class BadMaster:
             def _write(self, text):
                 if bad.mood == 'dribbling':  # never silent for long, and never through
                     for at in range(len(text)):
-                        if bad._over.wait(0.1):
+                        if bad.over.wait(0.1):
                             return
                         self.wfile.write(text[at : at + 1])
                 else:
@@ -77,7 +78,7 @@ class BadMaster:
         threading.Thread(target=self._server.serve_forever, daemon=True).start()
 
     def leave(self):
-        self._over.set()
+        self.over.set()
         self._server.shutdown()
         self._server.server_close()
 
@@ -210,6 +211,14 @@ def test_a_start_at_a_master_that_hangs_midway_is_given_up_in_time(
         if '/midway' in thread.name:
             thread.join(TIMEOUT)
             assert not thread.is_alive()
+
+
+@pytest.mark.parametrize('answers', range(4))
+def test_a_start_at_a_master_that_leaves_midway_raises_no_error_of_rospys(bad, answers):
+    bad.over.set()  # it closes the connection, instead of answering
+    bad.hangs_after = bad.asked + answers
+    with contextlib.suppress(pharos.MasterUnreachableError):
+        bad.master.create(BlockNode, named='/midway', domain='127.0.0.1')
 
 
 def test_a_start_at_no_master_says_so():

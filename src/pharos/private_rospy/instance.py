@@ -155,12 +155,13 @@ class PrivateRospy:
 
     @contextlib.contextmanager
     def _reached(self):
-        """Turns what rospy raises where the time is up into an error that names the master."""
+        """Turns what rospy raises for want of the master into an error that names it."""
         try:
             yield
         except (*registration.COMMUNICATION_ERRORS, process_rospy.rospy.ROSInitException) as error:
-            if not is_time_up():
-                raise
+            is_of_this_host = isinstance(error, OSError) and not isinstance(error, ConnectionError)
+            if is_of_this_host and not is_time_up():
+                raise  # a port is taken, a disk full
             raise self._stopped_answering() from error
 
     def _stopped_answering(self):
