@@ -323,6 +323,15 @@ def test_a_node_stopped_before_it_accepts_anybody_ends_its_threads(master, monke
     assert not any(thread.is_alive() for thread in accepting)
 
 
+def test_a_connection_that_is_closed_before_it_connects_ends_quietly(master):
+    node = create(master, '/node')
+    tcpros = node.ros.impl.tcpros_pubsub
+    subscription = tcpros.TCPROSSub('/t', message_class('std_msgs/String'))
+    connection = tcpros.TCPROSTransport(subscription, '/t')
+    connection.close()  # by the stop of the node
+    tcpros.robust_connect_subscriber(connection, '127.0.0.1', node.tcp_port, node.uri, print, '/t')
+
+
 def test_a_stop_ends_a_start_at_a_master_that_says_nothing():
     with silent_peer() as url:
         starting, outcome = in_thread(create, Master(url), '/premature')

@@ -46,10 +46,12 @@ def robust_connect_subscriber(
     conn, dest_addr, dest_port, pub_uri, receive_cb, resolved_topic_name, *, node, module
 ):
     """Try once: remove_connection sees to the next attempt."""
-    wanted = conn.protocol.recv_data_class
+    protocol = conn.protocol
+    if protocol is None:  # closed already, as the node stops
+        return
     try:
         conn.connect(dest_addr, dest_port, pub_uri, timeout=CONNECT_TIMEOUT)
-        refusals.check_md5sum(conn, wanted)
+        refusals.check_md5sum(conn, protocol.recv_data_class)
     except module.rospy.exceptions.TransportInitError:
         conn.close()
         refusals.examine(node, conn, resolved_topic_name, pub_uri)
