@@ -28,6 +28,7 @@ class OfferedService:
         self.service_class = messages.service_class(typed_as)
         self._check = copier_for(self.service_class._response_class).freeze
         self.block = block
+        self.closed = False  # whether close() was called
         opened = node.current_run.opened
         if any(isinstance(other, OfferedService) and other.name == name for other in opened):
             raise PharosError(f'{node.name} offers {name} already: close that one first')
@@ -43,6 +44,8 @@ class OfferedService:
             self.node.connect_timeout,
         )
         self.node.latest_run.remember(self)
+        if self.closed:  # meanwhile
+            self.close()
 
     def node_stopped(self) -> None:
         """The node stops, and its rospy closes all services."""
@@ -115,6 +118,7 @@ class OfferedService:
 
     def close(self) -> None:
         """Offer it no longer. Harmless when done twice."""
+        self.closed = True  # where it is only just being opened, it is closed right after that
         if self in self.node.latest_run.opened:
             self.node.latest_run.forget(self)
             with time_limit(UNREGISTER_TIMEOUT):
