@@ -6,7 +6,7 @@ import std_msgs.msg
 from helpers import InProcessMaster, speak_tcpros_only
 from pharos.testing import Mailbox, until
 import pharos
-from pharos import BlockNode, Master
+from pharos import BlockNode, Master, Node
 from programs import Program
 
 STRING = 'std_msgs/String'
@@ -125,6 +125,32 @@ def test_each_latched_channel_of_a_node_survives_its_restart(master, come):
     later, _ = come('/later', '/latch/several')
     assert texts(later, 1) == ['two']
     assert late.empty() and later.empty()
+
+
+def test_a_latched_value_survives_a_restart_of_a_class_that_opens_its_channels_in_start(
+    master, come
+):
+    class Mapper(Node):
+        def start(self):
+            super().start()
+            self.map, self.route = [
+                self.output_channel(f'/latch/{name}', STRING, latch=True)
+                for name in ('map', 'route')
+            ]
+
+    node = master.create(Mapper, named='/sender', domain='127.0.0.1')
+    node.map.send(data='kept')
+    node.route.send(data='gone')
+    node.route.close()
+    for _ in range(2):
+        node.stop()
+        node.start()
+    late, _ = come('/late', '/latch/map')
+    assert texts(late, 1) == ['kept']
+    other, _ = come('/other', '/latch/route')
+    until(lambda: node.route.connections)
+    node.route.send(data='news')
+    assert texts(other, 1) == ['news']
 
 
 def test_a_closed_channel_latches_nothing_any_more(master, come):

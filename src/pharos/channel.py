@@ -10,7 +10,7 @@ from pharos import first_message, messages
 from pharos.blocks import check_block, check_delegate, check_runs
 from pharos.errors import MessageTypeError, NodeStoppedError, PharosError
 from pharos.intraprocess.copier import copier_for
-from pharos.intraprocess.fanout import ClosedFanout, Latch
+from pharos.intraprocess.fanout import ClosedFanout
 from pharos.intraprocess.inbox import Inbox, SocketInbox
 from pharos.private_rospy.deadlines import time_limit
 from pharos.seconds import check_limit
@@ -252,7 +252,7 @@ class OutputChannel(Channel):
     """The end at which a node sends: made by :meth:`Node.output_channel`, or by the first
     ``send_to``.
 
-    :attr:`sent` counts the messages published.
+    :attr:`sent` counts the messages published; :attr:`latched` keeps the last, None: nothing does.
     """
 
     def __init__(
@@ -266,7 +266,7 @@ class OutputChannel(Channel):
     ) -> None:
         super().__init__(node, topic, message_class, queue_size)
         self.latch = latch
-        self._latch = Latch() if latch else None
+        self.latched = self._run.latch_for(topic, message_class) if latch else None
         self.sent = 0
         self._uninterested: Set[str] = set()  # names of nodes of which the log says so
         self._freeze = copier_for(message_class).freeze
@@ -281,7 +281,7 @@ class OutputChannel(Channel):
             endpoint, self._fanout = self._rospy.connections.advertise(
                 self.topic,
                 self.message_class,
-                self._latch,
+                self.latched,
                 timeout,
                 self.queue_size,
                 self.queue_bytes,
@@ -314,7 +314,7 @@ class OutputChannel(Channel):
             to = str(self._run.resolve_peer(to))
             self._check_is_there(to)
         try:
-            is_sent = self._fanout.publish(message, self._latch, to)
+            is_sent = self._fanout.publish(message, self.latched, to)
         except Exception as error:
             self._explain(error, message)
         if is_sent or to is None:
@@ -357,7 +357,7 @@ class OutputChannel(Channel):
 
     def _unregister(self, endpoint: Any) -> None:
         self._fanout = ClosedFanout
-        self._rospy.connections.unadvertise(endpoint, self._latch)
+        self._rospy.connections.unadvertise(endpoint, self.latched)
 
     def send(
         self, block: Optional[Callable[[Any], Any]] = None, *, to: Any = None, **fields: Any

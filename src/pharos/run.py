@@ -11,6 +11,7 @@ from pharos.channel import InputChannel, OutputChannel
 from pharos.errors import MessageTypeError, NodeStoppedError
 from pharos.external_node import ExternalNode
 from pharos.intraprocess.dispatcher import Dispatcher
+from pharos.intraprocess.fanout import Latch
 from pharos.private_rospy.instance import PrivateRospy
 from pharos.private_rospy.names import Resolved, check_name
 from pharos.private_rospy.process_rospy import rospy
@@ -49,6 +50,8 @@ class Run:
         # topic name -> the lock of the thread that opens a channel to send on it
         self._opening: Dict[str, Any] = {}
         self._settings = settings
+        # what the former run had open, where start() opens it anew
+        self._former: List[Any] = []
         self._starter: Optional[int] = threading.get_ident()  # the thread that starts the node
         self._is_cancelled = False  # whether a stop() came while the node started
         self._forked: 'weakref.WeakSet[threading.Thread]' = weakref.WeakSet()  # they run souls
@@ -79,6 +82,8 @@ class Run:
                 if former and reopens:
                     self.opened = list(former.opened)
                     self.rospy.parameters.restore_from_previous_run(former.rospy.parameters)
+                elif former:
+                    self._former = list(former.opened)
                 with node_registry.changed:
                     self._check_not_stopped()
                     self._become(Lifecycle.RUNNING)
@@ -222,6 +227,20 @@ class Run:
         with node_registry.changed:
             self.opened = [other for other in self.opened if other is not opened]
             self.senders.clear()
+
+    def latch_for(self, topic: str, message_class: Any) -> Latch:
+        """The Latch of a new channel: the former run's, where start() opens that channel anew."""
+        with node_registry.changed:
+            for channel in self._former:
+                if (
+                    isinstance(channel, OutputChannel)
+                    and (channel.topic, channel.message_class) == (topic, message_class)
+                    and channel.latched
+                    and not channel.closed
+                ):
+                    self._former.remove(channel)
+                    return channel.latched
+        return Latch()
 
     @property
     def channels(self) -> List[Any]:
