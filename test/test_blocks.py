@@ -158,7 +158,8 @@ def test_a_falsy_delegate_runs(master, inline):
     node.interested_in('/falsy', 'std_msgs/String', inline=inline)
     channel = node.interested_in('/falsy', 'std_msgs/String', delegate=own, inline=inline)
     node.send_to('/falsy', data='ran')
-    assert own.mailbox.next().data == nodes.mailbox.next().data == 'ran' and nodes.mailbox.empty()
+    assert own.mailbox.next().data == nodes.mailbox.next().data == 'ran'
+    assert nodes.mailbox.empty()
     assert channel.delegate is own
 
 
@@ -184,7 +185,8 @@ def test_falsy_blocks_of_other_kinds_run(master, transcript):
     create(master, '/another')
     assert changes.mailbox.next() in ('node', 'topic', 'service')
     end()
-    assert not node.errors and not transcript
+    assert not node.errors
+    assert not transcript
 
 
 def test_a_falsy_receiver_of_the_transcript_runs():

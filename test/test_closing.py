@@ -42,7 +42,8 @@ def test_no_delegate_runs_once_close_has_returned(master, inline):
     while not closing.closed:
         pass
     proceed.set()
-    assert ended(thread) and ended(first)
+    assert ended(thread)
+    assert ended(first)
     sender.send_to('/not_closing', typed_as=STRING, data='done')
     assert mailbox.next().data == 'done'  # whatever was queued before has been looked at
     assert calls == called_at_return == ['0']
@@ -186,7 +187,8 @@ def test_a_service_block_that_outlives_its_caller_ends_quietly(master, capfd):
     assert entered.wait(TIMEOUT)
     answering = [thread for thread in threading.enumerate() if thread.name.startswith('/provider ')]
     caller.stop()
-    assert ended(thread) and errors
+    assert ended(thread)
+    assert errors
     proceed.set()
     node.stop()
     assert all(map(ended, answering))

@@ -226,7 +226,8 @@ def told(value):
     nan is nan."""
     kind = type(value)
     if isinstance(value, (genpy.Message, genpy.rostime.TVal)):
-        assert not hasattr(value, '_connection_header') and not hasattr(value, '__dict__')
+        assert not hasattr(value, '_connection_header')
+        assert not hasattr(value, '__dict__')
         return kind, *[(name, told(getattr(value, name))) for name in value.__slots__]
     if kind in (list, tuple):
         return kind, *map(told, value)
@@ -258,13 +259,15 @@ def assert_as_on_the_wire(message):
     except Exception as error:
         with pytest.raises(type(error)) as caught:
             copier.freeze(message)
-        assert caught.type is type(error) and str(caught.value) == str(error)
+        assert caught.type is type(error)
+        assert str(caught.value) == str(error)
         return
     frozen = copier.freeze(message)
     assert is_immutable(frozen)
     first, second = copier.thaw(frozen), copier.thaw(frozen)
     assert told(first) == told(second) == told(expected)
-    assert not mutables(first) & mutables(second) and not mutables(first) & mutables(message)
+    assert not mutables(first) & mutables(second)
+    assert not mutables(first) & mutables(message)
 
 
 def frozen_fast(message):
@@ -539,7 +542,8 @@ def test_a_message_of_another_class_than_the_publishers_takes_the_wire():
             String(self.data.upper()).serialize(buffer)
 
     received = copier_for(String).thaw(copier_for(String).freeze(Shouted('text')))
-    assert type(received) is String and received.data == 'TEXT'
+    assert type(received) is String
+    assert received.data == 'TEXT'
 
 
 def test_a_class_with_a_constructor_of_its_own_is_made_by_it():
@@ -628,6 +632,7 @@ def test_numpy_msg_takes_and_gives_arrays():
     message = cls(data=numpy.array([1, 2], 'f4'))
     frozen = copier_for(cls).freeze(message)
     first, second = copier_for(cls).thaw(frozen), copier_for(cls).thaw(frozen)
-    assert told(first.data) == told(message.data) and first.data is not second.data
+    assert told(first.data) == told(message.data)
+    assert first.data is not second.data
     assert told(thawer(cls, Float32MultiArray)(frozen).data) == told((1.0, 2.0))
     assert copier_for(numpy_msg(Float64)).freeze_fields is None

@@ -27,7 +27,8 @@ def is_refused(url):
 
 
 def test_it_is_a_master_of_its_own(embedded):
-    assert embedded.is_reachable() and embedded.pid != os.getpid()
+    assert embedded.is_reachable()
+    assert embedded.pid != os.getpid()
     assert [node.name for node in embedded.nodes()] == ['/rosout']
     assert embedded.parameters['/rosdistro']
     assert run(embedded.url, 'rosnode', 'list').stdout == '/rosout\n'
@@ -79,7 +80,9 @@ def test_stop_ends_it_and_this_processs_nodes_there():
     master = Master.embedded()
     pid, node = master.pid, master.create(BlockNode, named='/n')
     master.stop()
-    assert not node.is_running and wait_for_end(pid, 0) and is_refused(master.url)
+    assert not node.is_running
+    assert wait_for_end(pid, 0)
+    assert is_refused(master.url)
     master.stop()  # harmless
     assert not master.is_reachable()
 
@@ -98,7 +101,8 @@ def test_it_comes_back_on_the_same_port_and_a_taken_one_is_said():
         ):
             Master.embedded(port)
     with Master.embedded(port) as again:
-        assert again.url == master.url and again.is_reachable()
+        assert again.url == master.url
+        assert again.is_reachable()
 
 
 def test_two_of_them_know_nothing_of_each_other():
@@ -145,7 +149,8 @@ def test_it_ends_with_the_program(code, status):
     with Program(refused_url(), sys.executable, '-c', PROGRAM % code) as program:
         url, pid = program.wait_for('URL').split()[1:]
         assert program.process.wait(TIMEOUT) == status
-        assert wait_for_end(int(pid), TIMEOUT) and is_refused(url)
+        assert wait_for_end(int(pid), TIMEOUT)
+        assert is_refused(url)
 
 
 def test_it_is_gone_when_a_program_has_ended_properly():
@@ -190,7 +195,8 @@ def test_it_ends_with_a_program_that_is_killed(code):
         fork = int(program.wait_for('FORK').split()[1]) if 'fork' in code else None
         program.process.kill()
         try:
-            assert wait_for_end(int(pid), TIMEOUT) and is_refused(url)
+            assert wait_for_end(int(pid), TIMEOUT)
+            assert is_refused(url)
         finally:
             if fork:
                 os.kill(fork, signal.SIGKILL)
@@ -243,4 +249,5 @@ def test_an_address_of_the_environment_that_nobody_would_reach_is_named(monkeypa
 def test_an_empty_address_of_the_environment_is_none(monkeypatch):
     monkeypatch.setenv('ROS_HOSTNAME', '')
     with Master.embedded() as master:
-        assert master.url.startswith('http://127.0.0.1:') and master.is_reachable()
+        assert master.url.startswith('http://127.0.0.1:')
+        assert master.is_reachable()

@@ -63,7 +63,8 @@ def test_a_node_that_is_waited_for_runs(master):
     thread, found = in_thread(master.wait_for_node, '/awaited', TIMEOUT)
     node = create(master, '/awaited')
     assert ended(thread)
-    assert found == [node] and node.is_running
+    assert found == [node]
+    assert node.is_running
 
 
 def test_of_threads_that_create_a_node_of_one_name_one_wins(master):
@@ -81,7 +82,8 @@ def test_of_threads_that_create_a_node_of_one_name_one_wins(master):
     assert all(
         '/contested' in str(error) and 'node of this process' in str(error) for error in errors
     )
-    assert nodes[0].is_running and master.node('/contested') is nodes[0]
+    assert nodes[0].is_running
+    assert master.node('/contested') is nodes[0]
 
 
 def test_a_name_is_free_again_when_the_start_has_failed(master):
@@ -247,7 +249,8 @@ def test_a_node_may_start_again_at_the_end_of_its_stop(master):
 
     node = create(master, '/phoenix', Phoenix)
     node.stop()
-    assert node.is_running and master.node('/phoenix') is node
+    assert node.is_running
+    assert master.node('/phoenix') is node
     node.stop()
     assert not node.is_running
 
@@ -273,9 +276,12 @@ def test_a_stop_during_the_start_ends_it(master, monkeypatch):
     stop, _ = in_thread(node.stop)
     until(lambda: node_registry._waiting)
     go_on.set()
-    assert ended(starting) and ended(stop)
-    assert isinstance(outcome[0], NodeStoppedError) and '/premature' in str(outcome[0])
-    assert node.lifecycle is Lifecycle.NEW and node_registry.nodes() == []
+    assert ended(starting)
+    assert ended(stop)
+    assert isinstance(outcome[0], NodeStoppedError)
+    assert '/premature' in str(outcome[0])
+    assert node.lifecycle is Lifecycle.NEW
+    assert node_registry.nodes() == []
     assert '/premature' not in [each.name for each in master.nodes()]
     monkeypatch.undo()
     node.start()
@@ -338,7 +344,8 @@ def test_a_stop_ends_a_start_at_a_master_that_says_nothing():
         until(node_registry.nodes)
         node_registry.stop_all()
         assert ended(starting)
-        assert isinstance(outcome[0], NodeStoppedError) and node_registry.nodes() == []
+        assert isinstance(outcome[0], NodeStoppedError)
+        assert node_registry.nodes() == []
 
 
 # -- what waits ends with the node
@@ -474,7 +481,8 @@ def test_a_thread_that_is_only_just_beginning_is_not_waited_for():
     thread = life.Thread(target=lambda: None)
     thread._started = started = StartsSlowly()
     starter, _ = in_thread(thread.start)
-    assert started.reached.wait(TIMEOUT) and thread.ident is not None
+    assert started.reached.wait(TIMEOUT)
+    assert thread.ident is not None
     assert life.finish_shutdown() == []
     started.allowed.set()
     assert ended(starter)
@@ -485,7 +493,9 @@ def test_a_part_of_a_wait_that_begins_after_the_stop_began_ends_too():
     with life.interrupts_waits(), lifetime.Interruption(woken.set):
         life.begin_shutdown()
         with lifetime.Interruption(parts.set) as part:
-            assert woken.is_set() and parts.is_set() and part.came
+            assert woken.is_set()
+            assert parts.is_set()
+            assert part.came
     with life.interrupts_waits(), lifetime.Interruption(parts.set) as last_words:
         assert not last_words.came
 

@@ -46,7 +46,8 @@ def test_a_taken_name(master):
         pharos.NodeNameInUseError, match='/taken is taken by a running node of this process: .*stop'
     ):
         create(master, '/taken')
-    assert owner.is_running and master.is_node_alive('/taken')
+    assert owner.is_running
+    assert master.is_node_alive('/taken')
 
 
 def test_a_name_left_by_a_dead_node_is_free(master):
@@ -109,7 +110,8 @@ def test_a_bad_name_has_a_caret_under_its_first_bad_character(master):
     with pytest.raises(ValueError) as error:
         create(master, '/robot/dri ver')
     line, caret = str(error.value).split('\n')[-2:]
-    assert line[caret.index('^')] == ' ' and line.strip() == '/robot/dri ver'
+    assert line[caret.index('^')] == ' '
+    assert line.strip() == '/robot/dri ver'
 
 
 @pytest.mark.parametrize('port', [-1, 65536, '80', 1.5, None, True])

@@ -113,12 +113,10 @@ def test_a_soul_may_raise_anything(master, transcript, dead_threads, outcast):
     assert node.execute() is None
     node.fork().join(TIMEOUT)
     (failure,) = node.failures
-    assert (
-        type(failure.error) is outcast
-        and failure.count == 2
-        and failure.block is soul
-        and not dead_threads
-    )
+    assert type(failure.error) is outcast
+    assert failure.count == 2
+    assert failure.block is soul
+    assert not dead_threads
 
 
 @pytest.mark.parametrize('outcast', OUTCASTS)
@@ -133,16 +131,19 @@ def test_a_service_block_may_raise_anything(master, transcript, dead_threads, ou
         service.call(timeout=timeout)
     assert time.monotonic() - begin < TIMEOUT  # it is not waited for in vain
     service.call(timeout=timeout)
-    assert classes_of(node.errors) == [outcast] and not dead_threads
+    assert classes_of(node.errors) == [outcast]
+    assert not dead_threads
 
 
 def test_a_service_block_called_from_outside_may_raise_anything(master, transcript, dead_threads):
     node = create(master)
     node.serve('/fails_outside', 'std_srvs/Empty', Raising(SystemExit('out')))
     done = run(master.url, 'rosservice', 'call', '/fails_outside')
-    assert 'SystemExit: out' in done.stderr and 'not able to' not in done.stderr
+    assert 'SystemExit: out' in done.stderr
+    assert 'not able to' not in done.stderr
     assert run(master.url, 'rosservice', 'call', '/fails_outside').returncode == 0
-    assert classes_of(node.errors) == [SystemExit] and not dead_threads
+    assert classes_of(node.errors) == [SystemExit]
+    assert not dead_threads
 
 
 def test_a_parameter_block_may_raise_anything(master, transcript):
@@ -201,12 +202,11 @@ def test_on_line_may_raise_anything(master, transcript):
     with master.run('topic_tools', 'relay', on_line=on_line) as process:
         process.wait(TIMEOUT)
     printed = process.output.split('\n')
-    assert len(printed) > 1 and lines.take(len(printed)) == printed
-    assert (
-        'block' in transcript[0]
-        and 'for the output of' in transcript[0]
-        and 'raised SystemExit' in transcript[0]
-    )
+    assert len(printed) > 1
+    assert lines.take(len(printed)) == printed
+    assert 'block' in transcript[0]
+    assert 'for the output of' in transcript[0]
+    assert 'raised SystemExit' in transcript[0]
 
 
 # -- plain rospy, and what else a thread of ours runs
@@ -234,7 +234,8 @@ def test_a_service_of_plain_rospy_may_raise_anything(master, dead_threads, outca
     ):
         service.call(timeout=timeout)
     service.call(timeout=timeout)
-    assert told == [outcast] and not dead_threads
+    assert told == [outcast]
+    assert not dead_threads
 
 
 def test_a_service_of_plain_rospy_called_from_outside_may_raise_anything(master, dead_threads):
@@ -265,7 +266,8 @@ def test_a_callback_of_plain_rospy_takes_nothing_from_a_channel_whatever_it_rais
     assert [message.data for message in mailbox.take(len(OUTCASTS) + 1)] == list(
         range(len(OUTCASTS) + 1)
     )
-    assert plain.taken.next().data == len(OUTCASTS) and not dead_threads
+    assert plain.taken.next().data == len(OUTCASTS)
+    assert not dead_threads
 
 
 @pytest.mark.parametrize('outcast', [SystemExit, ValueError])
@@ -280,7 +282,8 @@ def test_a_hook_of_on_shutdown_may_raise_anything(master, transcript, monkeypatc
     ) as closed:
         patched.setattr(sys, 'stderr', closed)  # where rospy would print it
         node.stop()
-    assert hook.taken.next() == 'the other' and classes_of(node.errors) == [outcast]
+    assert hook.taken.next() == 'the other'
+    assert classes_of(node.errors) == [outcast]
     assert '/node' not in [other.name for other in master.nodes()]
 
 
@@ -304,11 +307,9 @@ def test_a_stop_that_fails_in_a_thread_of_ours_is_a_failure_and_the_node_stops(
     else:
         node_registry.stop_all()
     until(lambda: node.failures)
-    assert (
-        node.lifecycle.value == 'stopped'
-        and classes_of(node.errors) == [SystemExit]
-        and not dead_threads
-    )
+    assert node.lifecycle.value == 'stopped'
+    assert classes_of(node.errors) == [SystemExit]
+    assert not dead_threads
     assert transcript[-1] == 'Failing.stop of /failing_stop raised SystemExit: stop'
     assert '/failing_stop' not in [other.name for other in master.nodes()]
 
@@ -317,7 +318,8 @@ def test_a_stop_that_fails_keeps_no_embedded_master_from_its_end(transcript):
     embedded = pharos.Master.embedded()
     embedded.create(Failing, named='/failing_stop', domain='127.0.0.1')
     embedded.stop()
-    assert not embedded.is_reachable() and 'SystemExit' in transcript[-1]
+    assert not embedded.is_reachable()
+    assert 'SystemExit' in transcript[-1]
 
 
 def test_a_stop_that_fails_hides_no_failure_of_the_start(master, transcript):
@@ -375,7 +377,8 @@ def test_an_error_that_cannot_be_shown_is_kept_all_the_same(master, transcript, 
     error.__cause__ = Unspeakable()
     node = create(master, delegate=fails_on_bad(mailbox, error))
     send_bad_and_good(node)
-    assert mailbox.next().data == 'good' and node.errors[0] is error
+    assert mailbox.next().data == 'good'
+    assert node.errors[0] is error
     assert f'raised {type(error).__name__}' in transcript[0]
     assert repr(node.failures)
 
@@ -383,8 +386,10 @@ def test_an_error_that_cannot_be_shown_is_kept_all_the_same(master, transcript, 
 def test_a_block_that_cannot_be_named_is_told_all_the_same(master, transcript, mailbox):
     node = create(master, delegate=UnnameableBlock(fails_on_bad(mailbox, ValueError('bad one'))))
     send_bad_and_good(node)
-    assert mailbox.next().data == 'good' and classes_of(node.errors) == [ValueError]
-    assert 'UnnameableBlock' in transcript[0] and 'bad one' in transcript[0]
+    assert mailbox.next().data == 'good'
+    assert classes_of(node.errors) == [ValueError]
+    assert 'UnnameableBlock' in transcript[0]
+    assert 'bad one' in transcript[0]
 
 
 @pytest.mark.parametrize('inline', [False, True])
@@ -403,12 +408,14 @@ def test_a_log_and_a_transcript_that_fail_change_nothing(master, mailbox, capsys
             Mute, named='/mute', delegate=fails_on_bad(mailbox, ValueError('bad one'))
         )
         send_bad_and_good(node, inline)
-        assert mailbox.next().data == 'good' and classes_of(node.errors) == [ValueError]
+        assert mailbox.next().data == 'good'
+        assert classes_of(node.errors) == [ValueError]
         Transcript.show('another', Unspeakable())
     finally:
         Transcript.on_show(before)
     about, line, another = capsys.readouterr().out.splitlines()
-    assert 'receiver' in about and f'raised {outcast.__name__}: no line' in about
+    assert 'receiver' in about
+    assert f'raised {outcast.__name__}: no line' in about
     assert line.endswith('raised ValueError: bad one')
     assert another == 'another <Unspeakable that cannot be shown>'
 
@@ -428,7 +435,8 @@ def test_an_output_that_cannot_be_written_changes_nothing(master, mailbox, monke
         patched.setattr(sys, 'stderr', file)
         node = create(master, delegate=fails_on_bad(mailbox, ValueError('bad one')))
         send_bad_and_good(node)
-        assert mailbox.next().data == 'good' and classes_of(node.errors) == [ValueError]
+        assert mailbox.next().data == 'good'
+        assert classes_of(node.errors) == [ValueError]
         node.fork(lambda me: 1 / 0).join(TIMEOUT)
         assert classes_of(node.errors) == [ValueError, ZeroDivisionError]
         with pytest.raises((OSError, ValueError)):
@@ -482,18 +490,18 @@ def test_identical_failures_are_one_told_once_and_then_counted(master, transcrip
     channel = failing(node, lambda number: ValueError('the same'), 250)
     (error,) = node.errors
     (failure,) = node.failures
-    assert isinstance(failure, pharos.Failure) and failure.error is error and failure.count == 250
-    assert (
-        failure.channel is channel
-        and failure.message.data == 249
-        and abs(failure.time - time.time()) < 100
-    )
-    assert (
-        'ValueError: the same, 250 times' in repr(failure) and 'raise error_of' in failure.traceback
-    )
+    assert isinstance(failure, pharos.Failure)
+    assert failure.error is error
+    assert failure.count == 250
+    assert failure.channel is channel
+    assert failure.message.data == 249
+    assert abs(failure.time - time.time()) < 100
+    assert 'ValueError: the same, 250 times' in repr(failure)
+    assert 'raise error_of' in failure.traceback
     first, tenth, hundredth = transcript
     assert first.endswith('on /counted raised ValueError: the same')
-    assert tenth == first + ', 10 times by now' and hundredth == first + ', 100 times by now'
+    assert tenth == first + ', 10 times by now'
+    assert hundredth == first + ', 100 times by now'
     assert '250 errors' in repr(node)
 
 
@@ -539,7 +547,8 @@ def test_failures_differ_in_block_channel_class_place_and_text(master, transcrip
         ('/two', lambda number: KeyError('a')),
     ]:
         failing(node, error_of, 2, topic).close()
-    assert [failure.count for failure in node.failures] == [2] * 4 and len(transcript) == 4
+    assert [failure.count for failure in node.failures] == [2] * 4
+    assert len(transcript) == 4
 
 
 def test_failures_of_ever_changing_text_are_told_a_few_times(master, transcript):
@@ -554,9 +563,8 @@ def test_failures_of_ever_changing_text_are_told_a_few_times(master, transcript)
         '999, 1000 times by now, with different texts',
     ]
     assert len(node.errors) == len(node.failures) == failures.KEPT
-    assert (
-        str(node.errors[0]) == 'no transform at 0' and str(node.errors[-1]) == 'no transform at 999'
-    )
+    assert str(node.errors[0]) == 'no transform at 0'
+    assert str(node.errors[-1]) == 'no transform at 999'
 
 
 def test_a_block_that_replaces_another_and_fails_as_that_did_is_told(master, transcript):
@@ -566,7 +574,8 @@ def test_a_block_that_replaces_another_and_fails_as_that_did_is_told(master, tra
         node.soul = eval(text)
         node.execute()
         node.execute()
-    assert len(transcript) == 2 and [failure.count for failure in node.failures] == [2, 2]
+    assert len(transcript) == 2
+    assert [failure.count for failure in node.failures] == [2, 2]
 
 
 def test_closures_of_one_place_that_fail_alike_are_told_once(master, transcript):
@@ -574,7 +583,8 @@ def test_closures_of_one_place_that_fail_alike_are_told_once(master, transcript)
     for number in range(3):
         node.soul = lambda me, number=number: me.nothing()
         node.execute()
-    assert len(transcript) == 1 and node.failures[0].count == 3
+    assert len(transcript) == 1
+    assert node.failures[0].count == 3
 
 
 def test_what_nobody_raised_is_told_without_a_traceback_that_only_repeats_it():
@@ -592,7 +602,8 @@ def test_a_flood_of_failures_displaces_no_other(master, transcript):
     assert [str(error) for error in node.errors if isinstance(error, KeyError)] == [
         "'the cause, perhaps'"
     ]
-    assert any('/rare' in line for line in transcript) and len(node.errors) == failures.KEPT
+    assert any('/rare' in line for line in transcript)
+    assert len(node.errors) == failures.KEPT
 
 
 def test_the_newest_failure_is_the_last(master, transcript):
@@ -604,20 +615,22 @@ def test_the_newest_failure_is_the_last(master, transcript):
     ]
     failing(node, lambda number: ValueError('more'), 1, '/more')
     assert [str(error) for error in node.errors] == ['0', '1', 'more']
-    assert [str(error) for error in node.errors[1:]] == ['1', 'more'] and repr(
-        node.errors
-    ).startswith('[ValueError(0)')
+    assert [str(error) for error in node.errors[1:]] == ['1', 'more']
+    assert repr(node.errors).startswith('[ValueError(0)')
 
 
 def test_errors_that_have_been_seen_to_may_be_taken_out(master, transcript):
     node = create(master)
     failing(node, ValueError, 3)
-    assert str(node.errors.pop()) == '2' and str(node.errors.pop(0)) == '0'
+    assert str(node.errors.pop()) == '2'
+    assert str(node.errors.pop(0)) == '0'
     assert [str(failure.error) for failure in node.failures] == ['1']
     node.errors.clear()
-    assert not node.errors and not node.failures
+    assert not node.errors
+    assert not node.failures
     failing(node, lambda number: ValueError('new'), 1, '/new')
-    assert len(node.errors) == 1 and 'new' in transcript[-1]
+    assert len(node.errors) == 1
+    assert 'new' in transcript[-1]
 
 
 # -- what is large is kept for the newest alone
@@ -709,7 +722,8 @@ def test_an_error_that_is_raised_again_and_again_does_not_collect_frames(master,
 def test_long_texts_are_cut(master, transcript):
     node = create(master)
     failing(node, lambda number: ValueError('x' * 10000000), 1)
-    assert len(transcript[0]) < 5000 and len(node.failures[0].traceback) < 50000
+    assert len(transcript[0]) < 5000
+    assert len(node.failures[0].traceback) < 50000
 
 
 # -- again
@@ -721,15 +735,17 @@ def test_a_delegate_is_run_again_as_it_is_now_on_the_same_message(master, transc
     node.send_to('/again', data='bad')
     (failure,) = node.failures
     # told, for somebody waits for it
-    assert failure.retry() is False and failure.count == 2 and len(transcript) == 2
+    assert failure.retry() is False
+    assert failure.count == 2
+    assert len(transcript) == 2
     node.delegate = mailbox
     assert failure.retry() is True
-    assert (
-        mailbox.next_with_channel() == (failure.message, channel) and failure.message.data == 'bad'
-    )
+    assert mailbox.next_with_channel() == (failure.message, channel)
+    assert failure.message.data == 'bad'
     assert (failure.count, channel.received) == (2, 1)
     channel.delegate = Raising(SystemExit('out'))
-    assert failure.retry() is False and classes_of(node.errors) == [ZeroDivisionError, SystemExit]
+    assert failure.retry() is False
+    assert classes_of(node.errors) == [ZeroDivisionError, SystemExit]
 
 
 def test_a_delegate_is_run_again_when_no_other_runs(master, transcript, mailbox):
@@ -750,9 +766,11 @@ def test_a_delegate_is_run_again_when_no_other_runs(master, transcript, mailbox)
     node.failures[0].channel.delegate = lambda message, channel: ran.append('again')
     retrying = threading.Thread(target=lambda: mailbox(node.failures[0].retry(), None))
     retrying.start()
-    assert mailbox.empty() and not ran
+    assert mailbox.empty()
+    assert not ran
     go_on.set()
-    assert mailbox.next() is True and ran == ['slow', 'again']
+    assert mailbox.next() is True
+    assert ran == ['slow', 'again']
 
 
 @pytest.mark.parametrize('inline', [False, True])
@@ -768,7 +786,8 @@ def test_a_delegate_may_have_another_one_run_again(master, transcript, mailbox, 
     node.send_to('/again', data='bad')
     until(lambda: node.failures)
     node.send_to('/retry')
-    assert mailbox.next() is True and failing_once.taken.next().data == 'bad'
+    assert mailbox.next() is True
+    assert failing_once.taken.next().data == 'bad'
 
 
 def test_what_came_inline_while_a_delegate_was_run_again_is_not_left_lying(
@@ -801,12 +820,12 @@ def test_a_soul_is_run_again_as_it_is_now(master, transcript, mailbox):
     node.fork(forked).join(TIMEOUT)
     node.soul = lambda me: mailbox('again', None)
     of_soul, of_fork = node.failures
-    assert (
-        of_soul.retry() is True
-        and mailbox.next() == 'again'
-        and of_soul.message is of_soul.channel is None
-    )
-    assert of_fork.retry() is True and forked.taken.next() is node and mailbox.empty()
+    assert of_soul.retry() is True
+    assert mailbox.next() == 'again'
+    assert of_soul.message is of_soul.channel is None
+    assert of_fork.retry() is True
+    assert forked.taken.next() is node
+    assert mailbox.empty()
 
 
 def test_a_service_block_is_run_again_on_the_same_request(master, transcript, mailbox):
@@ -815,9 +834,12 @@ def test_a_service_block_is_run_again_on_the_same_request(master, transcript, ma
     with pytest.raises(pharos.ServiceCallError):
         master.lookup_service('/fails_again').call(data=True)
     (failure,) = node.failures
-    assert failure.message.data is True and failure.retry() is False and failure.count == 2
+    assert failure.message.data is True
+    assert failure.retry() is False
+    assert failure.count == 2
     offered.block = lambda request: mailbox(request, None) or {'success': True}
-    assert failure.retry() is True and mailbox.next() is failure.message
+    assert failure.retry() is True
+    assert mailbox.next() is failure.message
 
 
 def test_a_parameter_block_is_run_again_on_the_same_value(master, transcript):
@@ -826,8 +848,10 @@ def test_a_parameter_block_is_run_again_on_the_same_value(master, transcript):
     parameter.on_change(block)
     parameter.set(5)
     (failure,) = node.failures
-    assert failure.message == 5 and failure.block is block
-    assert failure.retry() is True and block.taken.next() == 5
+    assert failure.message == 5
+    assert failure.block is block
+    assert failure.retry() is True
+    assert block.taken.next() == 5
     failing(node, ValueError, failures.WHOLE)
     with pytest.raises(pharos.PharosError, match='newest 5'):
         failure.retry()
@@ -843,7 +867,9 @@ def test_the_newest_failures_alone_are_run_again_and_looked_at(master, transcrip
     new.debug()
     *_, (innermost, _) = traceback.walk_tb(looked_at.pop())
     assert innermost.f_locals['message'].data == 9
-    assert old.message is None and old.error.__traceback__ is None and 'bad 0' in old.traceback
+    assert old.message is None
+    assert old.error.__traceback__ is None
+    assert 'bad 0' in old.traceback
     for do in old.retry, old.debug:
         with pytest.raises(pharos.PharosError, match='of /node on /counted.* newest 5'):
             do()

@@ -60,7 +60,8 @@ def bare():
 
 
 def test_a_bare_master_has_nothing(bare):
-    assert bare.is_reachable() and bare.wait(0) is bare
+    assert bare.is_reachable()
+    assert bare.wait(0) is bare
     assert (bare.nodes(), bare.topics(), bare.services(), bare.topic_types()) == ([], [], [], [])
     assert bare.system_state() == ({}, {}, {})
     assert (list(bare.parameters), len(bare.parameters), '/a' in bare.parameters) == ([], 0, False)
@@ -116,7 +117,8 @@ def test_nodes_topics_and_services_are_those_that_rostopic_and_rosnode_list(mast
         ['/here'],
         [],
     )
-    assert master.topic('in') == topics['/in'] and topics['/in'].subscribers == ['/here']
+    assert master.topic('in') == topics['/in']
+    assert topics['/in'].subscribers == ['/here']
     assert '/serve' in master.services()
     assert master.system_state()[2]['/serve'] == ['/here']
 
@@ -137,9 +139,8 @@ def test_a_topic_gives_channels_to_running_nodes_of_its_master_alone(master, ope
     node.stop()
     with pytest.raises(pharos.NodeStoppedError, match='/taker is stopped'):
         open_(topic, node, STRING)
-    assert not topic.channels and '/given' not in (
-        name for kind in master.system_state() for name in kind
-    )
+    assert not topic.channels
+    assert '/given' not in (name for kind in master.system_state() for name in kind)
 
 
 def test_parameters_that_others_have_named_oddly_are_in_the_mapping_too(bare):
@@ -163,7 +164,8 @@ def test_parameters_are_a_mapping(bare):
     bare.parameters['/robot/wheels'] = {'left': 1.5, 'right': [1, 2]}
     assert bare.parameters['/robot'] == {'name': 'r2', 'wheels': {'left': 1.5, 'right': [1, 2]}}
     assert list(bare.parameters) == ['/robot/name', '/robot/wheels/left', '/robot/wheels/right']
-    assert '/robot/wheels' in bare.parameters and 'robot/name' in bare.parameters
+    assert '/robot/wheels' in bare.parameters
+    assert 'robot/name' in bare.parameters
     assert dict(bare.parameters)['/robot/wheels/left'] == 1.5
     assert bare.parameters.get('/none', 'default') == 'default'
     del bare.parameters['/robot/wheels']
@@ -251,7 +253,8 @@ def test_wait_returns_once_the_master_answers():
     with concurrent.futures.ThreadPoolExecutor() as pool:
         waiting = pool.submit(master.wait, TIMEOUT)
         ros_master = InProcessMaster(int(url.rstrip('/').rpartition(':')[2]))
-        assert waiting.result(TIMEOUT) is master and master.is_reachable()
+        assert waiting.result(TIMEOUT) is master
+        assert master.is_reachable()
         ros_master.stop()
 
 
@@ -261,7 +264,8 @@ def test_wait_returns_once_the_master_answers():
 def test_a_rospy_node_from_outside(master):
     with peer(master, 'outside') as program:
         node = master.node('/outside')
-        assert isinstance(node, ExternalNode) and node.is_alive()
+        assert isinstance(node, ExternalNode)
+        assert node.is_alive()
         assert (node.name, node.pid, node.host) == ('/outside', program.process.pid, '127.0.0.1')
         assert node.uri.startswith('http://127.0.0.1:')
         assert (node.publications['/from_peers'], node.subscriptions) == (
@@ -279,7 +283,8 @@ def test_a_roscpp_node_from_outside(master, mailbox):
     receiver.interested_in('/relayed', STRING)
     with master.run('topic_tools', 'relay', '/direct', '/relayed', name='relay') as process:
         node = master.wait_for_node('/relay', TIMEOUT)
-        assert isinstance(node, ExternalNode) and node.is_alive()
+        assert isinstance(node, ExternalNode)
+        assert node.is_alive()
         assert (node.pid, node.host) == (process.pid, '127.0.0.1')
         sender = create(master, '/sender')
         while mailbox.empty():  # relay advertises only with its first message, which so is lost
@@ -295,20 +300,24 @@ def test_each_node_is_of_its_class(master):
     inside = create(master, '/inside')
     with peer(master, 'outside'):
         found = {node.name: node for node in master.nodes()}
-        assert found['/inside'] is inside and type(found['/outside']) is ExternalNode
-        assert master.node('/inside') is inside and master.node('outside') == found['/outside']
+        assert found['/inside'] is inside
+        assert type(found['/outside']) is ExternalNode
+        assert master.node('/inside') is inside
+        assert master.node('outside') == found['/outside']
 
 
 def test_a_node_that_was_killed_is_registered_and_not_alive(master):
     with peer(master, 'killed') as program:
         program.end(signal.SIGKILL)
         node = master.node('/killed')
-        assert node in master.nodes() and not node.is_alive()
+        assert node in master.nodes()
+        assert not node.is_alive()
         assert (node.publications['/from_peers'], node.subscriptions) == (
             STRING,
             {'/to_peers': STRING},
         )
-        assert '/killed/clear' in node.services and node.host == '127.0.0.1'
+        assert '/killed/clear' in node.services
+        assert node.host == '127.0.0.1'
         for ask in (lambda: node.pid), node.shutdown:
             with pytest.raises(
                 UnknownNodeError, match='/killed is registered at .* but does not answer .*cleanup'
@@ -354,7 +363,8 @@ def test_from_an_external_node_alone(master, mailbox):
             threading.Event().wait(0.01)
         for name in '/one', '/two', '/one', '/two':
             master.lookup_service(name + '/clear').call()
-        assert [message.data for message in mailbox.take(2)] == ['/two', '/two'] and mailbox.empty()
+        assert [message.data for message in mailbox.take(2)] == ['/two', '/two']
+        assert mailbox.empty()
 
 
 def test_to_an_external_node_alone(master):
@@ -362,7 +372,8 @@ def test_to_an_external_node_alone(master):
         node = create(master, '/sender')
         node.send_to('/to_peers', data='for two', to=master.node('/two'))
         node.send_to('/to_peers', data='for all')
-        assert 'for two' in two.wait_for('heard') and 'for all' in one.wait_for('heard')
+        assert 'for two' in two.wait_for('heard')
+        assert 'for all' in one.wait_for('heard')
 
 
 # -- what comes and goes
@@ -393,7 +404,8 @@ def test_on_change_tells_what_comes_and_goes(master):
     node.interested_in('/topic', STRING)
     node.serve('/service', 'std_srvs/Empty', lambda request: None)
     told = changes.wait_for('topic', '/topic', True)
-    assert ('node', '/comes', True) in told and '/there_before' not in [name for _, name, _ in told]
+    assert ('node', '/comes', True) in told
+    assert '/there_before' not in [name for _, name, _ in told]
     with peer(master, 'outside'):
         changes.wait_for('node', '/outside', True)
     changes.wait_for('node', '/outside', False)

@@ -289,12 +289,10 @@ def test_a_type_that_is_nowhere_here_is_received_with_all_fields_right(
     assert plain(message) == VALUES
     assert (message.OK, message.BROKEN, message.FRAME) == (0, 7, 'base "link" # not a comment')
     assert (message.STEP, message.TURNS, message.marks[0].places[1].UNKNOWN) == (0.25, True, -1)
-    assert isinstance(message.stamps[0], genpy.Time) and isinstance(
-        message.marks[0].waits[0], genpy.Duration
-    )
-    assert message.four == b'\1\0\3\xff' and message.points[0] == message_class(
-        'geometry_msgs/Point'
-    )(1, 2, -3)
+    assert isinstance(message.stamps[0], genpy.Time)
+    assert isinstance(message.marks[0].waits[0], genpy.Duration)
+    assert message.four == b'\1\0\3\xff'
+    assert message.points[0] == message_class('geometry_msgs/Point')(1, 2, -3)
     assert_unknown_here()
 
 
@@ -308,7 +306,8 @@ def test_nodes_that_learn_a_type_each_send_and_receive_it(master, rospy_peer, ma
     heard = receiver.interested_in('/types/from_rospy')
     mailbox.next()
     sent = sender.send_to('/types/from_rospy', text='from here')
-    assert type(sent) is heard.message_class and mailbox.next().text == 'from here'
+    assert type(sent) is heard.message_class
+    assert mailbox.next().text == 'from here'
 
 
 def test_a_type_learnt_serves_its_node_after_the_publisher_has_gone(master, mailbox):
@@ -344,10 +343,8 @@ def test_without_a_type_the_masters_is_taken(master, mailbox):
         node = create(master, '/node', delegate=mailbox)
         assert node.interested_in('/types/installed', wait=TIMEOUT).type == 'std_msgs/Int32'
         assert mailbox.next().data == 7
-        assert (
-            node.send_to('/types/installed', data=8)._type == 'std_msgs/Int32'
-            and mailbox.next().data == 8
-        )
+        assert node.send_to('/types/installed', data=8)._type == 'std_msgs/Int32'
+        assert mailbox.next().data == 8
 
 
 # -- sending
@@ -395,7 +392,8 @@ def test_rosbag_records_a_type_learnt_from_the_graph_and_sent_on(
     heard = node.interested_in('/types/from_rospy')
     node.output_channel('/types/sent_on', heard.message_class, latch=True).publish(mailbox.next())
     type_, message = read(record(master.url, '/types/sent_on', tmp_path / 'sent_on.bag'))
-    assert type_ == SCAN and plain(message) == VALUES
+    assert type_ == SCAN
+    assert plain(message) == VALUES
 
 
 def test_a_process_that_knows_nothing_hears_a_type_given_by_definition(master, defined):
@@ -419,7 +417,8 @@ def test_rostopic_echo_prints_it_where_generated_code_is_installed(
     rospy's or ours."""
     for topic in '/types/defined', '/types/from_rospy':
         echo = run(master.url, 'rostopic', 'echo', '-n1', topic)
-        assert echo.returncode == 1 and 'Cannot load message class' in echo.stderr
+        assert echo.returncode == 1
+        assert 'Cannot load message class' in echo.stderr
     definitions, package = tmp_path / 'definitions', tmp_path / 'python/defined_msgs/msg'
     definitions.mkdir()
     package.mkdir(parents=True)
@@ -489,7 +488,8 @@ def test_a_type_that_is_not_there_yet_is_waited_for(master, asked, way, request)
     topic = '/types/awaited_by_' + request.node.callspec.id
     with concurrent.futures.ThreadPoolExecutor() as pool:
         waiting = pool.submit(way, create(master, '/node'), topic, wait=TIMEOUT)
-        assert asked.wait(TIMEOUT) and not waiting.done()
+        assert asked.wait(TIMEOUT)
+        assert not waiting.done()
         create(master, '/other').output_channel(topic, 'std_msgs/Int32')
         assert waiting.result(TIMEOUT) == 'std_msgs/Int32'
 
@@ -505,7 +505,8 @@ def test_a_definition_that_is_not_there_yet_is_waited_for(master, asked):
         asked.clear()
         with concurrent.futures.ThreadPoolExecutor() as pool:
             waiting = pool.submit(node.interested_in, topic, wait=TIMEOUT)
-            assert asked.wait(TIMEOUT) and not waiting.done()
+            assert asked.wait(TIMEOUT)
+            assert not waiting.done()
             with Publisher(master, topic, type_, 'string word'):
                 assert waiting.result(TIMEOUT).type == type_
                 node.stop()
@@ -526,8 +527,10 @@ def test_the_stop_of_a_node_ends_its_wait_for_a_type(master, asked, transcript):
     assert asked.wait(TIMEOUT)
     node.stop()
     error = raised.next()
-    assert isinstance(error, NodeStoppedError) and '/types/never' in str(error)
-    assert not node.errors and not transcript
+    assert isinstance(error, NodeStoppedError)
+    assert '/types/never' in str(error)
+    assert not node.errors
+    assert not transcript
 
 
 # -- publishers that lie
@@ -645,12 +648,11 @@ def lie(master, tmp_path, monkeypatch):
         with Publisher(master, topic, type_, *args, **kwargs):
             with pytest.raises(PharosError) as error:
                 node.interested_in(topic)
-        assert (
-            node.is_running
-            and not node.channels
-            and '/victim' not in master.topic(topic).subscribers
-        )
-        assert list(tmp_path.iterdir()) == [] and len(str(error.value)) < 2000
+        assert node.is_running
+        assert not node.channels
+        assert '/victim' not in master.topic(topic).subscribers
+        assert list(tmp_path.iterdir()) == []
+        assert len(str(error.value)) < 2000
         return error.value
 
     return refusal
@@ -692,14 +694,16 @@ def lie(master, tmp_path, monkeypatch):
 def test_a_definition_that_cannot_be_read_is_refused_and_runs_nothing(lie, definition, reason):
     error = lie('lie_msgs/Lie', definition)
     assert isinstance(error, UnknownTypeError)
-    assert reason in str(error) and '/liar publishes on /types/lie_' in str(error)
+    assert reason in str(error)
+    assert '/liar publishes on /types/lie_' in str(error)
     assert_unknown_here('lie_msgs/Lie')
 
 
 def test_a_definition_that_has_not_the_md5sum_given_is_refused(lie):
     error = lie('lie_msgs/Lie', 'int8 a', md5sum='0123456789abcdef0123456789abcdef')
     assert isinstance(error, MessageTypeError)
-    assert 'md5sum 0123456789abcdef0123456789abcdef' in str(error) and 'a: int8' in str(error)
+    assert 'md5sum 0123456789abcdef0123456789abcdef' in str(error)
+    assert 'a: int8' in str(error)
 
 
 @pytest.mark.parametrize(
@@ -755,7 +759,9 @@ def test_code_in_a_constant_of_text_is_text(master, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with Publisher(master, '/types/text', 'text_msgs/Text', f'string X={CODE}\nstring x # {CODE}'):
         cls = master.topic('/types/text').message_class(create(master, '/node'))
-    assert cls.X == CODE and cls(CODE).x == CODE and list(tmp_path.iterdir()) == []
+    assert cls.X == CODE
+    assert cls(CODE).x == CODE
+    assert list(tmp_path.iterdir()) == []
 
 
 # -- several definitions of one type
@@ -789,7 +795,8 @@ def test_a_subscriber_takes_a_live_publishers_definition_before_one_given_or_shi
         message = mailbox.next()
     assert (message.level, message.more) == (7, 8)
     # nothing is defined for others
-    assert channel.message_class is not here and message_class(type_) is here
+    assert channel.message_class is not here
+    assert message_class(type_) is here
 
 
 def test_who_asks_for_a_class_gets_that_one(master):
@@ -835,9 +842,8 @@ def test_who_asks_for_a_definition_is_no_subscriber(master):
     header = publisher_header(tuple(asked[2][1:]), topic, time.monotonic() + TIMEOUT)
     assert (header['type'], header['callerid']) == ('std_msgs/Int32', '/sender')
     assert 'int32 data' in header['message_definition']
-    assert (
-        channel.connections == [] and not channel.node.latest_run.rospy.publisher(topic).connections
-    )
+    assert channel.connections == []
+    assert not channel.node.latest_run.rospy.publisher(topic).connections
 
 
 def test_who_sends_takes_the_definition_given(master, mailbox):
@@ -914,7 +920,8 @@ def test_no_publisher_takes_the_question_for_its_definition_for_a_subscriber(mas
     came = []
     with Publisher(master, topic, type_, there._full_text, there._md5sum, heard=came.append):
         assert create(master, '/node').interested_in(topic, type_).message_class is there
-    assert came and {header['callerid'] for header in came} == {'/node'}
+    assert came
+    assert {header['callerid'] for header in came} == {'/node'}
 
 
 def test_a_publisher_that_is_dead_is_not_waited_for(master):

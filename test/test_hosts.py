@@ -507,4 +507,5 @@ def test_a_publisher_that_refuses_is_asked_once(master, impatient, stranger):
                 pass
     until(lambda: not threads('/hosts/refused'))
     assert asked.acquire(blocking=False)
-    assert not threads('reconnect') and not asked.acquire(blocking=False)
+    assert not threads('reconnect')
+    assert not asked.acquire(blocking=False)

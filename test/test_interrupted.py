@@ -68,7 +68,8 @@ def test_what_is_opened_while_the_master_is_away_raises_and_leaves_nothing_behin
         with pytest.raises(pharos.MasterUnreachableError, match=away.url) as raised:
             OPENERS[opener](node)
         assert isinstance(raised.value.__cause__, ConnectionRefusedError)
-    assert node.channels == node.latest_run.opened == [] and not node.errors
+    assert node.channels == node.latest_run.opened == []
+    assert not node.errors
     away.come_back()
     until(lambda: registrations(away, '/node') == before)
     assert '/interrupted/opened' not in away.parameters
@@ -246,4 +247,5 @@ def test_a_channel_closed_while_its_node_is_stopped_does_not_come_back(away, sto
     for channel in list(stopped.latest_run.opened):
         channel.close()
     stopped.start()
-    assert stopped.channels == [] and '/interrupted/in' not in registrations(away, '/node')[1]
+    assert stopped.channels == []
+    assert '/interrupted/in' not in registrations(away, '/node')[1]

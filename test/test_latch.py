@@ -109,7 +109,8 @@ def test_a_latched_value_survives_a_restart_of_its_node(master, come):
     until(lambda: len(channel.connections) == 2)
     channel.send(data='news')
     assert texts(present, 1) == texts(late, 1) == ['news']
-    assert present.empty() and late.empty()
+    assert present.empty()
+    assert late.empty()
 
 
 def test_each_latched_channel_of_a_node_survives_its_restart(master, come):
@@ -124,7 +125,8 @@ def test_each_latched_channel_of_a_node_survives_its_restart(master, come):
     first.close()
     later, _ = come('/later', '/latch/several')
     assert texts(later, 1) == ['two']
-    assert late.empty() and later.empty()
+    assert late.empty()
+    assert later.empty()
 
 
 def test_a_latched_value_survives_a_restart_of_a_class_that_opens_its_channels_in_start(
@@ -200,7 +202,8 @@ def test_a_late_receiver_of_one_node_gets_what_that_one_latched(master):
     message = mailbox.next()
     assert (message.data, message._connection_header['latching']) == ('two', '1')
     node.interested_in('/latch/from', from_='/one')
-    assert texts(mailbox, 1) == ['one'] and mailbox.empty()
+    assert texts(mailbox, 1) == ['one']
+    assert mailbox.empty()
 
 
 def test_a_shared_receiver_that_comes_late_gets_a_message_of_its_own(master):
@@ -212,8 +215,7 @@ def test_a_shared_receiver_that_comes_late_gets_a_message_of_its_own(master):
         node.interested_in('/latch/shared', shared=True)
     sent.data = 'changed since'
     one, two = first.next(), second.next()
-    assert one.data == two.data == 'as it was' and one is not two
-    assert (
-        one._connection_header == two._connection_header
-        and one._connection_header['callerid'] == '/sender'
-    )
+    assert one.data == two.data == 'as it was'
+    assert one is not two
+    assert one._connection_header == two._connection_header
+    assert one._connection_header['callerid'] == '/sender'

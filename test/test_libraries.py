@@ -33,7 +33,8 @@ def kept_in(mailbox):
 @pytest.mark.parametrize('library', LIBRARIES)
 def test_a_library_is_bound_to_the_node_that_imports_it(pair, library):
     asking, serving = (node.ros_import(library) for node in pair)
-    assert asking is not serving and asking is pair[0].ros_import(library)
+    assert asking is not serving
+    assert asking is pair[0].ros_import(library)
     assert asking is not __import__(library)
     assert [node.ros.get_name() for node in pair] == ['/asking', '/serving']
 
@@ -240,7 +241,8 @@ def test_a_timer_fires_until_its_node_stops(pair, mailbox):
     first, second = mailbox.take(2)
     assert second.last_real == first.current_real < second.current_real
     asking.stop()
-    assert not timer.is_alive() and serving.is_running
+    assert not timer.is_alive()
+    assert serving.is_running
 
 
 def test_a_rate_ends_with_its_node(pair):
@@ -273,7 +275,8 @@ def test_what_is_private_to_a_node_stays_so(pair):
     asking, serving = pair
     asking.ros.set_param('~mine', 1)
     try:
-        assert asking.ros.get_param('/asking/mine') == 1 and not serving.ros.has_param('~mine')
+        assert asking.ros.get_param('/asking/mine') == 1
+        assert not serving.ros.has_param('~mine')
         assert [node.ros.resolve_name('~x') for node in pair] == ['/asking/x', '/serving/x']
     finally:
         asking.ros.delete_param('~mine')
@@ -284,7 +287,8 @@ def test_signal_shutdown_stops_that_node(pair):
     asking.ros.signal_shutdown('enough')
     with node_registry.changed:
         assert node_registry.changed.wait_for(lambda: asking.lifecycle.value == 'stopped', TIMEOUT)
-    assert serving.is_running and not serving.ros.is_shutdown()
+    assert serving.is_running
+    assert not serving.ros.is_shutdown()
 
 
 def test_a_shutdown_hook_runs_at_the_stop(pair):

@@ -162,12 +162,14 @@ def test_listing_3_5_a_wrong_md5sum_is_an_error_that_says_all_about_the_service(
 
 def test_listing_3_5_an_md5sum_that_yaml_reads_as_a_number_is_told(master, clear):
     done = run(master.url, script('clear_turtle'), '_md5sum:=0')
-    assert done.returncode == 1 and "the md5sum of /clear is a text such as 'd41d8" in done.stderr
-    assert 'in quotes' in done.stderr and not clear
+    assert done.returncode == 1
+    assert "the md5sum of /clear is a text such as 'd41d8" in done.stderr
+    assert 'in quotes' in done.stderr
+    assert not clear
     done = run(master.url, script('clear_turtle'), "_md5sum:='0'")
-    assert (
-        done.returncode == 1 and "the md5sum '0' is not that of /clear" in done.stderr and not clear
-    )
+    assert done.returncode == 1
+    assert "the md5sum '0' is not that of /clear" in done.stderr
+    assert not clear
 
 
 def test_listing_3_5_a_call_follows_remappings(master):

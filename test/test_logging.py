@@ -34,7 +34,8 @@ def test_each_line_is_on_rosout_once_with_name_file_and_line(master):
     heard = [lines.next() for _ in range(6)]
     for node in nodes:
         own, through_rospy = [log for log in heard if log.name == node.name]
-        assert own.msg == f'{node.name} says 100% hello' and own.level == own.WARN
+        assert own.msg == f'{node.name} says 100% hello'
+        assert own.level == own.WARN
         assert (os.path.basename(own.file), own.line) == (os.path.basename(__file__), line)
         assert own.function.endswith('test_each_line_is_on_rosout_once_with_name_file_and_line')
         assert (through_rospy.msg, through_rospy.line) == ('and through rospy', line + 2)
@@ -50,7 +51,8 @@ def test_a_log_level_is_set_per_node(master):
     assert levels is not None
     for node in quiet, normal:
         node.log('a detail')
-    assert lines.next().name == '/normal' and lines.empty()
+    assert lines.next().name == '/normal'
+    assert lines.empty()
 
 
 def test_each_node_has_a_log_file(master):
@@ -109,7 +111,8 @@ assert not rospy.is_shutdown() and a.lifecycle.value == 'stopped'
         check=False,
     )
     assert result.returncode == 0, result.stdout
-    assert result.stdout.count('the host speaks') == 1 and result.stdout.count('node a speaks') == 1
+    assert result.stdout.count('the host speaks') == 1
+    assert result.stdout.count('node a speaks') == 1
     assert 'caught' in result.stdout
 
 

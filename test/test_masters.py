@@ -39,15 +39,14 @@ def listen(master, topic, type_=STRING, name='/listener'):
 def test_nodes_of_one_name_live_on_two_masters(masters):
     nodes = [create(master, '/same') for master in masters]
     for master, node in zip(masters, nodes):
-        assert (
-            master.nodes() == [node]
-            and master.node('/same') is node
-            and master.local_nodes() == [node]
-        )
+        assert master.nodes() == [node]
+        assert master.node('/same') is node
+        assert master.local_nodes() == [node]
         assert run(master.url, 'rosnode', 'list').stdout == '/same\n'
         assert node.uri in run(master.url, 'rosnode', 'info', '/same').stdout
     nodes[0].stop()
-    assert masters[0].nodes() == [] and masters[1].nodes() == [nodes[1]]
+    assert masters[0].nodes() == []
+    assert masters[1].nodes() == [nodes[1]]
 
 
 def test_topics_services_and_parameters_of_two_masters_do_not_mix(masters):
@@ -85,7 +84,8 @@ def test_a_master_that_goes_away_leaves_the_nodes_of_another_alone(masters, mail
         node = create(third, '/n')
         listener = create(masters[0], '/n', delegate=mailbox)
         listener.interested_in('/t', STRING)
-    assert not node.is_running and listener.is_running
+    assert not node.is_running
+    assert listener.is_running
     create(masters[0], '/speaker').send_to('/t', data='still here')
     assert mailbox.next().data == 'still here'
 
@@ -126,18 +126,17 @@ def spellings(master):
 
 def test_masters_of_one_address_are_one(spellings):
     given, other = spellings
-    assert given == other and hash(given) == hash(other) and len({given, other}) == 1
+    assert given == other
+    assert hash(given) == hash(other)
+    assert len({given, other}) == 1
     assert other.url == given.url.replace('127.0.0.1', 'localhost')
-    assert (
-        given.topic('/t') == other.topic('/t') and len({given.topic('/t'), other.topic('/t')}) == 1
-    )
+    assert given.topic('/t') == other.topic('/t')
+    assert len({given.topic('/t'), other.topic('/t')}) == 1
     assert pharos.ExternalNode(given, '/n') == pharos.ExternalNode(other, '/n')
     node = create(given, '/own')
-    assert (
-        other.node('/own') is node
-        and other.local_nodes() == [node]
-        and other.wait_for_node('/own', TIMEOUT) is node
-    )
+    assert other.node('/own') is node
+    assert other.local_nodes() == [node]
+    assert other.wait_for_node('/own', TIMEOUT) is node
     assert other.nodes() == [node]
     assert pharos.watcher.watcher_of(given) is pharos.watcher.watcher_of(other)
 
@@ -259,7 +258,8 @@ def test_the_bridge_passes_messages_both_ways_without_echo(masters):
             assert [message.data for message in mailbox.take(2)] == [
                 'end',
                 'end',
-            ] and mailbox.empty()
+            ]
+            assert mailbox.empty()
 
 
 def test_the_bridge_joins_rospys_nodes(masters):
@@ -338,13 +338,15 @@ def test_a_bridge_that_cannot_start_says_why_in_one_line(masters):
     ):
         ended = run(url, script('bridge'), *arguments)
         assert ended.returncode == 1
-        assert len(ended.stderr.splitlines()) == 1 and ended.stderr.startswith(reason)
+        assert len(ended.stderr.splitlines()) == 1
+        assert ended.stderr.startswith(reason)
     assert masters[0].nodes() == []
 
 
 def test_help_says_what_it_is_for():
     shown = run(refused_url(), script('bridge'), '--help')
-    assert shown.returncode == 0 and not shown.stderr
+    assert shown.returncode == 0
+    assert not shown.stderr
     assert re.search(r'usage: bridge .*URL_A URL_B TOPIC', shown.stdout)
     for topics in ([], ['http://127.0.0.1:1/']):
         assert run(refused_url(), script('bridge'), *topics).returncode == 2

@@ -181,7 +181,8 @@ def test_two_threads_that_ask_get_the_same_class():
         thread.start()
     for thread in threads:
         thread.join()
-    assert len(answers) == 8 and len(set(answers)) == 1
+    assert len(answers) == 8
+    assert len(set(answers)) == 1
 
 
 def test_an_unknown_type_says_where_it_was_sought_and_how_to_provide_it(package_path, tmp_path):
@@ -265,7 +266,9 @@ def test_a_definition_may_nest_given_shipped_and_installed_types_and_header():
     assert over_the_wire(message) == message
     assert type(message.pose) is message_class('turtlesim/Pose')
     assert type(message.place) is geometry_msgs.msg.Pose
-    assert beast._has_header and beast._type == 'zoo/Beast' and beast.__name__ == 'Beast'
+    assert beast._has_header
+    assert beast._type == 'zoo/Beast'
+    assert beast.__name__ == 'Beast'
 
 
 def test_nested_definitions_in_the_text_are_defined_too():
@@ -433,7 +436,8 @@ def test_the_former_package_of_header_is_understood():
         'old/Stamped',
         f'roslib/Header header\n{SEPARATOR}\nMSG: roslib/Header\n' + std_msgs.msg.Header._full_text,
     )
-    assert type(cls().header) is std_msgs.msg.Header and cls._has_header
+    assert type(cls().header) is std_msgs.msg.Header
+    assert cls._has_header
 
 
 @pytest.mark.parametrize('cls', list(installed_classes()), ids=lambda cls: cls._type)
@@ -462,7 +466,8 @@ def test_a_service_made_from_text_is_like_a_generated_one():
         'string message # informational, e.g. for error messages\n',
     )
     like = std_srvs.srv.SetBool
-    assert made._type == 'made_srvs/SetBool' and made._md5sum == like._md5sum
+    assert made._type == 'made_srvs/SetBool'
+    assert made._md5sum == like._md5sum
     for part in ('_request_class', '_response_class'):
         ours, theirs = getattr(made, part), getattr(like, part)
         assert ours._type == theirs._type.replace('std_srvs', 'made_srvs')

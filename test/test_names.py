@@ -209,7 +209,8 @@ def test_remapped_channels_survive_a_restart_and_their_masters(master):
     api.unregisterSubscriber('/again/two', node.uri)  # as a master that has been restarted
     until(lambda: master.topic('/again/two').subscribers == ['/again/node'], what='the repair')
     assert not master.topic('/again/one').subscribers
-    assert '/again/one' in master.services() and '/again/two' not in master.services()
+    assert '/again/one' in master.services()
+    assert '/again/two' not in master.services()
     create(master, '/again/plain').send_to('two', data='once', typed_as=STRING)
     assert heard.next().data == 'once'
 
@@ -268,7 +269,8 @@ def test_from_is_resolved_like_the_nodes_other_names(master, mailbox, peer):
     assert channel.from_ == '/team/peer'
     create(master, '/team/other').send_to('talk', data='not this')
     master.node('/team/peer').send_to('talk', data='this')
-    assert mailbox.next().data == 'this' and mailbox.empty()
+    assert mailbox.next().data == 'this'
+    assert mailbox.empty()
 
 
 def test_a_private_name_is_that_of_a_node_below(master, mailbox):
@@ -304,7 +306,8 @@ def test_to_a_node_that_is_not_there_is_an_error_and_not_counted(master, node, m
         ):
             send(data='lost', to=to)
     channel.send(data='found', to='listener')
-    assert mailbox.next().data == 'found' and mailbox.empty()
+    assert mailbox.next().data == 'found'
+    assert mailbox.empty()
     assert channel.sent == 1
 
 

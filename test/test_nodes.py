@@ -101,9 +101,11 @@ def test_a_node_starts_again_under_the_same_name_and_ports(master, mailbox):
     sender = create(master, '/sender')
     for turn in range(3):
         node.stop()
-        assert node.lifecycle is Lifecycle.STOPPED and '/phoenix' not in registered(master)
+        assert node.lifecycle is Lifecycle.STOPPED
+        assert '/phoenix' not in registered(master)
         node.start()
-        assert node.lifecycle is Lifecycle.RUNNING and (node.tcp_port, node.xmlrpc_port) == ports
+        assert node.lifecycle is Lifecycle.RUNNING
+        assert (node.tcp_port, node.xmlrpc_port) == ports
         sender.stop()
         sender.start()  # its channels come back as well, and wait for who is interested
         sender.send_to('/ashes', data=str(turn), typed_as='std_msgs/String')
@@ -122,7 +124,8 @@ def test_a_subclass_makes_its_channels_in_start(master, mailbox):
     logger.start()
     assert len(logger.channels) == 1
     create(master, '/sender').send_to('/log_me', data='once')
-    assert mailbox.next().data == 'once' and mailbox.empty()
+    assert mailbox.next().data == 'once'
+    assert mailbox.empty()
 
 
 def test_further_keywords_go_to_the_nodes_init(master):
@@ -176,9 +179,9 @@ def test_rosnode_kill_stops_that_node_and_no_other(master):
         assert node_registry.changed.wait_for(
             lambda: victim.lifecycle is Lifecycle.STOPPED, TIMEOUT
         )
-    assert (
-        other.is_running and '/victim' not in registered(master) and '/other' in registered(master)
-    )
+    assert other.is_running
+    assert '/victim' not in registered(master)
+    assert '/other' in registered(master)
 
 
 def test_a_shutdown_meant_for_an_earlier_owner_of_the_uri_does_not_reach_a_node(master):
@@ -188,7 +191,8 @@ def test_a_shutdown_meant_for_an_earlier_owner_of_the_uri_does_not_reach_a_node(
     code, reason, _ = pharos.private_rospy.proxies.ServerProxy(node.uri).shutdown(
         '/master', '[/old] Reason: new node registered with same name'
     )
-    assert node.is_running and 'still this node' in reason
+    assert node.is_running
+    assert 'still this node' in reason
 
 
 def test_a_node_stops_from_its_own_delegate(master):
@@ -201,7 +205,8 @@ def test_a_node_stops_from_its_own_delegate(master):
     node = create(master, '/suicide', delegate=stop)
     node.interested_in('/poison', 'std_msgs/Empty')
     create(master, '/sender').send_to('/poison')
-    assert done.wait(TIMEOUT) and node.lifecycle is Lifecycle.STOPPED
+    assert done.wait(TIMEOUT)
+    assert node.lifecycle is Lifecycle.STOPPED
 
 
 def test_what_was_sent_before_the_stop_arrives(master, mailbox):
@@ -230,7 +235,8 @@ def test_a_soul_says_farewell(master, mailbox):
     driver.fork()
     assert mailbox.next().data == 1.0
     driver.stop()
-    assert mailbox.next().data == 0.0 and not driver.errors
+    assert mailbox.next().data == 0.0
+    assert not driver.errors
 
 
 def test_a_soul_that_ignores_the_stop_is_named_and_left_behind(master, capfd):
@@ -258,18 +264,17 @@ def test_an_exception_in_a_delegate_ends_only_that_run(master, transcript, mailb
     sender.send_to('/mixed', data='good')
     assert mailbox.next().data == 'good'
     assert [str(error) for error in node.errors] == ['this one is bad']
-    assert (
-        '/careful' in transcript[0]
-        and '/mixed' in transcript[0]
-        and 'ValueError: this one is bad' in transcript[0]
-    )
+    assert '/careful' in transcript[0]
+    assert '/mixed' in transcript[0]
+    assert 'ValueError: this one is bad' in transcript[0]
 
 
 def test_execute_runs_the_soul_here_and_returns_its_value(master):
     node = create(master, '/soul', soul=lambda me: (me.name, threading.current_thread()))
     assert node.execute() == ('/soul', threading.current_thread())
     node.soul = lambda me: 1 / 0
-    assert node.execute() is None and isinstance(node.errors[-1], ZeroDivisionError)
+    assert node.execute() is None
+    assert isinstance(node.errors[-1], ZeroDivisionError)
     node.soul = None
     with pytest.raises(pharos.PharosError, match='no soul'):
         node.execute()

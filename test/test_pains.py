@@ -487,7 +487,8 @@ def test_a_subscriber_that_has_left_is_not_taken_for_the_next_one(master):
             receive(client)
             assert receive(client)[4:].decode() == str(number)
             leave(client)
-        assert channel.connections == [] and not channel.wait_for_subscribers(1, 0)
+        assert channel.connections == []
+        assert not channel.wait_for_subscribers(1, 0)
 
 
 def test_a_subscriber_that_reads_nothing_takes_nothing_from_the_others(master, mailbox):

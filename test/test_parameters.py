@@ -72,7 +72,8 @@ def test_what_rosparam_sets_and_deletes_reaches_the_block_at_once(master):
         got = changes.get()
         assert (got, type(got), rate.value, type(rate.value)) == (value, float, value, float)
     assert run(master.url, 'rosparam', 'delete', PRIVATE).returncode == 0
-    assert changes.get() is None and rate.value is None
+    assert changes.get() is None
+    assert rate.value is None
     assert changes.until_now() == []
 
 
@@ -94,9 +95,8 @@ def test_what_rosparam_sets_to_another_type_is_reported_and_the_block_not_run(ma
     assert run(master.url, 'rosparam', 'set', PRIVATE, 'fast').returncode == 0
     assert changes.until_now() == []
     (error,) = rate.node.errors
-    assert isinstance(error, ValueError) and str(error).startswith(
-        PRIVATE + " holds float, and 'fast' is none"
-    )
+    assert isinstance(error, ValueError)
+    assert str(error).startswith(PRIVATE + " holds float, and 'fast' is none")
     assert any(f'parameter {PRIVATE}' in line for line in transcript)
     with pytest.raises(ValueError, match=PRIVATE):
         rate.value
@@ -127,7 +127,8 @@ def test_what_rosparam_sets_to_another_type_is_reported_and_the_block_not_run(ma
 def test_names_are_resolved_and_remapped(master, named, argv, asked, name):
     parameter = create(master, named, argv=argv).parameter(asked, initialized=1)
     changes = Changes(parameter.node).of(parameter)
-    assert parameter.name == name and master.parameters[name] == 1
+    assert parameter.name == name
+    assert master.parameters[name] == 1
     master.parameters[name] = 2
     assert changes.get() == parameter.value == 2
     parameter.set(3)
@@ -158,7 +159,8 @@ def test_a_parameter_without_a_value_gets_the_first_one_and_another_keeps_its_ow
     assert (
         node.parameter('~new', initialized=1).value == master.parameters['/robot1/driver/new'] == 1
     )
-    assert node.parameter('~none').value is None and '/robot1/driver/none' not in master.parameters
+    assert node.parameter('~none').value is None
+    assert '/robot1/driver/none' not in master.parameters
 
 
 @pytest.mark.parametrize(
@@ -250,7 +252,8 @@ def test_a_value_that_the_server_cannot_hold_is_refused_by_name(master, value):
     assert parameter.value is None
     with pytest.raises(ValueError, match='/robot1/driver/any cannot be'):
         master.parameters[parameter.name] = value
-    assert parameter.value is None and parameter.name not in master.parameters
+    assert parameter.value is None
+    assert parameter.name not in master.parameters
     if value is not None:
         with pytest.raises(ValueError, match='/robot1/driver/any cannot be'):
             parameter.node.parameter('~any', initialized=value)
@@ -346,14 +349,12 @@ def test_each_block_of_a_parameter_is_run_and_a_failing_one_alone_is_reported(ma
         set_()
         assert first.next() == second.next() == again.next() == value
         error = node.errors.pop()
-        assert (
-            isinstance(error, KeyError) and 'not with %d' % value in str(error) and not node.errors
-        )
-    assert (
-        f'parameter {PRIVATE}' in transcript[-1]
-        and 'failing' in transcript[-1]
-        and 'KeyError' in transcript[-1]
-    )
+        assert isinstance(error, KeyError)
+        assert 'not with %d' % value in str(error)
+        assert not node.errors
+    assert f'parameter {PRIVATE}' in transcript[-1]
+    assert 'failing' in transcript[-1]
+    assert 'KeyError' in transcript[-1]
 
 
 @pytest.mark.parametrize('block', [None, 5, lambda: None, lambda value, more: None])
@@ -369,7 +370,8 @@ def test_two_nodes_of_one_process_watch_one_parameter(master):
     assert one.value == other.value == 1
     changes = [Changes(parameter.node).of(parameter) for parameter in (one, other)]
     one.set(3)
-    assert [told.get() for told in changes] == [3, 3] and other.value == 3
+    assert [told.get() for told in changes] == [3, 3]
+    assert other.value == 3
     master.parameters['/shared'] = 4
     assert [told.get() for told in changes] == [4, 4]
     one.node.stop()
@@ -438,7 +440,8 @@ def test_a_parameter_needs_a_running_node_and_goes_on_with_the_next_run(master):
     assert repr(rate) == f'<Parameter {PRIVATE} of /robot1/driver>'
     master.parameters[rate.name] = 2
     rate.node.start()
-    assert changes.until_now() == [] and rate.value == 2
+    assert changes.until_now() == []
+    assert rate.value == 2
     master.parameters[rate.name] = 3
     rate.set(4)
     assert sorted(changes.until_now()) == [(PRIVATE, 3), (PRIVATE, 4)]

@@ -139,7 +139,8 @@ def test_a_publisher_and_a_subscriber_of_plain_rospy(pair):
     messages = mailbox.take(100)
     assert [message.data for message in messages] == [str(number) for number in range(100)]
     header = messages[0]._connection_header
-    assert header['callerid'] == '/publisher' and header['type'] == 'std_msgs/String'
+    assert header['callerid'] == '/publisher'
+    assert header['type'] == 'std_msgs/String'
     assert header['latching'] == '0'
     subscriber.unregister()
     connected(publisher, 0)
@@ -203,7 +204,8 @@ def test_callbacks_run_in_a_thread_for_each_connection_so_that_they_may_wait_for
     for publisher in publishers:
         connected(publisher)
         publisher.publish('come')
-    assert met.acquire(timeout=TIMEOUT) and met.acquire(timeout=TIMEOUT)
+    assert met.acquire(timeout=TIMEOUT)
+    assert met.acquire(timeout=TIMEOUT)
 
 
 def test_a_callback_that_fails_ends_nothing(pair):

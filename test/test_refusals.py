@@ -149,9 +149,11 @@ def test_a_publisher_of_another_type_is_told_once(master, topic, publishing, fir
             f'[{MD5SUM[INT32]}] (data: int32), and is not heard: use one type, or another topic'
         )
         assert (channel.refused, channel.connections, node.health().refused) == (1, [], 1)
-        assert '1 refused' in str(node.health()) and '1 refused' in repr(channel)
+        assert '1 refused' in str(node.health())
+        assert '1 refused' in repr(channel)
         until(lambda: screen('ERROR'))
-        assert len(screen('ERROR')) == 1 and '/near wants' in screen('ERROR')[0]
+        assert len(screen('ERROR')) == 1
+        assert '/near wants' in screen('ERROR')[0]
         (failure,) = node.failures
         assert failure.count == 1
     until(lambda: node.health().refused == 0)  # it has gone
@@ -221,7 +223,8 @@ def test_what_was_right_meanwhile_is_counted_anew(master, topic):
         until(lambda: node.health().refused == 0)
         right = in_time(lambda: sender.output_channel(topic, STRING))
         right.send(data='right')
-        assert mailbox.next().data == 'right' and node.health().refused == 0
+        assert mailbox.next().data == 'right'
+        assert node.health().refused == 0
         right.close()
         until(lambda: not node.channels[0].connections)
 
@@ -247,7 +250,8 @@ def test_a_subscriber_of_any_type_hears_all(master, topic):
             INT32,
             STRING,
         ]
-    assert not node.errors and node.health().refused == 0
+    assert not node.errors
+    assert node.health().refused == 0
 
 
 def test_a_publisher_of_any_type_is_told_as_one(master, topic):
@@ -286,7 +290,8 @@ def test_a_channel_beside_a_subscriber_of_any_type_hears_its_own_type_alone(
             far.send(data=0)  # which, read as a string, is an empty one
         assert anything.next()._buff == bytes(4)
         until(lambda: node.errors)
-        assert f'/near wants {topic} as {STRING}' in str(node.errors[0]) and len(node.errors) == 1
+        assert f'/near wants {topic} as {STRING}' in str(node.errors[0])
+        assert len(node.errors) == 1
         assert node.health().refused == 1
         with rospy_peer(master.url, topic, STRING, 'string data', name='/right'):
             assert mailbox.next()._connection_header['callerid'] == '/right'
@@ -310,7 +315,8 @@ def test_a_publisher_that_refuses_for_another_reason_is_no_matter_of_types(maste
     ):
         node.interested_in(topic, STRING)
         until(lambda: made)
-    assert not node.errors and node.health().refused == 0
+    assert not node.errors
+    assert node.health().refused == 0
 
 
 def test_a_channel_that_is_opened_while_its_node_connects_hears_the_publisher(
@@ -373,7 +379,10 @@ def test_a_subscriber_of_another_type_is_warned_of_once_and_not_waited_for(
         until(lambda: len(screen('WARN')) == 2)
         mine, others = screen('WARN')
         for line in mine, others:
-            assert topic in line and '/far' in line and STRING in line and INT32 in line
+            assert topic in line
+            assert '/far' in line
+            assert STRING in line
+            assert INT32 in line
         # another one, for which the master is asked
         in_time(lambda: sender.output_channel(topic, INT32))
         assert sender.latest_run.rospy.refusals.subscribers(topic) == ['/far']

@@ -56,9 +56,12 @@ def program(package, name, text):
 def test_a_program_of_the_source_space_is_run(master, package):
     with master.run('fake_robot', 'talker') as process:
         node = master.wait_for_node('/talker', TIMEOUT)
-        assert isinstance(process, RosProcess) and process.poll() is None
-        assert isinstance(node, ExternalNode) and node.pid == process.pid
-    assert process.poll() is not None and not node.is_alive()
+        assert isinstance(process, RosProcess)
+        assert process.poll() is None
+        assert isinstance(node, ExternalNode)
+        assert node.pid == process.pid
+    assert process.poll() is not None
+    assert not node.is_alive()
 
 
 @pytest.mark.parametrize('space', ['devel', 'install'])
@@ -173,7 +176,8 @@ def test_a_block_that_raises_does_not_end_the_program_or_its_output(master, pack
     ) as process:
         assert process.wait(TIMEOUT) == 0
         assert process.output == 'one\ntwo'
-    assert len(transcript) == 2 and 'RuntimeError: stumbled over one' in transcript[0]
+    assert len(transcript) == 2
+    assert 'RuntimeError: stumbled over one' in transcript[0]
     with pytest.raises(TypeError, match='on_line.text.'):
         master.run('fake_robot', 'two', on_line=lambda: None)
 
@@ -183,7 +187,8 @@ def test_its_exit_status_is_told(master, package):
         assert process.wait(TIMEOUT) == 7 == process.poll()
         assert repr(process).endswith('fail, ended with 7>')
     with master.run('fake_robot', program(package, 'sleep', 'exec sleep 1000')) as process:
-        assert process.poll() is None and repr(process).endswith('sleep, pid %d>' % process.pid)
+        assert process.poll() is None
+        assert repr(process).endswith('sleep, pid %d>' % process.pid)
         with pytest.raises(subprocess.TimeoutExpired):
             process.wait(0.01)
         assert process.terminate() == -signal.SIGINT
@@ -270,7 +275,8 @@ def test_a_roscpp_node_without_handlers_is_ended_through_ros(master, package, tm
     assert lines.get(timeout=TIMEOUT) == 'up'
     master.wait_for_node('/robot', TIMEOUT)
     assert process.terminate() == 0
-    assert '/robot' not in names_registered(master) and '/robot_serves' not in master.services()
+    assert '/robot' not in names_registered(master)
+    assert '/robot_serves' not in master.services()
 
 
 def test_the_nodes_of_a_launch_file_are_ended_through_ros(master, package):
@@ -294,9 +300,8 @@ def test_a_node_registered_with_a_port_that_cannot_be_keeps_no_program_from_endi
         process = master.run('topic_tools', 'relay', '/untyped', '/b', name='passes_on')
         master.wait_for_node('/passes_on', TIMEOUT)
         process.terminate()
-        assert names_registered(master) >= {'/liar'} and '/passes_on' not in names_registered(
-            master
-        )
+        assert names_registered(master) >= {'/liar'}
+        assert '/passes_on' not in names_registered(master)
     finally:
         liar.unregisterPublisher('/lies', uri)
 
@@ -308,7 +313,8 @@ def test_other_nodes_are_not_ended_with_a_program(master, package):
         other = master.wait_for_node('/other', TIMEOUT)
         with master.run('fake_robot', 'robot'):
             master.wait_for_node('/robot', TIMEOUT)
-        assert ours.is_running and other.is_alive()
+        assert ours.is_running
+        assert other.is_alive()
 
 
 def test_a_node_that_is_registered_and_dead_is_not_waited_for_in_vain(master, package):

@@ -327,10 +327,8 @@ def test_a_service_whose_type_nobody_here_knows_tells_it_and_is_called_once_it_i
     type_and_md5sum, unknown, wrong = done.stdout.splitlines()
     # turtlesim's own
     assert type_and_md5sum == 'turtlesim/TeleportAbsolute a130bc60ee6513855dc62ea83fcc5b20'
-    assert (
-        "unknown service type 'turtlesim/TeleportAbsolute'" in unknown
-        and 'define_service(' in unknown
-    )
+    assert "unknown service type 'turtlesim/TeleportAbsolute'" in unknown
+    assert 'define_service(' in unknown
     assert 'request: x: float32, y: float32, theta: float32; response: no fields' in wrong
 
 
@@ -865,7 +863,8 @@ def test_a_delegate_calls_its_own_node_and_one_that_calls_back(master, mailbox, 
     second.send_to('/calls/text', data='bob')
     first.send_to('/calls/text', data='ann')
     assert sorted(mailbox.take(4)) == ['ann', 'ann called back', 'bob', 'bob called back']
-    assert not first.errors and not second.errors
+    assert not first.errors
+    assert not second.errors
 
 
 @both_limits
@@ -894,7 +893,8 @@ def test_services_that_call_each_other_in_a_circle_end_with_an_error_at_once(
         pharos.ServiceCallError, match='/first/round failed: .*call each other in a circle'
     ):
         to_first.call(timeout=timeout)
-    assert first.errors and second.errors
+    assert first.errors
+    assert second.errors
     first.serve('/first/echo', ECHO, echo)  # both go on
     assert (
         master.lookup_service('/first/echo').call(load_namespace='bob', timeout=timeout).message

@@ -133,7 +133,8 @@ def test_a_loopback_domain_listens_on_loopback_alone(master):
     #315)."""
     before = listening()
     node = create(master, '/local', domain='127.0.0.2')
-    assert node.domain == '127.0.0.2' and node.uri == 'http://127.0.0.2:%d/' % node.xmlrpc_port
+    assert node.domain == '127.0.0.2'
+    assert node.uri == 'http://127.0.0.2:%d/' % node.xmlrpc_port
     assert listening() - before == {('127.0.0.2', node.tcp_port), ('127.0.0.2', node.xmlrpc_port)}
 
 

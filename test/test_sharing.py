@@ -34,7 +34,8 @@ def test_a_relay_of_a_shared_message_changes_nothing_that_others_hold(master, ty
     message = sent.send()
     held = holder.next()
     before = snapshot(held)
-    assert held is message and before[1]['callerid'] == '/sender'
+    assert held is message
+    assert before[1]['callerid'] == '/sender'
     passed_on = relayed.next()
     assert snapshot(held) == before
     assert passed_on == held or type_ is POINT
@@ -79,7 +80,8 @@ def test_a_message_published_twice_keeps_the_number_that_receivers_hold(master):
     channel.publish(message)
     first, second = mailbox.take(2)
     assert (first.header.seq, second.header.seq) == (1, 2)
-    assert first is message and second is not message
+    assert first is message
+    assert second is not message
     assert [one.header.seq for one in copies.take(2)] == [1, 2]
 
 

@@ -482,10 +482,8 @@ print('went on', *map(type, me.errors))
 ready()
 """
     )
-    assert (
-        running.read_to_the_end().count("<class 'KeyboardInterrupt'>") == 2
-        and running.process.wait(60) == 0
-    )
+    assert running.read_to_the_end().count("<class 'KeyboardInterrupt'>") == 2
+    assert running.process.wait(60) == 0
 
 
 # -- ends without a signal

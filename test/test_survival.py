@@ -41,7 +41,8 @@ def test_everything_is_registered_again_when_the_master_comes_back_empty(mortal_
     assert {message.data for message in mailbox.take(2)} == {
         'from a new peer',
         'from the old one',
-    } and mailbox.empty()
+    }
+    assert mailbox.empty()
     master.lookup_service('/service').call(timeout=TIMEOUT)
     master.parameters['/receiver/watched'] = 2
     assert changes.next() == 2
@@ -86,7 +87,8 @@ def test_a_peer_killed_outright_is_let_go_and_found_again(master, mailbox):
     told = node.output_channel('/to_peer', 'std_msgs/String')
     for _ in range(2):
         with subprocess.Popen([sys.executable, '-c', PEER]) as peer:
-            assert mailbox.next().data == 'hello' and told.wait_for_subscribers(1, TIMEOUT)
+            assert mailbox.next().data == 'hello'
+            assert told.wait_for_subscribers(1, TIMEOUT)
             peer.kill()
         until(lambda: not heard.connections and not told.connections)
         told.send(data='into the void')
@@ -105,7 +107,8 @@ def test_two_threads_may_stop_a_node_at_once(master):
             thread.start()
         for thread in threads:
             thread.join(TIMEOUT)
-        assert node.lifecycle.value == 'stopped' and not any(registrations(master, '/node'))
+        assert node.lifecycle.value == 'stopped'
+        assert not any(registrations(master, '/node'))
 
 
 def test_a_node_stops_while_it_publishes_receives_and_calls(master):

@@ -28,9 +28,11 @@ def wait_for_stop(node):
 def check_it_stays(master, topic):
     """The newer one is registered and answers, and nothing of ours is left."""
     newer = master.node('/contested')
-    assert isinstance(newer, ExternalNode) and newer.is_alive()
+    assert isinstance(newer, ExternalNode)
+    assert newer.is_alive()
     assert topic in newer.subscriptions
-    assert '/ours' not in newer.publications and '/ours/set_logger_level' not in newer.services
+    assert '/ours' not in newer.publications
+    assert '/ours/set_logger_level' not in newer.services
 
 
 def rospy_node(master):
