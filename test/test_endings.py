@@ -210,6 +210,20 @@ def test_a_node_is_stopped_when_its_stop_has_ended_however(master, fails):
     assert '/clumsy' not in [each.name for each in master.nodes()]
 
 
+def test_a_node_is_stopped_whatever_a_part_of_that_raises(master, monkeypatch):
+    def log(self, text):
+        raise ZeroDivisionError
+
+    release = threading.Event()
+    node = create(master, '/clumsy', type('Clumsy', (Node,), {'log': log}))
+    node.fork(lambda me: release.wait(TIMEOUT))
+    monkeypatch.setattr(type(node), 'stop_timeout', None)
+    with pytest.raises(TypeError, match='level'):  # as it tells of the soul that does not end
+        node.stop()
+    release.set()
+    create(master, '/clumsy')
+
+
 def test_nodes_that_stop_each_other_do_not_wait_for_ever(master):
     both = threading.Barrier(2)
 

@@ -258,6 +258,34 @@ def test_a_name_is_given_to_create_and_not_set(master, nothing_left):
         create(master, node_class=Arm)
 
 
+@pytest.mark.parametrize(
+    'name, value, error',
+    [
+        ('master', None, AttributeError),
+        ('log', [], AttributeError),
+        ('stop', None, AttributeError),
+        ('stop', print, AttributeError),
+        ('_settings', {}, AttributeError),
+        ('stop_timeout', None, ValueError),
+        ('connect_timeout', 'x', ValueError),
+        ('queue_bytes', None, ValueError),
+    ],
+)
+def test_what_a_node_needs_is_not_set_to_something_else(master, nothing_left, name, value, error):
+    """Its stop failed half way: it stayed registered, and its name could not be had again."""
+
+    class Arm(pharos.Node):
+        def start(self):
+            super().start()
+            setattr(self, name, value)
+
+    with pytest.raises(error, match=f'^{name} is'):
+        create(master, node_class=Arm)
+    if name in ('log', 'stop_timeout', 'connect_timeout', 'queue_bytes'):
+        with pytest.raises(error, match=f'^{name} is'):
+            type('Arm', (pharos.Node,), {name: value})
+
+
 def test_a_node_that_no_master_made_is_refused():
     with pytest.raises(
         TypeError, match=r'made by a master: .*create\(BlockNode, named=...\), not BlockNode\(\)'

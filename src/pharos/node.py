@@ -1,5 +1,7 @@
 """Nodes: real ROS nodes of this process, written with blocks."""
 import contextlib
+import inspect
+import numbers
 import threading
 from typing import TYPE_CHECKING, Any, Callable, Iterator, List, Optional, Type, Union
 
@@ -75,10 +77,21 @@ class Node:
                     f'{cls.__name__}.{name} would never run: each node has a {name} of its own,'
                     f' given to create() or set. Name it otherwise, and set self.{name} in start()'
                 )
+        for name in _CHECKED.intersection(vars(cls)):
+            value = getattr(cls, name)
+            if not isinstance(value, property) and _checked(name, value) is not value:
+                setattr(cls, name, _checked(name, value))
         for method in cls.start, cls.stop:
             check_runs(method, f'{cls.__name__}.{method.__name__}')
         cls._reopens = cls.start is Node.start
         cls.stop = node_registry.one_stop_at_a_time(cls.stop)  # type: ignore[assignment]
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in _CHECKED:
+            if name in ('start', 'stop') or name in _SET_ONCE and name in vars(self):
+                raise _not_to_be_set(name)
+            value = _checked(name, value)
+        super().__setattr__(name, value)
 
     def _configure(
         self, master: 'Master', settings: Settings, soul: Block, delegate: Block
@@ -457,6 +470,31 @@ class Node:
             f'<{type(self).__name__} {self.name} {self.lifecycle.value},'
             f' {len(self.channels)} channels{health}>'
         )
+
+
+_METHODS = frozenset(name for name, value in vars(Node).items() if inspect.isfunction(value))
+_SET_ONCE = frozenset(['master', '_settings', '_errors'])
+_SECONDS = frozenset(['connect_timeout', 'stop_timeout'])
+#: attributes without which a node could not work, nor stop
+_CHECKED = _METHODS | _SET_ONCE | _SECONDS | {'queue_bytes'}
+
+
+def _checked(name: str, value: Any) -> Any:
+    """The value that an attribute of Node's gets, in a class or one of its nodes."""
+    if name in _SECONDS:
+        return check_seconds(name, value)
+    is_number = isinstance(value, numbers.Real)
+    if name == 'queue_bytes' and not (is_number and value > 0):
+        raise ValueError(f'queue_bytes is a number of bytes above 0, not {value!r}')
+    if name in _METHODS and not callable(value):
+        raise _not_to_be_set(name)
+    return value
+
+
+def _not_to_be_set(name: str) -> AttributeError:
+    return AttributeError(
+        f'{name} is what each Node has, and needs: give what else has that name another one'
+    )
 
 
 class BlockNode(Node):

@@ -16,6 +16,7 @@ from pharos.private_rospy.instance import PrivateRospy
 from pharos.private_rospy.names import Resolved, check_name
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.settings import Settings
+from pharos.seconds import check_seconds
 from pharos.topic import Topic
 from pharos.transcript import Transcript
 from pharos.watcher import watcher_of
@@ -129,8 +130,9 @@ class Run:
                 return
             self._become(Lifecycle.STOPPING)
         try:
-            for end, *limit in self._ends():
-                end(*limit)
+            with contextlib.ExitStack() as ends:  # each of them, whatever another one raises
+                for end, *limit in reversed(self._ends()):
+                    ends.callback(end, *limit)
         finally:
             self._become(Lifecycle.STOPPED)
             node_registry.collect()
@@ -138,7 +140,7 @@ class Run:
 
     def _ends(self) -> List[Tuple[Any, ...]]:
         """What a stop ends, in this order: (how, the seconds that it may take, if it takes any)."""
-        timeout = self.node.stop_timeout
+        timeout = attempt(lambda: check_seconds('stop_timeout', self.node.stop_timeout), 0.0)
         return [
             (self.rospy.end,),  # what waits
             (self._end_souls, timeout),
