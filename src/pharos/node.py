@@ -344,8 +344,9 @@ class Node:
 
         The report (listing 3.1)::
 
-            self sendTo: '/turtle1/command_velocity' a: [:message | message angular: 1.0. message
-            linear: 2.0] self.send_to('/turtle1/command_velocity', angular=1.0, linear=2.0)
+            self sendTo: '/turtle1/command_velocity'
+                a: [:message | message angular: 1.0. message linear: 2.0]
+            self.send_to('/turtle1/command_velocity', angular=1.0, linear=2.0)
 
         The first message on a topic waits for the subscribers that the master knows, for up to
         ``connect_timeout`` seconds (None: the node's), so that it is not lost.
@@ -502,8 +503,9 @@ class BlockNode(Node):
 
     The report (listing 3.7)::
 
-        node := master create: PhaROSBlockNode named: '/myNode' ... soul: [:myNode | ...]. node
-        execute node = master.create(BlockNode, named='/myNode', soul=lambda me: ...);
+        node := master create: PhaROSBlockNode named: '/myNode' ... soul: [:myNode | ...].
+        node execute
+        node = master.create(BlockNode, named='/myNode', soul=lambda me: ...)
         node.execute()
     """
 
