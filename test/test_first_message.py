@@ -165,3 +165,17 @@ def test_who_waits_for_a_subscriber_waits_until_messages_go_to_it(master, mailbo
     sent.send(data='first')
     assert mailbox.next().data == 'first'
     opening.join(TIMEOUT)
+
+
+def test_a_delegate_that_sends_while_its_node_starts_again_opens_no_second_channel(master):
+    node, mailbox = create(master, '/relay'), Mailbox()
+    create(master, '/end').interested_in('/first/again', STRING, delegate=mailbox)
+    before = node.interested_in('/first/before', STRING)
+    node.output_channel('/first/again', STRING, latch=True)
+    open_again = before.open
+    before.open = lambda: (open_again(), node.send_to('/first/again', data='early'))
+    for _ in range(3):
+        node.stop()
+        node.start()
+        assert len(node.channels) == 2
+    assert mailbox.next().data == 'early'

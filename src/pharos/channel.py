@@ -28,6 +28,8 @@ class Channel:
     Its node opens it, again after a restart, and forgets it when it is closed.
     """
 
+    refused: Any = 0  # how many of the other end the channel cannot hear
+
     def __init__(
         self, node: 'Node', topic: str, message_class: Type[genpy.Message], queue_size: int
     ) -> None:
@@ -110,11 +112,6 @@ class Channel:
     def node_stopped(self) -> None:
         """The node stops, and its rospy closes all endpoints."""
         self._endpoint = None
-
-    @property
-    def refused(self) -> int:
-        """How many of the other end the channel cannot hear."""
-        return 0
 
     def __repr__(self) -> str:
         counts = collections.Counter(transport for _, transport in self.connections)
@@ -249,8 +246,7 @@ class InputChannel(Channel):
 
 
 class OutputChannel(Channel):
-    """The end at which a node sends: made by :meth:`Node.output_channel`, or by the first
-    ``send_to``.
+    """The end at which a node sends, as :meth:`Node.output_channel` or ``send_to`` makes it.
 
     :attr:`sent` counts the messages published; :attr:`latched` keeps the last, None: nothing does.
     """
@@ -271,12 +267,14 @@ class OutputChannel(Channel):
         self._uninterested: Set[str] = set()  # names of nodes of which the log says so
         self._freeze = copier_for(message_class).freeze
         self._fanout: Any = ClosedFanout
+        self._opener: Optional[threading.Thread] = None
+        self._connected = threading.Event()
         self._begin(connect_timeout)
 
     def open(self, connect_timeout: Optional[float] = None) -> None:
         timeout = self.node.connect_timeout if connect_timeout is None else connect_timeout
         deadline = time.monotonic() + timeout
-        self._opener, self._connected = threading.current_thread(), threading.Event()
+        self._opener = threading.current_thread()
         try:
             endpoint, self._fanout = self._rospy.connections.advertise(
                 self.topic,
@@ -292,11 +290,8 @@ class OutputChannel(Channel):
             self._connected.set()
 
     def wait_until_connected(self, timeout: float) -> None:
-        """Wait while another thread opens the channel and connects it to the subscribers that the
-        master knows.
-
-        :param timeout: seconds
-        """
+        """Wait for up to ``timeout`` seconds while another thread opens the channel and connects it
+        to the subscribers that the master knows."""
         if self._opener is not threading.current_thread():
             self._connected.wait(timeout)
 
@@ -398,3 +393,5 @@ class OutputChannel(Channel):
     def node_stopped(self) -> None:
         super().node_stopped()
         self._fanout = ClosedFanout
+        self._connected.set()
+        self._opener, self._connected = None, threading.Event()

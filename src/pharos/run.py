@@ -51,6 +51,7 @@ class Run:
         # topic name -> the lock of the thread that opens a channel to send on it
         self._opening: Dict[str, Any] = {}
         self._settings = settings
+        self._to_reopen: List[Any] = []  # those of the former run's that are closed still
         # what the former run had open, where start() opens it anew
         self._former: List[Any] = []
         self._starter: Optional[int] = threading.get_ident()  # the thread that starts the node
@@ -82,6 +83,7 @@ class Run:
                 self.rospy.start(self.node.connect_timeout)
                 if former and reopens:
                     self.opened = list(former.opened)
+                    self._to_reopen = list(former.opened)
                     self.rospy.parameters.restore_from_previous_run(former.rospy.parameters)
                 elif former:
                     self._former = list(former.opened)
@@ -94,7 +96,7 @@ class Run:
             watcher_of(self.node.master).check()
             for opened in self.opened:
                 self._check_not_stopped()
-                opened.open()
+                self._reopen(opened)
             with self.node.master.reached():
                 self.rospy.parameters.renew()
         except BaseException as error:
@@ -230,6 +232,14 @@ class Run:
             self.opened = [other for other in self.opened if other is not opened]
             self.senders.clear()
 
+    def _reopen(self, opened: Any) -> None:
+        """Open what the former run had open, unless that is done, or a thread is doing it."""
+        with node_registry.changed:
+            if opened not in self._to_reopen:
+                return
+            self._to_reopen.remove(opened)
+        opened.open()
+
     def latch_for(self, topic: str, message_class: Any) -> Latch:
         """The Latch of a new channel: the former run's, where start() opens that channel anew."""
         with node_registry.changed:
@@ -259,8 +269,9 @@ class Run:
         limit = max(0.0, wait + connect_timeout)
         is_mine = opening.acquire(timeout=min(limit, threading.TIMEOUT_MAX))
         try:
-            for channel in self.channels:
-                if channel.topic == topic.name and isinstance(channel, OutputChannel):
+            for channel in self.opened:
+                if isinstance(channel, OutputChannel) and channel.topic == topic.name:
+                    self._reopen(channel)  # else a start would open it beside another one
                     return channel
             return topic.output_channel(
                 self.node, typed_as, connect_timeout=connect_timeout, wait=wait
