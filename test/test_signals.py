@@ -8,6 +8,7 @@ import pytest
 import rosmaster.master_api
 
 from pharos.testing import Mailbox, TIMEOUT
+from helpers import create
 from pharos import BlockNode
 from programs import Program
 
@@ -633,3 +634,26 @@ threading.Event().wait()
 """
     )
     assert running.process.wait(TIMEOUT) == ended_by(with_signal)
+
+
+def test_what_a_handler_of_the_program_raises_in_an_inline_delegate_reaches_who_publishes(
+    master,
+):
+    class TimeIsUp(Exception):
+        """What the program ends a call with."""
+
+    def ring(number, frame):
+        raise TimeIsUp
+
+    channel = create(master, '/sender').output_channel('/alarm', 'std_msgs/Empty')
+    receiver = create(master, '/receiver')
+    receiver.interested_in(
+        '/alarm', delegate=lambda *_: signal.raise_signal(signal.SIGALRM), inline=True
+    )
+    before = signal.signal(signal.SIGALRM, ring)
+    try:
+        with pytest.raises(TimeIsUp):
+            channel.send()
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    assert not receiver.errors

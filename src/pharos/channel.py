@@ -14,6 +14,7 @@ from pharos.intraprocess.fanout import ClosedFanout
 from pharos.intraprocess.inbox import Inbox, SocketInbox
 from pharos.private_rospy.deadlines import time_limit
 from pharos.seconds import check_limit
+from pharos.signals import is_from_signal
 
 if TYPE_CHECKING:
     from pharos.node import Node
@@ -341,7 +342,9 @@ class OutputChannel(Channel):
             )
 
     def _explain(self, error: Exception, message: genpy.Message) -> NoReturn:
-        """Raise our error for one that publishing raised."""
+        """Raise our error for one that publishing raised, but that of a handler of signals."""
+        if is_from_signal(error):
+            raise error
         if not self.is_open or self._rospy.connections.is_closed(self._endpoint):
             raise NodeStoppedError(
                 f'the channel of {self.node.name} on {self.topic} is closed: open another with'
