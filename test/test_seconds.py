@@ -42,6 +42,12 @@ def test_what_is_no_number_of_seconds_is_refused(node, wait, seconds):
         wait(node, seconds)
 
 
+@pytest.mark.parametrize('wait', ['interested_in', 'send_to'])
+def test_a_wait_for_a_type_is_not_negative(node, wait):
+    with pytest.raises(ValueError, match='wait is a number of seconds, 0 or more, not -1'):
+        WAITS[wait](node, -1)
+
+
 @pytest.mark.parametrize(
     'seconds, expected',
     [

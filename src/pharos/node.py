@@ -367,7 +367,7 @@ class Node:
         else:
             connect_timeout = check_seconds('connect_timeout', connect_timeout)
         if wait != 0:
-            wait = check_seconds('wait', wait)
+            wait = check_seconds('wait', wait, least=0)
         run = self.current_run
         channel = run.senders.get(topic) if isinstance(topic, str) else None
         if channel is None or not channel.is_open:

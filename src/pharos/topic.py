@@ -149,7 +149,7 @@ class Topic:
         :raises MessageTypeError: if the node uses the topic with another type already
         :raises NodeStoppedError: if the node stops meanwhile
         """
-        wait = check_seconds('wait', wait)
+        wait = check_seconds('wait', wait, least=0)
         with time_limit(wait + MARGIN if wait else None):
             return self._message_class(node, typed_as, wait, receives)
 
