@@ -1,12 +1,14 @@
 """Another process starts a node of our name: ROS's rule is that the newer one stays, and the older
 one ends."""
+import contextlib
 import sys
+import threading
 
 import pytest
 
 from helpers import create
 from pharos.testing import TIMEOUT, until
-from pharos import BlockNode, ExternalNode, Lifecycle, node_registry, watcher
+from pharos import BlockNode, ExternalNode, Lifecycle, NodeStoppedError, node_registry, watcher
 from pharos.private_rospy import registration
 from programs import Program, forget_parameters
 
@@ -86,11 +88,21 @@ def test_what_a_node_opens_and_says_while_it_gives_way_is_not_registered(master)
     forget_parameters(master.url)
 
 
+def obey_nobody(monkeypatch):
+    """As if the master had not told the older node yet."""
+    is_anothers = registration.name_is_anothers
+
+    def known_here(node):
+        thread = threading.current_thread().name
+        return thread.startswith(('MainThread', 'watcher')) and is_anothers(node)
+
+    monkeypatch.setattr(registration, 'name_is_anothers', known_here)
+
+
 def test_a_node_that_was_not_told_notices(master, monkeypatch):
     """It finds its registrations gone, and does not take the name back."""
     monkeypatch.setattr(watcher, 'PERIOD', 0.05)
-    # it does not obey
-    monkeypatch.setattr(registration, 'name_is_anothers', lambda node: False)
+    obey_nobody(monkeypatch)
     ours = create(master, '/contested')
     ours.output_channel('/ours', 'std_msgs/String')
     with rospy_node(master) as newer:
@@ -98,3 +110,28 @@ def test_a_node_that_was_not_told_notices(master, monkeypatch):
         wait_for_stop(ours)
         check_it_stays(master, '/newer_hears')
         assert newer.process.poll() is None
+
+
+USES = {
+    'log': lambda node: node.log('here I am'),
+    'interested_in': lambda node: node.interested_in('/ours/in', 'std_msgs/String'),
+    'output_channel': lambda node: node.output_channel('/ours/out', 'std_msgs/String'),
+    'serve': lambda node: node.serve('/ours/late', 'std_srvs/Empty', lambda request: None),
+    'on_change': lambda node: node.parameter('/ours/parameter').on_change(print),
+}
+
+
+@pytest.mark.parametrize('use', USES)
+def test_a_node_that_is_not_told_yet_does_not_take_the_name_back(master, monkeypatch, use):
+    """The master tells it only after it has registered the newer one, which would end by that."""
+    ours = create(master)
+    ours.log('so rospy subscribes to the parameter by which it leaves out the topics')
+    obey_nobody(monkeypatch)
+    newer, uri = master.api(ours.name), 'http://127.0.0.1:1/'
+    newer.registerPublisher('/newer', 'std_msgs/String', uri)
+    try:
+        with contextlib.suppress(NodeStoppedError):  # it has just noticed
+            USES[use](ours)
+        assert master.uri_of(ours.name) == uri
+    finally:
+        newer.unregisterPublisher('/newer', uri)

@@ -6,6 +6,7 @@ import xmlrpc.client
 
 import rosgraph
 
+from pharos.private_rospy import registration
 from pharos.private_rospy.proxies import master_api
 
 
@@ -66,6 +67,8 @@ class WatchedParameters:
                 return
             if any(_contains(other, name) for other in self._subscribed):
                 return
+            if not registration.keeps_name(self._node):
+                return
             master.subscribeParam(uri, name)
             within = {other for other in self._subscribed if _contains(name, other)}
             self._subscribed = self._subscribed - within | {name}
@@ -91,6 +94,7 @@ class WatchedParameters:
         for name in list(self.cached):
             with contextlib.suppress(KeyError):
                 cache.delete(name)  # rospy subscribes anew when it is asked for it
+            self.cached.discard(name)
         with self._subscribing:
             self._subscribed.clear()
         self.renew()

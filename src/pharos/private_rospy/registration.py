@@ -70,6 +70,15 @@ def name_is_anothers(node):
         return False
 
 
+def keeps_name(node):
+    """Whether the node, a PrivateRospy, may register: that would take the name back, and end the
+    newer node, where another one has it by now. Then this one stops, as ROS has it."""
+    if not node.has_lost_name and name_is_anothers(node):
+        node.has_lost_name = True
+        node.request_stop('another node has taken its name')
+    return not node.has_lost_name
+
+
 def claim_name(master_url, name, timeout):
     """Make sure that no running node has ``name``; what a dead one left with the master goes.
 
@@ -202,10 +211,7 @@ def repair(node, state, was_away):
     # every node offers this from its start on; a channel may have been opened with a restarted
     # master already
     is_forgotten = node.name not in services.get(node.rospy.resolve_name('~get_loggers'), ())
-    if any(kind.lost(node) for kind in kinds) and _belongs_to_another(master, node.name, node.uri):
-        # To register again would take the name back, and end the newer node.
-        node.has_lost_name = True
-        node.request_stop('another node has taken its name')
+    if any(kind.lost(node) for kind in kinds) and not keeps_name(node):
         return False
     for kind in kinds:
         kind.repair(node, was_away)

@@ -12,8 +12,12 @@ def set_cached(self, key, value, *, node, original):
 @patch(
     'rospy.msproxy',
     'MasterProxy.get_param_cached',
-    'subscribes for a line of the log, which registers anew a node that stops',
+    'subscribes for each line of the log, which registers anew a node that stops, or has lost its'
+    ' name to a newer one',
 )
-def get_param_cached(self, key, *, node, original):
-    """Subscribe only while the node runs."""
+def get_param_cached(self, key, *, node, original, module):
+    """Subscribe once, and only while the node runs."""
+    name = module.rospy.names.resolve_name(key)
+    if name in node.parameters.cached:
+        return module.rospy.impl.paramserver.get_param_server_cache().get(name)
     return original(self, key) if node.parameters.may_subscribe() else self[key]

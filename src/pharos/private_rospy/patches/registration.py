@@ -20,7 +20,7 @@ _KINDS = {
 )
 def reg_added(self, resolved_name, data_type_or_uri, reg_type, *, node, module):
     """Try once; the watcher repairs what failed."""
-    if node.has_lost_name:
+    if node.has_lost_name or registration.is_awaited() and not registration.keeps_name(node):
         return
     method, kind = _KINDS[reg_type]
     register = getattr(module.xmlrpcapi(self.master_uri), method)
