@@ -402,6 +402,29 @@ def test_a_listener_greets_each_subscriber(pair):
     assert subscribing.ros.wait_for_message('/plain/greeted', STRING, TIMEOUT).data == 'welcome'
 
 
+@pytest.mark.parametrize('error', [ValueError, SystemExit])
+def test_a_listener_that_fails_ends_nothing_of_others(pair, mailbox, error):
+    publishing, subscribing = pair
+
+    class Failing(rospy.SubscribeListener):
+        """Takes nobody."""
+
+        def peer_subscribe(self, *_):
+            raise error
+
+        peer_unsubscribe = peer_subscribe
+
+    publisher = publishing.ros.Publisher(
+        '/plain/failing', STRING, subscriber_listener=Failing(), queue_size=1
+    )
+    channel = subscribing.interested_in('/plain/failing', STRING, delegate=mailbox)
+    connected(publisher)
+    publisher.publish('text')
+    assert mailbox.next().data == 'text'
+    channel.close()
+    connected(publisher, 0)
+
+
 # -- what is left
 
 

@@ -3,12 +3,14 @@ import contextlib
 import functools
 import math
 import struct
+import traceback
 
 from pharos.intraprocess.fanout import ClosedError, Fanout, Latch, StartupLogBuffer
 from pharos.intraprocess.link import links_of
 from pharos.private_rospy.patches.table import addition, patch
 from pharos.private_rospy.changes import notify
 from pharos.private_rospy.sender import Sender, Sockets
+from pharos.signals import is_from_signal
 
 
 @patch(
@@ -80,8 +82,7 @@ def add_connection(self, c, *, node, module):
             return False
         self.fanout.send_latched(c)
     publish_single = functools.partial(self.publish, connection_override=c)
-    for listener in self.subscriber_listeners or ():
-        listener.peer_subscribe(self.resolved_name, self.publish, publish_single)
+    _tell_listeners(self, node, 'peer_subscribe', self.publish, publish_single)
     notify()
     self.fanout.run()
     return True
@@ -103,12 +104,11 @@ def receivers_changed(self, link):
 @patch(
     'rospy.topics', '_PublisherImpl.remove_connection', 'trips over listeners that are gone by then'
 )
-def remove_connection(self, c, *, module):
+def remove_connection(self, c, *, node, module):
     """Tell the fan-out, and the listeners that there are."""
     module._TopicImpl.remove_connection(self, c)
     _refresh(self)
-    for listener in self.subscriber_listeners or ():
-        listener.peer_unsubscribe(self.resolved_name, len(self.connections))
+    _tell_listeners(self, node, 'peer_unsubscribe', len(self.connections or ()))
     notify()
 
 
@@ -136,6 +136,17 @@ def _latched_first(publisher):
                 stack.enter_context(link.unbounded())
             stack.enter_context(lock)
         yield lock is not None
+
+
+def _tell_listeners(publisher, node, method, *arguments):
+    """Have a listener fail alone: who connects may be the thread of another node."""
+    for listener in publisher.subscriber_listeners or ():
+        try:
+            getattr(listener, method)(publisher.resolved_name, *arguments)
+        except BaseException as error:
+            if is_from_signal(error):
+                raise
+            node.rospy.logerr('bad listener: %s\n%s', listener, traceback.format_exc())
 
 
 def _refresh(publisher, link=None):
