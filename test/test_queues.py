@@ -1,16 +1,18 @@
 """What waits for a slow receiver is bounded: by a number of messages, and by their bytes."""
+import struct
 import threading
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers import create
-from pharos.testing import Mailbox, TIMEOUT
-from pharos import Node, define_message
+from helpers import create, ended, in_thread
+from pharos.testing import Mailbox, TIMEOUT, until
+from pharos import Node, define_message, message_class
 from pharos.intraprocess.dispatcher import Dispatcher
 from pharos.intraprocess.inbox import Inbox
 from pharos.private_rospy import sender
+from sockets import subscribe
 
 BYTES, NUMBERS = 'std_msgs/UInt8MultiArray', 'std_msgs/Float64MultiArray'
 MEGABYTE = 1 << 20
@@ -141,7 +143,7 @@ def test_a_queue_never_holds_more_than_it_may_and_counts_what_it_drops(steps):
 class Connection:
     """A connection whose socket is full, and stays so."""
 
-    done, socket = False, None
+    done, socket, cleanup_cb = False, None, None
 
     def __init__(self):
         self.writes = threading.Semaphore(0)
@@ -181,3 +183,42 @@ def test_a_latched_message_that_waits_counts_with_its_bytes(master):
     sender.send_to('/latched_large', data=bytes(3 * MEGABYTE))
     assert latched.dropped == 1
     gate.opened.set()
+
+
+# -- what waits for a subscriber elsewhere
+
+
+def read(sock, count):
+    """The ``data`` of so many messages, after the connection header."""
+    file = sock.makefile('rb')
+    read = [file.read(*struct.unpack('<I', file.read(4))) for _ in range(count + 1)]
+    return [message[12:] for message in read[1:]]
+
+
+@pytest.mark.parametrize('first, second', [(100, 1), (1, 100)])
+def test_of_the_sizes_that_the_channels_of_a_topic_ask_for_the_largest_is_the_queues(
+    master, first, second
+):
+    node = create(master, '/sender')
+    sent = node.output_channel('/remote', BYTES, queue_size=first)
+    with subscribe(node.tcp_port, '/remote') as sock:
+        until(lambda: sent.connections)
+        node.output_channel('/remote', BYTES, queue_size=second)
+        messages = [bytes([number]) * (MEGABYTE // 2) for number in range(30)]
+        for message in messages:
+            sent.send(data=message)
+        assert read(sock, 30) == messages
+
+
+@pytest.mark.filterwarnings('ignore:The publisher should be created')
+def test_a_channel_waits_for_nobody_also_beside_a_publisher_without_a_queue(master):
+    node = create(master, '/sender')
+    plain = node.ros.Publisher('/remote', message_class(BYTES))
+    with subscribe(node.tcp_port, '/remote') as sock:
+        until(plain.get_num_connections)
+        sent = node.output_channel('/remote', BYTES)
+        messages = [bytes([number]) * (MEGABYTE // 2) for number in range(30)]
+        thread = in_thread(lambda: [sent.send(data=message) for message in messages])
+        assert ended(thread)
+        assert read(sock, 30) == messages
+    until(lambda: not sent.connections)

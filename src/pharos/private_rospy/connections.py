@@ -132,6 +132,7 @@ class Connections:
         )
         fanout = endpoint.impl.fanout
         endpoint.impl.queue_bytes = queue_bytes
+        endpoint.impl.set_queue_size(queue_size)  # again, with these bytes
         if latch is not None:
             fanout.resume(latch)
             fanout.run()

@@ -61,13 +61,18 @@ class Sender:
         """
         self._connection = connection
         self._queue, self._bytes = collections.deque(), 0
-        self._limit, self._byte_limit = queue_size or math.inf, queue_bytes
+        self.resize(queue_size, queue_bytes)
         self._begun = b''  # the rest of a message whose beginning the socket has
         self._is_idle = True  # nothing is on its way but what the socket has
         self._error = None  # of the thread, for the next who publishes, as in rospy
         self._changed = threading.Condition(threading.Lock())
+        self._cleanup = connection.cleanup_cb  # where it has been in use without a queue
         connection.set_cleanup_callback(self._closed)
         start_thread(self._run, name='sender')
+
+    def resize(self, queue_size, queue_bytes):
+        """Have other limits from the next message on; see :meth:`__init__`."""
+        self._limit, self._byte_limit = queue_size or math.inf, queue_bytes
 
     def __getattr__(self, name):
         return getattr(self._connection, name)
@@ -129,6 +134,8 @@ class Sender:
                     self._error = error
 
     def _closed(self, connection):
+        if self._cleanup:
+            self._cleanup(connection)
         with self._changed:
             self._changed.notify_all()
 

@@ -68,10 +68,10 @@ def add_connection(self, c, *, node, module):
     """Send what is latched first, through the fan-out, and queue for TCPROS with a thread that
     ends."""
     link = getattr(c, 'link', None)
-    if link is None and self.queue_size is not None:
-        c = Sender(c, self.queue_size, node.start_thread, self.queue_bytes)
     with _latched_first(self) as is_open:
         with self.c_lock:
+            if link is None and self.queue_size is not None:
+                c = Sender(c, self.queue_size, node.start_thread, self.queue_bytes)
             is_added = is_open and module._TopicImpl.add_connection(self, c)
             if is_added:
                 # who counts the connections counts this one only when messages go through it;
@@ -86,6 +86,29 @@ def add_connection(self, c, *, node, module):
     notify()
     self.fanout.run()
     return True
+
+
+@patch(
+    'rospy.topics',
+    '_PublisherImpl.set_queue_size',
+    'takes the last of the sizes that Publishers on the topic ask for, and only for those who'
+    ' connect later',
+)
+def set_queue_size(self, queue_size, *, node):
+    """Take the largest, 0 being without limit, for those who are connected, too."""
+    asked = [size for size in (self.queue_size, queue_size) if size is not None]
+    with self.c_lock:
+        self.queue_size = 0 if 0 in asked else max(asked)
+        limits = self.queue_size, self.queue_bytes
+        connections = []
+        for connection in self.connections or ():
+            if isinstance(connection, Sender):
+                connection.resize(*limits)
+            elif not hasattr(connection, 'link'):
+                connection = Sender(connection, limits[0], node.start_thread, limits[1])
+            connections.append(connection)
+        self.connections = connections
+        _refresh(self)
 
 
 @addition('rospy.topics', '_PublisherImpl.receivers_changed', 'links call it')
