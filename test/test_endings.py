@@ -272,6 +272,30 @@ def test_a_node_may_start_again_at_the_end_of_its_stop(master):
 # -- stop() during the start
 
 
+def test_what_a_start_opens_is_not_for_a_later_run(master):
+    """It opened a second channel there, and each message came twice."""
+    slow, go_on = threading.Event(), threading.Event()
+
+    class Slow(Node):
+        def start(self):
+            super().start()
+            if not slow.is_set():
+                slow.set()
+                assert go_on.wait(TIMEOUT)
+            self.interested_in('/t', 'std_msgs/String')
+
+    starting, outcome = in_thread(create, master, '/slow', Slow)
+    assert slow.wait(TIMEOUT)
+    (node,) = node_registry.nodes()
+    node.stop()
+    node.start()
+    go_on.set()
+    assert ended(starting)
+    assert isinstance(outcome[0], NodeStoppedError)
+    assert node.is_running
+    assert len(node.channels) == 1
+
+
 def test_a_stop_during_the_start_ends_it(master, monkeypatch):
     from pharos.private_rospy import registration
 

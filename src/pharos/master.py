@@ -322,13 +322,14 @@ class Master(MasterCalls):
 
 
 def _start(node: nodes_of_ours.Node) -> None:
-    try:
-        node.start()
-        if node.lifecycle is Lifecycle.NEW:
-            raise PharosError(
-                f'{node.name} did not start: {type(node).__name__}.start() has to call '
-                'super().start() before anything else'
-            )
-    except BaseException:
-        node_registry.stop(node)
-        raise
+    with node_registry.start_of(node):
+        try:
+            node.start()
+            if node.lifecycle is Lifecycle.NEW:
+                raise PharosError(
+                    f'{node.name} did not start: {type(node).__name__}.start() has to call '
+                    'super().start() before anything else'
+                )
+        except BaseException:
+            node_registry.stop(node)
+            raise

@@ -1,5 +1,6 @@
 """Nodes: real ROS nodes of this process, written with blocks."""
 import contextlib
+import functools
 import inspect
 import numbers
 import threading
@@ -84,6 +85,8 @@ class Node:
         for method in cls.start, cls.stop:
             check_runs(method, f'{cls.__name__}.{method.__name__}')
         cls._reopens = cls.start is Node.start
+        if 'start' in vars(cls):
+            cls.start = _of_one_run(cls.start)  # type: ignore[assignment]
         cls.stop = node_registry.one_stop_at_a_time(cls.stop)  # type: ignore[assignment]
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -161,6 +164,8 @@ class Node:
 
         :raises NodeStoppedError: if the node is not started
         """
+        if node_registry.is_superseded(self):
+            raise NodeStoppedError(f'{self.name} was stopped while it started, and started again')
         run, lifecycle = self.latest_run, self.lifecycle
         if run is not None and lifecycle in (Lifecycle.RUNNING, Lifecycle.STOPPING):
             return run
@@ -471,6 +476,15 @@ class Node:
             f'<{type(self).__name__} {self.name} {self.lifecycle.value},'
             f' {len(self.channels)} channels{health}>'
         )
+
+
+def _of_one_run(start: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(start)
+    def start_in_run(node: Node, *args: Any, **kwargs: Any) -> Any:
+        with node_registry.start_of(node):
+            return start(node, *args, **kwargs)
+
+    return start_in_run
 
 
 _METHODS = frozenset(name for name, value in vars(Node).items() if inspect.isfunction(value))

@@ -8,7 +8,18 @@ import os
 import sys
 import threading
 import time
-from typing import TYPE_CHECKING, Any, Callable, Dict, Iterable, List, Optional, Set, Tuple
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Callable,
+    Dict,
+    Iterable,
+    Iterator,
+    List,
+    Optional,
+    Set,
+    Tuple,
+)
 
 from pharos import signals
 from pharos.blocks import name_of
@@ -34,6 +45,8 @@ _nodes: 'Dict[Tuple[Any, str], Node]' = {}
 # node -> the identifier of the thread that runs its stop(), and the time.monotonic() until which
 # others wait for that
 _stops: 'Dict[Node, Tuple[int, float]]' = {}
+# (node, identifier of the thread that is in its start()) -> the run that it has begun there
+_starts: 'Dict[Tuple[Node, int], Optional[Run]]' = {}
 _waiting: 'Dict[int, Node]' = {}  # identifier of a thread -> the node for whose stop it waits
 _runs_ended = 0  # since the collector ran
 _finalizer: Any = None  # what multiprocessing runs at the end of its processes
@@ -72,6 +85,9 @@ def claim(run: 'Run') -> 'Optional[Run]':
                 ' again'
             )
         node.latest_run = run
+        key = node, threading.get_ident()
+        if key in _starts:
+            _starts[key] = run
     return former
 
 
@@ -126,6 +142,26 @@ def one_stop_at_a_time(method: Callable[..., Any]) -> Callable[..., Any]:
     return stop
 
 
+@contextlib.contextmanager
+def start_of(node: 'Node') -> 'Iterator[None]':
+    """Within this, what this thread does with the node is for the run that it starts: not for a
+    later one, where others have stopped that and started the node again."""
+    key = node, threading.get_ident()
+    is_outermost = key not in _starts
+    _starts.setdefault(key, None)
+    try:
+        yield
+    finally:
+        if is_outermost:
+            _starts.pop(key, None)
+
+
+def is_superseded(node: 'Node') -> bool:
+    """Whether this thread is in a :func:`start_of` a run that is not the node's latest."""
+    mine = _starts.get((node, threading.get_ident())) if _starts else None
+    return mine is not None and mine is not node.latest_run
+
+
 def stop(node: 'Node') -> None:
     """Stop a node where no code of the user's asked for it, who would get what an overriding stop()
     raises."""
@@ -138,6 +174,8 @@ def stop(node: 'Node') -> None:
 def _begin_stop(node: 'Node') -> 'Optional[Run]':
     """The run that this thread is to end; None where another one has done it, or there is nothing
     to end."""
+    if is_superseded(node):
+        return None
     if node.latest_run is not None:
         node.latest_run.cancel_start()
     with changed:
@@ -290,7 +328,7 @@ def _forget() -> None:
     changed = threading.Condition()
     _finalizer = None  # its parent's, which multiprocessing has dropped
     former = list(_nodes.values())
-    for known in (_nodes, _stops, _waiting, _others):
+    for known in (_nodes, _stops, _starts, _waiting, _others):
         known.clear()  # type: ignore[attr-defined]
     for node in former:
         node.latest_run.abandon()
