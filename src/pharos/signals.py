@@ -9,7 +9,7 @@ import threading
 import time
 import traceback
 import _thread
-from types import FrameType
+from types import CodeType, FrameType
 from typing import Any, Callable, Iterator, Optional, Set
 
 import rosgraph
@@ -35,6 +35,9 @@ _OURS = tuple(
     for file in (__file__, rosgraph.__file__, rospy.__file__, logging.__file__)
 )
 _PYTHONS = os.path.dirname(os.__file__), '<frozen '
+#: functions of Python's that run when something is freed, where it drops what is raised: those that
+#: close sockets and files, name them in a ResourceWarning, and take them out of weak collections
+_FINALIZERS = {'__repr__', 'close', '_real_close', '_close_conn', '_remove', 'remove'}
 
 #: signals that have come to be ours, perhaps by way of a handler that the program has set since
 taken_on: Set[int] = set()
@@ -69,20 +72,24 @@ class _Signal:
         """Have the main thread's handler look again and again, until it has raised an exception."""
         global _is_reminded
         main_thread = threading.main_thread().ident
-        while _coming is self and signal.getsignal(self.number) is _on_signal:
+        while signal.getsignal(self.number) is _on_signal:
+            time.sleep(REMINDER)  # first: mostly it is cut off at once, and needs none
+            if _coming is not self:
+                return
             _is_reminded = True
             signal.pthread_kill(main_thread, self.number)  # type: ignore[arg-type]
-            time.sleep(REMINDER)
 
     def may_cut_off(self, frame: Optional[FrameType]) -> bool:
         """Whether the main thread, which is at that frame, can be cut off there."""
         now = time.monotonic()
         if _holds:
             return now - self._came > HOLD_LIMIT
-        if _waits or not _runs_ours(frame):
+        if _waits:
             return True
+        if any(_is_finalizer(each.f_code) for each in _with_callers(frame)):
+            return now - self._came > HOLD_LIMIT
         if self._stopped is None:
-            return False
+            return not _runs_ours(frame)
         return now - self._stopped > PATIENCE or not _runs_ours(_without_pythons(frame), 1)
 
 
@@ -98,6 +105,12 @@ def _without_pythons(frame: Optional[FrameType]) -> Optional[FrameType]:
         if _runs_ours(each, 1) or not each.f_code.co_filename.startswith(_PYTHONS):
             return each
     return None
+
+
+def _is_finalizer(code: CodeType) -> bool:
+    """Whether the code may run because something is freed."""
+    is_pythons = code.co_filename.startswith(_PYTHONS)
+    return code.co_name == '__del__' or is_pythons and code.co_name in _FINALIZERS
 
 
 def _with_callers(frame: Optional[FrameType]) -> Iterator[FrameType]:
