@@ -193,3 +193,21 @@ def test_a_service_block_that_outlives_its_caller_ends_quietly(master, capfd):
     node.stop()
     assert all(map(ended, answering))
     assert 'Traceback' not in capfd.readouterr().err
+
+
+def test_a_channel_that_is_opened_while_its_node_stops_says_so(master, monkeypatch):
+    node = create(master, '/node')
+    topics = node.latest_run.rospy.topics
+    acquire = topics.acquire_impl
+
+    def acquire_and_stop(*arguments):
+        topic = acquire(*arguments)
+        node.stop()
+        return topic
+
+    monkeypatch.setattr(topics, 'acquire_impl', acquire_and_stop)
+    with pytest.raises(
+        pharos.NodeStoppedError, match='/node stopped while it opened /closing/late'
+    ):
+        node.interested_in('/closing/late', 'std_msgs/String')
+    assert not node.channels

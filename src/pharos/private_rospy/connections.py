@@ -3,10 +3,12 @@ import os
 import select
 import threading
 
+from pharos.errors import NodeStoppedError
 from pharos.private_rospy.addresses import is_same_master
 from pharos.private_rospy.names import Resolved
 from pharos.private_rospy import changes, registration
 from pharos.private_rospy.deadlines import time_limit
+from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.proxies import ServerProxy
 from pharos.private_rospy.registration import UNREGISTER_TIMEOUT, registered
 from pharos.private_rospy.socket_callback import SocketCallback
@@ -58,6 +60,7 @@ class Connections:
         :param inbox: of the receiver, for what comes through sockets
         :param timeout: seconds that all may take
         :raises MasterUnreachableError: if it cannot be registered
+        :raises NodeStoppedError: if the node stops meanwhile
         """
         topic, callback = receiver.topic, SocketCallback(receiver, inbox, self._node)
         with self._lock:
@@ -77,10 +80,14 @@ class Connections:
                 timeout,
             )
             self._connect(topic, timeout)
-        except BaseException:
+        except BaseException as error:
             self._forget(receiver)
             if endpoint is not None:
                 _unregister(endpoint)
+            if type(error) is rospy.ROSException and self._node.ended.is_set():
+                raise NodeStoppedError(
+                    f'{self._node.name} stopped while it opened {topic}: start() it first'
+                ) from error
             raise
         return endpoint
 
