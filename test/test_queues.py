@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers import create, ended, in_thread
+from helpers import create, ended, in_thread, speak_tcpros_only
 from pharos.testing import Mailbox, TIMEOUT, until
 from pharos import Node, define_message, message_class
 from pharos.intraprocess.dispatcher import Dispatcher
@@ -222,3 +222,23 @@ def test_a_channel_waits_for_nobody_also_beside_a_publisher_without_a_queue(mast
         assert ended(thread)
         assert read(sock, 30) == messages
     until(lambda: not sent.connections)
+
+
+def test_the_queue_of_a_plain_subscriber_cuts_nothing_of_a_channel_beside_it(master):
+    node, mailbox, plain = speak_tcpros_only(create(master, '/receiver')), Mailbox(), Gate()
+    node.ros.Subscriber(
+        '/beside', message_class(BYTES), lambda message: plain(message, None), queue_size=1
+    )
+    channel = node.interested_in('/beside', BYTES, delegate=mailbox)
+    sent = create(master, '/sender').output_channel('/beside', BYTES)
+    sent.send()
+    assert plain.entered.wait(TIMEOUT)
+    for size in range(1, 100):
+        sent.send(data=bytes(size))
+    plain.opened.set()
+    assert [len(mailbox.next().data) for _ in range(100)] == list(range(100))
+    assert channel.dropped == 0
+    sizes = [plain.sizes.next()]
+    while sizes[-1] != 99:
+        sizes.append(plain.sizes.next())
+    assert len(sizes) < 50  # it gets the newest of what was read at once

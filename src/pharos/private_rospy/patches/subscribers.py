@@ -32,8 +32,14 @@ def init_subscriber(self, name, data_class, *, original):
 )
 def receive_callback(self, msgs, connection, *, node, original):
     """Run the delegates after the batch: channels only queue in their callbacks, so that of a
-    batch the newest are kept."""
-    original(self, msgs, connection)
+    batch the newest are kept, and counts. The queue_size of a plain Subscriber is for the others.
+    """
+    limit = self.queue_size or len(msgs)
+    for message in msgs[:-limit]:
+        for callback, arguments in self.callbacks or ():
+            if isinstance(callback, SocketCallback):
+                self._invoke_callback(message, callback, arguments)
+    original(self, msgs[-limit:], connection)
     node.on_received()
 
 
@@ -80,6 +86,7 @@ def add_callback(self, cb, cb_args, *, original):
     """Links have inboxes for channels and one for all other callbacks, and know what was
     latched."""
     original(self, cb, cb_args)
+    self.limit_reading()
     for link in links_of(self.connections):
         for message in link.callback_added(cb):
             self._invoke_callback(message, cb, cb_args)
@@ -89,8 +96,19 @@ def add_callback(self, cb, cb_args, *, original):
 def remove_callback(self, cb, cb_args, *, original):
     """Tell the links."""
     original(self, cb, cb_args)
+    self.limit_reading()
     for link in links_of(self.connections):
         link.callback_removed()
+
+
+@addition('rospy.topics', '_SubscriberImpl.limit_reading', 'connections are read by it')
+def limit_reading(self):
+    """Have queue_size cut what is read from sockets only where no channel is to get it."""
+    is_heard = any(isinstance(callback, SocketCallback) for callback, _ in self.callbacks or ())
+    for connection in self.connections or ():
+        protocol = getattr(connection, 'protocol', None)
+        if protocol is not None:
+            protocol.queue_size = None if is_heard else self.queue_size
 
 
 @addition('rospy.topics', '_SubscriberImpl.has_plain_callbacks', 'links ask for it')

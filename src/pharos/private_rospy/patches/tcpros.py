@@ -59,6 +59,9 @@ def robust_connect_subscriber(
         node.refusals.publisher_connected(resolved_topic_name, pub_uri)
         conn.is_heard = True
         notify()
+        subscriber = node.subscriber(resolved_topic_name)
+        if subscriber is not None:
+            subscriber.limit_reading()
         conn.receive_loop(receive_cb)
 
 
