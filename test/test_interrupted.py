@@ -1,5 +1,6 @@
 """What cannot be done because the master is away, or the start ends early, leaves nothing behind
 and loses nothing."""
+import os
 import signal
 import socket
 import threading
@@ -12,7 +13,7 @@ from helpers import create, registrations
 from pharos.testing import Mailbox, TIMEOUT, until
 import pharos
 from pharos import Master, node_registry, watcher
-from pharos.private_rospy import proxies
+from pharos.private_rospy import proxies, registration
 
 STRING = 'std_msgs/String'
 
@@ -36,6 +37,7 @@ def away(monkeypatch):
 
         def hang(self):
             embedded._child.send_signal(signal.SIGSTOP)
+            os.waitid(os.P_PID, embedded._child.pid, os.WSTOPPED)  # it is not at once
 
         def go_on(self):
             embedded._child.send_signal(signal.SIGCONT)
@@ -128,6 +130,27 @@ def test_what_is_closed_while_the_master_hangs_is_unregistered_when_it_goes_on(a
         node.output_channel('/interrupted/later', STRING)
     until(lambda: watcher.watcher_of(away).reachable_since is None)
     away.go_on()
+    until(lambda: registrations(away, '/node') == before)
+
+
+@pytest.mark.parametrize('stops', [False, True])
+@pytest.mark.parametrize('opener', ['interested_in', 'output_channel', 'serve'])
+def test_what_could_not_be_opened_while_the_master_hung_is_not_there_when_it_goes_on(
+    away, monkeypatch, opener, stops
+):
+    """The call had timed out here, and was made there later."""
+    node = create(away, '/node')
+    before = registrations(away, '/node')
+    node.connect_timeout = 0.1
+    monkeypatch.setattr(registration, 'REGISTER_TIMEOUT', 0.1)
+    monkeypatch.setattr(registration, 'name_is_anothers', lambda node: False)  # asks it, too
+    away.hang()
+    with pytest.raises(pharos.MasterUnreachableError):
+        OPENERS[opener](node)
+    away.go_on()
+    if stops:
+        node.stop()
+        before = [[], [], []]
     until(lambda: registrations(away, '/node') == before)
 
 

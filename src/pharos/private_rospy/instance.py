@@ -51,6 +51,9 @@ class PrivateRospy:
         self._stopping = threading.Lock()
         # whether a newer node has it: what registers this one again would end that one
         self.has_lost_name = False
+        #: (method that undoes it, name, URI) of each registration that failed: a master that only
+        #: hung goes on with it later
+        self.unsure = set()
         #: called with what a hook of rospy.on_shutdown raised
         self.on_failure = lambda error: None
         #: called after the callbacks of a batch of messages, in its thread

@@ -167,6 +167,11 @@ class _Kind(NamedTuple):
                 self.unregister(name, self.uri)  # closed while we registered it
             elif is_subscribing and handler:
                 handler.reg_man.publisher_update(name, publishers)
+        for failed in [each for each in node.unsure if each[0] == self.unregister.__name__]:
+            _, name, uri = failed
+            if name not in dict(self.ours()):
+                self.unregister(name, uri)
+            node.unsure.discard(failed)
         if was_away:
             ours = dict(self.ours())
             for name, nodes in self.theirs.items():

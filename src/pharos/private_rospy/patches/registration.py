@@ -30,6 +30,8 @@ def reg_added(self, resolved_name, data_type_or_uri, reg_type, *, node, module):
     except registration.COMMUNICATION_ERRORS as error:
         code, message, cause = 0, error, error
     if code != 1:
+        uri = data_type_or_uri if reg_type == 'srv' else self.uri
+        node.unsure.add(('un' + method, resolved_name, uri))
         text = (
             f'cannot register {kind} {resolved_name} of {node.name} with the master'
             f' {self.master_uri}: {message}'
@@ -86,6 +88,8 @@ def cleanup(self, reason, *, node, module):
         calls.unregisterPublisher(node.name, name, self.uri)
     for name, uri in services.get_services():
         calls.unregisterService(node.name, name, uri)
+    for unregister, name, uri in tuple(node.unsure):
+        getattr(calls, unregister)(node.name, name, uri)
     node.parameters.unsubscribe(calls)
     try:
         calls()
