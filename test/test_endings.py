@@ -269,6 +269,19 @@ def test_a_node_may_start_again_at_the_end_of_its_stop(master):
     assert not node.is_running
 
 
+def test_a_soul_in_spin_ends_with_its_node(master, monkeypatch):
+    has_nodes, spinning = node_registry._has_nodes_to_wait_for, threading.Event()
+    monkeypatch.setattr(
+        node_registry, '_has_nodes_to_wait_for', lambda: spinning.set() or has_nodes()
+    )
+    node, other = create(master, '/node'), create(master, '/other')
+    soul = node.fork(lambda me: node_registry.spin())
+    assert spinning.wait(TIMEOUT)
+    node.stop()
+    assert not soul.is_alive()
+    assert other.is_running
+
+
 # -- stop() during the start
 
 

@@ -25,7 +25,7 @@ from pharos import signals
 from pharos.blocks import name_of
 from pharos.errors import NodeNameInUseError, PharosError
 from pharos.private_rospy import process_rospy
-from pharos.private_rospy.lifetime import SIGNAL_LATENCY
+from pharos.private_rospy.lifetime import SIGNAL_LATENCY, Interruption
 
 if TYPE_CHECKING:
     from pharos.node import Node
@@ -234,12 +234,14 @@ def spin() -> None:
     """Block until every node of the process has stopped, or Ctrl-C, SIGTERM or SIGHUP, which stop
     them.
 
-    A node whose ``stop()`` does not end within 30 s is not waited for.
+    A node whose ``stop()`` does not end within 30 s is not waited for. In a soul or delegate, it
+    ends with the node.
     """
+    mine = Interruption()
     with signals.interruptible_wait():
         try:
             with changed:
-                while _has_nodes_to_wait_for():
+                while _has_nodes_to_wait_for() and not mine.came:
                     changed.wait(SIGNAL_LATENCY)
         except KeyboardInterrupt:  # the host program has a handler of its own
             stop_all()
