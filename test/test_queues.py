@@ -140,6 +140,49 @@ def test_a_queue_never_holds_more_than_it_may_and_counts_what_it_drops(steps):
         assert receiver.dropped == len(put) - len(receiver.taken) - len(inbox._queue)
 
 
+def test_no_delegate_begins_to_run_inline_once_the_dispatcher_has_closed():
+    dispatcher = Dispatcher(None)
+    receiver, closing = Receiver(), Receiver()
+    inbox, others = Inbox(receiver, dispatcher), Inbox(closing, dispatcher)
+
+    def close(message, header):
+        dispatcher.close()
+        inbox.put('put while another delegate runs')
+
+    closing.deliver = close
+    others.put('closes')
+    dispatcher.run()
+    assert receiver.taken == []
+    inbox.put('put afterwards')
+    dispatcher.run()
+    assert receiver.taken == []
+
+
+def test_a_dispatcher_that_closes_while_its_thread_waits_for_a_delegate_runs_no_more():
+    threads = []
+
+    def start_thread(target, name):
+        threads.append(threading.Thread(target=target, name=name, daemon=True))
+        threads[-1].start()
+
+    dispatcher = Dispatcher(start_thread)
+    receiver = Receiver()
+    receiver.inline = False
+    inbox = Inbox(receiver, dispatcher)
+    dispatcher.need_thread()
+
+    def close_while_the_thread_waits():
+        inbox.put('waits for this delegate')
+        dispatcher.wake()
+        until(lambda: not dispatcher.scheduled, what='the thread to take the inbox')
+        dispatcher.close()
+
+    dispatcher.run_in_turn(close_while_the_thread_waits)
+    threads[0].join(TIMEOUT)
+    assert not threads[0].is_alive()
+    assert receiver.taken == []
+
+
 class Connection:
     """A connection whose socket is full, and stays so."""
 

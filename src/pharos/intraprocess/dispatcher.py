@@ -2,9 +2,11 @@
 
 A node's delegates run in one of two threads: in the thread that brings the message (a TCPROS
 connection's, where the delegate is fast, or the publisher's where a channel is inline), or in the
-node's dispatcher thread. Nobody ever waits for a busy node: what comes meanwhile waits in its inbox
-for whoever is running the node. So no wiring deadlocks or recurses. Nor does a thread run a node
-for long because others bring messages: those it leaves to the dispatcher thread.
+node's dispatcher thread. No one who brings a message waits for a busy node: what comes meanwhile
+waits in its inbox for whoever is running the node. So no wiring deadlocks or recurses. (The
+``close()`` of a channel and the ``retry()`` of a failure do wait for the delegate that runs.) Nor
+does a thread run a node for long because others bring messages: those it leaves to the dispatcher
+thread.
 """
 import collections
 import threading
@@ -40,12 +42,14 @@ class Dispatcher:
         self.idle = False  # whether that thread waits for inboxes
         self._running = threading.Lock()  # held by the thread that runs delegates,
         self._runner: Optional[int] = None  # which is this one, by its identifier
-        self._start_thread, self._name, self._started = start_thread, name, threading.Lock()
+        self._start_thread, self._name = start_thread, name
+        self._thread_claim = threading.Lock()  # taken for good by who starts the thread
         self._closed = self._finishing = False
-        # bare locks as signals: every other primitive costs several of them
-        self._woken, self._awake = allocate_lock(), allocate_lock()
-        self._woken.acquire()
-        self._awake.acquire()
+        # Two bare locks serve as signals, for every other primitive costs several of them. Each is
+        # held until it is released to say something: that the thread is to wake up, and that it has.
+        self._wake_signal, self._awake_signal = allocate_lock(), allocate_lock()
+        self._wake_signal.acquire()
+        self._awake_signal.acquire()
 
     def run(self) -> None:
         """Run the delegates of the inline inboxes in this thread, unless another thread is running
@@ -56,17 +60,20 @@ class Dispatcher:
         let this thread go.
         """
         inline, running = self.inline, self._running
-        turns, until = len(inline), 0.0
+        owed = len(inline)  # runs that are due in any case: those of the inboxes that wait now
+        deadline = 0.0  # of what comes meanwhile; 0.0 until all that was owed has run
         while inline and running.acquire(False):
             self._runner = get_ident()
             try:
                 while inline:
-                    if turns <= 0:
+                    if self._closed:
+                        return
+                    if owed <= 0:
                         now = time.perf_counter()
-                        until = until or now + COURTESY
-                        if now > until:
+                        deadline = deadline or now + COURTESY
+                        if now > deadline:
                             break
-                    turns -= 1
+                    owed -= 1
                     inline.popleft().run_next()
             except IndexError:
                 pass  # close() cleared it
@@ -74,7 +81,7 @@ class Dispatcher:
                 self._runner = None
                 running.release()
             # looked at again: what was scheduled just before the release found the node busy
-            if until and inline:
+            if deadline and inline:
                 self._leave_to_thread()
                 return
 
@@ -119,7 +126,7 @@ class Dispatcher:
 
     def need_thread(self) -> None:
         """Have the dispatcher thread, from the first channel on that is not inline."""
-        if self._started.acquire(blocking=False):
+        if self._thread_claim.acquire(blocking=False):
             self._start_thread(self._loop, name=self._name)
 
     def schedule(self, inbox: Runnable) -> None:
@@ -131,33 +138,35 @@ class Dispatcher:
     def wake(self) -> None:
         """Wake the dispatcher thread, which is idle."""
         self.idle = False
-        self._awake.acquire(False)  # a stale acknowledgement
-        _release(self._woken)
+        self._awake_signal.acquire(False)  # takes back what was said of an earlier waking
+        _release(self._wake_signal)
 
     def yield_gil(self) -> None:
         """Let the woken dispatcher thread have the interpreter: it would get it 5 ms later from a
         busy publisher."""
-        self._awake.acquire(True, YIELD_LIMIT)
+        self._awake_signal.acquire(True, YIELD_LIMIT)
 
     def _loop(self) -> None:
         scheduled, inline = self.scheduled, self.inline
         acquire, release = self._running.acquire, self._running.release  # ``with`` costs more
         me = get_ident()
-        while not self._closed:
+        while True:
             try:
                 inbox = scheduled.popleft()
             except IndexError:
-                if self._finishing:
+                if self._closed or self._finishing:
                     return
                 self.idle = True
                 if not (scheduled or self._closed or self._finishing):
-                    self._woken.acquire()
-                    _release(self._awake)
+                    self._wake_signal.acquire()
+                    _release(self._awake_signal)
                 self.idle = False
                 continue
             acquire()
             self._runner = me
             try:
+                if self._closed:  # while this thread waited for the delegate of another one
+                    return
                 inbox.run_next()
             finally:
                 self._runner = None
@@ -171,7 +180,7 @@ class Dispatcher:
         self.wake()
 
     def close(self) -> None:
-        """Forget what has not run, and end the thread."""
+        """Forget what has not run, and end the thread; a delegate that runs goes on to its end."""
         self._closed = True
         self.inline.clear()
         self.scheduled.clear()
