@@ -43,7 +43,7 @@ class Channel:
         self.queue_size, self.queue_bytes = queue_size, node.queue_bytes
         self.closed = False  # whether close() was called
         self._endpoint: Any = None  # rospy's Publisher or Subscriber while the channel is open
-        # guards the above against two threads that close it, and what a subclass has
+        # held to take the endpoint away, for two threads may close the channel at once
         self._lock = threading.Lock()
 
     def open(self) -> None:
@@ -160,7 +160,7 @@ class InputChannel(Channel):
             dispatcher.need_thread()
         inbox = Inbox(self, dispatcher) if self.inline else SocketInbox(self, dispatcher)
         self._opened(self._rospy.connections.subscribe(self, inbox, self.node.connect_timeout))
-        dispatcher.run()  # what came latched
+        dispatcher.run()  # the inline inboxes that latched messages have filled
 
     def _unregister(self, endpoint: Any) -> None:
         self._rospy.connections.unsubscribe(self, endpoint)

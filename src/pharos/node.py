@@ -374,11 +374,11 @@ class Node:
         if wait != 0:
             wait = check_seconds('wait', wait, least=0)
         run = self.current_run
-        channel = run.senders.get(topic) if isinstance(topic, str) else None
+        channel = run.send_channels.get(topic) if isinstance(topic, str) else None
         if channel is None or not channel.is_open:
             check_block(block, 'block', ('message',))
             channel = run.sender(self._topic(topic), typed_as, connect_timeout, wait)
-            run.senders[topic] = channel
+            run.send_channels[topic] = channel
         if typed_as not in (None, channel.message_class, channel.type):
             self._topic(topic).message_class(self, typed_as)  # refuses another type
         # another thread may be opening it just now

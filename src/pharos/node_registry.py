@@ -59,6 +59,14 @@ def nodes() -> 'List[Node]':
         return list(_nodes.values())
 
 
+def is_node(thing: Any) -> bool:
+    """Whether it is a Node of this process.
+
+    By what its class has, for :mod:`pharos.node` imports those that ask.
+    """
+    return hasattr(type(thing), 'latest_run')
+
+
 # -- starts and stops
 
 

@@ -47,13 +47,15 @@ class Run:
         self.node = node
         self.lifecycle = Lifecycle.STARTING
         self.opened: List[Any] = []
-        self.senders: Dict[str, Any] = {}  # topic name, as given to send_to -> its OutputChannel
+        # topic name, as given to send_to -> its OutputChannel
+        self.send_channels: Dict[str, Any] = {}
         # topic name -> the lock of the thread that opens a channel to send on it
         self._opening: Dict[str, Any] = {}
         self._settings = settings
         self._to_reopen: List[Any] = []  # those of the former run's that are closed still
-        # what the former run had open, where start() opens it anew
-        self._former: List[Any] = []
+        # what the former run had open, where the class's own start() opens channels: a channel that
+        # it opens for a topic that one of these latched on goes on with that one's Latch
+        self._former_opened: List[Any] = []
         self._starter: Optional[int] = threading.get_ident()  # the thread that starts the node
         self._is_cancelled = False  # whether a stop() came while the node started
         self._forked: 'weakref.WeakSet[threading.Thread]' = weakref.WeakSet()  # they run souls
@@ -86,7 +88,7 @@ class Run:
                     self._to_reopen = list(former.opened)
                     self.rospy.parameters.restore_from_previous_run(former.rospy.parameters)
                 elif former:
-                    self._former = list(former.opened)
+                    self._former_opened = list(former.opened)
                 with node_registry.changed:
                     self._check_not_stopped()
                     self._become(Lifecycle.RUNNING)
@@ -104,7 +106,7 @@ class Run:
                 raise  # it could not be claimed
             is_stopped = self._is_cancelled or self.is_ending
             if self.is_starting:
-                self.rospy.stop(0)
+                self.rospy.finish_stop(0)
                 self.node.latest_run = former  # type: ignore[assignment]
                 self._become(Lifecycle.STOPPED)
             self.end()
@@ -123,7 +125,7 @@ class Run:
             if not self.is_starting:
                 return
             self._is_cancelled = True
-        self.rospy.end()
+        self.rospy.begin_stop()
 
     def end(self) -> None:
         """End all that the run has, unless it ends already."""
@@ -144,11 +146,13 @@ class Run:
         """What a stop ends, in this order: (how, the seconds that it may take, if it takes any)."""
         timeout = attempt(lambda: check_seconds('stop_timeout', self.node.stop_timeout), 0.0)
         return [
-            (self.rospy.end,),  # what waits
+            (self.rospy.begin_stop,),  # what waits
             (self._end_souls, timeout),
             (self.dispatcher.close,),
-            # links, services, watched parameters, messages under way, registrations, servers,
-            # sockets and threads
+            # In this order: the node leaves the local ones, messages under way are flushed, the hooks
+            # of on_shutdown run, all is unregistered (watched parameters, too), links and topics
+            # close, then services, servers, XML-RPC proxies and sockets; threads are joined, and
+            # handlers of the log closed.
             (self._end_rospy, timeout),
             (self._close_opened,),
         ]
@@ -167,7 +171,7 @@ class Run:
             )
 
     def _end_rospy(self, timeout: float) -> None:
-        left = self.rospy.stop(timeout, self._ignoring)
+        left = self.rospy.finish_stop(timeout, self._ignoring)
         if left:
             Transcript.show(
                 f"{self.node.name} left behind threads that did not end: {', '.join(left)}"
@@ -230,7 +234,7 @@ class Run:
         """It was closed for good."""
         with node_registry.changed:
             self.opened = [other for other in self.opened if other is not opened]
-            self.senders.clear()
+            self.send_channels.clear()
 
     def _reopen(self, opened: Any) -> None:
         """Open what the former run had open, unless that is done, or a thread is doing it."""
@@ -243,14 +247,14 @@ class Run:
     def latch_for(self, topic: str, message_class: Any) -> Latch:
         """The Latch of a new channel: the former run's, where start() opens that channel anew."""
         with node_registry.changed:
-            for channel in self._former:
+            for channel in self._former_opened:
                 if (
                     isinstance(channel, OutputChannel)
                     and (channel.topic, channel.message_class) == (topic, message_class)
                     and channel.latched
                     and not channel.closed
                 ):
-                    self._former.remove(channel)
+                    self._former_opened.remove(channel)
                     return channel.latched
         return Latch()
 
@@ -267,6 +271,7 @@ class Run:
         for which the others wait."""
         opening = self._opening.setdefault(topic.name, threading.RLock())
         limit = max(0.0, wait + connect_timeout)
+        # False: another thread is still opening it; this one then tries by itself
         is_mine = opening.acquire(timeout=min(limit, threading.TIMEOUT_MAX))
         try:
             for channel in self.opened:
@@ -297,7 +302,7 @@ class Run:
         :param peer: a name, Node or ExternalNode
         :raises ValueError: if it is none of these, or of another master
         """
-        if isinstance(peer, ExternalNode) or hasattr(type(peer), 'latest_run'):
+        if isinstance(peer, ExternalNode) or node_registry.is_node(peer):
             if peer.master != self.node.master:
                 raise ValueError(
                     f'{peer} is at another master than {self.node.name}, and nothing goes from one'

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, List, Optional,
 import genpy
 import rosgraph
 
-from pharos import messages
+from pharos import messages, node_registry
 from pharos.channel import Channel, InputChannel, OutputChannel
 from pharos.errors import (
     MasterUnreachableError,
@@ -154,7 +154,7 @@ class Topic:
             return self._message_class(node, typed_as, wait, receives)
 
     def _check_node(self, node: Any) -> None:
-        if not hasattr(type(node), 'current_run'):
+        if not node_registry.is_node(node):
             raise TypeError(
                 f'a channel on {self.name} is given to a node of this process, not to {node!r}'
             )
@@ -212,9 +212,8 @@ class Topic:
     def _local_classes(self, type_: Any) -> List[Type[genpy.Message]]:
         """The classes with which nodes of this process publish that type on the topic."""
         instances = [node.latest_run.rospy for node in self.master.local_nodes()]
-        publishers = [instance.publisher(self.name) for instance in instances]
-        classes = [publisher.data_class for publisher in publishers if publisher]
-        return [cls for cls in classes if cls._type == type_]
+        classes = [instance.published_class(self.name) for instance in instances]
+        return [cls for cls in classes if cls and cls._type == type_]
 
     def _agree_with_publishers(self, channel: InputChannel) -> None:
         """Have an input channel take the definition of a publisher elsewhere, where none suits it

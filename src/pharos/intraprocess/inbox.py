@@ -7,11 +7,12 @@ import genpy
 
 from pharos.intraprocess.dispatcher import Dispatcher
 
-# seconds; so often a publisher yields to a receiver that takes nothing from a full inbox
+# A publisher yields to a receiver that takes nothing from a full inbox once in so many seconds.
 STARVATION_INTERVAL = 1e-3
-# seconds; a delegate that takes longer is not run by a thread that has a socket to read,
+# A delegate that takes so many seconds is slow: no thread that has a socket to read runs it.
 FAST_CALLBACK = 1e-3
-FAST_STREAK = 10  # and one is that has been faster so many times in a row
+# A delegate that was not slow so many times in a row is run by the thread that reads the socket.
+FAST_STREAK = 10
 
 Thaw = Callable[[Any], genpy.Message]
 
@@ -53,8 +54,8 @@ class Inbox:
     :param header: the ``_connection_header`` of the messages; None where they have one already
     """
 
-    # All that a message needs lies together, which a message that comes alone finds in the
-    # processor's caches with fewer misses.
+    # Slots keep what each message needs close together in memory: a message that comes after a pause
+    # then waits for fewer of the processor's cache lines.
     __slots__ = (
         'receiver',
         'dispatcher',
@@ -91,9 +92,10 @@ class Inbox:
         self._is_scheduled = False
         self._has_taken = True  # since a publisher yielded
         self._last_yield = 0.0
-        # of the large messages in the queue, and for a moment of one more
+        # the sizes of the messages in the queue, where sizes matter; for a moment that of one more
         self._sizes: Deque[int] = collections.deque()
-        # of those put and not dropped, and of those taken: two threads change the two
+        # Their difference is the bytes that wait. They are two, for the thread that puts changes
+        # the one (minus what it drops), and the thread that runs the other, without a lock.
         self._put_bytes = self._taken_bytes = 0
 
     def put(self, value: Any, size: int = 0) -> None:

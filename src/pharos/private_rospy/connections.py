@@ -40,11 +40,11 @@ class Connections:
         # (topic, URI) of each publisher just being connected to -> whether somebody asked again
         self._connecting = {}
 
-    def open(self):
+    def announce(self):
         """The node runs: its neighbours may connect to it."""
         _running[self._node.uri] = self._node
 
-    def close(self):
+    def withdraw(self):
         """The node stops."""
         if _running.get(self._node.uri) is self._node:
             del _running[self._node.uri]

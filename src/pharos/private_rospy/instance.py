@@ -126,14 +126,14 @@ class PrivateRospy:
 
         :param timeout: seconds that the master may take
         :raises MasterUnreachableError, NodeNameInUseError, PortInUseError:
-        :raises NodeStoppedError: if :meth:`end` was called meanwhile
+        :raises NodeStoppedError: if :meth:`begin_stop` was called meanwhile
         """
         settings = self.settings
         self._deadline = time.monotonic() + timeout
         with time_limit(timeout), self._reached():
             registration.claim_name(settings.master_url, self.name, timeout)
         # the first, so that the threads that rospy waits for end at once
-        self.rospy.core._shutdown_hooks.insert(0, lambda reason: self.end())
+        self.rospy.core._shutdown_hooks.insert(0, lambda reason: self.begin_stop())
         try:
             with _ports_checked('tcp_port', settings.tcp_port):
                 self.tcp_port = tcpros_server.listen(self.rospy.impl.tcpros_base, settings.tcp_port)
@@ -149,7 +149,7 @@ class PrivateRospy:
                     )
             self._check_not_ended()
         except BaseException:
-            self.stop(0)
+            self.finish_stop(0)
             raise
         self.xmlrpc_port = self.lifetime.xmlrpc.port
         self.domain = self.import_library('rosgraph.network').get_host_name()
@@ -184,9 +184,9 @@ class PrivateRospy:
                 target=self._on_stop_request, args=(reason,), name=self.name + ' stop', daemon=True
             ).start()
 
-    def end(self):
-        """Begin the stop: all that waits ends, ``is_shutdown()`` holds, and nothing more is
-        received."""
+    def begin_stop(self):
+        """Begin the stop: all that waits ends, ``is_shutdown()`` holds, and nothing more is read
+        from sockets; nodes of this process still deliver until the dispatcher closes."""
         self.lifetime.begin_shutdown()
         waiting = [self.rospy.rostime.get_rostime_cond()]  # simulated time may stand still
         handler = self.handler
@@ -196,7 +196,7 @@ class PrivateRospy:
             with changed:
                 changed.notify_all()
 
-    def stop(self, flush_timeout, abandoned=()):
+    def finish_stop(self, flush_timeout, abandoned=()):
         """Send what is under way (for up to ``flush_timeout`` seconds), unregister, close the
         ports, end the threads.
 
@@ -205,7 +205,7 @@ class PrivateRospy:
         """
         if not self._stopping.acquire(blocking=False):
             return []
-        self.connections.close()
+        self.connections.withdraw()
         core = self.rospy.core
         self._flush(flush_timeout)
         core.signal_shutdown('stop')
@@ -252,6 +252,11 @@ class PrivateRospy:
     def debug(self, text):
         """A line in the node's log for those who look for errors."""
         self.rospy.logdebug('%s', text)
+
+    def published_class(self, topic):
+        """The message class with which the node publishes on the topic; None where it does not."""
+        publisher = self.publisher(topic)
+        return publisher and publisher.data_class
 
     @property
     def thread_count(self):

@@ -23,7 +23,7 @@ def init_handler(self, name, master_uri, *, node, original):
 def _ready(self, uri, *, node, original):
     """Be found by those who hear of the node from the master, as soon as it registers."""
     node.uri = uri
-    node.connections.open()
+    node.connections.announce()
     original(self, uri)
 
 
