@@ -106,3 +106,17 @@ def test_what_the_tests_import_is_declared():
 
 def test_nothing_is_declared_twice():
     assert declared('exec_depend') & declared('test_depend') == set()
+
+
+def test_the_tools_install_what_debian_has_under_that_name():
+    """The rest comes along with rospy and roslaunch."""
+    manifest = xml.etree.ElementTree.parse(ROOT / 'package.xml')
+    needed = {element.text for element in manifest.iter('exec_depend')}
+    for tool in 'demo', 'test':
+        text = (ROOT / 'tools' / tool).read_text()
+        missing = [
+            name for name in needed if name.startswith('python3-') and f' {name} ' not in text
+        ]
+        assert [
+            name for name in missing if name not in ('python3-rospkg', 'python3-tk')
+        ] == [], tool

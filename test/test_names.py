@@ -331,9 +331,9 @@ def test_to_a_node_that_is_not_interested_is_said_once_and_not_counted(master, n
 
 
 def test_to_a_program_elsewhere(master, node):
-    node.output_channel('/afar', STRING)  # rostopic waits for the type
+    channel = node.output_channel('/afar', STRING)  # rostopic waits for the type
     with Program(master.url, 'rostopic', 'echo', '/afar', '__name:=hearer') as echo:
-        until(lambda: master.topic('/afar').subscribers, what='the subscriber')
+        assert channel.wait_for_subscribers(1, TIMEOUT)  # the master knows it some time before
         hearer = master.topic('/afar').subscribers[0]
         node.send_to('/afar', data='hello', to=hearer)
         assert echo.wait_for('hello')
