@@ -12,6 +12,7 @@ from pharos.errors import MessageTypeError, NodeStoppedError
 from pharos.external_node import ExternalNode
 from pharos.intraprocess.dispatcher import Dispatcher
 from pharos.intraprocess.fanout import Latch
+from pharos.private_rospy import changes
 from pharos.private_rospy.instance import PrivateRospy
 from pharos.private_rospy.names import Resolved, check_name
 from pharos.private_rospy.process_rospy import rospy
@@ -180,6 +181,7 @@ class Run:
     def _close_opened(self) -> None:
         for opened in self.opened:
             opened.node_stopped()
+        changes.notify()  # for sends that began when the stop had, and wait for subscribers
 
     def abandon(self) -> None:
         """This is a process that was forked: the node runs in its parent, and here it is
