@@ -15,11 +15,12 @@ from typing import (
 import rosgraph
 from rosgraph.rosenv import ROS_MASTER_URI
 
-from pharos import embedded_master, node as nodes_of_ours, node_registry, ros_process
+from pharos import attributes, embedded_master, node_registry, ros_process
 from pharos.blocks import check_block
 from pharos.errors import PharosError, UnknownNodeError, suggest
 from pharos.external_node import ExternalNode
 from pharos.master_calls import MasterCalls
+from pharos.node import Node
 from pharos.parameters import Parameters
 from pharos.private_rospy.addresses import check_port, check_url
 from pharos.private_rospy.names import check_name, global_name
@@ -35,8 +36,8 @@ if TYPE_CHECKING:
     from typing_extensions import ParamSpec  # part of typing since Python 3.10
 
     Init = ParamSpec('Init')
-NodeType = TypeVar('NodeType', bound=nodes_of_ours.Node)
-AnyNode = Union[nodes_of_ours.Node, ExternalNode]
+NodeType = TypeVar('NodeType', bound=Node)
+AnyNode = Union[Node, ExternalNode]
 
 
 class Master(MasterCalls):
@@ -142,7 +143,7 @@ class Master(MasterCalls):
         :raises ValueError: if a name, port or address cannot be one, also an address in
             ROS_HOSTNAME or ROS_IP
         """
-        node = nodes_of_ours.make(
+        node = attributes.make(
             node_class,
             self,
             named,
@@ -285,7 +286,7 @@ class Master(MasterCalls):
         """The parameter server as a mapping: ``master.parameters['/rosdistro']``."""
         return Parameters(self)
 
-    def local_nodes(self) -> List[nodes_of_ours.Node]:
+    def local_nodes(self) -> List[Node]:
         """The nodes of this process at this master."""
         return [node for node in node_registry.nodes() if node.master == self]
 
@@ -321,7 +322,7 @@ class Master(MasterCalls):
         return f'<Master {self.url}>'
 
 
-def _start(node: nodes_of_ours.Node) -> None:
+def _start(node: Node) -> None:
     with node_registry.start_of(node):
         try:
             node.start()

@@ -1,40 +1,34 @@
 """Nodes: real ROS nodes of this process, written with blocks."""
 import contextlib
 import functools
-import inspect
-import numbers
 import threading
 from typing import TYPE_CHECKING, Any, Callable, Iterator, List, Optional, Type, Union
 
 import genpy
 
 from pharos import node_registry, signals
-from pharos.blocks import attempt, check_block, check_delegate, check_runs, check_soul
+from pharos.attributes import Block, NodeAttributes
+from pharos.blocks import check_block, check_soul
 from pharos.channel import InputChannel, OutputChannel
 from pharos.errors import NodeStoppedError, PharosError
-from pharos.failures import Failure, Failures
 from pharos.health import Health, health_of
 from pharos.offered_service import OfferedService
 from pharos.parameter import Parameter
 from pharos.private_rospy.process_rospy import rospy
-from pharos.private_rospy.settings import Settings
 from pharos.run import Lifecycle, Run
 from pharos.seconds import check_seconds
 from pharos.topic import QUEUE_SIZE, Topic
-from pharos.transcript import Transcript
 
 if TYPE_CHECKING:
     from pharos.external_node import ExternalNode
-    from pharos.master import Master
 
     Peer = Union[str, 'Node', ExternalNode, None]
 
-Block = Optional[Callable[..., Any]]
 TypedAs = Union[str, Type[genpy.Message], None]
 Channel = Union[InputChannel, OutputChannel]
 
 
-class Node:
+class Node(NodeAttributes):
     """A ROS node of this process: made by :meth:`Master.create`, subclassed to override
     :meth:`start` and :meth:`stop`.
 
@@ -49,60 +43,15 @@ class Node:
     ``create``.
     """
 
-    #: seconds that a topic's first message waits for the subscribers the master knows
-    connect_timeout = 2.0
-    #: bytes of messages, about, that wait for a slow receiver for each publisher, or one message
-    queue_bytes = 64 << 20
-    #: whether any host may ask it to stop, not only this one and the master's
-    allow_remote_shutdown = False
-    #: seconds that :meth:`stop` waits for souls, and for messages under way
-    stop_timeout = 2.0
-
-    #: the run of the present start, or the last one; None before the first start
-    latest_run: Run = None  # type: ignore[assignment]
     #: whether a start opens again what the last run had; a start() of one's own opens it itself
     _reopens = True
 
-    def __init__(self) -> None:
-        if '_settings' not in vars(self):
-            name = type(self).__name__
-            raise TypeError(
-                f'a node is made by a master: Master().create({name}, named=...), not {name}()'
-            )
-
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        for name in ('soul', 'delegate'):
-            if name in vars(cls) and not isinstance(vars(cls)[name], property):
-                raise TypeError(
-                    f'{cls.__name__}.{name} would never run: each node has a {name} of its own,'
-                    f' given to create() or set. Name it otherwise, and set self.{name} in start()'
-                )
-        for name in _CHECKED.intersection(vars(cls)):
-            value = getattr(cls, name)
-            if not isinstance(value, property) and _checked(name, value) is not value:
-                setattr(cls, name, _checked(name, value))
-        for method in cls.start, cls.stop:
-            check_runs(method, f'{cls.__name__}.{method.__name__}')
         cls._reopens = cls.start is Node.start
         if 'start' in vars(cls):
             cls.start = _of_one_run(cls.start)  # type: ignore[assignment]
         cls.stop = node_registry.one_stop_at_a_time(cls.stop)  # type: ignore[assignment]
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name in _CHECKED:
-            if name in ('start', 'stop') or name in _SET_ONCE and name in vars(self):
-                raise _not_to_be_set(name)
-            value = _checked(name, value)
-        super().__setattr__(name, value)
-
-    def _configure(
-        self, master: 'Master', settings: Settings, soul: Block, delegate: Block
-    ) -> None:
-        self.master = master
-        self._settings = settings
-        self._errors = Failures(self._tell_failure)
-        self.soul, self.delegate = soul, delegate
 
     # -- life
 
@@ -134,19 +83,6 @@ class Node:
         stopped, too: its start raises NodeStoppedError.
         """
         self.current_run.end()
-
-    @property
-    def name(self) -> str:
-        """The node's name, as the master knows it: '/robot1/driver'."""
-        return self._settings.name
-
-    @name.setter
-    def name(self, value: Any) -> None:
-        raise AttributeError(
-            f'{self.name} is the name by which the master knows the node: give another one to'
-            f' create(), as named={value!r}, and what else {type(self).__name__} is called to'
-            ' another attribute'
-        )
 
     @property
     def lifecycle(self) -> Lifecycle:
@@ -202,33 +138,6 @@ class Node:
 
     # -- blocks
 
-    @property
-    def soul(self) -> Block:
-        """The block that says what the node does, called as ``soul(node)`` by :meth:`execute` and
-        :meth:`fork`.
-
-        May be replaced while the node runs, and takes effect with the next run.
-        """
-        return self._soul
-
-    @soul.setter
-    def soul(self, block: Block) -> None:
-        self._soul = check_soul(block)
-
-    @property
-    def delegate(self) -> Block:
-        """The block run for each message received, called as ``delegate(message, channel)``.
-
-        The report: ``self receiverDelegate: [:message :channel | ...]``. Delegates of a node run
-        one at a time. It may be replaced while the node runs, and takes effect with the next
-        message.
-        """
-        return self._delegate
-
-    @delegate.setter
-    def delegate(self, block: Block) -> None:
-        self._delegate = check_delegate(block)
-
     def execute(self) -> Any:
         """Run the soul once, in the calling thread, and return its value.
 
@@ -253,25 +162,6 @@ class Node:
                 f'{self.name} has no soul to run: give it one with soul= or node.soul ='
             )
         return lambda: run.run_soul(soul, again=lambda nothing: self._soul_runner(block)())
-
-    @property
-    def errors(self) -> Failures:
-        """The exceptions that blocks raised, the newest last: of identical ones the newest alone.
-
-        100 are kept, among them the first, for it may be the cause of the others. Who has seen to
-        them may ``pop`` or ``clear`` them.
-        """
-        return self._errors
-
-    @property
-    def failures(self) -> List[Failure]:
-        """For each of :attr:`errors` its :class:`~pharos.Failure`: what failed, on what, how
-        often."""
-        return self._errors.all()
-
-    def _tell_failure(self, line: str, details: str) -> None:
-        attempt(lambda: self.log(f'{line}\n{details}' if details else line, level='error'))
-        Transcript.show(line)
 
     # -- topics
 
@@ -395,7 +285,9 @@ class Node:
 
     # -- services, parameters, log
 
-    def serve(self, name: str, typed_as: TypedAs, block: Callable[[Any], Any]) -> OfferedService:
+    def serve(
+        self, name: str, typed_as: Union[str, type], block: Callable[[Any], Any]
+    ) -> OfferedService:
         """Offer a service; returns a handle with ``close()``.
 
         ``block(request)`` runs in a thread of the caller's connection and returns a response, a
@@ -411,21 +303,6 @@ class Node:
         """The :class:`Parameter` of that name ('~rate' is private); set to ``initialized`` where it
         has no value."""
         return Parameter(self, self.current_run.resolve(name, 'parameter'), initialized)
-
-    def log(self, text: str, level: str = 'info') -> None:
-        """Log a line on /rosout, the node's log file and the screen, with the file and line of the
-        caller.
-
-        :param level: 'debug', 'info', 'warning' (or 'warn'), 'error' or 'fatal'
-        """
-        try:
-            level = _LEVELS[level]
-        except KeyError:
-            raise ValueError(f"no log level {level!r}: there are {', '.join(_LEVELS)}") from None
-        if self.latest_run is not None:
-            log = self.latest_run.rospy.log
-            # no wrapper between: rospy looks for the caller of this method
-            log('%s', (text,), {}, level=level)
 
     # -- what rospy offers beyond
 
@@ -448,16 +325,6 @@ class Node:
         return self.latest_run.rospy.uri if self.latest_run else None
 
     @property
-    def tcp_port(self) -> int:
-        """The TCPROS port; the one asked for, before the first start."""
-        return self._settings.tcp_port
-
-    @property
-    def xmlrpc_port(self) -> int:
-        """The XML-RPC port; the one asked for, before the first start."""
-        return self._settings.xmlrpc_port
-
-    @property
     def domain(self) -> Optional[str]:
         """The address that the node advertises, None before the first start."""
         return self.latest_run.rospy.domain if self.latest_run else None
@@ -478,40 +345,6 @@ class Node:
         )
 
 
-def _of_one_run(start: Callable[..., Any]) -> Callable[..., Any]:
-    @functools.wraps(start)
-    def start_in_run(node: Node, *args: Any, **kwargs: Any) -> Any:
-        with node_registry.start_of(node):
-            return start(node, *args, **kwargs)
-
-    return start_in_run
-
-
-_METHODS = frozenset(name for name, value in vars(Node).items() if inspect.isfunction(value))
-_SET_ONCE = frozenset(['master', '_settings', '_errors'])
-_SECONDS = frozenset(['connect_timeout', 'stop_timeout'])
-#: attributes without which a node could not work, nor stop
-_CHECKED = _METHODS | _SET_ONCE | _SECONDS | {'queue_bytes'}
-
-
-def _checked(name: str, value: Any) -> Any:
-    """The value that an attribute of Node's gets, in a class or one of its nodes."""
-    if name in _SECONDS:
-        return check_seconds(name, value)
-    is_number = isinstance(value, numbers.Real)
-    if name == 'queue_bytes' and not (is_number and value > 0):
-        raise ValueError(f'queue_bytes is a number of bytes above 0, not {value!r}')
-    if name in _METHODS and not callable(value):
-        raise _not_to_be_set(name)
-    return value
-
-
-def _not_to_be_set(name: str) -> AttributeError:
-    return AttributeError(
-        f'{name} is what each Node has, and needs: give what else has that name another one'
-    )
-
-
 class BlockNode(Node):
     """A node made of blocks alone, for tests and prototypes.
 
@@ -524,25 +357,10 @@ class BlockNode(Node):
     """
 
 
-def make(
-    node_class: Type[Node],
-    master: 'Master',
-    named: str,
-    soul: Block,
-    delegate: Block,
-    args: Any,
-    kwargs: Any,
-    **settings: Any,
-) -> Node:
-    """A new node of ``node_class``, configured and not yet started."""
-    if not (isinstance(node_class, type) and issubclass(node_class, Node)):
-        raise TypeError(f'a node is made of a subclass of Node, or BlockNode; not {node_class!r}')
-    node = node_class.__new__(node_class)
-    node._configure(master, Settings(named, master.url, **settings), soul, delegate)
-    node.__init__(*args, **kwargs)  # type: ignore[misc]
-    return node
+def _of_one_run(start: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(start)
+    def start_in_run(node: Node, *args: Any, **kwargs: Any) -> Any:
+        with node_registry.start_of(node):
+            return start(node, *args, **kwargs)
 
-
-# names of levels -> rospy's
-_LEVELS = {level: level for level in ('debug', 'info', 'warning', 'error', 'critical')}
-_LEVELS.update(warn='warning', err='error', fatal='critical')
+    return start_in_run

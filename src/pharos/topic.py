@@ -191,10 +191,10 @@ class Topic:
             own = self._local_classes(type_or_class)
             if own:
                 return own[0]
-            known = messages.class_from_publishers(self.name, type_or_class, self._headers())
-            if known is None:
+            found = messages.class_from_publishers(self.name, type_or_class, self._headers())
+            if found is None:
                 raise
-            return known
+            return found
         if receives and known is not type_or_class and messages.is_provisional(known):
             own = self._local_classes(known._type)
             return next((cls for cls in own if cls._md5sum == known._md5sum), (own or [known])[0])

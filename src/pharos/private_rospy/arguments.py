@@ -7,6 +7,7 @@ one alone says so as in ROS 2: ``detector:image:=/camera/image``.
 """
 import re
 import threading
+from typing import Any, List
 
 import rosgraph.names
 
@@ -14,7 +15,7 @@ from pharos.private_rospy.addresses import is_same_master
 
 _FOR_ONE = re.compile(r'([A-Za-z]\w*):(?!=)(.*)', re.ASCII | re.DOTALL)
 # (master URL, arguments, node that takes the __name in them): for good, since nodes start again
-_takers = []
+_takers: List[Any] = []
 _lock = threading.Lock()  # guards it
 
 

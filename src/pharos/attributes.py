@@ -1,0 +1,206 @@
+"""What a node has, whether it runs or not: its settings, blocks, failures and log; and what may be
+set of it, in its class or on it."""
+import inspect
+import numbers
+from typing import TYPE_CHECKING, Any, Callable, FrozenSet, List, Optional, TypeVar
+
+from pharos.blocks import attempt, check_delegate, check_runs, check_soul
+from pharos.failures import Failure, Failures
+from pharos.private_rospy.settings import Settings
+from pharos.seconds import check_seconds
+from pharos.transcript import Transcript
+
+if TYPE_CHECKING:
+    from pharos.master import Master
+    from pharos.run import Run
+
+#: what a node runs, or None
+Block = Optional[Callable[..., Any]]
+NodeType = TypeVar('NodeType', bound='NodeAttributes')
+_SET_ONCE = frozenset(['master', '_settings', '_errors'])
+_SECONDS = frozenset(['connect_timeout', 'stop_timeout'])
+_NUMBERS = _SECONDS | {'queue_bytes'}
+# names of levels -> rospy's
+_LEVELS = {level: level for level in ('debug', 'info', 'warning', 'error', 'critical')}
+_LEVELS.update(warn='warning', err='error', fatal='critical')
+
+
+class NodeAttributes:
+    """What lasts of a node from its making on; the base of Node alone, which adds its life.
+
+    Whatever a user sets is checked here, so that the node can still work, and stop.
+    """
+
+    #: seconds that a topic's first message waits for the subscribers the master knows
+    connect_timeout = 2.0
+    #: bytes of messages, about, that wait for a slow receiver for each publisher, or one message
+    queue_bytes = 64 << 20
+    #: whether any host may ask it to stop, not only this one and the master's
+    allow_remote_shutdown = False
+    #: seconds that :meth:`stop` waits for souls, and for messages under way
+    stop_timeout = 2.0
+
+    #: the run of the present start, or the last one; None before the first start
+    latest_run: 'Run' = None  # type: ignore[assignment]
+    #: names of the methods of Node, without which it could not work, nor stop
+    _methods: FrozenSet[str] = frozenset()
+
+    def __init__(self) -> None:
+        if '_settings' not in vars(self):
+            name = type(self).__name__
+            raise TypeError(
+                f'a node is made by a master: Master().create({name}, named=...), not {name}()'
+            )
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if NodeAttributes in cls.__bases__:  # Node itself
+            methods = inspect.getmembers(cls, inspect.isfunction)
+            cls._methods = frozenset(name for name, _ in methods)
+            return
+        for name in ('soul', 'delegate'):
+            if name in vars(cls) and not isinstance(vars(cls)[name], property):
+                raise TypeError(
+                    f'{cls.__name__}.{name} would never run: each node has a {name} of its own,'
+                    f' given to create() or set. Name it otherwise, and set self.{name} in start()'
+                )
+        for name in (cls._methods | _NUMBERS).intersection(vars(cls)):
+            value = getattr(cls, name)
+            if not isinstance(value, property) and cls._checked(name, value) is not value:
+                setattr(cls, name, cls._checked(name, value))
+        for name in ('start', 'stop'):
+            check_runs(getattr(cls, name), f'{cls.__name__}.{name}')
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in ('start', 'stop') or name in _SET_ONCE and name in vars(self):
+            raise _not_to_be_set(name)
+        super().__setattr__(name, self._checked(name, value))
+
+    @classmethod
+    def _checked(cls, name: str, value: Any) -> Any:
+        """The value that an attribute gets, in a class of nodes or in one of them."""
+        if name in _SECONDS:
+            return check_seconds(name, value)
+        is_number = isinstance(value, numbers.Real)
+        if name == 'queue_bytes' and not (is_number and value > 0):
+            raise ValueError(f'queue_bytes is a number of bytes above 0, not {value!r}')
+        if name in cls._methods and not callable(value):
+            raise _not_to_be_set(name)
+        return value
+
+    def _configure(
+        self, master: 'Master', settings: Settings, soul: Block, delegate: Block
+    ) -> None:
+        self.master = master
+        self._settings = settings
+        self._errors = Failures(self._tell_failure)
+        self.soul, self.delegate = soul, delegate
+
+    @property
+    def name(self) -> str:
+        """The node's name, as the master knows it: '/robot1/driver'."""
+        return self._settings.name
+
+    @name.setter
+    def name(self, value: Any) -> None:
+        raise AttributeError(
+            f'{self.name} is the name by which the master knows the node: give another one to'
+            f' create(), as named={value!r}, and what else {type(self).__name__} is called to'
+            ' another attribute'
+        )
+
+    @property
+    def tcp_port(self) -> int:
+        """The TCPROS port; the one asked for, before the first start."""
+        return self._settings.tcp_port
+
+    @property
+    def xmlrpc_port(self) -> int:
+        """The XML-RPC port; the one asked for, before the first start."""
+        return self._settings.xmlrpc_port
+
+    @property
+    def soul(self) -> Block:
+        """The block that says what the node does, called as ``soul(node)`` by :meth:`execute` and
+        :meth:`fork`.
+
+        May be replaced while the node runs, and takes effect with the next run.
+        """
+        return self._soul
+
+    @soul.setter
+    def soul(self, block: Block) -> None:
+        self._soul = check_soul(block)
+
+    @property
+    def delegate(self) -> Block:
+        """The block run for each message received, called as ``delegate(message, channel)``.
+
+        The report: ``self receiverDelegate: [:message :channel | ...]``. Delegates of a node run
+        one at a time. It may be replaced while the node runs, and takes effect with the next
+        message.
+        """
+        return self._delegate
+
+    @delegate.setter
+    def delegate(self, block: Block) -> None:
+        self._delegate = check_delegate(block)
+
+    @property
+    def errors(self) -> Failures:
+        """The exceptions that blocks raised, the newest last: of identical ones the newest alone.
+
+        100 are kept, among them the first, for it may be the cause of the others. Who has seen to
+        them may ``pop`` or ``clear`` them.
+        """
+        return self._errors
+
+    @property
+    def failures(self) -> List[Failure]:
+        """For each of :attr:`errors` its :class:`~pharos.Failure`: what failed, on what, how
+        often."""
+        return self._errors.all()
+
+    def _tell_failure(self, line: str, details: str) -> None:
+        attempt(lambda: self.log(f'{line}\n{details}' if details else line, level='error'))
+        Transcript.show(line)
+
+    def log(self, text: str, level: str = 'info') -> None:
+        """Log a line on /rosout, the node's log file and the screen, with the file and line of the
+        caller.
+
+        :param level: 'debug', 'info', 'warning' (or 'warn'), 'error' or 'fatal'
+        """
+        try:
+            level = _LEVELS[level]
+        except KeyError:
+            raise ValueError(f"no log level {level!r}: there are {', '.join(_LEVELS)}") from None
+        if self.latest_run is not None:
+            log = self.latest_run.rospy.log
+            # no wrapper between: rospy looks for the caller of this method
+            log('%s', (text,), {}, level=level)
+
+
+def make(
+    node_class: Callable[..., NodeType],
+    master: 'Master',
+    named: str,
+    soul: Block,
+    delegate: Block,
+    args: Any,
+    kwargs: Any,
+    **settings: Any,
+) -> NodeType:
+    """A new node of ``node_class``, configured and not yet started."""
+    if not (isinstance(node_class, type) and issubclass(node_class, NodeAttributes)):
+        raise TypeError(f'a node is made of a subclass of Node, or BlockNode; not {node_class!r}')
+    node: NodeType = node_class.__new__(node_class)
+    node._configure(master, Settings(named, master.url, **settings), soul, delegate)
+    node.__init__(*args, **kwargs)
+    return node
+
+
+def _not_to_be_set(name: str) -> AttributeError:
+    return AttributeError(
+        f'{name} is what each Node has, and needs: give what else has that name another one'
+    )
