@@ -6,6 +6,7 @@ setup(
     **generate_distutils_setup(
         packages=[
             'pharos',
+            'pharos.compose',
             'pharos.intraprocess',
             'pharos.messages',
             'pharos.private_rospy',

@@ -38,7 +38,11 @@ def sources(*folders):
         for path in (ROOT / folder).rglob('*')
         if path.suffix in ('', '.py')
     ]
-    return [path for path in files if path.is_file()]
+    return [path for path in files if path.is_file() and is_python(path)]
+
+
+def is_python(path):
+    return path.suffix == '.py' or 'python' in path.read_text().partition('\n')[0]
 
 
 def imports(source):

@@ -189,7 +189,7 @@ class Master(MasterCalls):
 
     def launch(
         self,
-        package: str,
+        package: Optional[str],
         file: str,
         on_line: Optional[Callable[[str], Any]] = None,
         **args: object,
@@ -197,6 +197,7 @@ class Master(MasterCalls):
         """Start a launch file at this master, as ``roslaunch`` does; returns the
         :class:`RosProcess`.
 
+        :param package: a ROS package; None: ``file`` is a path
         :param args: the launch file's arguments
         :param on_line: block called as ``on_line(text)`` for each line of its output, in a thread
             of its own

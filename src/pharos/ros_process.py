@@ -279,7 +279,7 @@ def _find(package: str, executable: str) -> List[str]:
 
 def launch(
     master: 'Master',
-    package: str,
+    package: Optional[str],
     file: str,
     args: Dict[str, object],
     on_line: Optional[Block] = None,
@@ -291,15 +291,29 @@ def launch(
 
     :raises UnknownNodeError: if there is no such package or launch file
     """
+    path = find_launch_file(package, file)
+    roslaunch = [sys.executable, '-c', 'import roslaunch; roslaunch.main()', '--skip-log-check']
+    arguments = [f'{name}:={value}' for name, value in args.items()]
+    return RosProcess([*roslaunch, path, *arguments], master, on_line)
+
+
+def find_launch_file(package: Optional[str], file: str) -> str:
+    """The path of a launch file, as roslaunch looks it up.
+
+    :param package: None: ``file`` is a path
+    :raises UnknownNodeError: if there is no such package or launch file
+    """
+    if package is None:
+        if not os.path.isfile(file):
+            raise UnknownNodeError(f'there is no launch file {file!r}: is the path spelt so?')
+        return file
     with _known(package):
         found = roslib.packages.find_resource(package, file)
     if not found:
         raise UnknownNodeError(
             f'the ROS package {package} has no launch file {file!r}: is it spelt so, and installed?'
         )
-    roslaunch = [sys.executable, '-c', 'import roslaunch; roslaunch.main()', '--skip-log-check']
-    arguments = [f'{name}:={value}' for name, value in args.items()]
-    return RosProcess([*roslaunch, found[0], *arguments], master, on_line)
+    return str(found[0])
 
 
 @contextlib.contextmanager

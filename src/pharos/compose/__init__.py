@@ -1,0 +1,1 @@
+"""rospy programs and launch files, unmodified, as nodes of this process."""

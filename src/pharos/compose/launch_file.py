@@ -1,0 +1,241 @@
+"""Launch files, read by roslaunch itself, and who is to run which of their nodes."""
+import copy
+import os
+import re
+import shlex
+import sys
+from typing import Any, Collection, Dict, Iterable, List, NamedTuple, Optional, Set, Tuple
+
+import rosgraph.names
+import roslaunch.config
+import roslaunch.core
+import roslaunch.node_args
+import roslaunch.xmlloader
+import rospkg
+
+from pharos.errors import PharosError, UnknownNodeError, suggest
+from pharos.ros_process import find_launch_file
+
+_PYTHON = re.compile(rb'python(3(\.\d+)?)?')
+#: a program of ours makes its nodes itself: within another one they would not end with it
+_USES_PHAROS = re.compile(rb'^\s*(from|import) pharos\b', re.MULTILINE)
+#: what roslaunch lacks in the file, and its words for that
+_MISSING_ARG = re.compile(r"requires the '(\S+)' arg to be set")
+
+
+class LaunchedNode(NamedTuple):
+    """A node of a launch file that is to run in this process."""
+
+    name: str
+    program: str  # 'package/executable'
+    path: str
+    args: List[str]  # the whole command line that roslaunch would give it, but for the path
+    namespace: str
+    env: Dict[str, str]  # what the launch file adds to the environment
+    cwd: str
+    is_cwd_asked_for: bool
+    output: str  # 'log' or 'screen'
+    is_required: bool
+    respawn_delay: Optional[float]  # seconds; None: it is not started again
+    file: str  # the launch file that it is in
+
+
+class Problem(NamedTuple):
+    """Why a node is not started."""
+
+    name: str
+    file: str
+    why: str
+
+    def __str__(self) -> str:
+        return f'{self.file}: {self.name} is not started: {self.why}'
+
+
+class LaunchFile:
+    """A launch file and all that it includes.
+
+    :param master_url: the master that its nodes are for
+    :param package: a ROS package; None: ``file`` is a path
+    :param args: the arguments of the launch file
+    :param only: the names of the nodes that are wanted; all, if there are none
+    :param apart: the names of those that are to run in processes of their own
+    :raises UnknownNodeError: if there is no such package, file, argument or node
+    :raises PharosError: if roslaunch cannot read it
+    """
+
+    def __init__(
+        self,
+        master_url: str,
+        package: Optional[str],
+        file: str,
+        args: Dict[str, object],
+        only: Collection[str] = (),
+        apart: Collection[str] = (),
+    ) -> None:
+        self.path = find_launch_file(package, file)
+        #: roslaunch's configuration, whole
+        self.config = self._read(args)
+        self.config.master.uri = master_url
+        named = {_name_of(node): node for node in self.config.nodes}
+        wanted = self._chosen(only, named) or set(named)
+        kept_apart = self._chosen(apart, named)
+        #: the nodes for this process
+        self.here: List[LaunchedNode] = []
+        #: roslaunch's nodes, for processes of their own
+        self.apart: List[Any] = []
+        #: those that nobody can start
+        self.problems: List[Problem] = []
+        for name, node in named.items():
+            if name in wanted:
+                self._sort(name, node, name in kept_apart)
+
+    def _read(self, args: Dict[str, object]) -> Any:
+        loader = roslaunch.xmlloader.XmlLoader()
+        argv = [f'{name}:={_as_text(value)}' for name, value in args.items()]
+        try:
+            config = roslaunch.config.load_config_default(
+                [(self.path, argv)], None, loader=loader, verbose=False
+            )
+        except (roslaunch.core.RLException, rospkg.ResourceNotFound, ValueError) as error:
+            raise self._unreadable(error) from error
+        declared = loader.root_context.resolve_dict.get('arg_doc', {})
+        with open(self.path, encoding='utf-8', errors='replace') as file:
+            passes_all_on = 'pass_all_args' in file.read()
+        for name in args:
+            if name not in declared and not passes_all_on:
+                raise UnknownNodeError(
+                    f'{self.path} has no arg {name!r}{suggest(name, declared)}: it has'
+                    f" {', '.join(sorted(declared)) or 'none'}"
+                )
+        return config
+
+    def _unreadable(self, error: Exception) -> PharosError:
+        """What roslaunch says, with the file before it."""
+        if isinstance(error, rospkg.ResourceNotFound):
+            package = str(error).partition('\n')[0]
+            return UnknownNodeError(
+                f'{self.path} needs the ROS package {package!r}, which is not on ROS_PACKAGE_PATH:'
+                " install it, or source its workspace's setup.bash"
+            )
+        text = str(error)
+        missing = _MISSING_ARG.search(text)
+        if missing:
+            text += f': give it with {missing.group(1)}:=VALUE'
+        return PharosError(text if self.path in text else f'{self.path}: {text}')
+
+    def _chosen(self, names: Iterable[str], known: Iterable[str]) -> Set[str]:
+        """The full names that are meant, each by itself or by its last part."""
+        if isinstance(names, str):
+            raise TypeError(f'the names of nodes are a list or tuple, not {names!r}')
+        chosen = set()
+        for name in names:
+            found = {each for each in known if name in (each, each[1:], each.rpartition('/')[2])}
+            if not found:
+                raise UnknownNodeError(
+                    f'{self.path} has no node {name!r}{suggest(name, known)}: it has'
+                    f" {', '.join(sorted(known)) or 'none'}"
+                )
+            chosen |= found
+        return chosen
+
+    def _sort(self, name: str, node: Any, is_kept_apart: bool) -> None:
+        is_local = roslaunch.core.is_machine_local(node.machine)
+        if not is_local:
+            self.apart.append(node)
+            return
+        try:
+            command = _command(node)
+        except (roslaunch.node_args.NodeParamsException, ValueError) as error:
+            why = str(error).partition('\n')[0]
+            if isinstance(error.__context__, rospkg.ResourceNotFound):
+                why = (
+                    f'there is no ROS package {node.package!r} on ROS_PACKAGE_PATH: install it, or'
+                    " source its workspace's setup.bash"
+                )
+            self.problems.append(Problem(name, node.filename, why))
+            return
+        if is_kept_apart or node.launch_prefix or not runs_here(command[0]):
+            self.apart.append(node)
+            return
+        self.here.append(
+            LaunchedNode(
+                name=name,
+                program=f'{node.package}/{node.type}',
+                path=command[0],
+                args=command[1:],
+                namespace=node.namespace,
+                env={str(key): str(value) for key, value in node.env_args},
+                cwd=os.path.dirname(command[0]) if node.cwd == 'node' else rospkg.get_ros_home(),
+                is_cwd_asked_for=node.cwd is not None,
+                output=node.output or 'log',
+                is_required=bool(node.required),
+                respawn_delay=float(node.respawn_delay or 0) if node.respawn else None,
+                file=node.filename,
+            )
+        )
+
+    def rest(self) -> Any:
+        """The configuration that is left for roslaunch: the nodes apart, without the parameters."""
+        rest = copy.copy(self.config)
+        rest.nodes = self.apart
+        rest.nodes_core, rest.tests, rest.executables = [], [], []
+        rest.params, rest.clear_params, rest.config_errors = {}, [], []
+        # whether there is another machine among them
+        machines = [node.machine for node in rest.nodes]
+        rest.machines = {machine.name: machine for machine in [rest.machines[''], *machines]}
+        return rest
+
+
+def _name_of(node: Any) -> str:
+    if not node.name:  # roslaunch invents one, which says less
+        node.name = rosgraph.names.anonymous_name(node.type)
+    return str(rosgraph.names.ns_join(node.namespace, node.name))
+
+
+def _as_text(value: object) -> str:
+    """As a launch file writes it."""
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _command(node: Any) -> List[str]:
+    """The command line by which roslaunch would start the node, without its launch-prefix."""
+    arguments = roslaunch.node_args.create_local_process_args(
+        node, node.machine, env=os.environ  # else what ROS_PACKAGE_PATH was at first
+    )
+    prefix = shlex.split(node.launch_prefix) if node.launch_prefix else []
+    return list(arguments[len(prefix) :])
+
+
+def runs_here(path: str) -> bool:
+    """Whether a program is Python's, for this interpreter, as its first line says."""
+    with open(path, 'rb') as file:
+        first_line = file.readline(256)
+        text = file.read() if first_line.startswith(b'#!') else b''
+    words = first_line[2:].split() if first_line.startswith(b'#!') else []
+    interpreter = next((word for word in words if _is_python(word)), None)
+    return interpreter is not None and not _USES_PHAROS.search(text)
+
+
+def _is_python(word: bytes) -> bool:
+    folder, _, base = word.rpartition(b'/')
+    match = _PYTHON.fullmatch(base)
+    if not match:
+        return False
+    minor = match.group(2)
+    if minor and minor != b'.%d' % sys.version_info[1]:
+        return False
+    # a virtual environment has packages of its own
+    environment = os.path.dirname(folder.decode(errors='replace'))
+    is_virtual = os.path.exists(os.path.join(environment, 'pyvenv.cfg')) if folder else False
+    return not is_virtual or os.path.realpath(environment) == os.path.realpath(sys.prefix)
+
+
+def find_program(program: str) -> Tuple[str, str]:
+    """``(package, executable)`` of a text 'PKG/EXECUTABLE'.
+
+    :raises ValueError: if it is none
+    """
+    package, _, executable = program.partition('/')
+    if not package or not executable:
+        raise ValueError(f'{program!r} names no program: it is to be PACKAGE/EXECUTABLE')
+    return package, executable
