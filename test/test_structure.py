@@ -5,6 +5,7 @@ is needed no longer fails here, too, and ``test/test_structure.py`` as a program
 """
 import ast
 import inspect
+import os
 import pathlib
 import re
 import subprocess
@@ -16,6 +17,7 @@ import structure
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / 'src' / 'pharos'
 EXCEPTIONS = pathlib.Path(__file__).with_name('structure_exceptions.txt')
+PATH = {**os.environ, 'PYTHONPATH': str(ROOT / 'src')}
 MODULES = structure.modules()
 
 LINES = 400  # of a module
@@ -41,15 +43,15 @@ ROS_NAMES = {
 ROSPYS_NAMES = {
     *('_base_logger', '_shutdown_flag', '_shutdown_hooks', '_shutdown_lock', '_TopicImpl'),
     *('_handlerList', '_handlers', '_marshaled_dispatch', '_tcp_server_callback', '_shutdown'),
-    '_xmlrpc_cache',
+    *('_xmlrpc_cache', '_init_node_args'),
 }
 ROSPYS_INSIDE = re.compile(
     r'rospy\.impl|rospy\.(core|topics|names)\._|_topic_manager|protocol_handlers'
 )
 
 EXPORTS = """
-    Master Node BlockNode Lifecycle ExternalNode Topic InputChannel OutputChannel Service Parameter Transcript
-    RosProcess Failure message_class service_class define_message define_service spin __version__
+    Master Node BlockNode ScriptNode Lifecycle ExternalNode Topic InputChannel OutputChannel Service
+    Parameter Transcript RosProcess Failure message_class service_class define_message define_service spin __version__
     PharosError MasterUnreachableError NodeNameInUseError PortInUseError UnknownNodeError UnknownTopicError
     UnknownTypeError MessageTypeError UnknownServiceError ServiceTypeError ServiceCallError NodeStoppedError
 """.split()
@@ -60,12 +62,16 @@ EXPORTS = """
 
 def wrong_arrows():
     """Imports from one room into another against the arrows; also within functions, and for type
-    checkers alone. What itself imports nothing of the facade, such as the errors, all may use."""
+    checkers alone, but for the facade's of what it loads on demand. What itself imports nothing of
+    the facade, such as the errors, all may use."""
     graph = structure.import_graph(with_types=True)
+    at_run_time = structure.import_graph(with_types=False)
     rooms = {module.name: module.room for module in MODULES}
     for name, imported in graph.items():
         for other in imported:
             allowed = {rooms[name], *ARROWS[rooms[name]]}
+            if rooms[name] == structure.FACADE and other not in at_run_time[name]:
+                allowed.add(structure.ABOVE)
             imports_facade = any(rooms[third] == structure.FACADE for third in graph[other])
             if rooms[other] not in allowed and (rooms[other] in BELOW or imports_facade):
                 yield f'{name} imports {other}'
@@ -230,7 +236,18 @@ def test_the_table_of_contents_is_imports_and_all():
         statement.targets[0].id for statement in statements if isinstance(statement, ast.Assign)
     ]
     assert assigned == ['__version__', '__all__']
-    assert {type(statement) for statement in statements} == {ast.Assign, ast.ImportFrom}
+    for_types = [each for each in statements if isinstance(each, ast.If)]
+    assert [ast.unparse(each.test) for each in for_types] == ['TYPE_CHECKING']
+    kinds = {type(statement) for statement in statements}
+    assert kinds - {ast.If} == {ast.Assign, ast.ImportFrom}
+
+
+def test_what_is_loaded_on_demand_is_not_loaded_before():
+    source = 'import sys, pharos; print(*dir(pharos)); print(*sys.modules)'
+    printed = subprocess.check_output([sys.executable, '-c', source], env=PATH, text=True)
+    names, modules = (line.split() for line in printed.splitlines())
+    assert 'ScriptNode' in names
+    assert not [name for name in modules if name.startswith('pharos.compose')]
 
 
 def test_scripts_are_run_by_debians_python():

@@ -1,4 +1,6 @@
 """PhaROS for Python: many ROS nodes in one process, written with blocks."""
+from typing import TYPE_CHECKING
+
 from pharos.channel import InputChannel, OutputChannel
 from pharos.errors import (
     MasterUnreachableError,
@@ -28,15 +30,20 @@ from pharos.node import BlockNode, Node
 from pharos.parameter import Parameter
 from pharos.ros_process import RosProcess
 from pharos.node_registry import spin
+from pharos.on_demand import __dir__, __getattr__  # noqa: F401  # PEP 562
 from pharos.service import Service
 from pharos.topic import Topic
 from pharos.transcript import Transcript
+
+if TYPE_CHECKING:
+    from pharos.compose.script import ScriptNode
 
 __version__ = '0.1.0'
 __all__ = [
     'Master',
     'Node',
     'BlockNode',
+    'ScriptNode',
     'Lifecycle',
     'ExternalNode',
     'Topic',

@@ -1,4 +1,5 @@
 """The proxy of a ROS master."""
+import importlib
 import subprocess
 from typing import (
     TYPE_CHECKING,
@@ -33,7 +34,11 @@ from pharos.topic import Topic
 from pharos.watcher import watcher_of
 
 if TYPE_CHECKING:
+    import os
+
     from typing_extensions import ParamSpec  # part of typing since Python 3.10
+
+    from pharos.compose.script import ScriptNode
 
     Init = ParamSpec('Init')
 NodeType = TypeVar('NodeType', bound=Node)
@@ -203,6 +208,39 @@ class Master(MasterCalls):
             of its own
         """
         return ros_process.launch(self, package, file, args, on_line)
+
+    def load(
+        self,
+        package: Union[str, 'os.PathLike[str]'],
+        executable: Optional[str] = None,
+        *args: object,
+        name: Optional[str] = None,
+        namespace: Optional[str] = None,
+        remap: Optional[Dict[str, str]] = None,
+        params: Optional[Dict[str, object]] = None,
+    ) -> 'ScriptNode':
+        """Run a rospy program, unmodified, as a node of this process; returns the
+        :class:`~pharos.ScriptNode`.
+
+        It returns when the program's ``rospy.init_node`` has registered the node; see
+        :meth:`ScriptNode.start <pharos.compose.script.ScriptNode.start>`.
+
+        :param package: where ``executable`` is, as ``rosrun`` looks it up; without that, the path
+            of the program
+        :param args: its further arguments
+        :param name: the name of its node, for ``__name:=``; None: the one that it gives to
+            ``init_node``
+        :param namespace: the namespace of its node, for ``__ns:=``
+        :param remap: ``{name: name}`` of remappings
+        :param params: ``{name: value}`` of private parameters
+        :raises UnknownNodeError: if there is no such package or program
+        :raises NodeNameInUseError: if another node has its name
+        :raises PharosError: if it is no Python program, or raised an exception before it was a node
+        """
+        node: 'ScriptNode' = importlib.import_module('pharos.compose.script').load(
+            self, package, executable, args, name, namespace, remap=remap, params=params
+        )
+        return node
 
     # -- what is there
 

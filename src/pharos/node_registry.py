@@ -81,12 +81,8 @@ def claim(run: 'Run') -> 'Optional[Run]':
     with contextlib.suppress(TimeoutError):
         _wait_for_stop(node)  # for what an overriding stop() does last
     with changed:
-        former, other = node.latest_run, _nodes.setdefault((node.master, node.name), node)
-        if other is not node:
-            raise NodeNameInUseError(
-                f'the node name {node.name} is taken by a {other.lifecycle.value} node of this'
-                ' process: choose another name, or stop() that node first'
-            )
+        former = node.latest_run
+        _claim_name(node, node.name)
         if former is not None and not former.is_over:
             raise PharosError(
                 f'{node.name} is {node.lifecycle.value} already: stop() it before you start it'
@@ -97,6 +93,27 @@ def claim(run: 'Run') -> 'Optional[Run]':
         if key in _starts:
             _starts[key] = run
     return former
+
+
+def rename(node: 'Node', name: str) -> None:
+    """The node, of which the master does not know yet, is called so from now on.
+
+    :raises NodeNameInUseError: if another node of this process has the name at its master
+    """
+    with changed:
+        _claim_name(node, name)
+        if name != node.name:
+            discard(node)
+        node.latest_run.rospy.rename(name)
+
+
+def _claim_name(node: 'Node', name: str) -> None:
+    other = _nodes.setdefault((node.master, name), node)
+    if other is not node:
+        raise NodeNameInUseError(
+            f'the node name {name} is taken by a {other.lifecycle.value} node of this process:'
+            ' choose another name, or stop() that node first'
+        )
 
 
 def discard(node: 'Node') -> None:
@@ -245,14 +262,29 @@ def spin() -> None:
     A node whose ``stop()`` does not end within 30 s is not waited for. In a soul or delegate, it
     ends with the node.
     """
-    mine = Interruption()
     with signals.interruptible_wait():
         try:
-            with changed:
-                while _has_nodes_to_wait_for() and not mine.came:
-                    changed.wait(SIGNAL_LATENCY)
+            wait_until(lambda: not _has_nodes_to_wait_for())
         except KeyboardInterrupt:  # the host program has a handler of its own
             stop_all()
+
+
+def wait_until(predicate: Callable[[], bool], timeout: Optional[float] = None) -> bool:
+    """Wait until ``predicate()`` holds, which is looked at when the life cycle of a node has
+    changed, or the node stops on whose behalf this thread runs.
+
+    :param timeout: seconds, None: without limit
+    :returns: False where the time was up before
+    """
+    mine = Interruption()
+    deadline = float('inf') if timeout is None else time.monotonic() + timeout
+    with changed:
+        while not (predicate() or mine.came):
+            left = deadline - time.monotonic()
+            if left <= 0:
+                return False
+            changed.wait(min(left, SIGNAL_LATENCY))
+    return True
 
 
 def _has_nodes_to_wait_for() -> bool:

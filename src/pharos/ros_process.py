@@ -254,6 +254,14 @@ def run(
 
     :raises UnknownNodeError: if there is no such package or program
     """
+    return RosProcess([find(package, executable)[0], *args], master, on_line)
+
+
+def find(package: str, executable: str) -> List[str]:
+    """The paths of a program, as rosrun looks it up.
+
+    :raises UnknownNodeError: if there is no such package or program
+    """
     with _known(package):
         paths = _find(package, executable)
     if not paths:
@@ -261,11 +269,10 @@ def run(
             f'the ROS package {package} has no program {executable!r}: see what it has with rosrun'
             f' {package} <Tab>'
         )
-    return RosProcess([paths[0], *args], master, on_line)
+    return paths
 
 
 def _find(package: str, executable: str) -> List[str]:
-    """The paths of a program, as rosrun looks it up."""
     try:
         return list(roslib.packages.find_node(package, executable))
     except rospkg.ResourceNotFound:

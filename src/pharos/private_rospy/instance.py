@@ -56,6 +56,9 @@ class PrivateRospy:
         self.unsure = set()
         #: called with what a hook of rospy.on_shutdown raised
         self.on_failure = lambda error: None
+        #: called as ``on_init_node(name, register, xmlrpc_port, tcpros_port)`` when the program of
+        #: the node calls rospy.init_node; None: the node has no program of its own
+        self.on_init_node = None
         #: called after the callbacks of a batch of messages, in its thread
         self.on_received = lambda: None
 
@@ -74,6 +77,8 @@ class PrivateRospy:
         modules = self._private_imports()
         #: import_library(name): a library written on rospy, such as 'actionlib', for this node
         self.import_library = modules.load
+        #: run_main(path, argv): see PrivateImports.run_main
+        self.run_main = modules.run_main
         self.rospy = modules.load('rospy')
         patches.check_applied(modules.modules)
         #: rospy's _base_logger; it reports the caller of its caller, who must call it himself
@@ -121,14 +126,23 @@ class PrivateRospy:
 
     # -- life
 
-    def start(self, timeout):
+    def rename(self, name):
+        """Have the node, which is not registered yet, be called so."""
+        self.name = self.settings.name = self.lifetime.name = name
+
+    def start(self, timeout, register=None):
         """Open the ports, claim the name, register. On an error, nothing is left behind.
 
         :param timeout: seconds that the master may take
+        :param register: called as ``register(xmlrpc_port=, tcpros_port=)`` instead of rospy's
+            init_node
         :raises MasterUnreachableError, NodeNameInUseError, PortInUseError:
         :raises NodeStoppedError: if :meth:`begin_stop` was called meanwhile
         """
         settings = self.settings
+        register = register or functools.partial(
+            self.rospy.init_node, settings.base_name, argv=settings.argv, disable_signals=True
+        )
         self._deadline = time.monotonic() + timeout
         with time_limit(timeout), self._reached():
             registration.claim_name(settings.master_url, self.name, timeout)
@@ -140,13 +154,7 @@ class PrivateRospy:
             with _ports_checked('xmlrpc_port', settings.xmlrpc_port):
                 # half of it until rospy is registered
                 with time_limit(2 * timeout), self._reached():
-                    self.rospy.init_node(
-                        settings.base_name,
-                        argv=settings.argv,
-                        disable_signals=True,
-                        xmlrpc_port=settings.xmlrpc_port,
-                        tcpros_port=settings.tcp_port,
-                    )
+                    register(xmlrpc_port=settings.xmlrpc_port, tcpros_port=settings.tcp_port)
             self._check_not_ended()
         except BaseException:
             self.finish_stop(0)

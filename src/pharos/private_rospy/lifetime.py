@@ -30,6 +30,7 @@ class Lifetime:
     """
 
     def __init__(self, name):
+        self.name = name
         self.ended = threading.Event()  # set when the node stops
         # set when the node is unregistered, and its XML-RPC server closed
         self.silent = threading.Event()
@@ -49,7 +50,7 @@ class Lifetime:
 
             def start(self):
                 self.daemon = True
-                self.name = f'{name} {self.name}'
+                self.name = f'{lifetime.name} {self.name}'
                 lifetime.threads.add(self)
                 super().start()
 

@@ -9,6 +9,8 @@ import functools
 import importlib.util
 import pathlib
 import re
+import tokenize
+import types
 from importlib.machinery import PathFinder
 
 from pharos.private_rospy.process_rospy import rospy
@@ -73,6 +75,16 @@ class PrivateImports:
         """The private module ``name``; its top-level package is private from now on."""
         self._private.add(name.partition('.')[0])
         return self._load(name)
+
+    def run_main(self, path, argv):
+        """Run the program of the file as ``__main__``, in this thread; what it raises is the
+        caller's."""
+        with tokenize.open(path) as text:
+            code = compile(text.read(), path, 'exec')
+        main = types.ModuleType('__main__')
+        vars(main).update(__file__=path, __builtins__=self._builtins)
+        self._substitutes['sys'].__dict__['argv'] = argv
+        exec(code, vars(main))
 
     def load_single(self, name, path):
         """A private copy of one module of a package that is otherwise shared."""

@@ -1,7 +1,10 @@
 """ROS names: what can be one, and how a name that is resolved already passes through rospy as it
 is."""
+import itertools
+import os
 import re
 import reprlib
+import time
 
 import rosgraph.names
 
@@ -11,6 +14,8 @@ _LEGAL = re.compile(r'(?:~/?|/)?(?:(?:[A-Za-z]|(?<=[~/])_)\w*(?:/\w+)*)?', re.AS
 _EMPTY = '', '/', '~', '~/'
 NAME_LIMIT = 1000  # characters of a name, also in what other nodes send
 NODE_LIMIT = 250  # of that of a node of ours: its log file is named after it
+_numbers = itertools.count(1)  # of the anonymous nodes of this process
+_numbers = itertools.count(1)  # of the anonymous nodes of this process
 
 
 def check_name(name, what, private=False, base=False, limit=NAME_LIMIT):
@@ -64,6 +69,12 @@ def _bad_character(name, is_node, private, base):
 def global_name(name, what):
     """The full form of a name that no node is there to resolve; ValueError if it cannot be one."""
     return rosgraph.names.resolve_name(check_name(name, what), '/')
+
+
+def unique_name(base):
+    """The name of an anonymous node, as rospy makes it, which would give the same to those that one
+    process makes within a millisecond."""
+    return f'{base}_{os.getpid()}_{int(time.time() * 1000)}{next(_numbers)}'
 
 
 class Resolved(str):

@@ -17,7 +17,7 @@ from pharos.private_rospy.addresses import (
 )
 from pharos.private_rospy.arguments import mappings_for, takes_name
 from pharos.private_rospy.process_rospy import rospy
-from pharos.private_rospy.names import NODE_LIMIT, check_name
+from pharos.private_rospy.names import NODE_LIMIT, check_name, unique_name
 from pharos.private_rospy.parameters import as_stored
 
 
@@ -76,6 +76,28 @@ class Settings:
             mappings.pop(left, None)
         self.argv = [self.base_name, *map(rosgraph.names.REMAP.join, mappings.items())]
         _check_private_parameters(self.argv)
+
+    def for_program(self, path, args, remap, params, env, takes_own_name):
+        """Have them be those of a program that calls ``init_node`` itself.
+
+        :param path: what it finds as ``sys.argv[0]``
+        :param params: ``{name: value}`` of private parameters
+        :param env: ``{name: value}`` of further environment variables
+        :param takes_own_name: whether it has the name that it gives to ``init_node``; until then it
+            has one that is nobody else's
+        :raises ValueError: if one of them cannot be
+        """
+        mappings = [f'{left}{rosgraph.names.REMAP}{right}' for left, right in remap.items()]
+        if takes_own_name:
+            self.name = unique_name(self.name)
+        elif '__name' not in rosgraph.names.load_mappings(args):  # which roslaunch gives
+            mappings.append(f'__name{rosgraph.names.REMAP}{self.base_name}')
+        self.argv = [path, *args, *self.argv[1:], *mappings]
+        self.environ.update(env)
+        self.params = {
+            check_name(name.lstrip('~'), 'parameter'): as_stored('~' + name, value)
+            for name, value in params.items()
+        }
 
     def _set_domain(self, domain, mappings):
         """Have rosgraph find the address to advertise, which is checked."""

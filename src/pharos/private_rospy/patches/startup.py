@@ -3,6 +3,9 @@ import sys
 import time
 import traceback
 
+import rosgraph.names
+
+from pharos.private_rospy.names import unique_name
 from pharos.private_rospy.loader import ModuleProxy
 from pharos.private_rospy.patches.table import patch, substitute
 from pharos.private_rospy.process_rospy import rospy
@@ -12,6 +15,46 @@ from pharos.private_rospy.process_rospy import rospy
 def time_of_init(*, node):
     """Wait in short steps, and not for ever."""
     return ModuleProxy(time, sleep=node.wait_for_registration)
+
+
+@patch('rospy.client', 'init_node', 'knows nothing of the nodes that a process has beside it')
+def init_node(
+    name,
+    argv=None,
+    anonymous=False,
+    log_level=None,
+    disable_rostime=False,
+    disable_rosout=False,
+    disable_signals=False,
+    xmlrpc_port=0,
+    tcpros_port=0,
+    *,
+    node,
+    original,
+    module,
+):
+    """Start the node of a script, which names it by this call."""
+    as_given = name
+    options = log_level, disable_rostime, disable_rosout
+    named, is_first = isinstance(name, str) and name and '/' not in name, not module._init_node_args
+    if not (node.on_init_node and named and is_first):
+        original(name, argv, anonymous, *options, disable_signals, xmlrpc_port, tcpros_port)
+        return
+    if argv is not None:
+        module.rospy.names.reload_mappings(argv)
+    given = module.rospy.names.get_mappings().get('__name')
+    if anonymous and not given:
+        name = unique_name(name)
+    resolved = rosgraph.names.resolve_name(given or name, module.rospy.core.get_caller_id())
+
+    def register(xmlrpc_port, tcpros_port):
+        # signals are for the threads of the process, which the script does not run in
+        original(name, argv, False, *options, True, xmlrpc_port, tcpros_port)
+
+    node.on_init_node(resolved, register, xmlrpc_port, tcpros_port)
+    # what a second call has to give
+    argv = module.sys.argv if argv is None else argv
+    module._init_node_args = as_given, argv, anonymous, *options[:2], disable_signals
 
 
 @patch(

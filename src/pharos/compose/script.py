@@ -1,0 +1,187 @@
+"""Scripts: rospy programs that run unmodified as nodes of this process."""
+import sys
+import threading
+from typing import TYPE_CHECKING, Any, Dict, Optional, Sequence
+
+import rosgraph.names
+
+from pharos import node_registry, signals
+from pharos.compose.programs import find_program, source_of
+from pharos.errors import PharosError
+from pharos.node import Node
+from pharos.run import Lifecycle, Run
+from pharos.watcher import watcher_of
+
+if TYPE_CHECKING:
+    from pharos.master import Master
+
+UNNAMED = 'script'  # what a program's node is called until it calls init_node, with a number
+
+
+class ScriptNode(Node):
+    """A rospy program, unmodified, as a node of this process: made by :meth:`Master.load`.
+
+    :meth:`start` runs it from its first line, in a thread of its own; its ``rospy.init_node``
+    registers the node. :meth:`stop` ends it, and the node stops when it has ended by itself.
+
+    :param path: the file of the program
+    :param args: its arguments, ROS's among them
+    :param remap: ``{name: name}`` of remappings
+    :param params: ``{name: value}`` of private parameters, set when it calls ``init_node``
+    :param env: ``{name: value}`` of further environment variables
+    :param takes_own_name: whether it has the name that it gives to ``init_node``, and not the one
+        given here
+    """
+
+    #: seconds that :meth:`start` waits for the program to call ``rospy.init_node``, or to end
+    init_timeout = 10.0
+
+    def __init__(
+        self,
+        path: str,
+        args: Sequence[str] = (),
+        remap: Optional[Dict[str, str]] = None,
+        params: Optional[Dict[str, Any]] = None,
+        env: Optional[Dict[str, str]] = None,
+        takes_own_name: bool = False,
+    ) -> None:
+        super().__init__()
+        found = find_program(path)
+        self.path, self.args = source_of(found), [str(argument) for argument in args]
+        self._settings.for_program(
+            found, self.args, remap or {}, params or {}, env or {}, takes_own_name
+        )
+
+    def start(self) -> None:
+        """Run the program from its first line.
+
+        Returns when its node is registered, or it has ended without one, or has run for
+        :attr:`init_timeout` seconds.
+
+        :raises PharosError: if the program raised an exception by then, its cause
+        """
+        source_of(self.path)  # it may have been edited
+        ScriptRun(self, self._settings).start(reopens=False)
+
+    @property
+    def exit_code(self) -> Optional[int]:
+        """What its process would have ended with; None while it runs, or if it did not end."""
+        return self.latest_run.exit_code if isinstance(self.latest_run, ScriptRun) else None
+
+    def wait(self, timeout: Optional[float] = None) -> Optional[int]:
+        """Wait until it has ended, and its node has stopped; returns its :attr:`exit_code`.
+
+        :param timeout: seconds, None: without limit
+        :raises TimeoutError: if it has not in that time
+        """
+        run = self.latest_run
+        with signals.interruptible_wait():
+            if not node_registry.wait_until(lambda: run.is_over, timeout):
+                raise TimeoutError(f'{self.name} has not ended within {timeout:g} s: stop() it')
+        return self.exit_code
+
+
+class ScriptRun(Run):
+    """One run of a program."""
+
+    node: ScriptNode
+
+    def __init__(self, node: ScriptNode, settings: Any) -> None:
+        super().__init__(node, settings)
+        self.exit_code: Optional[int] = None
+        self.is_registered = False
+        self._has_ended = False  # whether the program has
+        self._error: Optional[BaseException] = None  # with which it ended before it was a node
+        self.rospy.on_init_node = self._init_node
+
+    def start(self, reopens: bool) -> None:
+        """Run the program in a thread of its own; see :meth:`ScriptNode.start`."""
+        with signals.held():
+            node_registry.claim(self)
+            self._become(Lifecycle.RUNNING)
+            self.fork(self._run, 'script')
+            node_registry.wait_until(
+                lambda: self.is_registered or self._has_ended or self.is_over,
+                self.node.init_timeout,
+            )
+            with node_registry.changed:
+                error, self._error = self._error, None
+                self._is_awaited = False
+            if self._has_ended:
+                self.node.stop()
+        if error is not None:
+            kind = type(error) if isinstance(error, PharosError) else PharosError
+            raise kind(
+                f'{self.node.path}, to be the node {self.node.name}, ended before it was one:'
+                f' {type(error).__name__}: {error}'
+            ) from error
+
+    _is_awaited = True  # whether start() waits still, whose caller gets what the program raises
+
+    def _run(self) -> None:
+        """What the thread of the program does."""
+        try:
+            self._ended(self._run_program())
+        except SystemExit as error:
+            code = error.code
+            if code is not None and not isinstance(code, int):
+                print(code, file=sys.stderr)
+            self._ended(code if isinstance(code, int) else int(code is not None))
+        except BaseException as error:
+            self._ended(1, error)
+
+    def _run_program(self) -> int:
+        self.rospy.run_main(self.node.path, self._settings.argv)
+        return 0
+
+    def _ended(self, exit_code: int, error: Optional[BaseException] = None) -> None:
+        with node_registry.changed:
+            self.exit_code, self._has_ended = exit_code, True
+            is_for_caller = self._is_awaited and not self.is_registered
+            if is_for_caller:
+                self._error = error
+            node_registry.changed.notify_all()
+        if error is not None and not is_for_caller:
+            self.report(error, self.node.path, 'script')
+        if not self.is_ending:
+            threading.Thread(
+                target=node_registry.stop,
+                args=(self.node,),
+                name=f'{self.node.name} stop',
+                daemon=True,
+            ).start()
+
+    def _init_node(self, name: str, register: Any, xmlrpc_port: int, tcpros_port: int) -> None:
+        """Its program calls ``rospy.init_node``, in whatever thread."""
+        node, settings = self.node, self._settings
+        node_registry.rename(node, name)
+        settings.xmlrpc_port = xmlrpc_port or settings.xmlrpc_port
+        settings.tcp_port = tcpros_port or settings.tcp_port
+        for parameter, value in settings.params.items():
+            full_name = f'{name}/{parameter}'
+            node.master.parameters[full_name] = value
+            self.rospy.parameters.initialize(full_name, value)
+        self.rospy.start(node.connect_timeout, register)
+        with node_registry.changed:
+            self.is_registered = True
+            node_registry.changed.notify_all()
+        watcher_of(node.master).check()
+
+
+def load(
+    master: 'Master',
+    package: str,
+    executable: Optional[str] = None,
+    args: Sequence[str] = (),
+    name: Optional[str] = None,
+    namespace: Optional[str] = None,
+    **options: Any,
+) -> ScriptNode:
+    """What :meth:`Master.load` does."""
+    path = find_program(package, executable)
+    named = name or UNNAMED
+    if namespace:
+        named = rosgraph.names.ns_join(namespace, named)
+    return master.create(
+        ScriptNode, named, path=path, args=args, takes_own_name=name is None, **options
+    )

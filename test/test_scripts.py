@@ -1,0 +1,105 @@
+"""master.load: rospy programs, unmodified, as nodes of this process."""
+import json
+
+import pytest
+
+import pharos
+from helpers import create, registrations
+from pharos.testing import Mailbox
+from programs import ROOT
+
+TALKING = ROOT / 'test' / 'programs' / 'talking'
+TALKER, REPORTER, WORKER = (TALKING / f'{name}.py' for name in ('talker', 'reporter', 'worker'))
+
+
+def report_of(master, *args, **options):
+    """What the reporter, loaded so, says of its start; it has ended then."""
+    listener = create(master, '/listener_of_reports')
+    mailbox = Mailbox(listener, options.pop('topic', '/report'), 'std_msgs/String')
+    with master.load(REPORTER, None, *args, **options):
+        report = json.loads(mailbox.next().data)
+    listener.stop()
+    return report
+
+
+def test_a_script_is_a_node(master):
+    with master.load(TALKER, name='greeter') as node:
+        assert node.name == '/greeter'
+        assert isinstance(node, pharos.ScriptNode)
+        assert registrations(master, '/greeter')[0] == ['/chatter', '/rosout']
+        assert master.node('/greeter') is node
+        assert node in master.nodes()
+
+
+def test_a_scripts_messages_arrive(master):
+    mailbox = Mailbox(create(master, '/hearer'), '/chatter', 'std_msgs/String')
+    with master.load(TALKER, name='greeter'):
+        assert mailbox.next().data == 'hello from /greeter'
+
+
+def test_a_script_without_a_name_given_has_its_own(master):
+    with master.load(WORKER, None, 'spin') as node:
+        assert node.name == '/worker'
+
+
+def test_scripts_that_ask_for_anonymous_names_have_different_ones(master):
+    with master.load(TALKER) as one, master.load(TALKER) as other:
+        assert one.name.startswith('/talker_')
+        assert other.name.startswith('/talker_')
+        assert one.name != other.name
+
+
+def test_the_stop_of_a_node_ends_its_script(master):
+    node = master.load(TALKER, name='ended')
+    node.stop()
+    assert node.wait(0) == 0
+    assert registrations(master, '/ended') == [[], [], []]
+
+
+def test_a_script_gets_its_whole_command_line(master):
+    report = report_of(master, '--mode', 'fast', name='teller', remap={'image': '/camera/image'})
+    assert report['argv'] == [
+        *(str(REPORTER), '--mode', 'fast', 'image:=/camera/image', '__name:=teller')
+    ]
+    assert report['mode'] == 'fast'
+    assert report['topic'] == '/camera/image'
+
+
+def test_a_script_is_in_the_namespace_given(master):
+    report = report_of(master, namespace='/robot1', topic='/robot1/report')
+    assert report['name'] == '/robot1/reporter'
+
+
+def test_a_script_finds_its_private_parameters(master):
+    assert report_of(master, params={'rate': {'high': [1.5, 'x']}})['rate'] == {'high': [1.5, 'x']}
+
+
+def test_a_script_is_the_main_program(master):
+    report = report_of(master)
+    assert report['main'] == '__main__'
+    assert report['file'] == str(REPORTER)
+
+
+@pytest.mark.parametrize(
+    'how, code', [('return', 0), ('exit', 0), ('exit 3', 3), ('exit text', 1), ('raise', 1)]
+)
+def test_a_script_that_ends_stops_its_node(how, code, master):
+    node = master.load(WORKER, None, how)
+    assert node.wait(30) == code
+    assert not node.is_running
+    assert registrations(master, '/worker') == [[], [], []]
+
+
+def test_what_a_script_raises_is_a_failure_of_its_node(master, transcript):
+    node = master.load(WORKER, None, 'raise')
+    node.wait(30)
+    assert isinstance(node.errors[0], ZeroDivisionError)
+    assert 'return 1 / 0' in node.failures[0].traceback
+    assert transcript == [
+        f"script {str(WORKER)!r} of /worker raised ZeroDivisionError: division by zero"
+    ]
+
+
+def test_a_script_that_never_names_its_node_runs_to_its_end(master):
+    assert master.load(WORKER, None, 'nameless').exit_code == 0
+    assert master.load(WORKER, None, 'nameless exit 4').exit_code == 4
