@@ -5,20 +5,22 @@
 as usual, also for imports that rospy does inside functions later on.
 """
 import builtins
+import collections
 import functools
 import importlib.util
+import os
 import pathlib
 import re
-import tokenize
+import sys
 import types
-from importlib.machinery import PathFinder
+from importlib.machinery import PathFinder, SourceFileLoader
 
 from pharos.private_rospy.process_rospy import rospy
 
 # so that ``except rospy.ROSException`` catches every node's
 _SHARED = {'rospy.exceptions': rospy.exceptions}
 _IMPORTS_ROSPY = re.compile(rb'^\s*(import|from)\s+rospy\b', re.MULTILINE)
-_found = {}  # module name -> (spec, code), the same for all sets
+_found = {}  # (module name, path) -> (spec, code), the same for all sets
 
 
 class ModuleProxy:
@@ -33,12 +35,13 @@ class ModuleProxy:
 
 def _find(name, path):
     """The spec and the compiled code of module ``name``, looked up once per process."""
-    if name not in _found:
+    key = name, path and tuple(path)
+    if key not in _found:
         spec = PathFinder.find_spec(name, path)
         if spec is None:
             raise ModuleNotFoundError(f'No module named {name!r}', name=name)
-        _found[name] = spec, spec.loader.get_code(name)
-    return _found[name]
+        _found[key] = spec, spec.loader.get_code(name)
+    return _found[key]
 
 
 @functools.lru_cache(maxsize=None)
@@ -68,7 +71,9 @@ class PrivateImports:
         self.modules = {}
         self._private = {'rospy', 'rosgraph'}
         self._substitutes = substitutes
+        substitutes['sys'].modules = collections.ChainMap(self.modules, sys.modules)
         self._patch = patch
+        self._folders = []  # of the programs of the set: what is in them is theirs alone
         self._builtins = dict(vars(builtins), __import__=self._import)
 
     def load(self, name):
@@ -77,14 +82,22 @@ class PrivateImports:
         return self._load(name)
 
     def run_main(self, path, argv):
-        """Run the program of the file as ``__main__``, in this thread; what it raises is the
-        caller's."""
-        with tokenize.open(path) as text:
-            code = compile(text.read(), path, 'exec')
+        """Run the file as a program of the set, in this thread: what it raises, SystemExit too, comes
+        through.
+
+        :param argv: its ``sys.argv``, whole
+        """
+        folder = os.path.dirname(os.path.realpath(path))
+        self._folders.insert(0, folder)
+        system = self._substitutes['sys']
+        system.argv, system.path = argv, [folder, *system.path]
+        loader = SourceFileLoader('__main__', path)
         main = types.ModuleType('__main__')
-        vars(main).update(__file__=path, __builtins__=self._builtins)
-        self._substitutes['sys'].__dict__['argv'] = argv
-        exec(code, vars(main))
+        vars(main).update(
+            __file__=path, __loader__=loader, __cached__=None, __builtins__=self._builtins
+        )
+        self.modules['__main__'] = main
+        exec(loader.source_to_code(loader.get_data(path), path), vars(main))
 
     def load_single(self, name, path):
         """A private copy of one module of a package that is otherwise shared."""
@@ -100,11 +113,19 @@ class PrivateImports:
         if name in _SHARED:
             self.modules[name] = _SHARED[name]
         else:
-            self._run(*_find(name, parent.__path__ if parent else None), self.modules)
+            path = parent.__path__ if parent else self._substitutes['sys'].path
+            self._run(*_find(name, path), self.modules)
             self._patch(self.modules[name])
         if parent:
             setattr(parent, leaf, self.modules[name])
         return self.modules[name]
+
+    def _is_private(self, top):
+        if top in self._private or top in self.modules:
+            return True
+        if PathFinder.find_spec(top, self._folders):
+            return True
+        return _is_written_on_rospy(top)
 
     def _run(self, spec, code, modules):
         """Run the code of a module, which is among ``modules`` before: rospy's import each other in
@@ -128,7 +149,7 @@ class PrivateImports:
         if top in self._substitutes:
             real = builtins.__import__(name, globals, locals, fromlist, level)
             return self._substitutes.get(absolute, real) if fromlist else self._substitutes[top]
-        if top not in self._private and not _is_written_on_rospy(top):
+        if not self._is_private(top):
             return builtins.__import__(name, globals, locals, fromlist, level)
         module = self._load(absolute)
         if not fromlist:

@@ -1,0 +1,2 @@
+"""What the program beside it counts with."""
+COUNT = []
