@@ -416,6 +416,45 @@ ready()
     assert 'atexit' not in printed
 
 
+def test_a_signal_that_wakes_nobody_is_handled_while_the_program_ends(program):
+    """Python handles it in the main thread, which goes on waiting where another thread got it, or
+    where it came just before the wait."""
+    running = program(
+        """
+pharos.node_registry.STOP_LIMIT = 3600
+def goes_on():
+    while not pharos.signals._holds:    # the main thread may be on its way to the end still
+        threading.Event().wait(0.001)
+    signal.pthread_kill(threading.get_ident(), signal.SIGTERM)
+    while pharos.signals._coming is None:
+        threading.Event().wait(0.001)
+    print('handled', flush=True)
+me = node()
+me.ros.on_shutdown(goes_on)
+ready()
+"""
+    )
+    running.wait_for('handled')
+    assert running.process.wait(TIMEOUT) == 0
+
+
+def test_a_signal_that_wakes_nobody_ends_a_wait_for_subscribers(program):
+    running = program(
+        """
+me = node()
+channel = me.output_channel('/wakes_nobody', 'std_msgs/Empty')
+def end():
+    while not me.latest_run.rospy.lifetime.interruptions:
+        threading.Event().wait(0.001)
+    signal.pthread_kill(threading.get_ident(), signal.SIGTERM)
+threading.Thread(target=end, daemon=True).start()
+ready()
+channel.wait_for_subscribers()
+"""
+    )
+    assert running.process.wait(TIMEOUT) in (0, ended_by(signal.SIGTERM))
+
+
 def test_what_else_is_to_end_with_the_program_does_though_one_cannot(program):
     running = program(
         """

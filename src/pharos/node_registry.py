@@ -13,7 +13,6 @@ from typing import (
     Any,
     Callable,
     Dict,
-    Iterable,
     Iterator,
     List,
     Optional,
@@ -25,7 +24,7 @@ from pharos import signals
 from pharos.blocks import name_of
 from pharos.errors import NodeNameInUseError, PharosError
 from pharos.private_rospy import process_rospy
-from pharos.private_rospy.lifetime import SIGNAL_LATENCY, Interruption
+from pharos.private_rospy.lifetime import SIGNAL_LATENCY, Interruption, join
 
 if TYPE_CHECKING:
     from pharos.node import Node
@@ -312,13 +311,6 @@ def stop_all() -> None:
     for thread in threads:
         thread.start()
     join(threads, STOP_LIMIT)
-
-
-def join(threads: Iterable[threading.Thread], timeout: float) -> None:
-    """Wait until the threads have ended, for up to ``timeout`` seconds in all."""
-    deadline = time.monotonic() + timeout
-    for thread in threads:
-        thread.join(max(0.0, deadline - time.monotonic()))
 
 
 # -- the end of the program

@@ -14,6 +14,7 @@ from pharos.intraprocess.dispatcher import Dispatcher
 from pharos.intraprocess.fanout import Latch
 from pharos.private_rospy import changes
 from pharos.private_rospy.instance import PrivateRospy
+from pharos.private_rospy.lifetime import join
 from pharos.private_rospy.names import Resolved, check_name
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.settings import Settings
@@ -161,8 +162,7 @@ class Run:
     def _end_souls(self, timeout: float) -> None:
         """Wait for the souls, but this thread's."""
         threads = [thread for thread in self._forked if thread is not threading.current_thread()]
-        node_registry.join(threads, timeout)
-        self._ignoring = [thread for thread in threads if thread.is_alive()]
+        self._ignoring = join(threads, timeout)
         if self._ignoring:
             self.node.log(
                 f"left behind, for it did not end within {timeout:g} s of the stop:"

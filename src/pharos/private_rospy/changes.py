@@ -1,8 +1,9 @@
 """Waiting for connections of the publishers of this process."""
 import os
 import threading
+import time
 
-from pharos.private_rospy.lifetime import Interruption
+from pharos.private_rospy.lifetime import SIGNAL_LATENCY, Interruption
 
 # notified whenever a publisher of this process gains or loses a connection
 _changed = threading.Condition()
@@ -21,9 +22,10 @@ def wait_until(lifetime, predicate, timeout):
     :param lifetime: of the node with whose stop the wait ends
     """
     with Interruption(notify, lifetime) as stop, _changed:
-        _changed.wait_for(
-            lambda: stop.came or predicate(), None if timeout is None else max(0.0, timeout)
-        )
+        until = float('inf') if timeout is None else time.monotonic() + timeout
+        while not (stop.came or predicate()) and time.monotonic() < until:
+            # not longer: this may be the main thread, which handles signals
+            _changed.wait(max(0.0, min(until - time.monotonic(), SIGNAL_LATENCY)))
 
 
 def _forget():

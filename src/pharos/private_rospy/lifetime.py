@@ -5,10 +5,10 @@ import socket
 import threading
 import time
 import weakref
-from typing import Any, Callable, Optional
+from typing import Any, Callable, Iterable, List, Optional
 
-# A signal that the kernel gives to another thread does not end the main thread's wait, in which
-# Python would handle it.
+# A signal that the kernel gives to another thread, or that comes just before the main thread waits,
+# does not end that wait, after which Python would handle it.
 SIGNAL_LATENCY = 0.2  # seconds that such a wait lasts at the most
 JOIN_TIMEOUT = 2.0  # seconds that a thread is waited for
 # A peer that vanishes says nothing: TCP notices that it is gone where it is asked to, here within
@@ -108,12 +108,22 @@ class Lifetime:
         for sock in list(self._sockets):
             shutdown_socket(sock)
         others = set(self.threads) - {threading.current_thread(), *abandoned}
-        # Else it has ended, or is only just being started, and will see that all has.
-        threads = [thread for thread in others if thread.is_alive()]
-        deadline = time.monotonic() + JOIN_TIMEOUT
-        for thread in threads:
-            thread.join(max(0.0, deadline - time.monotonic()))
-        return [thread for thread in threads if thread.is_alive()]
+        # One that is not alive has ended, or is just being started, and will see that all has.
+        return join(others, JOIN_TIMEOUT)
+
+
+def join(threads: Iterable[threading.Thread], timeout: float) -> List[threading.Thread]:
+    """Wait until the threads have ended, for up to ``timeout`` seconds in all; returns those that
+    have not.
+
+    In short waits, so that the main thread handles a signal that came just before one began, too.
+    """
+    deadline = time.monotonic() + timeout
+    left = [thread for thread in threads if thread.is_alive()]
+    while left and time.monotonic() < deadline:
+        left[0].join(max(0.0, min(deadline - time.monotonic(), SIGNAL_LATENCY)))
+        left = [thread for thread in left if thread.is_alive()]
+    return left
 
 
 class Interruption:
