@@ -149,6 +149,22 @@ def test_an_action_is_cancelled(pair):
     assert client.get_state() == actionlib_msgs.msg.GoalStatus.PREEMPTED
 
 
+def test_an_answer_that_comes_before_the_goal_is_sent_is_not_lost(pair):
+    """The client did not know its goal yet, and waited for ever."""
+    client = action(pair, lambda server, goal: server.set_succeeded())
+    manager, over = client.action_client.manager, Mailbox()
+    send = manager.send_goal_fn
+
+    def send_and_be_answered(goal):
+        send(goal)
+        until(lambda: manager.statuses[-1]().state)  # it has been accepted
+
+    manager.register_send_goal_fn(send_and_be_answered)
+    client.send_goal(actionlib.msg.TestGoal(goal=1), done_cb=lambda state, _: over(state, None))
+    assert over.next() == actionlib_msgs.msg.GoalStatus.SUCCEEDED
+    assert client.wait_for_result(pair[0].ros.Duration(TIMEOUT))
+
+
 # -- tf2
 
 

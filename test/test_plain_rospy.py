@@ -18,13 +18,6 @@ INT, STRING, ARRAY = std_msgs.msg.Int32, std_msgs.msg.String, std_msgs.msg.UInt8
 NUMBERS = std_msgs.msg.Float64MultiArray
 
 
-def create_eager(master, name, **kwargs):
-    """A node whose plain subscriptions connect in process even where no channel is beside them."""
-    node = create(master, name, **kwargs)
-    node.latest_run.rospy.connections.takes_plain_callbacks = True
-    return node
-
-
 def listen(node, topic, message_class, **kwargs):
     """A plain Subscriber of the node, and what it gets."""
     mailbox = Mailbox()
@@ -43,7 +36,7 @@ def link_threads(node):
 
 def test_nothing_is_lost_when_a_plain_subscriber_comes_and_goes_beside_a_channel(master, mailbox):
     """The link used to go down, and TCPROS to take its place 50 ms later."""
-    both, sender = create_eager(master, '/both'), create_eager(master, '/sender')
+    both, sender = create(master, '/both'), create(master, '/sender')
     channel = both.interested_in('/beside/numbers', INT, delegate=mailbox, queue_size=100000)
     sent = sender.output_channel('/beside/numbers', INT)
     over = threading.Event()
@@ -71,7 +64,7 @@ def test_nothing_is_lost_when_a_plain_subscriber_comes_and_goes_beside_a_channel
 
 
 def test_nothing_is_lost_when_channels_open_and_close_beside_another(master, mailbox):
-    both, sender = create_eager(master, '/both'), create_eager(master, '/sender')
+    both, sender = create(master, '/both'), create(master, '/sender')
     channel = both.interested_in('/beside/others', INT, delegate=mailbox, queue_size=100000)
     sent = sender.output_channel('/beside/others', INT)
     over = threading.Event()
@@ -95,12 +88,12 @@ def test_nothing_is_lost_when_channels_open_and_close_beside_another(master, mai
 
 def test_a_channel_gets_its_own_type_beside_a_subscriber_of_any_type(master, mailbox):
     for name, transport in ('/here', 'INTRAPROCESS'), ('/there', 'TCPROS'):
-        node = create_eager(master, name)
+        node = create(master, name)
         if transport == 'TCPROS':
             speak_tcpros_only(node)
         _, anything = listen(node, '/beside/any', rospy.AnyMsg)
         node.interested_in('/beside/any', STRING, delegate=mailbox)
-        sent = create_eager(master, name + '_sender').output_channel('/beside/any', STRING)
+        sent = create(master, name + '_sender').output_channel('/beside/any', STRING)
         assert sent.wait_for_subscribers(1, TIMEOUT)
         assert (name, transport) in sent.connections
         sent.send(data='text')
@@ -116,7 +109,7 @@ def test_a_channel_gets_its_own_type_beside_a_subscriber_of_any_type(master, mai
 @pytest.fixture(params=['INTRAPROCESS', 'TCPROS'])
 def pair(request, master):
     """A node that publishes and one that subscribes, connected by the transport named."""
-    nodes = create_eager(master, '/publisher'), create_eager(master, '/subscriber')
+    nodes = create(master, '/publisher'), create(master, '/subscriber')
     if request.param == 'TCPROS':
         speak_tcpros_only(nodes[1])
     nodes[1].transport = request.param
@@ -190,7 +183,7 @@ def test_callbacks_run_in_a_thread_for_each_connection_so_that_they_may_wait_for
     pair, master
 ):
     publishing, subscribing = pair
-    other = create_eager(master, '/other_publisher')
+    other = create(master, '/other_publisher')
     publishers = [
         node.ros.Publisher('/plain/meet', STRING, queue_size=1) for node in (publishing, other)
     ]
@@ -349,7 +342,7 @@ def test_nobody_waits_for_a_publisher_that_waits_for_another(pair, master, comes
     assert entered.wait(TIMEOUT)
     thread.join(0.5)
     assert thread.is_alive()
-    other = create_eager(master, '/other')
+    other = create(master, '/other')
 
     def come():
         if comes == 'wait_for_message':
@@ -429,10 +422,8 @@ def test_a_listener_that_fails_ends_nothing_of_others(pair, mailbox, error):
 
 
 def test_a_link_has_a_thread_for_callbacks_only_while_there_are_some(master, mailbox):
-    node = create_eager(master, '/subscriber')
-    publisher = create_eager(master, '/publisher').ros.Publisher(
-        '/plain/threads', STRING, queue_size=1
-    )
+    node = create(master, '/subscriber')
+    publisher = create(master, '/publisher').ros.Publisher('/plain/threads', STRING, queue_size=1)
     channel = node.interested_in('/plain/threads', STRING, delegate=mailbox)
     connected(publisher)
     assert len(link_threads(node)) == 1  # the channels'
@@ -449,7 +440,7 @@ def test_a_link_has_a_thread_for_callbacks_only_while_there_are_some(master, mai
 def test_no_thread_is_left_when_a_channel_opens_while_the_last_callback_goes(
     master, mailbox, monkeypatch
 ):
-    both, sender = create_eager(master, '/both'), create_eager(master, '/sender')
+    both, sender = create(master, '/both'), create(master, '/sender')
     channel = sender.output_channel('/threads/last', INT)
     subscriber, _ = listen(both, '/threads/last', INT)
     assert channel.wait_for_subscribers(1, TIMEOUT)
@@ -466,10 +457,8 @@ def test_no_thread_is_left_when_a_channel_opens_while_the_last_callback_goes(
 
 
 def test_a_link_that_is_closed_opens_no_thread_for_callbacks(master):
-    node = create_eager(master, '/subscriber')
-    publisher = create_eager(master, '/publisher').ros.Publisher(
-        '/plain/closed', STRING, queue_size=1
-    )
+    node = create(master, '/subscriber')
+    publisher = create(master, '/publisher').ros.Publisher('/plain/closed', STRING, queue_size=1)
     listen(node, '/plain/closed', STRING)
     connected(publisher)
     link = publisher.impl.connections[0].link
@@ -526,9 +515,7 @@ def test_what_is_put_while_another_thread_takes_is_counted():
 
 
 def test_large_messages_are_dropped_from_a_full_queue_the_oldest_first(master):
-    publishing, subscribing = create_eager(master, '/publisher'), create_eager(
-        master, '/subscriber'
-    )
+    publishing, subscribing = create(master, '/publisher'), create(master, '/subscriber')
     publisher = publishing.ros.Publisher('/plain/full', ARRAY, queue_size=2)
     entered, release, sizes = threading.Event(), threading.Event(), Mailbox()
 

@@ -328,7 +328,6 @@ def test_a_channel_that_is_opened_while_its_node_connects_hears_the_publisher(
         create_patient(master, '/far'),
         Mailbox(),
     )
-    node.latest_run.rospy.connections.takes_plain_callbacks = True
     match, opened = Link.match_receivers, []
 
     def match_and_open(self):

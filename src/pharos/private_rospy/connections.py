@@ -27,8 +27,6 @@ def local_nodes():
 class Connections:
     """The channels of one :class:`~.instance.PrivateRospy`."""
 
-    takes_plain_callbacks = False  # whether subscriptions without any channel connect here, too
-
     def __init__(self, node):
         self._node = node
         self._receivers = {}  # topic -> those that :meth:`subscribe` has connected to it
@@ -199,14 +197,6 @@ class Connections:
         """The receivers that :meth:`subscribe` has connected to the topic."""
         return self._receivers.get(topic, ())
 
-    def _may_be_in_process(self, topic):
-        """Whether a connection on the topic may be INTRAPROCESS.
-
-        Not where nobody but plain rospy callbacks listens: actionlib, for one, does not stand
-        answers that come so quickly, and waits for ever.
-        """
-        return self.takes_plain_callbacks or bool(self.receivers_on(topic))
-
     def connect(self, topic, uri):
         """Connect the subscription to the publisher at that URI, unless it is connected.
 
@@ -250,11 +240,7 @@ class Connections:
                 return 0, f'{self._node.name} or its interest in {topic} ends', 0
             if subscriber.has_connection(uri):
                 return 1, f'connected to {uri} already', 0
-            transports = [
-                transport
-                for transport in handler.protocol_handlers or ()
-                if transport.supports('TCPROS') or self._may_be_in_process(topic)
-            ]
+            transports = tuple(handler.protocol_handlers or ())
             offered = [each for transport in transports for each in transport.get_supported()]
             try:
                 code, text, chosen = ServerProxy(uri).requestTopic(self._node.name, topic, offered)

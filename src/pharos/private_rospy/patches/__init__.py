@@ -15,11 +15,13 @@ further frame. ``@addition`` gives a class or module of rospy a function that it
 ``@substitute`` a module another object for one of its names. What a patch remembers belongs to the
 node, never to a module.
 
-A target that is missing, or that has other parameters, is an error when a node is made.
+A target that is missing, or that has other parameters, is an error when a node is made, or imports
+the library that has it.
 test/test_patches.py compares the sources of the targets with the releases of rospy that are known
 (and says how to know another), and doc/patches.md is this table: ``tools/patches`` writes it.
 """
 from pharos.private_rospy.patches import (
+    libraries,
     logs,
     names,
     parameters,
@@ -38,6 +40,7 @@ __all__ = [
     'TABLE',
     'apply',
     'check_applied',
+    'libraries',
     'logs',
     'names',
     'parameters',

@@ -1,7 +1,7 @@
 """How an override gets into the table of patches, and from there into the rospy of a node."""
 import functools
 import types
-from typing import Any, Callable, Container, List, NamedTuple
+from typing import Any, Callable, Collection, List, NamedTuple
 
 from pharos.errors import PharosError
 
@@ -9,7 +9,7 @@ from pharos.errors import PharosError
 class Patch(NamedTuple):
     """One row of the table."""
 
-    module: str  # of rospy or rosgraph
+    module: str  # of rospy or rosgraph; or of a library on it, which a node may never load
     target: str  # 'Class.method', or the name of a function or variable of the module
     reason: str
     function: Callable
@@ -80,10 +80,11 @@ def apply(module: types.ModuleType, node: Any) -> None:
             each.apply(module, node)
 
 
-def check_applied(names: Container[str]) -> None:
-    """Raise PharosError for a patch of a module that is not among the names of those loaded."""
+def check_applied(names: Collection[str]) -> None:
+    """Raise PharosError for a patch of a module of packages that are loaded, but not it."""
+    packages = {name.partition('.')[0] for name in names}
     for each in TABLE:
-        if each.module not in names:
+        if each.module.partition('.')[0] in packages and each.module not in names:
             raise each.error('is not there')
 
 
