@@ -1,10 +1,13 @@
 """master.load: rospy programs, unmodified, as nodes of this process."""
 import json
+import pathlib
+import shutil
 
 import pytest
 
 import pharos
 from helpers import create, registrations
+from pharos import ros_process
 from pharos.testing import Mailbox
 from programs import ROOT
 
@@ -103,3 +106,25 @@ def test_what_a_script_raises_is_a_failure_of_its_node(master, transcript):
 def test_a_script_that_never_names_its_node_runs_to_its_end(master):
     assert master.load(WORKER, None, 'nameless').exit_code == 0
     assert master.load(WORKER, None, 'nameless exit 4').exit_code == 4
+
+
+RELAY = """#!/usr/bin/python3
+# generated from catkin/cmake/template/script.py.in for a devel space
+import sys
+python_script = {source!r}
+"""
+
+
+def test_a_program_and_catkins_wrapper_of_it_are_one(master, tmp_path, monkeypatch):
+    package, wrappers = tmp_path / 'wrapped', tmp_path / 'wrapped' / 'wrappers'
+    wrappers.mkdir(parents=True)
+    (package / 'package.xml').write_text('<package><name>wrapped</name></package>')
+    program = pathlib.Path(shutil.copy(WORKER, package))
+    wrapper = wrappers / program.name
+    wrapper.write_text(RELAY.format(source=str(program)))
+    for file in program, wrapper:
+        file.chmod(0o755)
+    monkeypatch.setenv('ROS_PACKAGE_PATH', str(tmp_path))
+    assert len(ros_process.find('wrapped', program.name)) == 2
+    with master.load('wrapped', program.name, 'spin') as node:
+        assert node.path == str(program)

@@ -25,7 +25,8 @@ def find_program(package: Any, executable: Optional[str] = None) -> str:
             )
         return path
     paths = ros_process.find(package, executable)
-    if len(paths) > 1:
+    # a devel space has a wrapper of what the package's folder has
+    if len(paths) > 1 and len({os.path.realpath(source_of(path)) for path in paths}) > 1:
         raise UnknownNodeError(
             f'the ROS package {package} has several programs {executable!r}: load the one that you'
             f" mean by its path, of {', '.join(paths)}"
