@@ -26,7 +26,7 @@ from fuzz import Fuzz
 from pharos import BlockNode
 from pharos.private_rospy import acceptor, xmlrpc_server
 from pharos.private_rospy.patches import tcpros_server
-from programs import Program
+from programs import Program, run
 
 FUZZ_COUNT = int(os.environ.get('PHAROS_FUZZ_COUNT', 2500))  # bad clients; tools/soak makes it more
 STRING = std_msgs.msg.String
@@ -745,6 +745,15 @@ def test_the_master_may_stop_a_node_whose_name_it_gave_away(master, far_client):
     )
     until(lambda: node.lifecycle.value == 'stopped')
     master.api('/taken_over').unregisterPublisher('/clients/taken', 'http://127.0.0.1:1/')
+
+
+def test_a_service_that_is_for_nearby_callers_answers_them_alone(node, warnings, monkeypatch):
+    node.serve('/clients/near', 'std_srvs/Trigger', lambda request: (True, 'done'), only_nearby=True)
+    caller = ['rosservice', 'call', '/clients/near']
+    assert 'done' in run(node.master.url, *caller).stdout
+    monkeypatch.setattr(xmlrpc_server, 'ends_of_call', lambda: (FAR, '192.0.2.1'))
+    assert "for this host and the master's alone" in run(node.master.url, *caller).stderr
+    assert "/clients/near is for this host and the master's alone: refused to /" in warnings.next()
 
 
 @pytest.mark.parametrize(

@@ -286,7 +286,11 @@ class Node(NodeAttributes):
     # -- services, parameters, log
 
     def serve(
-        self, name: str, typed_as: Union[str, type], block: Callable[[Any], Any]
+        self,
+        name: str,
+        typed_as: Union[str, type],
+        block: Callable[[Any], Any],
+        only_nearby: bool = False,
     ) -> OfferedService:
         """Offer a service; returns a handle with ``close()``.
 
@@ -295,9 +299,11 @@ class Node(NodeAttributes):
         and is reported as a delegate's.
 
         :param typed_as: service type name, such as 'std_srvs/Empty', or class
+        :param only_nearby: answer only calls from this host and the master's
         :raises MasterUnreachableError: if the master does not answer; nothing is left behind then
         """
-        return OfferedService(self, self.current_run.resolve(name, 'service'), typed_as, block)
+        name = self.current_run.resolve(name, 'service')
+        return OfferedService(self, name, typed_as, block, only_nearby)
 
     def parameter(self, name: str, initialized: Any = None) -> Parameter:
         """The :class:`Parameter` of that name ('~rate' is private); set to ``initialized`` where it

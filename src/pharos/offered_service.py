@@ -12,6 +12,7 @@ from pharos.private_rospy import local_services
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.deadlines import time_limit
 from pharos.private_rospy.registration import UNREGISTER_TIMEOUT
+from pharos.private_rospy.xmlrpc_server import is_call_from_nearby
 
 if TYPE_CHECKING:
     from pharos.node import Node
@@ -22,9 +23,17 @@ Block = Callable[[Any], Any]
 class OfferedService:
     """A service of a node; made by :meth:`Node.serve`."""
 
-    def __init__(self, node: 'Node', name: str, typed_as: Union[str, type], block: Block) -> None:
+    def __init__(
+        self,
+        node: 'Node',
+        name: str,
+        typed_as: Union[str, type],
+        block: Block,
+        only_nearby: bool = False,
+    ) -> None:
         self.node = node
         self.name = name
+        self._only_nearby = only_nearby
         self.service_class = messages.service_class(typed_as)
         self._check = copier_for(self.service_class._response_class).freeze
         self.block = block
@@ -69,6 +78,10 @@ class OfferedService:
 
     def _answer(self, request: genpy.Message) -> genpy.Message:
         block = self.block
+        if self._only_nearby and not is_call_from_nearby(self.node.master.url):
+            why = f"{self.name} is for this host and the master's alone"
+            self.node.log(f'{why}: refused to {request._connection_header["callerid"]}', 'warn')
+            raise rospy.ServiceException(f'refused: {why}')
         try:
             return self._as_response(block(request))
         except BaseException as error:

@@ -16,7 +16,8 @@ from pharos.private_rospy.deadlines import DeadlineReader
 REQUEST_TIMEOUT = 30.0  # seconds from one answer until the next request has come, however slowly
 REQUEST_LIMIT = 1 << 20  # bytes of a request
 
-_thread = threading.local()  # .handler: the RequestHandler whose client's call it answers
+#: .handler: the RequestHandler whose client's call it answers, .connection: the socket of a client
+_thread = threading.local()
 
 
 class RequestHandler(xmlrpc.server.SimpleXMLRPCRequestHandler):
@@ -94,6 +95,7 @@ class RequestHandler(xmlrpc.server.SimpleXMLRPCRequestHandler):
             self.server.node.lifetime.untrack_socket(self.connection)
             self.close_connection = True
         _thread.handler = self
+        answers_calls_of(self.connection)
         answer = self.server._marshaled_dispatch(body)
         self.connection.settimeout(REQUEST_TIMEOUT)
         self.send_response(200)
@@ -121,18 +123,27 @@ def caller():
     return _thread.handler
 
 
+def answers_calls_of(sock):
+    """What this thread does from now on is for the client at that socket."""
+    _thread.connection = sock
+
+
 def ends_of_call():
-    """The IP addresses, the client's and ours, of the call that this thread answers."""
-    ends = caller().client_address, caller().connection.getsockname()
+    """The IP addresses, the client's and ours, of the call that this thread answers; two times the
+    same for a call within this process."""
+    connection = getattr(_thread, 'connection', None)
+    if connection is None:
+        return ['127.0.0.1', '127.0.0.1']
+    ends = connection.getpeername(), connection.getsockname()
     return [address.partition('%')[0].replace('::ffff:', '') for address, *_ in ends]
 
 
 def is_call_from_nearby(master_url):
     """Whether the call that this thread answers comes from this host, or that of the master."""
-    client, here = map(ipaddress.ip_address, ends_of_call())
-    if client == here or client.is_loopback:
-        return True
     try:
+        client, here = map(ipaddress.ip_address, ends_of_call())
+        if client == here or client.is_loopback:
+            return True
         return client in addresses_of(urllib.parse.urlsplit(master_url).hostname)
-    except OSError:  # the name has no address, or none that can be found now
+    except OSError:  # the client has gone; or the name has no address, or none that can be found now
         return False

@@ -13,6 +13,7 @@ from pharos.private_rospy.lifetime import shutdown_socket
 from pharos.private_rospy.names import NAME_LIMIT
 from pharos.private_rospy.patches.table import patch, substitute
 from pharos.private_rospy.process_rospy import rospy
+from pharos.private_rospy.xmlrpc_server import answers_calls_of
 
 HANDSHAKE_TIMEOUT = 5.0  # seconds for the whole handshake, however slowly it comes
 HANDSHAKE_LIMIT = 1 << 20  # bytes of a connection header; real ones hold a message definition
@@ -207,6 +208,7 @@ def handle(self, transport, header, *, node):
     clients, sock = node.service_clients, transport.socket
     is_persistent = header.get('persistent', '').lower() in ('1', 'true')
     goes_on = header.get('probe') != '1'
+    answers_calls_of(sock)
     try:
         address = sock.getpeername()
         while goes_on:
