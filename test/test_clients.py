@@ -748,7 +748,9 @@ def test_the_master_may_stop_a_node_whose_name_it_gave_away(master, far_client):
 
 
 def test_a_service_that_is_for_nearby_callers_answers_them_alone(node, warnings, monkeypatch):
-    node.serve('/clients/near', 'std_srvs/Trigger', lambda request: (True, 'done'), only_nearby=True)
+    node.serve(
+        '/clients/near', 'std_srvs/Trigger', lambda request: (True, 'done'), only_nearby=True
+    )
     caller = ['rosservice', 'call', '/clients/near']
     assert 'done' in run(node.master.url, *caller).stdout
     monkeypatch.setattr(xmlrpc_server, 'ends_of_call', lambda: (FAR, '192.0.2.1'))

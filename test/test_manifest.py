@@ -77,6 +77,13 @@ def types(source):
             yield node.value.partition('/')[0]
 
 
+def libraries(source):
+    """The packages of the libraries that it binds to a node, by ros_import."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call) and getattr(node.func, 'attr', None) == 'ros_import':
+            yield node.args[0].value.partition('.')[0]
+
+
 def is_standard(module):
     if module in KEYS:  # tkinter is a package of its own in Debian
         return False
@@ -99,7 +106,9 @@ def test_what_is_used_at_run_time_is_declared_and_nothing_else():
     # whoever uses pharos.testing has pytest, which runs it
     paths = [path for path in sources('src', 'scripts') if path.name != 'testing.py']
     texts = [path.read_text() for path in paths]
-    used = keys(name for text in texts for found in (imports, types) for name in found(text))
+    used = keys(
+        name for text in texts for found in (imports, types, libraries) for name in found(text)
+    )
     assert used == declared('depend', 'exec_depend')
 
 

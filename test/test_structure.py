@@ -51,7 +51,8 @@ ROSPYS_INSIDE = re.compile(
 
 EXPORTS = """
     Master Node BlockNode ScriptNode Lifecycle ExternalNode Topic InputChannel OutputChannel Service
-    Parameter Transcript RosProcess Failure message_class service_class define_message define_service spin __version__
+    Parameter Transcript RosProcess Composition Failure message_class
+    service_class define_message define_service spin __version__
     PharosError MasterUnreachableError NodeNameInUseError PortInUseError UnknownNodeError UnknownTopicError
     UnknownTypeError MessageTypeError UnknownServiceError ServiceTypeError ServiceCallError NodeStoppedError
 """.split()

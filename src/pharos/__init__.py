@@ -36,6 +36,7 @@ from pharos.topic import Topic
 from pharos.transcript import Transcript
 
 if TYPE_CHECKING:
+    from pharos.compose.composition import Composition
     from pharos.compose.script import ScriptNode
 
 __version__ = '0.1.0'
@@ -53,6 +54,7 @@ __all__ = [
     'Parameter',
     'Transcript',
     'RosProcess',
+    'Composition',
     'Failure',
     'message_class',
     'service_class',

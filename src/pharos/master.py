@@ -5,6 +5,7 @@ from typing import (
     TYPE_CHECKING,
     Any,
     Callable,
+    Collection,
     Dict,
     Iterable,
     List,
@@ -21,13 +22,12 @@ from pharos.blocks import check_block
 from pharos.errors import PharosError, UnknownNodeError, suggest
 from pharos.external_node import ExternalNode
 from pharos.master_calls import MasterCalls
-from pharos.node import Node
+from pharos.node import Node, start_made
 from pharos.parameters import Parameters
 from pharos.private_rospy.addresses import check_port, check_url
 from pharos.private_rospy.names import check_name, global_name
 from pharos.private_rospy.deadlines import MARGIN, time_limit
 from pharos.ros_process import RosProcess
-from pharos.run import Lifecycle
 from pharos.seconds import check_limit
 from pharos.service import Service
 from pharos.topic import Topic
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
     from typing_extensions import ParamSpec  # part of typing since Python 3.10
 
+    from pharos.compose.composition import Composition
     from pharos.compose.script import ScriptNode
 
     Init = ParamSpec('Init')
@@ -161,7 +162,7 @@ class Master(MasterCalls):
             xmlrpc_port=xmlrpc_port,
             argv=argv,
         )
-        _start(node)
+        start_made(node)
         return node
 
     def run(
@@ -241,6 +242,37 @@ class Master(MasterCalls):
             self, package, executable, args, name, namespace, remap=remap, params=params
         )
         return node
+
+    def compose(
+        self,
+        package: Optional[str],
+        file: str,
+        *,
+        only: Collection[str] = (),
+        apart: Collection[str] = (),
+        share_connections: bool = False,
+        **args: object,
+    ) -> 'Composition':
+        """Start a launch file whose Python nodes all run in this process, unmodified; returns the
+        :class:`~pharos.Composition`.
+
+        What else is in it (C++, nodes of other machines, those with a launch-prefix) runs as
+        ``roslaunch`` starts it, in processes of their own. A node that cannot be started is told,
+        and the others go on.
+
+        :param package: a ROS package; None: ``file`` is a path
+        :param only: the names of the nodes that are wanted; all, if there are none
+        :param apart: the names of Python nodes that are to have processes of their own
+        :param share_connections: is to come
+        :param args: the launch file's arguments
+        :raises UnknownNodeError: if there is no such package, launch file, argument or node in it
+        :raises PharosError: if roslaunch cannot read the file
+        :raises MasterUnreachableError: if the master does not answer
+        """
+        composition: 'Composition' = importlib.import_module('pharos.compose.composition').compose(
+            self, package, file, only, apart, share_connections, args
+        )
+        return composition
 
     # -- what is there
 
@@ -359,17 +391,3 @@ class Master(MasterCalls):
 
     def __repr__(self) -> str:
         return f'<Master {self.url}>'
-
-
-def _start(node: Node) -> None:
-    with node_registry.start_of(node):
-        try:
-            node.start()
-            if node.lifecycle is Lifecycle.NEW:
-                raise PharosError(
-                    f'{node.name} did not start: {type(node).__name__}.start() has to call '
-                    'super().start() before anything else'
-                )
-        except BaseException:
-            node_registry.stop(node)
-            raise

@@ -370,3 +370,21 @@ def _of_one_run(start: Callable[..., Any]) -> Callable[..., Any]:
             return start(node, *args, **kwargs)
 
     return start_in_run
+
+
+def start_made(node: Node) -> None:
+    """Start a node that has just been made; where that fails, nothing of it is left.
+
+    :raises PharosError: if its own start() does not start it
+    """
+    with node_registry.start_of(node):
+        try:
+            node.start()
+            if node.latest_run is None:
+                raise PharosError(
+                    f'{node.name} did not start: {type(node).__name__}.start() has to call '
+                    'super().start() before anything else'
+                )
+        except BaseException:
+            node_registry.stop(node)
+            raise

@@ -50,6 +50,7 @@ _waiting: 'Dict[int, Node]' = {}  # identifier of a thread -> the node for whose
 _runs_ended = 0  # since the collector ran
 _finalizer: Any = None  # what multiprocessing runs at the end of its processes
 _others: List[Callable[[], Any]] = []  # they end what else was started: programs, masters
+_starters: List[Callable[[], Any]] = []  # they have nodes started no more
 
 
 def nodes() -> 'List[Node]':
@@ -303,6 +304,8 @@ def stop_all() -> None:
 
     Returns when each has ended its ``stop()``, or after STOP_LIMIT seconds.
     """
+    for function in list(_starters):
+        function()
     with changed:
         threads = [
             threading.Thread(target=stop, args=(node,), name=node.name + ' stop', daemon=True)
@@ -311,6 +314,17 @@ def stop_all() -> None:
     for thread in threads:
         thread.start()
     join(threads, STOP_LIMIT)
+
+
+def before_stop_all(function: Callable[[], Any]) -> None:
+    """Run ``function()`` before all nodes are stopped, so that who starts nodes anew starts none."""
+    _starters.append(function)
+
+
+def not_before_stop_all(function: Callable[[], Any]) -> None:
+    """Run it no more. Harmless when done twice."""
+    with contextlib.suppress(ValueError):
+        _starters.remove(function)
 
 
 # -- the end of the program
@@ -362,7 +376,7 @@ def _forget() -> None:
     changed = threading.Condition()
     _finalizer = None  # its parent's, which multiprocessing has dropped
     former = list(_nodes.values())
-    for known in (_nodes, _stops, _starts, _waiting, _others):
+    for known in (_nodes, _stops, _starts, _waiting, _others, _starters):
         known.clear()  # type: ignore[attr-defined]
     for node in former:
         node.latest_run.abandon()

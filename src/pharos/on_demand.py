@@ -3,7 +3,10 @@ import importlib
 import sys
 from typing import Any, List
 
-_MODULES = {'ScriptNode': 'pharos.compose.script'}
+_MODULES = {
+    'Composition': 'pharos.compose.composition',
+    'ScriptNode': 'pharos.compose.script',
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -1,10 +1,22 @@
 """Launch files, read by roslaunch itself, and who is to run which of their nodes."""
 import copy
+import dataclasses
 import os
 import re
 import shlex
 import sys
-from typing import Any, Collection, Dict, Iterable, List, NamedTuple, Optional, Set, Tuple
+from typing import (
+    Any,
+    Collection,
+    Dict,
+    Iterable,
+    List,
+    Mapping,
+    NamedTuple,
+    Optional,
+    Sequence,
+    Set,
+)
 
 import rosgraph.names
 import roslaunch.config
@@ -23,21 +35,22 @@ _USES_PHAROS = re.compile(rb'^\s*(from|import) pharos\b', re.MULTILINE)
 _MISSING_ARG = re.compile(r"requires the '(\S+)' arg to be set")
 
 
-class LaunchedNode(NamedTuple):
-    """A node of a launch file that is to run in this process."""
+@dataclasses.dataclass(frozen=True)
+class LaunchedNode:
+    """A node that is to run in this process, of a launch file mostly."""
 
     name: str
     program: str  # 'package/executable'
     path: str
-    args: List[str]  # the whole command line that roslaunch would give it, but for the path
-    namespace: str
-    env: Dict[str, str]  # what the launch file adds to the environment
-    cwd: str
-    is_cwd_asked_for: bool
-    output: str  # 'log' or 'screen'
-    is_required: bool
-    respawn_delay: Optional[float]  # seconds; None: it is not started again
-    file: str  # the launch file that it is in
+    args: Sequence[str] = ()  # the command line, but for the path, as roslaunch would give it
+    env: Mapping[str, str] = dataclasses.field(default_factory=dict)  # of the launch file
+    cwd: Optional[str] = None
+    output: str = 'log'  # or 'screen'
+    is_required: bool = False
+    respawn_delay: Optional[float] = None  # seconds; None: it is not started again
+    file: str = ''  # the launch file that it is in
+    takes_own_name: bool = False  # whether its program names the node
+    private_name: Optional[str] = None  # the node in whose namespace its private names are
 
 
 class Problem(NamedTuple):
@@ -163,10 +176,8 @@ class LaunchFile:
                 program=f'{node.package}/{node.type}',
                 path=command[0],
                 args=command[1:],
-                namespace=node.namespace,
                 env={str(key): str(value) for key, value in node.env_args},
                 cwd=os.path.dirname(command[0]) if node.cwd == 'node' else rospkg.get_ros_home(),
-                is_cwd_asked_for=node.cwd is not None,
                 output=node.output or 'log',
                 is_required=bool(node.required),
                 respawn_delay=float(node.respawn_delay or 0) if node.respawn else None,
@@ -228,14 +239,3 @@ def _is_python(word: bytes) -> bool:
     environment = os.path.dirname(folder.decode(errors='replace'))
     is_virtual = os.path.exists(os.path.join(environment, 'pyvenv.cfg')) if folder else False
     return not is_virtual or os.path.realpath(environment) == os.path.realpath(sys.prefix)
-
-
-def find_program(program: str) -> Tuple[str, str]:
-    """``(package, executable)`` of a text 'PKG/EXECUTABLE'.
-
-    :raises ValueError: if it is none
-    """
-    package, _, executable = program.partition('/')
-    if not package or not executable:
-        raise ValueError(f'{program!r} names no program: it is to be PACKAGE/EXECUTABLE')
-    return package, executable

@@ -31,6 +31,7 @@ class ScriptNode(Node):
     :param env: ``{name: value}`` of further environment variables
     :param takes_own_name: whether it has the name that it gives to ``init_node``, and not the one
         given here
+    :param private_name: the node in whose namespace its private names are; None: itself
     """
 
     #: seconds that :meth:`start` waits for the program to call ``rospy.init_node``, or to end
@@ -44,6 +45,7 @@ class ScriptNode(Node):
         params: Optional[Dict[str, Any]] = None,
         env: Optional[Dict[str, str]] = None,
         takes_own_name: bool = False,
+        private_name: Optional[str] = None,
     ) -> None:
         super().__init__()
         found = find_program(path)
@@ -51,6 +53,7 @@ class ScriptNode(Node):
         self._settings.for_program(
             found, self.args, remap or {}, params or {}, env or {}, takes_own_name
         )
+        self._settings.private_name = private_name
 
     def start(self) -> None:
         """Run the program from its first line.

@@ -38,6 +38,9 @@ class Settings:
         parameter
     """
 
+    #: the node in whose namespace its private names are; None: itself
+    private_name: Optional[str] = None
+
     def __init__(
         self,
         name: str,

@@ -145,5 +145,5 @@ def is_call_from_nearby(master_url):
         if client == here or client.is_loopback:
             return True
         return client in addresses_of(urllib.parse.urlsplit(master_url).hostname)
-    except OSError:  # the client has gone; or the name has no address, or none that can be found now
+    except OSError:  # the client has gone, or the name has no address that can be found now
         return False

@@ -4,9 +4,11 @@ from pharos.private_rospy.patches.table import patch
 
 
 @patch('rospy.names', 'resolve_name', 'remaps once more what is resolved already')
-def resolve_name(name, caller_id=None, *, original):
-    """Leave alone what says that it is resolved."""
-    return str(name) if isinstance(name, Resolved) else original(name, caller_id)
+def resolve_name(name, caller_id=None, *, node, original):
+    """Leave alone what says that it is resolved; find private names where the settings say."""
+    if isinstance(name, Resolved):
+        return str(name)
+    return original(name, caller_id or node.settings.private_name)
 
 
 @patch(

@@ -1,4 +1,4 @@
-#!/usr/bin/python3
+#!/usr/bin/env python3
 """Says on 'mirrored' how it was started: arguments, environment, working directory, parameters."""
 import json
 import os

@@ -1,0 +1,107 @@
+"""The node that a composition is for others: it loads and unloads programs by nodelet's services."""
+from typing import TYPE_CHECKING, Any, Dict, List
+
+from pharos.compose.kept_node import KeptNode
+from pharos.compose.launch_file import LaunchedNode
+from pharos.compose.programs import find_program
+from pharos.errors import PharosError, UnknownNodeError, suggest
+from pharos.node import Node
+
+if TYPE_CHECKING:
+    from pharos.compose.composition import Composition
+
+SERVICES = 'load_nodelet', 'unload_nodelet', 'list'
+
+
+class Container(Node):
+    """Loads programs into a composition, as nodelet's manager does nodelets: ``nodelet load
+    PACKAGE/EXECUTABLE NAME``, where NAME is this node's.
+
+    :param composition: whose nodes they will be
+    :param allow_remote_load: whether any host may ask for that, not only this one and the master's
+    """
+
+    def __init__(self, composition: 'Composition', allow_remote_load: bool = False) -> None:
+        super().__init__()
+        self.composition = composition
+        self._only_nearby = not allow_remote_load
+        self._loaded: Dict[str, KeptNode] = {}
+        self._bonds: Dict[str, Any] = {}
+
+    def start(self) -> None:
+        """Offer the services.
+
+        :raises UnknownTypeError: if nodelet is not installed
+        """
+        super().start()
+        self.serve('~load_nodelet', 'nodelet/NodeletLoad', self._load, self._only_nearby)
+        self.serve('~unload_nodelet', 'nodelet/NodeletUnload', self._unload, self._only_nearby)
+        self.serve('~list', 'nodelet/NodeletList', self._list)
+
+    def _load(self, request: Any) -> bool:
+        package, _, executable = request.type.partition('/')
+        if not package or not executable or '/' in executable:
+            raise PharosError(f'{request.type!r} names no program: it is to be PACKAGE/EXECUTABLE')
+        if request.name in self._running():
+            raise PharosError(f'{request.name} is loaded already: unload it first, or name another')
+        if len(request.remap_source_args) != len(request.remap_target_args):
+            raise PharosError('there are not as many sources of remappings as targets')
+        remaps = zip(request.remap_source_args, request.remap_target_args)
+        name = request.name
+        if request._connection_header.get('callerid') == name:
+            # `nodelet load` has that name itself, for as long as this is loaded
+            name += f"_in_{self.name.rpartition('/')[2]}"
+        launched = LaunchedNode(
+            name=name,
+            program=request.type,
+            path=find_program(package, executable),
+            args=[*request.my_argv, *(f'{source}:={target}' for source, target in remaps)],
+            private_name=request.name,
+        )
+        (kept,) = self.composition.start([launched])
+        kept.settled.wait()
+        if kept.problem is not None:
+            raise kept.problem
+        self._loaded[request.name] = kept
+        if request.bond_id:
+            self._bind(request.name, request.bond_id)
+        return True
+
+    def _bind(self, name: str, bond_id: str) -> None:
+        """Unload it when whoever loaded it has gone, and have them know when it has ended."""
+        bond = self.ros_import('bondpy').bondpy.Bond(
+            f'{self.name}/bond', bond_id, on_broken=lambda: self._drop(name)
+        )
+        self._bonds[name] = bond
+        bond.start()
+        self.fork(lambda me: self._drop_at_its_end(name), name=f'bond of {name}')
+
+    def _drop_at_its_end(self, name: str) -> None:
+        kept = self._loaded[name]
+        while not kept.is_over:
+            self.sleep(0.1)
+        self._drop(name)
+
+    def _drop(self, name: str) -> None:
+        kept, bond = self._loaded.pop(name, None), self._bonds.pop(name, None)
+        if kept is not None:
+            kept.stop()
+        if bond is not None:
+            bond.shutdown()
+
+    def _unload(self, request: Any) -> bool:
+        if request.name not in self._loaded:
+            raise UnknownNodeError(
+                f'{request.name} is not loaded here{suggest(request.name, self._loaded)}'
+            )
+        self._drop(request.name)
+        return True
+
+    def _list(self, request: Any) -> List[str]:
+        return self._running()
+
+    def _running(self) -> List[str]:
+        loaded = {id(kept): name for name, kept in self._loaded.items()}
+        return [
+            loaded.get(id(kept), kept.name) for kept in self.composition.kept if not kept.is_over
+        ]

@@ -1,0 +1,181 @@
+"""master.compose: launch files whose Python nodes run in this process."""
+import json
+import os
+
+import pytest
+
+import pharos
+from helpers import create
+from pharos.compose import composition
+from pharos.testing import Mailbox, TIMEOUT, until
+from programs import ROOT, forget_parameters
+
+PACKAGE = ROOT / 'test' / 'programs' / 'composed_robot'
+STRING = 'std_msgs/String'
+
+
+@pytest.fixture(autouse=True)
+def packages(monkeypatch, tmp_path):
+    """The packages of test/programs are on ROS_PACKAGE_PATH; ROS's own folder is the test's."""
+    monkeypatch.setenv('ROS_PACKAGE_PATH', os.pathsep.join([str(PACKAGE.parent), '/usr/share']))
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+
+
+@pytest.fixture
+def compose(master):
+    """``compose('chat.launch', text='hello')``: a Composition, which ends with the test."""
+    begun = []
+
+    def compose(file, **options):
+        begun.append(master.compose('composed_robot', file, **options))
+        return begun[-1]
+
+    yield compose
+    for each in begun:
+        each.stop()
+    forget_parameters(master.url)
+
+
+def test_the_python_nodes_of_a_launch_file_run_in_this_process(master, compose):
+    composed = compose('chat.launch')
+    assert [node.name for node in composed.nodes] == ['/talker']
+    assert isinstance(composed, pharos.Composition)
+    assert master.node('/talker') is composed.nodes[0]
+
+
+def test_the_others_run_as_roslaunch_starts_them(master, compose):
+    mailbox = Mailbox(create(master, '/hearer'), '/heard', STRING)
+    composed = compose('chat.launch', text='by way of C++')
+    assert mailbox.next(TIMEOUT).data == 'by way of C++'
+    assert isinstance(master.node('/relay'), pharos.ExternalNode)
+    assert composed.process.poll() is None
+
+
+def test_there_is_no_process_where_all_nodes_run_here(compose):
+    assert compose('respawn.launch', delay=100).process is None
+
+
+def test_a_python_node_runs_apart_where_asked_for(master, compose):
+    composed = compose('chat.launch', apart=['talker'])
+    assert composed.nodes == []
+    assert isinstance(master.wait_for_node('/talker', TIMEOUT), pharos.ExternalNode)
+
+
+def test_the_parameters_of_the_file_are_set(master, compose):
+    compose('chat.launch', only=['talker'])
+    assert master.parameters['/said_by'] == 'the file'
+    assert master.parameters['/talker/text'] == 'hello'
+
+
+def test_parameters_are_cleared_where_the_file_says_so(master, compose):
+    master.parameters['/cleared/old'] = 1
+    master.parameters['/kept/old'] = 1
+    compose('cleared.launch')
+    assert master.parameters['/cleared'] == {'new': 1}
+    assert master.parameters['/kept/old'] == 1
+
+
+def test_a_node_finds_what_roslaunch_would_have_given_it(master, compose):
+    mailbox = Mailbox(create(master, '/hearer'), '/reflection', STRING)
+    compose('mirror.launch')
+    told = json.loads(mailbox.next(TIMEOUT).data)
+    run_id = master.parameters['/run_id']
+    log = os.path.join(os.environ['ROS_LOG_DIR'], run_id, 'deep-mirror-1.log')
+    assert told['argv'] == [
+        *(str(PACKAGE / 'scripts' / 'mirror.py'), 'one', 'two words'),
+        *('mirrored:=/reflection', '__name:=mirror', f'__log:={log}'),
+    ]
+    assert told['environment']['FOR_ONE'] == '1'
+    assert told['environment']['ROS_NAMESPACE'] == '/deep'
+    assert told['environment']['ROS_MASTER_URI'] == master.url
+    assert told['parameters'] == {'list': [1, 2]}
+    assert os.path.exists(log)
+
+
+def test_the_environment_of_a_node_is_its_own(compose):
+    compose('mirror.launch')
+    assert 'FOR_ONE' not in os.environ
+
+
+def test_a_stop_ends_all_nodes(master, compose):
+    composed = compose('chat.launch')
+    master.wait_for_node('/relay', TIMEOUT)
+    composed.stop()
+    assert not composed.nodes[0].is_running
+    assert composed.process.poll() is not None
+    assert {node.name for node in master.nodes()} <= {'/rosout'}
+
+
+def test_it_ends_with_its_block(master, compose):
+    with compose('chat.launch') as composed:
+        pass
+    assert not composed.nodes[0].is_running
+
+
+def test_to_wait_has_a_limit(compose):
+    with pytest.raises(TimeoutError, match='/talker have not ended within 0.1 s'):
+        compose('chat.launch', only=['talker']).wait(0.1)
+
+
+def test_a_required_node_that_ends_here_ends_all(master, compose, transcript):
+    composed = compose('required.launch')
+    master.wait_for_node('/relay', TIMEOUT)
+    del master.parameters['/ends/stay']
+    assert composed.wait(TIMEOUT) == 1
+    assert not any(node.is_running for node in composed.nodes)
+    assert composed.process.poll() is not None
+    assert '/ends, which is required, has ended: all others end' in transcript
+
+
+def test_a_required_node_that_ends_apart_ends_all(master, compose, transcript):
+    composed = compose('required.launch', apart=['ends'])
+    master.wait_for_node('/ends', TIMEOUT)
+    del master.parameters['/ends/stay']
+    assert composed.wait(TIMEOUT) == 1
+    assert not any(node.is_running for node in composed.nodes)
+    assert (
+        'a required one of /relay, /ends, which run apart, has ended: all others end' in transcript
+    )
+
+
+def test_a_node_that_is_to_be_started_again_is(master, compose):
+    compose('respawn.launch')
+    until(lambda: master.parameters.get('/ends/starts', 0) > 2)
+
+
+def test_a_node_is_started_again_after_the_delay(master, compose):
+    composed = compose('respawn.launch', delay=1000)
+    (kept,) = composed.kept
+    until(lambda: kept.outcome == 'ended with exit code 1')
+    assert not composed.is_over
+
+
+@pytest.mark.parametrize('how', ['stop', 'stop_all'])
+def test_what_has_been_ended_is_not_started_again(compose, how):
+    composed = compose('respawn.launch')
+    {'stop': composed.stop, 'stop_all': pharos.node_registry.stop_all}[how]()
+    until(lambda: composed.is_over)
+    assert not composed.nodes[0].is_running
+
+
+def test_a_node_that_takes_long_to_start_does_not_keep_the_others(master, compose, monkeypatch):
+    monkeypatch.setattr(composition, 'PATIENCE', 0.1)
+    composed = compose('hangs.launch')
+    assert [node.name for node in composed.nodes][1] == '/talker'
+    master.parameters['/go'] = True
+    assert isinstance(master.wait_for_node('/hangs', TIMEOUT), pharos.ScriptNode)
+
+
+def test_what_cannot_be_started_is_told_and_the_others_go_on(compose, transcript):
+    composed = compose('missing.launch')
+    assert [node.name for node in composed.nodes if node.is_running] == ['/talker']
+    package, program, syntax = transcript
+    assert "missing.launch: /without_package is not started: there is no ROS package" in package
+    assert 'missing.launch: /without_program is not started: Cannot locate node' in program
+    assert "missing.launch: /with_syntax_error (composed_robot/broken) is not started" in syntax
+    assert "SyntaxError: 'return' outside function" in syntax
+
+
+def test_to_share_connections_is_to_come(compose):
+    with pytest.raises(pharos.PharosError, match='share_connections is to come'):
+        compose('chat.launch', share_connections=True)
