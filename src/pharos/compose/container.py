@@ -64,15 +64,18 @@ class Container(Node):
             raise kept.problem
         self._loaded[request.name] = kept
         if request.bond_id:
-            self._bind(request.name, request.bond_id)
+            try:
+                self._bind(request.name, request.bond_id)
+            except BaseException:
+                self._drop(request.name)
+                raise
         return True
 
     def _bind(self, name: str, bond_id: str) -> None:
         """Unload it when whoever loaded it has gone, and have them know when it has ended."""
-        bond = self.ros_import('bondpy').bondpy.Bond(
+        bond = self._bonds[name] = self.ros_import('bondpy.bondpy').Bond(
             f'{self.name}/bond', bond_id, on_broken=lambda: self._drop(name)
         )
-        self._bonds[name] = bond
         bond.start()
         self.fork(lambda me: self._drop_at_its_end(name), name=f'bond of {name}')
 

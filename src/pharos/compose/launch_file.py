@@ -130,7 +130,7 @@ class LaunchFile:
                 f'{self.path} needs the ROS package {package!r}, which is not on ROS_PACKAGE_PATH:'
                 " install it, or source its workspace's setup.bash"
             )
-        text = str(error)
+        text = '; '.join(line for line in str(error).splitlines() if line)
         missing = _MISSING_ARG.search(text)
         if missing:
             text += f': give it with {missing.group(1)}:=VALUE'

@@ -1,0 +1,179 @@
+"""rosrun pharos compose, as a user runs it, and its services of a nodelet manager."""
+import os
+import signal
+import sys
+
+import pytest
+
+from helpers import create
+from pharos import Master
+from pharos.testing import Mailbox, TIMEOUT, until
+from programs import ROOT, Program, forget_parameters, run, script
+
+PACKAGES = ROOT / 'test' / 'programs'
+STRING = 'std_msgs/String'
+NODELET = '/usr/lib/nodelet/nodelet'  # where rosrun finds it in Debian
+LOAD = [NODELET, 'load', 'composed_robot/talker', 'compose', '__name:=talker']
+
+
+@pytest.fixture(autouse=True)
+def packages(monkeypatch, tmp_path):
+    """The packages of test/programs are on ROS_PACKAGE_PATH; ROS's own folder is the test's."""
+    monkeypatch.setenv('ROS_PACKAGE_PATH', os.pathsep.join([str(PACKAGES), '/usr/share']))
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+
+
+@pytest.fixture
+def compose(master):
+    """``compose('composed_robot', 'chat.launch')``: the program, which ends with the test."""
+    begun = []
+
+    def compose(*arguments, url=master.url):
+        begun.append(Program(url, sys.executable, script('compose'), *arguments))
+        return begun[-1]
+
+    yield compose
+    for program in begun:
+        program.end()
+    forget_parameters(master.url)
+
+
+def nodes(master):
+    return {node.name for node in master.nodes()} - {'/rosout', '/pharos'}
+
+
+def test_a_launch_file_is_composed_until_ctrl_c(master, compose):
+    program = compose('composed_robot', 'chat.launch', 'text:=from the terminal')
+    mailbox = Mailbox(create(master, '/hearer'), '/heard', STRING)
+    assert mailbox.next(TIMEOUT).data == 'from the terminal'
+    assert master.wait_for_node('/talker', TIMEOUT).pid == program.process.pid
+    assert program.end(signal.SIGINT) == 0
+    assert nodes(master) == {'/hearer'}
+
+
+def test_it_tells_how_far_it_has_come_and_what_has_become_of_each(compose):
+    program = compose('composed_robot', 'missing.launch')
+    program.wait_for('with_syntax_error (composed_robot/broken) is not started')
+    program.end(signal.SIGINT)
+    printed = program.read_to_the_end().splitlines()
+    assert 'starting 1 of 2: /talker' in printed
+    assert printed[-2:] == ['/talker: stopped', '/with_syntax_error: did not start']
+
+
+def test_it_ends_when_all_nodes_have_ended(master, compose):
+    program = compose('--script', 'composed_robot/talker', 'composed_robot/no_such_program')
+    program.wait_for("composed_robot has no program 'no_such_program'")
+    (talker,) = [name for name in until_nodes(master, 2) if name.startswith('/talker_')]
+    assert run(master.url, 'rosnode', 'kill', talker).returncode == 0
+    assert program.process.wait(TIMEOUT) == 0
+
+
+def until_nodes(master, count):
+    until(lambda: len(nodes(master)) == count)
+    return nodes(master)
+
+
+def test_a_required_node_that_ends_is_told_and_is_the_status(master, compose):
+    program = compose('composed_robot', 'required.launch')
+    master.wait_for_node('/ends', TIMEOUT)
+    del master.parameters['/ends/stay']
+    program.wait_for('/ends, which is required, has ended: all others end')
+    assert program.process.wait(TIMEOUT) == 1
+
+
+@pytest.mark.parametrize(
+    'arguments, said',
+    [
+        (['no_such_package', 'a.launch'], "no ROS package 'no_such_package'"),
+        (['composed_robot', 'a.launch'], "composed_robot has no launch file 'a.launch'"),
+        (['/no/such.launch'], "there is no launch file '/no/such.launch'"),
+        (['composed_robot', 'broken.launch'], 'broken.launch: Invalid roslaunch XML syntax'),
+        (
+            ['composed_robot', 'twice.launch'],
+            'twice.launch: roslaunch file contains multiple nodes',
+        ),
+        (['composed_robot', 'chat.launch', 'texd:=x'], "chat.launch has no arg 'texd'"),
+        (['composed_robot', 'chat.launch', '--only', 'x'], "chat.launch has no node 'x'"),
+    ],
+)
+def test_what_cannot_be_composed_is_one_line_and_the_status(compose, arguments, said):
+    program = compose(*arguments)
+    assert program.process.wait(TIMEOUT) == 1
+    (line,) = [line for line in program.read_to_the_end().splitlines() if line]
+    assert said in line
+
+
+def test_a_master_is_started_where_there_is_none(compose):
+    port = free_port()
+    program = compose('composed_robot', 'respawn.launch', url=f'http://127.0.0.1:{port}/')
+    program.wait_for(f'no ROS master at http://127.0.0.1:{port}/: started one')
+    program.wait_for('started /ends')
+    assert program.end() == 0
+    assert not Master(f'http://127.0.0.1:{port}/').is_reachable()
+
+
+def free_port():
+    with Master.embedded() as master:
+        return int(master.url.rstrip('/').rpartition(':')[2])
+
+
+def test_two_of_them_go_side_by_side(master, compose):
+    compose()
+    master.wait_for_node('/compose', TIMEOUT)
+    compose()
+    assert len(until_nodes(master, 2)) == 2
+
+
+# -- a nodelet manager
+
+
+def test_nodelet_loads_a_program_which_ends_with_it(master, compose):
+    compose()
+    mailbox = Mailbox(create(master, '/hearer'), '/said', STRING)
+    with Program(master.url, *LOAD, 'chatter:=said', '_text:=loaded'):
+        assert mailbox.next(TIMEOUT).data == 'loaded'
+        assert '/talker' in run(master.url, 'rosservice', 'call', '/compose/list').stdout
+    until(lambda: nodes(master) == {'/compose', '/hearer'})
+
+
+def test_a_program_that_is_unloaded_ends_and_nodelet_with_it(master, compose):
+    compose()
+    with Program(master.url, *LOAD) as loader:
+        master.wait_for_node('/talker_in_compose', TIMEOUT)
+        unload = master.lookup_service('/compose/unload_nodelet')
+        assert unload.call(name='/talker').success
+        assert loader.process.wait(TIMEOUT) == 0
+    until(lambda: nodes(master) == {'/compose'})
+
+
+@pytest.mark.leaves('the registrations of the loader')
+def test_a_program_whose_loader_is_killed_ends(master, compose):
+    compose()
+    with Program(master.url, *LOAD) as loader:
+        master.wait_for_node('/talker_in_compose', TIMEOUT)
+        loader.end(signal.SIGKILL)
+    until(lambda: not master.is_node_alive('/talker_in_compose'))
+
+
+def test_a_launch_file_of_nodelets_loads_programs(master, compose):
+    compose()
+    mailbox = Mailbox(create(master, '/hearer'), '/said', STRING)
+    with master.launch('composed_robot', 'nodelet.launch'):
+        assert mailbox.next(TIMEOUT).data == 'loaded'
+
+
+@pytest.mark.parametrize(
+    'what, said',
+    [
+        ('composed_robot/../talker', 'names no program'),
+        ('/bin/sh', 'names no program'),
+        ('no_such_package/talker', "no ROS package 'no_such_package'"),
+        ('composed_robot/broken', 'SyntaxError'),
+    ],
+)
+def test_what_cannot_be_loaded_is_said_to_who_asked(master, compose, what, said):
+    compose()
+    until(lambda: '/compose/load_nodelet' in master.services())
+    request = f'{{name: /x, type: "{what}"}}'
+    answer = run(master.url, 'rosservice', 'call', '/compose/load_nodelet', request)
+    assert said in answer.stderr
