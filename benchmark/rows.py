@@ -5,6 +5,7 @@ import json
 import os
 import pathlib
 import signal
+import socket
 import subprocess
 import sys
 from typing import List, NamedTuple
@@ -205,3 +206,10 @@ def build_cpp():
         if done.returncode:
             sys.exit(f"{' '.join(command)} failed in {BUILD}:\n{done.stdout}")
     return []
+
+
+def free_port():
+    """A port that nobody has now."""
+    with socket.socket() as free:
+        free.bind(('127.0.0.1', 0))
+        return free.getsockname()[1]
