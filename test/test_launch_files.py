@@ -35,8 +35,8 @@ def test_nodes_of_python_run_here():
     assert names_here(read()) == ['/r2/talker', '/r2/mirror', '/again']
 
 
-def test_other_programs_prefixed_ones_and_those_of_another_python_run_apart():
-    assert names_apart(read()) == ['relay', 'prefixed', 'shell', 'old']
+def test_other_programs_prefixed_ones_and_those_that_make_nodes_themselves_run_apart():
+    assert names_apart(read()) == ['relay', 'prefixed', 'shell', 'own_nodes']
 
 
 def test_a_node_runs_apart_where_asked_for():
@@ -76,7 +76,7 @@ def test_required_and_respawn_are_read():
 
 def test_roslaunch_gets_the_rest_without_what_is_done_here():
     rest = read().rest()
-    assert [node.name for node in rest.nodes] == ['relay', 'prefixed', 'shell', 'old']
+    assert [node.name for node in rest.nodes] == ['relay', 'prefixed', 'shell', 'own_nodes']
     assert (rest.params, rest.nodes_core) == ({}, [])
     assert rest.master.uri == MASTER
 
@@ -141,3 +141,14 @@ def test_a_node_that_cannot_be_found_is_told_and_the_others_are_there():
         in package
     )
     assert 'Cannot locate node of type [no_such_program] in package [composed_robot]' in program
+
+
+def test_a_script_whose_interpreter_is_missing_is_told():
+    (problem,) = read().problems
+    assert problem.name == '/old'
+    assert problem.why.endswith('scripts/old names /usr/bin/python2.0, which is not there')
+
+
+def test_nodes_of_other_machines_run_there_and_tests_not_at_all():
+    file = read('machines.launch')
+    assert (names_here(file), names_apart(file), file.problems) == (['/here'], ['there'], [])

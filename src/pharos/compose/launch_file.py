@@ -4,6 +4,7 @@ import dataclasses
 import os
 import re
 import shlex
+import shutil
 import sys
 from typing import (
     Any,
@@ -25,10 +26,11 @@ import roslaunch.node_args
 import roslaunch.xmlloader
 import rospkg
 
+from pharos.compose.programs import source_of
 from pharos.errors import PharosError, UnknownNodeError, suggest
 from pharos.ros_process import find_launch_file
 
-_PYTHON = re.compile(rb'python(3(\.\d+)?)?')
+_PYTHON = re.compile(r'python(3(\.\d+)?)?')
 #: a program of ours makes its nodes itself: within another one they would not end with it
 _USES_PHAROS = re.compile(rb'^\s*(from|import) pharos\b', re.MULTILINE)
 #: what roslaunch lacks in the file, and its words for that
@@ -167,7 +169,12 @@ class LaunchFile:
                 )
             self.problems.append(Problem(name, node.filename, why))
             return
-        if is_kept_apart or node.launch_prefix or not runs_here(command[0]):
+        lacking = _lacks(command[0])
+        if lacking:
+            why = f'the first line of {command[0]} names {lacking}, which is not there'
+            self.problems.append(Problem(name, node.filename, why))
+            return
+        if is_kept_apart or node.launch_prefix or not _runs_here(command[0]):
             self.apart.append(node)
             return
         self.here.append(
@@ -217,25 +224,40 @@ def _command(node: Any) -> List[str]:
     return list(arguments[len(prefix) :])
 
 
-def runs_here(path: str) -> bool:
-    """Whether a program is Python's, for this interpreter, as its first line says."""
+def _interpreter(path: str) -> List[str]:
+    """The words of a script's first line that say what is to run it; none for other programs."""
     with open(path, 'rb') as file:
-        first_line = file.readline(256)
-        text = file.read() if first_line.startswith(b'#!') else b''
-    words = first_line[2:].split() if first_line.startswith(b'#!') else []
-    interpreter = next((word for word in words if _is_python(word)), None)
-    return interpreter is not None and not _USES_PHAROS.search(text)
+        line = file.readline(256).decode(errors='replace')
+    return line[2:].split() if line.startswith('#!') else []
 
 
-def _is_python(word: bytes) -> bool:
-    folder, _, base = word.rpartition(b'/')
-    match = _PYTHON.fullmatch(base)
-    if not match:
+def _lacks(path: str) -> str:
+    """What of the interpreter of a script is not there; roslaunch would start nothing at all for
+    that."""
+    words = _interpreter(path)
+    if not words:
+        return ''
+    if not os.path.exists(words[0]):
+        return words[0]
+    named = [word for word in words[1:] if not word.startswith('-') and '=' not in word]
+    is_env = os.path.basename(words[0]) == 'env'
+    return named[0] if is_env and named and shutil.which(named[0]) is None else ''
+
+
+def _runs_here(path: str) -> bool:
+    """Whether a program is Python's, for this interpreter, as its first line says."""
+    if not any(map(_is_python, _interpreter(path))):
         return False
-    minor = match.group(2)
-    if minor and minor != b'.%d' % sys.version_info[1]:
+    with open(source_of(path), 'rb') as file:
+        return not _USES_PHAROS.search(file.read())
+
+
+def _is_python(word: str) -> bool:
+    folder, base = os.path.split(word)
+    match = _PYTHON.fullmatch(base)
+    if not match or match.group(2) not in (None, f'.{sys.version_info[1]}'):
         return False
     # a virtual environment has packages of its own
-    environment = os.path.dirname(folder.decode(errors='replace'))
-    is_virtual = os.path.exists(os.path.join(environment, 'pyvenv.cfg')) if folder else False
+    environment = os.path.dirname(folder)
+    is_virtual = bool(folder) and os.path.exists(os.path.join(environment, 'pyvenv.cfg'))
     return not is_virtual or os.path.realpath(environment) == os.path.realpath(sys.prefix)
