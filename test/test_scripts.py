@@ -2,14 +2,15 @@
 import json
 import pathlib
 import shutil
+import signal
 
 import pytest
 
 import pharos
 from helpers import create, registrations
 from pharos import ros_process
-from pharos.testing import Mailbox
-from programs import ROOT
+from pharos.testing import Mailbox, until
+from programs import ROOT, Program, run
 
 TALKING = ROOT / 'test' / 'programs' / 'talking'
 TALKER, REPORTER, WORKER = (TALKING / f'{name}.py' for name in ('talker', 'reporter', 'worker'))
@@ -128,3 +129,98 @@ def test_a_program_and_catkins_wrapper_of_it_are_one(master, tmp_path, monkeypat
     assert len(ros_process.find('wrapped', program.name)) == 2
     with master.load('wrapped', program.name, 'spin') as node:
         assert node.path == str(program)
+
+
+@pytest.mark.parametrize('how', ['spin', 'sleep', 'nameless sleep', 'loop'])
+def test_what_spins_or_sleeps_ends_with_its_node(how, master):
+    pharos.ScriptNode.init_timeout, before = 0.5, pharos.ScriptNode.init_timeout
+    node = master.load(WORKER, None, how)
+    pharos.ScriptNode.init_timeout = before
+    node.stop_timeout = 0.2
+    node.stop()
+    # a sleep that the stop finds ends with it; one that begins then is cut off when the time is up
+    assert node.exit_code == 0 or node.exit_code == -signal.SIGTERM and how != 'spin'
+
+
+def test_a_script_that_ignores_its_end_is_named_and_left_behind(master, tmp_path):
+    logged = Mailbox(create(master, '/reader'), '/rosout', 'rosgraph_msgs/Log')
+    node = master.load(WORKER, None, 'ignore', tmp_path / 'end')
+    node.stop_timeout = 0.1
+    node.stop()
+    assert logged.wait_for(lambda line: 'left behind' in line.msg).msg == (
+        'left behind, for it did not end within 0.1 s of the stop: /worker script. A script ends by'
+        ' itself if it spins, sleeps, or loops while not rospy.is_shutdown(); one that cannot is'
+        ' better a process of its own: master.run()'
+    )
+    assert node.exit_code is None
+    assert registrations(master, '/worker') == [[], [], []]
+    (tmp_path / 'end').touch()
+
+
+def test_a_script_may_do_its_last_things_after_the_stop_has_begun(master, tmp_path):
+    node = master.load(WORKER, None, 'last words', tmp_path / 'said')
+    node.stop()
+    assert (tmp_path / 'said').read_text() == 'put away\n'
+    assert node.exit_code == 0
+
+
+def test_a_script_ends_with_its_threads(master, tmp_path):
+    node = master.load(WORKER, None, 'thread', tmp_path / 'said')
+    node.wait(30)
+    assert (tmp_path / 'said').read_text() == 'done\n'
+
+
+def test_a_hook_of_on_shutdown_sleeps_as_long_as_it_says(master, tmp_path):
+    node = master.load(WORKER, None, 'hook', tmp_path / 'said')
+    until(lambda: '/last_words' in registrations(master, '/worker')[0])
+    node.stop()
+    assert (tmp_path / 'said').read_text() == 'slept True, is_shutdown False\n'
+
+
+def test_what_a_hook_of_on_shutdown_publishes_arrives(master, tmp_path):
+    mailbox = Mailbox(create(master, '/hearer'), '/last_words', 'std_msgs/String')
+    echo = 'rostopic', 'echo', '-n1', '/last_words'
+    node = master.load(WORKER, None, 'hook', tmp_path / 'said')
+    with Program(master.url, *echo) as program:
+        until(lambda: len(master.topic('/last_words').subscribers) == 2)
+        publisher = node.latest_run.rospy.publisher('/last_words')
+        until(lambda: publisher.get_num_connections() == 2)
+        node.stop()
+        program.wait_for('data: "stopping"')
+    assert mailbox.next().data == 'stopping'
+
+
+def test_signal_shutdown_ends_the_node(master):
+    node = master.load(WORKER, None, 'signal_shutdown')
+    assert node.wait(30) == 0
+    assert registrations(master, '/worker') == [[], [], []]
+
+
+def test_rosnode_kill_ends_a_script(master):
+    node = master.load(WORKER, None, 'spin')
+    assert 'killed' in run(master.url, 'rosnode', 'kill', '/worker').stdout
+    assert node.wait(30) == 0
+
+
+def test_a_script_starts_again_from_its_first_line(master, tmp_path):
+    node = master.load(WORKER, None, 'runs', tmp_path / 'said')
+    until((tmp_path / 'said').exists)
+    node.stop()
+    node.start()
+    until(lambda: (tmp_path / 'said').read_text() == '1\n1\n')
+    assert master.node('/worker') is node
+    node.stop()
+
+
+def test_wait_says_when_the_time_is_up(master):
+    node = master.load(WORKER, None, 'spin')
+    with pytest.raises(TimeoutError, match='^/worker has not ended within 0.1 s: stop'):
+        node.wait(0.1)
+
+
+def test_the_node_of_another_script_is_told_that_a_script_is_not_there_yet(master, monkeypatch):
+    monkeypatch.setattr(pharos.ScriptNode, 'init_timeout', 0.1)
+    node = master.load(WORKER, None, 'nameless sleep', name='late')
+    assert node.is_running
+    with pytest.raises(pharos.UnknownNodeError):
+        master.wait_for_node('/late', 0)

@@ -184,9 +184,13 @@ class Master(MasterCalls):
         :param on_line: block called as ``on_line(text)`` for each line of its output, in a thread
             of its own
         :raises UnknownNodeError: if there is no such package or program
-        :raises TypeError, ValueError: if an argument or name cannot be one
         """
-        arguments = ros_process.arguments_of(args, name, remap, params)
+        mappings: Dict[str, object] = {**(remap or {})}
+        for key, value in (params or {}).items():
+            mappings['_' + key] = value
+        if name is not None:
+            mappings['__name'] = name
+        arguments = [*map(str, args), *(f'{key}:={value}' for key, value in mappings.items())]
         return ros_process.run(self, package, executable, arguments, on_line)
 
     def launch(
@@ -334,7 +338,7 @@ class Master(MasterCalls):
         not: None."""
         for node in self.local_nodes():
             if node.name == name:
-                return node if node.is_running else None
+                return node if node.is_running and node.uri else None
         return ExternalNode(self, name) if self.is_node_alive(name, or_busy=True) else None
 
     def on_change(self, block: Callable[[str, str, bool], Any]) -> Callable[[], None]:

@@ -123,6 +123,7 @@ class Node(NodeAttributes):
         """
         seconds = check_seconds('a sleep', seconds)
         run = self.current_run
+        run.end_soul()
         with signals.interruptible_wait(), contextlib.suppress(rospy.ROSInterruptException):
             run.rospy.rospy.sleep(seconds)
         run.end_soul()

@@ -14,7 +14,6 @@ from pharos.intraprocess.dispatcher import Dispatcher
 from pharos.intraprocess.fanout import Latch
 from pharos.private_rospy import changes
 from pharos.private_rospy.instance import PrivateRospy
-from pharos.private_rospy.lifetime import join
 from pharos.private_rospy.names import Resolved, check_name
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.settings import Settings
@@ -159,15 +158,18 @@ class Run:
             (self._close_opened,),
         ]
 
+    #: what to say of souls that are left behind
+    left_behind = 'A soul ends by itself if it waits with node.sleep() or loops over node.every()'
+
     def _end_souls(self, timeout: float) -> None:
         """Wait for the souls, but this thread's."""
         threads = [thread for thread in self._forked if thread is not threading.current_thread()]
-        self._ignoring = join(threads, timeout)
+        self.rospy.lifetime.await_end(threads, timeout)
+        self._ignoring = [thread for thread in threads if thread.is_alive()]
         if self._ignoring:
             self.node.log(
                 f"left behind, for it did not end within {timeout:g} s of the stop:"
-                f" {', '.join(thread.name for thread in self._ignoring)}. A soul ends by itself if"
-                ' it waits with node.sleep() or loops over node.every()',
+                f" {', '.join(thread.name for thread in self._ignoring)}. {self.left_behind}",
                 level='warning',
             )
 
@@ -338,6 +340,8 @@ class Run:
         """What :meth:`Node.every` returns, by a Rate of rospy's."""
         while self.lifecycle is Lifecycle.RUNNING:
             yield
+            if self.lifecycle is not Lifecycle.RUNNING:
+                return
             with signals.interruptible_wait(), contextlib.suppress(rospy.ROSInterruptException):
                 rate.sleep()
 

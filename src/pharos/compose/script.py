@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Dict, Optional, Sequence
 import rosgraph.names
 
 from pharos import node_registry, signals
-from pharos.compose.programs import find_program, source_of
+from pharos.compose.programs import check_source, find_program, source_of
 from pharos.errors import PharosError
 from pharos.node import Node
 from pharos.run import Lifecycle, Run
@@ -63,7 +63,7 @@ class ScriptNode(Node):
 
         :raises PharosError: if the program raised an exception by then, its cause
         """
-        source_of(self.path)  # it may have been edited
+        check_source(self.path)
         ScriptRun(self, self._settings).start(reopens=False)
 
     @property
@@ -88,6 +88,10 @@ class ScriptRun(Run):
     """One run of a program."""
 
     node: ScriptNode
+    left_behind = (
+        'A script ends by itself if it spins, sleeps, or loops while not rospy.is_shutdown(); one'
+        ' that cannot is better a process of its own: master.run()'
+    )
 
     def __init__(self, node: ScriptNode, settings: Any) -> None:
         super().__init__(node, settings)
@@ -96,6 +100,7 @@ class ScriptRun(Run):
         self._has_ended = False  # whether the program has
         self._error: Optional[BaseException] = None  # with which it ended before it was a node
         self.rospy.on_init_node = self._init_node
+        self.rospy.lifetime.has_program = True
 
     def start(self, reopens: bool) -> None:
         """Run the program in a thread of its own; see :meth:`ScriptNode.start`."""
@@ -122,37 +127,31 @@ class ScriptRun(Run):
     _is_awaited = True  # whether start() waits still, whose caller gets what the program raises
 
     def _run(self) -> None:
-        """What the thread of the program does."""
+        """What the thread of the program does, and Python at the end of one."""
+        error: Optional[BaseException] = None
         try:
-            self._ended(self._run_program())
-        except SystemExit as error:
-            code = error.code
-            if code is not None and not isinstance(code, int):
-                print(code, file=sys.stderr)
-            self._ended(code if isinstance(code, int) else int(code is not None))
-        except BaseException as error:
-            self._ended(1, error)
-
-    def _run_program(self) -> int:
-        self.rospy.run_main(self.node.path, self._settings.argv)
-        return 0
-
-    def _ended(self, exit_code: int, error: Optional[BaseException] = None) -> None:
+            self.rospy.run_main(self.node.path, self._settings.argv)
+            exit_code = 0
+        except SystemExit as wanted:
+            exit_code = _exit_code(wanted.code)
+        except BaseException as raised:
+            exit_code, error = 1, _in_program(raised, self.node.path)
         with node_registry.changed:
-            self.exit_code, self._has_ended = exit_code, True
             is_for_caller = self._is_awaited and not self.is_registered
             if is_for_caller:
                 self._error = error
-            node_registry.changed.notify_all()
         if error is not None and not is_for_caller:
             self.report(error, self.node.path, 'script')
+        self.rospy.lifetime.wait_for_threads()
+        with node_registry.changed:
+            self.exit_code, self._has_ended = exit_code, True
+            node_registry.changed.notify_all()
         if not self.is_ending:
-            threading.Thread(
-                target=node_registry.stop,
-                args=(self.node,),
-                name=f'{self.node.name} stop',
-                daemon=True,
-            ).start()
+            stop = threading.Thread(
+                target=node_registry.stop, args=(self.node,), name=f'{self.node.name} stop'
+            )
+            stop.daemon = True
+            stop.start()
 
     def _init_node(self, name: str, register: Any, xmlrpc_port: int, tcpros_port: int) -> None:
         """Its program calls ``rospy.init_node``, in whatever thread."""
@@ -169,6 +168,22 @@ class ScriptRun(Run):
             self.is_registered = True
             node_registry.changed.notify_all()
         watcher_of(node.master).check()
+
+
+def _exit_code(code: Any) -> int:
+    """What Python makes of the argument of ``sys.exit``."""
+    if code is None or isinstance(code, int):
+        return int(code or 0)
+    print(code, file=sys.stderr)
+    return 1
+
+
+def _in_program(error: BaseException, path: str) -> BaseException:
+    """The exception, without what ran the program in its traceback."""
+    frames = error.__traceback__
+    while frames is not None and frames.tb_frame.f_code.co_filename != path:
+        frames = frames.tb_next
+    return error.with_traceback(frames or error.__traceback__)
 
 
 def load(

@@ -12,7 +12,7 @@ import xmlrpc
 import xmlrpc.client
 import _thread
 
-import rosgraph.network
+import rosgraph
 
 from pharos.errors import MasterUnreachableError, NodeStoppedError, PortInUseError
 from pharos.private_rospy import (
@@ -128,7 +128,8 @@ class PrivateRospy:
 
     def rename(self, name):
         """Have the node, which is not registered yet, be called so."""
-        self.name = self.settings.name = self.lifetime.name = name
+        self.name = self.settings.name = name
+        self.lifetime.rename(name)
 
     def start(self, timeout, register=None):
         """Open the ports, claim the name, register. On an error, nothing is left behind.
@@ -163,11 +164,6 @@ class PrivateRospy:
         self.domain = self.import_library('rosgraph.network').get_host_name()
         # rospy.signal_shutdown called by the node's own code
         self.rospy.core.add_preshutdown_hook(self.request_stop)
-        if not rosgraph.network.is_local_address(self.domain):
-            self.warn(
-                f'{self.domain}, which {self.name} tells others to come to, is no address of this'
-                ' host: nobody reaches it unless something forwards its ports'
-            )
 
     @contextlib.contextmanager
     def _reached(self):
@@ -197,12 +193,6 @@ class PrivateRospy:
                 target=self._on_stop_request, args=(reason,), name=self.name + ' stop', daemon=True
             ).start()
 
-    def is_in_shutdown_hook(self):
-        """Whether this thread has called the node's ``rospy.signal_shutdown``, and is in a hook;
-        afterwards, that asks for the stop."""
-        core = self.rospy.core
-        return core._in_shutdown and not core._shutdown_flag and core._shutdown_lock._is_owned()
-
     def begin_stop(self):
         """Begin the stop: all that waits ends, ``is_shutdown()`` holds, and nothing more is read
         from sockets; nodes of this process still deliver until the dispatcher closes."""
@@ -227,6 +217,8 @@ class PrivateRospy:
         self.connections.withdraw()
         core = self.rospy.core
         self._flush(flush_timeout)
+        self.lifetime.hooks_thread = threading.get_ident()
+        core._preshutdown_hooks.insert(0, lambda reason: self._end_hooks(flush_timeout))
         core.signal_shutdown('stop')
         with core._shutdown_lock:
             pass  # where the node's own code called that, it returned at once
@@ -235,6 +227,11 @@ class PrivateRospy:
         left = self.lifetime.finish_shutdown(abandoned)
         logs.close_handlers(self._logging)
         return [thread.name for thread in left]
+
+    def _end_hooks(self, flush_timeout):
+        """The hooks of rospy.on_shutdown have run."""
+        self.lifetime.hooks_thread = None
+        self._flush(flush_timeout)
 
     def _flush(self, timeout):
         """Wait until what the node published is with the sockets, up to ``timeout`` seconds."""

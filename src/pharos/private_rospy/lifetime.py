@@ -1,6 +1,7 @@
 """What a node's rospy holds while it runs, so that its stop leaves nothing behind: threads and
 sockets."""
 import contextlib
+import signal
 import socket
 import threading
 import time
@@ -11,14 +12,20 @@ from typing import Any, Callable, Iterable, List, Optional
 # does not end that wait, after which Python would handle it.
 SIGNAL_LATENCY = 0.2  # seconds that such a wait lasts at the most
 JOIN_TIMEOUT = 2.0  # seconds that a thread is waited for
+CUT_OFF_TIMEOUT = 0.5  # seconds likewise, when what sleeps in it is cut off
 # A peer that vanishes says nothing: TCP notices that it is gone where it is asked to, here within
 # half a minute.
 KEEPALIVE_IDLE = 10  # seconds of silence after which the peer's host is asked whether it is there
 KEEPALIVE_INTERVAL = 5  # seconds between two such questions
 KEEPALIVE_COUNT = 4  # of them without an answer, and the connection is broken
 
-# .lifetime: of the node on whose behalf the thread runs; .interruption: the innermost it is within
+# .lifetime: of the node on whose behalf the thread runs; .interruption: the innermost it is within;
+# .was_cut_off: whether a ProgramCutOff was raised in it
 _thread = threading.local()
+
+
+class ProgramCutOff(SystemExit):
+    """Ends a thread of a program that goes on when the time that it has after the stop is up."""
 
 
 class Lifetime:
@@ -34,6 +41,10 @@ class Lifetime:
         self.ended = threading.Event()  # set when the node stops
         # set when the node is unregistered, and its XML-RPC server closed
         self.silent = threading.Event()
+        # whether the node has a program of its own, which may do its last things after the stop has
+        # begun; until this, when what sleeps in it is cut off
+        self.has_program, self.overdue = False, threading.Event()
+        self.hooks_thread = None  # the identifier of the thread that runs the hooks of on_shutdown
         self.interruptions = set()  # of waits under way
         self.threads = weakref.WeakSet()
         self.xmlrpc = None  # the node's XML-RPC server, once it is bound
@@ -49,6 +60,8 @@ class Lifetime:
                     super().run()
 
             def start(self):
+                is_rospys = str(getattr(self._target, '__module__', '')).startswith('rospy.')
+                self.is_waited_for = not (self.daemon or is_rospys)
                 self.daemon = True
                 self.name = f'{lifetime.name} {self.name}'
                 lifetime.threads.add(self)
@@ -56,9 +69,15 @@ class Lifetime:
 
         self.Thread = Thread
 
+    def rename(self, name):
+        """Have the threads be named after the node, which is called so from now on."""
+        for thread in list(self.threads):
+            thread.name = thread.name.replace(self.name, name, 1)
+        self.name = name
+
     def start_thread(self, target, args=(), name=None):
         """Run ``target`` in a thread of this lifetime; the same as ``_thread.start_new_thread``."""
-        thread = self.Thread(target=target, args=args, name=name)
+        thread = self.Thread(target=target, args=args, name=name, daemon=True)
         thread.start()
         return thread
 
@@ -79,15 +98,51 @@ class Lifetime:
         for interruption in tuple(self.interruptions):
             interruption.wake()
 
+    def await_end(self, threads, timeout):
+        """Wait for the threads, for up to ``timeout`` seconds; what sleeps in a program still is cut
+        off then."""
+        join(threads, timeout)
+        self.overdue.set()
+        if self.has_program:
+            join(threads, CUT_OFF_TIMEOUT)
+
+    def wait_for_threads(self):
+        """Wait until those threads of the program have ended for which Python waits at its end, or
+        the time is up."""
+        for thread in list(self.threads):
+            if thread.is_waited_for and thread is not threading.current_thread():
+                while thread.is_alive() and not self.overdue.is_set():
+                    thread.join(SIGNAL_LATENCY)
+
     def sleep(self, seconds):
         """``time.sleep`` that ends with the node; ``sleep(0)`` yields, as rospy's publishers mean
-        it to."""
+        it to.
+
+        What a program does after the stop has begun, and hooks of rospy.on_shutdown, sleeps for as
+        long as it says.
+
+        :raises ProgramCutOff: in a thread of a program for which the time is up
+        """
         if seconds <= 0:
             time.sleep(0)
+        elif threading.get_ident() == self.hooks_thread:
+            time.sleep(seconds)
+        elif not self.ended.is_set():
+            self._sleep_until(self.ended, seconds)
+        elif self.has_program and threading.current_thread() in self.threads:
+            if getattr(_thread, 'was_cut_off', False):
+                time.sleep(seconds)  # it has caught what was raised, and goes on
+            self._sleep_until(self.overdue, seconds)
+            if self.overdue.is_set():
+                _thread.was_cut_off = True
+                raise ProgramCutOff(-signal.SIGTERM)
+
+    @staticmethod
+    def _sleep_until(event, seconds):
         is_main = threading.current_thread() is threading.main_thread()
         longest = SIGNAL_LATENCY if is_main else seconds
         until = time.monotonic() + seconds
-        while seconds > 0 and not self.ended.wait(min(seconds, longest)):
+        while seconds > 0 and not event.wait(min(seconds, longest)):
             seconds = until - time.monotonic()
 
     def track_socket(self, sock):

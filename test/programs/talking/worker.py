@@ -1,9 +1,14 @@
 #!/usr/bin/python3
-"""Ends as it is told to: ``worker.py HOW``."""
+"""Ends as it is told to: ``worker.py HOW [FILE]``."""
+import os
 import sys
+import threading
 import time
 
 import rospy
+from std_msgs.msg import String
+
+RUNS = []  # of this program, in the module that this is
 
 
 def divide():
@@ -11,8 +16,60 @@ def divide():
     return 1 / 0
 
 
+def loop():
+    """Sleep again and again."""
+    while True:
+        time.sleep(0.01)
+
+
+def ignore(file):
+    """Go on until there is the file."""
+    while not os.path.exists(file):
+        threading.Event().wait(0.01)
+
+
+def say(file, text):
+    """Add a line to the file."""
+    with open(file, 'a') as lines:
+        print(text, file=lines)
+
+
+def speak_last(file):
+    """Do some things after the stop has begun."""
+    rospy.spin()
+    time.sleep(0.05)
+    rospy.sleep(0.05)
+    say(file, 'put away')
+
+
+def wait_in_thread(file):
+    """Leave work to a thread."""
+
+    def work():
+        time.sleep(0.05)
+        say(file, 'done')
+
+    threading.Thread(target=work).start()
+
+
+def hook(file):
+    """Say something in a hook of on_shutdown."""
+
+    def shut_down():
+        begun = time.monotonic()
+        rospy.sleep(0.1)
+        publisher.publish('stopping')
+        is_slept = time.monotonic() - begun >= 0.1
+        say(file, f'slept {is_slept}, is_shutdown {rospy.is_shutdown()}')
+
+    rospy.on_shutdown(shut_down)
+    publisher = rospy.Publisher('last_words', String, queue_size=1)
+    rospy.spin()
+
+
 if __name__ == '__main__':
-    how = rospy.myargv()[1]
+    RUNS.append(1)
+    how, *more = rospy.myargv()[1:]
     if 'nameless' not in how:
         rospy.init_node('worker')
     rospy.sleep(0)
@@ -31,5 +88,11 @@ if __name__ == '__main__':
         'signal_shutdown': lambda: [rospy.signal_shutdown('enough'), rospy.spin()],
         'sleep': lambda: time.sleep(1000),
         'spin': rospy.spin,
+        'loop': loop,
+        'ignore': ignore,
+        'last words': speak_last,
+        'thread': wait_in_thread,
+        'hook': hook,
+        'runs': lambda file: [say(file, len(RUNS)), rospy.spin()],
     }
-    ends[how]()
+    ends[how](*more)

@@ -1,5 +1,6 @@
 """Start and stop: registering takes no longer than it must, and loops hear early of the stop."""
 import sys
+import threading
 import time
 import traceback
 
@@ -61,8 +62,10 @@ def init_node(
     'rospy.core', 'is_shutdown', 'holds at the end of the stop, which waits for loops until then'
 )
 def is_shutdown(*, node, original):
-    """Hold from the beginning of the stop."""
-    return original() or node.ended.is_set()
+    """Hold from the beginning of the stop, but in hooks of on_shutdown, as ever."""
+    if original():
+        return True
+    return node.ended.is_set() and node.lifetime.hooks_thread != threading.get_ident()
 
 
 @patch('rospy.topics', 'is_shutdown', 'keeps a soul that ends from sending its last messages')
