@@ -201,6 +201,27 @@ def test_callbacks_run_in_a_thread_for_each_connection_so_that_they_may_wait_for
     assert met.acquire(timeout=TIMEOUT)
 
 
+@pytest.mark.parametrize('latch', [False, True])
+def test_a_subscriber_that_is_counted_hears_what_is_published_from_then_on(
+    master, monkeypatch, latch
+):
+    """A publisher that had waited for it lost its first message."""
+    publishing, subscribing = create(master, '/publisher'), create(master, '/subscriber')
+    publisher = publishing.ros.Publisher('/plain/counted', INT, queue_size=1, latch=latch)
+    match, counted = LocalLink.match_receivers, []
+
+    def count_first(link):
+        counted.append(publisher.get_num_connections())
+        return match(link)
+
+    monkeypatch.setattr(LocalLink, 'match_receivers', count_first)
+    _, mailbox = listen(subscribing, '/plain/counted', INT)
+    connected(publisher)
+    publisher.publish(1)
+    assert mailbox.next().data == 1
+    assert counted[0] == 0
+
+
 def test_a_callback_that_fails_ends_nothing(pair):
     publishing, subscribing = pair
     publisher = publishing.ros.Publisher('/plain/failing', INT, queue_size=10)

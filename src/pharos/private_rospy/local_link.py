@@ -44,16 +44,18 @@ class LocalLink(Link):
         self.receiving = _End(
             self, rospy.impl.transport.INBOUND, subscriber.resolved_name, other.uri
         )
-        self.receiving.callerid_pub = other.name
 
     def open(self):
         """Add the ends to the subscription and the publisher; returns whether both are open still.
 
         The publisher matches the receivers. Those that come between the two know the link already.
         """
-        return self.subscriber.add_connection(self.receiving) and self.publisher.add_connection(
+        is_open = self.subscriber.add_connection(self.receiving) and self.publisher.add_connection(
             self.sending
         )
+        # actionlib goes by the name: who has one hears what is published from now on
+        self.receiving.callerid_pub = self._other.name
+        return is_open
 
     def receivers(self):
         """The channels that hear the publisher, and the subscription's callbacks and statistics."""
@@ -134,6 +136,7 @@ class _End(rospy.impl.transport.Transport):
     """One end of a link, as rospy's topics keep it among their connections."""
 
     transport_type = 'INTRAPROCESS'
+    callerid_pub = 'unknown'  # the publisher's name, when it sends through the link
     latch = None  # those who come late get latched messages from the link
     is_heard = True  # its publisher is of the right type
 

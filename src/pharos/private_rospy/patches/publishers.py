@@ -72,11 +72,11 @@ def add_connection(self, c, *, node, module):
         with self.c_lock:
             if link is None and self.queue_size is not None:
                 c = Sender(c, self.queue_size, node.start_thread, self.queue_bytes)
+            # who counts the connections counts this one only when messages go through it
+            others = [each for each in self.connections or () if each.endpoint_id != c.endpoint_id]
+            _refresh(self, link, (*others, c))
             is_added = is_open and module._TopicImpl.add_connection(self, c)
-            if is_added:
-                # who counts the connections counts this one only when messages go through it;
-                # receivers may have come since the link was made, and have not seen it yet
-                _refresh(self, link)
+            _refresh(self)
         if not is_added:
             c.close()
             return False
@@ -172,10 +172,10 @@ def _tell_listeners(publisher, node, method, *arguments):
             node.rospy.logerr('bad listener: %s\n%s', listener, traceback.format_exc())
 
 
-def _refresh(publisher, link=None):
-    """Have the fan-out go by the connections, and a link by the receivers, that there are; returns
-    its new inboxes."""
+def _refresh(publisher, link=None, connections=None):
+    """Have the fan-out go by the connections, by default those that there are, and a link by the
+    receivers; returns its new inboxes."""
     with publisher.c_lock:
         new = link.match_receivers() if link else []
-        publisher.fanout.set_connections(publisher.connections or ())
+        publisher.fanout.set_connections(connections or publisher.connections or ())
         return new
