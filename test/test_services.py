@@ -9,7 +9,7 @@ import pytest
 import rosgraph.network
 import std_srvs.srv
 
-from helpers import create
+from helpers import create, speak_tcpros_only
 from pharos.testing import TIMEOUT
 import pharos
 from pharos.private_rospy.process_rospy import rospy
@@ -27,7 +27,7 @@ def call_here(master, service, /, **fields):
 
 def call_through_tcp(master, service, /, **fields):
     """The way of any other ROS node."""
-    with create(master, '/caller') as caller:
+    with speak_tcpros_only(create(master, '/caller')) as caller:
         service_class = master.lookup_service(service, '/caller').service_class
         return caller.ros.ServiceProxy(service, service_class)(**fields)
 

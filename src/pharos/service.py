@@ -116,7 +116,7 @@ class Service:
                 f' {md5sum!r}: where it comes from YAML, as parameters do, put one of digits alone'
                 ' in quotes (\"\'0\'\")'
             )
-        self._md5sum_by_hand = md5sum
+        self._md5sum_by_hand, self._local = md5sum, None
 
     @property
     def service_class(self) -> Any:
@@ -211,10 +211,11 @@ class Service:
         """Send the request to where the provider is thought to be; returns the response."""
         local = self._local
         if local is None or not local.is_offered(self.uri):
-            local = self._local = local_services.find(self.name, self.uri, self.service_class)
-        # what is sent by hand as another type's is left to the wire
-        if local and not (local.md5sum == self._md5sum_sent == self.service_class._md5sum):
-            local = None
+            if local is not None:
+                self._look_up(deadline)
+            local = self._local = local_services.find(
+                self.name, self.uri, self.service_class, self._md5sum_sent
+            )
         try:
             data = local.freeze(request) if local else serialized(request)
         except Exception:

@@ -24,7 +24,6 @@ class LocalService:
     """
 
     def __init__(self, offered: Any, wanted: Any) -> None:
-        self.md5sum = offered._md5sum
         #: the first half of copying a request; raises what ``request.serialize()`` raises
         self.freeze = copier_for(wanted._request_class).freeze
         self._thaw = thawer(wanted._request_class, offered._request_class)

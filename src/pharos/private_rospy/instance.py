@@ -54,6 +54,8 @@ class PrivateRospy:
         #: (method that undoes it, name, URI) of each registration that failed: a master that only
         #: hung goes on with it later
         self.unsure = set()
+        #: names of the services of this node that another one offers, as the master last said
+        self.services_of_others = set()
         #: called with what a hook of rospy.on_shutdown raised
         self.on_failure = lambda error: None
         #: called as ``on_init_node(name, register, xmlrpc_port, tcpros_port)`` when the program of

@@ -1,8 +1,11 @@
 """rospy's Services, as the nodes of this process offer them and call each other's."""
+import functools
+import math
 import queue
 import socket
 import sys
 import time
+import weakref
 
 from pharos.intraprocess.copier import copier_for
 from pharos.intraprocess.services import Failed, LocalService
@@ -15,11 +18,16 @@ from pharos.private_rospy.registration import registered
 from pharos.signals import is_from_signal
 
 
-def find(name, uri, service_class):
+def find(name, uri, service_class, md5sum):
     """The service of that name and URI, to be called with that class, if its provider is of this
-    process; else None."""
+    process; else None.
+
+    :param md5sum: what the caller says that the class has; what does not fit is left to the wire
+    """
     node, service = _offered_here(name, uri)
-    return service and RospyService(node, service, service_class)
+    if service is None or not service.service_class._md5sum == md5sum == service_class._md5sum:
+        return None
+    return RospyService(node, service, service_class)
 
 
 def class_of(name, uri):
@@ -61,11 +69,19 @@ class RospyService(LocalService):
         super().__init__(service.service_class, wanted)
         self._node, self._service, self._offered = node, service, node.service_manager.map
         self._freeze_response = copier_for(service.response_class).freeze
+        self._run = functools.partial(node.start_thread, name='service')
+        #: that of the responses, as TCPROS would bring it
+        self.header = service.protocol.get_header_fields()
 
     def is_offered(self, uri):
-        """Whether it is still offered, at that URI."""
-        service = self._service
-        return service.uri == uri and self._offered.get(service.resolved_name) is service
+        """Whether it is still offered, at that URI, as far as is known without asking the
+        master."""
+        service, name = self._service, self._service.resolved_name
+        return (
+            service.uri == uri
+            and self._offered.get(name) is service
+            and name not in self._node.services_of_others
+        )
 
     def answer(self, request):
         """What rospy's ServiceImpl._handle_request does, but for the writing."""
@@ -96,6 +112,14 @@ class RospyService(LocalService):
                 f'the error handler of {self._service.resolved_name} raised {another!r}'
             )
 
+    def keep_thread(self):
+        """Have one thread run all that :meth:`run_until` is given, as TCPROS has one for each
+        persistent connection; it ends with this object."""
+        jobs = queue.SimpleQueue()
+        self._run = jobs.put
+        self._node.start_thread(_work, (jobs, self._node), 'service')
+        weakref.finalize(self, jobs.put, None)
+
     def run_until(self, deadline, job):
         """Run it in a thread of the provider's; one that is stuck is not waited for."""
         outcome = queue.SimpleQueue()
@@ -110,9 +134,10 @@ class RospyService(LocalService):
         if self._node.ended.is_set():
             raise stopped
         with Interruption(lambda: outcome.put((None, stopped)), self._node.lifetime):
-            self._node.start_thread(work, name='service')
+            self._run(work)
+            limit = None if deadline == math.inf else max(0.0, deadline - time.monotonic())
             try:
-                response, error = outcome.get(timeout=max(0.0, deadline - time.monotonic()))
+                response, error = outcome.get(timeout=limit)
             except queue.Empty:
                 raise socket.timeout('time is up') from None
         if error is not None:
@@ -122,10 +147,15 @@ class RospyService(LocalService):
     def call(self, frozen, header, deadline):
         """See :meth:`LocalService.call`; the response has the header that TCPROS would bring."""
         response = super().call(frozen, header, deadline)
-        response._connection_header = {
-            'service': self._service.resolved_name,
-            'type': self._service.service_class._type,
-            'md5sum': self.md5sum,
-            'callerid': self._node.name,
-        }
+        response._connection_header = self.header
         return response
+
+
+def _work(jobs, node):
+    with Interruption(lambda: jobs.put(None), node.lifetime):
+        while not node.ended.is_set():
+            job = jobs.get()
+            if job is None:
+                return
+            job()
+            del job  # it holds the service

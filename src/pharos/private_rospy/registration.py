@@ -193,6 +193,9 @@ def repair(node, state, was_away):
     master = master_api(node.settings.master_url, node.name)
     publishers, subscribers, services = state
     get_services = node.service_manager.get_services
+    node.services_of_others = {
+        name for name, _ in get_services() if node.name not in services.get(name, [node.name])
+    }
     service_uri = next((uri for _, uri in get_services()), None)  # one for all of them
     kinds = (
         _Kind(
