@@ -3,14 +3,16 @@ import json
 import pathlib
 import shutil
 import signal
+import sys
 
 import pytest
 
 import pharos
-from helpers import create, registrations
+from helpers import create, ended, in_thread, registrations
 from pharos import ros_process
 from pharos.testing import Mailbox, until
 from programs import ROOT, Program, run
+from sockets import refused_url
 
 TALKING = ROOT / 'test' / 'programs' / 'talking'
 TALKER, REPORTER, WORKER = (TALKING / f'{name}.py' for name in ('talker', 'reporter', 'worker'))
@@ -224,3 +226,120 @@ def test_the_node_of_another_script_is_told_that_a_script_is_not_there_yet(maste
     assert node.is_running
     with pytest.raises(pharos.UnknownNodeError):
         master.wait_for_node('/late', 0)
+
+
+# -- bad input
+
+
+def test_a_file_that_is_not_there_is_named(master):
+    with pytest.raises(pharos.UnknownNodeError, match='there is no file /nowhere/talker.py: to'):
+        master.load('/nowhere/talker.py')
+
+
+def test_a_package_that_is_not_there_is_named(master):
+    with pytest.raises(pharos.UnknownNodeError, match="no ROS package 'nowhere' on ROS_PACKAGE"):
+        master.load('nowhere', 'talker.py')
+
+
+def test_a_program_that_a_package_has_not_is_named(master):
+    with pytest.raises(pharos.UnknownNodeError, match="std_msgs has no program 'talker.py': see"):
+        master.load('std_msgs', 'talker.py')
+
+
+def test_programs_of_one_name_are_named(master, tmp_path, monkeypatch):
+    package = tmp_path / 'doubled'
+    for folder in 'nodes', 'scripts':
+        (package / folder).mkdir(parents=True)
+        shutil.copy(WORKER, package / folder)
+    (package / 'package.xml').write_text('<package><name>doubled</name></package>')
+    monkeypatch.setenv('ROS_PACKAGE_PATH', str(tmp_path))
+    with pytest.raises(pharos.UnknownNodeError, match='several programs') as caught:
+        master.load('doubled', WORKER.name)
+    assert str(package / 'nodes' / WORKER.name) in str(caught.value)
+    assert str(package / 'scripts' / WORKER.name) in str(caught.value)
+
+
+def test_a_compiled_program_is_refused(master):
+    with pytest.raises(pharos.PharosError, match='relay is no Python program but a compiled one'):
+        master.load('topic_tools', 'relay')
+
+
+def test_a_syntax_error_is_told_with_file_and_line(master):
+    with pytest.raises(pharos.PharosError, match='mistyped is no Python 3 program') as caught:
+        master.load(TALKING / 'mistyped')
+    assert 'line 3' in str(caught.value)
+    assert isinstance(caught.value.__cause__, SyntaxError)
+
+
+def test_what_a_script_raises_before_it_is_a_node_is_the_callers(master):
+    with pytest.raises(pharos.PharosError, match='ended before it was one: ZeroDiv') as caught:
+        master.load(WORKER, None, 'nameless raise', name='early')
+    assert f'{WORKER}, to be the node /early' in str(caught.value)
+    assert isinstance(caught.value.__cause__, ZeroDivisionError)
+    assert master.local_nodes() == []
+
+
+def test_two_scripts_of_one_name_are_refused_before_the_second_runs(master, tmp_path):
+    with master.load(WORKER, None, 'spin', name='one'):
+        with pytest.raises(pharos.NodeNameInUseError, match='/one is taken by a running node'):
+            master.load(WORKER, None, 'runs', tmp_path / 'said', name='one')
+    assert not (tmp_path / 'said').exists()
+
+
+def test_a_script_that_takes_the_name_of_another_is_refused(master):
+    with master.load(WORKER, None, 'spin') as first:
+        with pytest.raises(pharos.NodeNameInUseError, match='/worker is taken') as caught:
+            master.load(WORKER, None, 'spin')
+        assert str(WORKER) in str(caught.value)
+        assert first.is_running
+
+
+def test_a_script_may_not_take_the_name_of_a_node_elsewhere(master):
+    with Program(master.url, sys.executable, WORKER, 'spin'):
+        master.wait_for_node('/worker', 30)
+        with pytest.raises(pharos.NodeNameInUseError, match='/worker is taken by a running node'):
+            master.load(WORKER, None, 'spin')
+
+
+def test_init_node_may_be_called_again_with_the_same_arguments(master):
+    node = master.load(WORKER, None, 'again')
+    assert node.wait(30) == 0
+
+
+def test_init_node_with_other_arguments_is_rospys_own_error(master):
+    node = master.load(WORKER, None, 'other name')
+    assert node.wait(30) == 1
+    assert 'has already been called with different arguments' in str(node.errors[0])
+
+
+def test_without_a_master_a_script_is_not_loaded():
+    with pytest.raises(pharos.MasterUnreachableError, match=f'{WORKER.name}, to be the node /lost'):
+        pharos.Master(refused_url()).load(WORKER, None, 'spin', name='lost')
+
+
+@pytest.mark.parametrize(
+    'options, text',
+    [
+        ({'name': 'no name'}, "'no name' cannot be a node name"),
+        ({'namespace': 'n s', 'name': 'x'}, "'n s/x' cannot be a node name"),
+        ({'params': {'rate': object()}}, '~rate cannot be <object'),
+        ({'params': {'a b': 1}}, "'a b' cannot be a parameter name"),
+        ({'remap': {'a': 'b c'}}, "'b c' cannot be a remapped name"),
+    ],
+)
+def test_what_cannot_be_given_to_a_script_is_refused(options, text, master):
+    with pytest.raises(ValueError, match=text):
+        master.load(WORKER, None, 'spin', **options)
+    assert master.local_nodes() == []
+
+
+def test_scripts_are_loaded_from_several_threads_at_once(master):
+    nodes = []
+    names = [f'worker_{number}' for number in range(5)]
+    threads = [
+        in_thread(lambda name: nodes.append(master.load(WORKER, None, 'spin', name=name)), name)
+        for name in names
+    ]
+    assert all(ended(thread) for thread in threads)
+    assert sorted(node.name for node in nodes) == ['/' + name for name in names]
+    assert {'/' + name for name in names} <= {node.name for node in master.nodes()}

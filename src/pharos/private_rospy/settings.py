@@ -90,7 +90,10 @@ class Settings:
             has one that is nobody else's
         :raises ValueError: if one of them cannot be
         """
-        mappings = [f'{left}{rosgraph.names.REMAP}{right}' for left, right in remap.items()]
+        mappings = [
+            rosgraph.names.REMAP.join(check_name(name, 'remapped', private=True) for name in names)
+            for names in remap.items()
+        ]
         if takes_own_name:
             self.name = unique_name(self.name)
         elif '__name' not in rosgraph.names.load_mappings(args):  # which roslaunch gives
