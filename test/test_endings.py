@@ -157,6 +157,15 @@ def test_a_stop_that_comes_from_the_node_itself_is_waited_for(master, how):
     assert node.calls == ['begun', 'ended']
 
 
+def test_a_stop_may_be_a_hook_of_rospys(master, transcript):
+    """rospy runs the other hooks, which close the servers, only afterwards."""
+    node = create(master, '/hooked')
+    node.ros.on_shutdown(node.stop)
+    node.ros.signal_shutdown('done')
+    until(lambda: node.lifecycle is Lifecycle.STOPPED)
+    assert transcript == []  # nothing was left behind
+
+
 def test_a_mixins_stop_runs_once_too(master):
     class Mixin:
         calls = 0
