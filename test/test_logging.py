@@ -42,6 +42,13 @@ def test_each_line_is_on_rosout_once_with_name_file_and_line(master):
     assert lines.empty()
 
 
+def test_a_node_that_is_not_started_logs_to_the_transcript(master, transcript):
+    node = create(master)
+    node.stop()
+    node.log('after all', 'warning')
+    assert transcript == ['[WARNING] /node: after all']
+
+
 def test_a_log_level_is_set_per_node(master):
     lines = hear(master)
     quiet, normal = create(master, '/quiet'), create(master, '/normal')
