@@ -129,6 +129,11 @@ def test_names_that_cannot_be_any_are_refused_before_it_starts(master, package, 
         master.run('fake_robot', 'talker', **given)
 
 
+def test_a_namespace_is_given_as_a_remapping(master, package):
+    with master.run('fake_robot', 'talker', remap={'__ns': '/robots'}):
+        master.wait_for_node('/robots/talker', TIMEOUT)
+
+
 def test_an_argument_that_is_none_is_refused(master, package):
     with pytest.raises(TypeError, match='texts or numbers, not None'):
         master.run('fake_robot', 'talker', None)

@@ -279,8 +279,10 @@ def arguments_of(
             raise TypeError(f'{what} is a dict by name, not {given!r}')
     mappings: Dict[str, object] = {}
     for left, right in (remap or {}).items():
-        check_name(left, 'remapped', private=True)
-        mappings[left] = check_name(right, 'remapped', private=True)
+        if not (isinstance(left, str) and left.startswith('__')):  # else it is no name, as __ns
+            check_name(left, 'remapped', private=True)
+            check_name(right, 'remapped', private=True)
+        mappings[left] = right
     for key, value in (params or {}).items():
         mappings['_' + check_name(key, 'parameter').lstrip('/')] = value
     if name is not None:
