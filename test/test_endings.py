@@ -466,8 +466,8 @@ def waiting(master, monkeypatch):
     monkeypatch.setattr('pharos.channel.OutputChannel.connections', [])
     monkeypatch.setattr(
         'pharos.private_rospy.local_services.find',
-        lambda name, uri, cls, find=local_services.find: (
-            find(name, uri, cls) if name == '/sleep' else None
+        lambda name, *rest, find=local_services.find: (
+            find(name, *rest) if name == '/sleep' else None
         ),
     )
     yield waiting
