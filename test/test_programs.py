@@ -1,10 +1,23 @@
 """Programs and libraries of ROS as a node's own: they find what they would in a process of their
 own."""
+import concurrent.futures
+import importlib
+import logging
+import os
 import pathlib
+import pickle
+import shutil
+import sys
+import termios
+import threading
 
+import numpy
 import pytest
 
-from helpers import create
+from helpers import create, ended, in_thread
+from pharos.private_rospy import ownership
+from pharos.testing import TIMEOUT
+from workspaces import SPACES, build, forget
 
 PROGRAMS = pathlib.Path(__file__).parent / 'programs'
 
@@ -16,9 +29,25 @@ def node(master):
 
 
 def run(node, program, *arguments):
-    """Run a program of the tests as the node's, in this thread."""
+    """Run a program of the tests as the node's, in this thread; returns its ``__main__``."""
     path = str(PROGRAMS / program)
     node.latest_run.rospy.run_main(path, [path, *arguments])
+    return node.ros_import('__main__')
+
+
+@pytest.fixture(params=SPACES)
+def space(request, tmp_path, monkeypatch):
+    """A space with the packages of the tests, on Python's path."""
+    folder = build(request.param, tmp_path)
+    monkeypatch.syspath_prepend(str(folder))
+    monkeypatch.setattr(sys, 'path', list(sys.path))  # packages of a devel space add to it
+    if request.param == 'debian':
+        monkeypatch.setattr(ownership, '_SITES', {*ownership._SITES, str(folder)})
+    yield folder
+    forget()
+
+
+# -- programs
 
 
 def test_a_program_is_main_and_has_its_arguments_and_the_modules_beside_it(master):
@@ -30,3 +59,211 @@ def test_a_program_is_main_and_has_its_arguments_and_the_modules_beside_it(maste
         found = node.parameter('~found').value
         assert found == ['__main__', *2 * [str(PROGRAMS / path)], 'one', '--two', name]
         assert exit_.value.code == 3
+
+
+def test_a_module_beside_a_program_is_read_anew_when_it_has_changed(node, tmp_path):
+    for text in 'before', 'after, and longer':
+        (tmp_path / 'beside_it.py').write_text(f'TEXT = {text!r}')
+        os.utime(tmp_path / 'beside_it.py', (len(text), len(text)))
+        (tmp_path / 'program.py').write_text('from beside_it import TEXT')
+        assert run(node, tmp_path / 'program.py').TEXT == text
+        node.stop()
+        node.start()
+
+
+def test_classes_of_a_program_are_found_by_the_name_of_their_module(node):
+    main = run(node, 'own/looks_itself_up.py')
+    assert main.itself
+    assert main.fields == ['x', 'at']
+    assert isinstance(main.pose, main.Pose) and main.pose.x == 1
+    assert isinstance(main.colour, main.Colour) and main.colour.red == 7
+    assert main.source.startswith('class Stamp:')
+    assert main.module == '__main__'
+    assert main.hints['at'] is main.Stamp
+    assert main.time == node.ros.Time(3, 4)
+    assert [type(each) for each in main.copied] == [node.ros.Time, node.ros.Duration]
+
+
+@pytest.mark.parametrize('kind', ['Time', 'Duration'])
+def test_times_of_a_node_pickle(node, kind):
+    time = getattr(node.ros, kind)(3, 4)
+    copy = pickle.loads(pickle.dumps([time]))[0]
+    assert copy == time
+    assert type(copy).__module__.startswith('genpy')
+
+
+def test_a_program_that_is_a_test_finds_its_tests(node):
+    with pytest.raises(SystemExit) as exit_:
+        run(node, 'own/unit_tests.py')
+    assert exit_.value.code  # of all its tests, one fails
+    result = node.ros_import('__main__').result
+    assert (result.testsRun, result.failures, result.errors) == (1, [], [])
+
+
+def test_children_see_the_environment_of_the_node(node):
+    found = run(node, 'own/children.py').found
+    assert found == {
+        'getenv': 'own',
+        'expandvars': 'own',
+        'subprocess': '/ own\n',
+        'run': 'too\n',
+        'popen': 'own\n',
+        'system': 0,
+        'system_fails': 7,
+        'spawn': 0,
+        'check_call': 1,
+        'child_of_child': '/ own\n',
+        'multiprocessing': 'own',
+        'answer': True,
+        'exit_code': 0,
+    }
+    assert 'OWN_VARIABLE' not in os.environ
+    assert os.system('test -z "$OWN_VARIABLE$OWN_VARIABLE_TOO"') == 0
+
+
+def test_what_a_program_sets_is_not_the_processs(node, capsys):
+    before = sys.argv, sys.path, sys.stdout, logging.getLogger().handlers, logging.getLogger().level
+    copies = [list(each) for each in before[:2]]
+    main = run(node, 'own/speaks.py')
+    assert main.sys.stdout.getvalue() == 'own\nlogged\nlogged too\n'
+    assert main.redirected.getvalue() == 'redirected\n'
+    assert capsys.readouterr().out == ''
+    root = logging.getLogger()
+    assert before == (sys.argv, sys.path, sys.stdout, root.handlers, root.level)
+    assert copies == [sys.argv, sys.path]
+    assert main.root is not root
+
+
+def test_arguments_are_the_programs_own_after_star_imports_too(node, master):
+    main = run(node, 'own/reads_arguments.py', '--speed', '3', '/a:=/b')
+    assert main.argv[1:] == ['--speed', '3', '/a:=/b']
+    assert main.speed == 3
+    assert main.program == 'reads_arguments.py'
+    assert main.usage == 'reads_arguments.py'
+    assert main.rest == ['/a:=/b']
+    assert main.variable == master.url
+
+
+def test_rospy_is_the_nodes_in_whatever_way_it_is_imported(node):
+    main = run(node, 'own/imports_rospy.py')
+    assert main.names == {'/program_node'}
+    assert main.same
+    assert main.reloaded
+
+
+# -- the end
+
+
+def test_exit_handlers_and_those_of_signals_run_at_the_stop_and_timers_end(node):
+    main = run(node, 'own/ends.py')
+    assert main.known
+    node.stop()
+    assert main.ended == [('SIGINT', None), 'last registered', 'first registered']
+    assert ended(main.timer)
+
+
+def test_a_program_ends_as_python_ends_it_after_its_threads(node):
+    main = run(node, 'own/threads.py')
+    ending = in_thread(node.latest_run.rospy.exit_main)
+    assert main.ended == []
+    main.go_on.set()
+    assert ended(ending)
+    assert main.ended == ['thread', 'atexit']
+
+
+def test_a_program_that_has_ended_gets_no_signal(node):
+    main = run(node, 'own/ends.py')
+    main.timer.cancel()
+    assert ended(main.timer)
+    node.latest_run.rospy.exit_main()
+    node.stop()
+    assert main.ended == ['last registered', 'first registered']
+
+
+def test_an_exit_handler_that_raises_or_hangs_is_told_and_the_stop_goes_on(node, transcript):
+    library, go_on = node.ros_import('rospy.core'), threading.Event()
+    library.atexit.register(go_on.wait)
+    library.atexit.register(lambda: 1 / 0)
+    node.stop()
+    go_on.set()
+    assert [type(error) for error in node.errors] == [ZeroDivisionError]
+    assert any('/program_node left behind' in line and 'atexit' in line for line in transcript)
+
+
+# -- packages
+
+
+@pytest.mark.parametrize('imported_first', ['messages', 'code'])
+def test_messages_of_a_package_with_code_are_the_same_for_all(master, space, imported_first):
+    if imported_first == 'messages':
+        importlib.import_module('robot_eyes.msg')
+    nodes = [create(master, name) for name in ('/left_eye', '/right_eye')]
+    left, right = (each.ros_import('robot_eyes.looking') for each in nodes)
+    messages = importlib.import_module('robot_eyes.msg')
+    assert left is not right
+    for library in left, right:
+        assert library.Look is messages.Look
+        assert library.Find is importlib.import_module('robot_eyes.srv').Find
+        assert isinstance(library.look('red'), messages.Look)
+    assert messages.Look().spots == []
+    assert left.robot_eyes.SEEN == [('/left_eye', nodes[0].ros.core.sys.argv[0])]
+
+
+def test_a_module_of_a_subpackage_finds_its_package(node, space):
+    deep = node.ros_import('robot_eyes.nested.deep')
+    assert deep.looking is node.ros_import('robot_eyes.looking')
+    assert deep.Spot is importlib.import_module('robot_eyes.msg').Spot
+
+
+def test_a_package_that_reaches_rospy_through_another_one_is_the_nodes(master, space):
+    nodes = [create(master, name) for name in ('/left_mind', '/right_mind')]
+    left, right = (each.ros_import('robot_mind') for each in nodes)
+    assert left is not right
+    assert [mind.looking.rospy.get_name() for mind in (left, right)] == [
+        '/left_mind',
+        '/right_mind',
+    ]
+    assert left.robot_maths.Vector is right.robot_maths.Vector
+
+
+def test_a_c_extension_is_shared_also_in_a_package_that_is_the_nodes(master, space):
+    nodes = [create(master, name) for name in ('/left_hand', '/right_hand')]
+    shutil.copy(termios.__file__, space / 'robot_eyes')
+    left, right = (each.ros_import('robot_eyes.termios') for each in nodes)
+    assert left is right is importlib.import_module('robot_eyes.termios')
+    assert nodes[0].ros_import('numpy') is numpy
+
+
+# -- threads
+
+
+@pytest.fixture
+def rings(node, tmp_path, monkeypatch):
+    """The packages whose modules import each other in a circle."""
+    monkeypatch.syspath_prepend(str(build('install', tmp_path)))
+    return node
+
+
+def test_threads_that_import_the_same_get_it_whole(rings):
+    started = []
+    rings.ros.started = started.append
+    both = threading.Barrier(8)
+
+    def get():
+        both.wait(TIMEOUT)
+        return rings.ros_import('robot_rings.one').two.NAME
+
+    with concurrent.futures.ThreadPoolExecutor(8) as pool:
+        names = [each.result(TIMEOUT) for each in [pool.submit(get) for _ in range(8)]]
+    assert names == ['two'] * 8
+    assert sorted(started) == ['one', 'two']
+
+
+def test_threads_that_import_in_a_circle_do_not_wait_for_each_other_for_ever(rings):
+    both = threading.Barrier(2)
+    rings.ros.started = lambda name: both.wait(TIMEOUT)
+    with concurrent.futures.ThreadPoolExecutor(2) as pool:
+        names = ['robot_rings.one', 'robot_rings.two']
+        modules = [pool.submit(rings.ros_import, name) for name in names]
+        assert [module.result(TIMEOUT).NAME for module in modules] == ['one', 'two']
+    assert rings.ros_import('robot_rings.two').one is rings.ros_import('robot_rings.one')

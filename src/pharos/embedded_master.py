@@ -5,7 +5,9 @@ import sys
 from typing import Tuple
 
 from pharos.errors import MasterUnreachableError, PortInUseError
-from pharos.private_rospy.addresses import check_environment, loopback
+from pharos.private_rospy.addresses import check_environment
+
+LOOPBACK = '127.0.0.1'
 
 
 def start(port: int) -> Tuple['subprocess.Popen[str]', str]:
@@ -16,7 +18,7 @@ def start(port: int) -> Tuple['subprocess.Popen[str]', str]:
     """
     environ = dict(os.environ, PYTHONPATH=os.pathsep.join(path for path in sys.path if path))
     if check_environment(environ) is None:
-        environ['ROS_HOSTNAME'] = loopback()  # for this host alone, where nothing else is said
+        environ['ROS_HOSTNAME'] = LOOPBACK  # for this host alone, where nothing else is said
     # Ctrl-C is the program's
     child = subprocess.Popen(
         [sys.executable, '-m', 'pharos.master_program', str(port), str(os.getpid())],

@@ -1,18 +1,11 @@
 """One node's rospy: loaded, started and stopped."""
-import atexit
 import contextlib
 import errno
 import functools
-import os
-import socket
-import sys
 import threading
 import time
-import xmlrpc
-import xmlrpc.client
-import _thread
 
-import rosgraph.network
+import rosgraph
 
 from pharos.errors import MasterUnreachableError, NodeStoppedError, PortInUseError
 from pharos.private_rospy import (
@@ -25,11 +18,11 @@ from pharos.private_rospy import (
 )
 from pharos.private_rospy.acceptor import Acceptor
 from pharos.private_rospy.lifetime import Lifetime
-from pharos.private_rospy.loader import ModuleProxy, PrivateImports
+from pharos.private_rospy.loader import PrivateImports
+from pharos.private_rospy.own_process import OwnProcess
 from pharos.private_rospy.patches import tcpros_server
 from pharos.private_rospy.parameters import WatchedParameters
 from pharos.private_rospy.deadlines import is_time_up, time_limit
-from pharos.private_rospy.proxies import ServerProxy
 from pharos.private_rospy.connections import Connections
 
 POLL = 0.001  # seconds between rospy's own looks at whether it is registered; it takes 0.1 s
@@ -75,14 +68,17 @@ class PrivateRospy:
         self.refusals = refusals.Refusals(self)
         self.parameters = WatchedParameters(self)
 
-        self._logging = logs.private_logging()
-        modules = self._private_imports()
+        imports = PrivateImports(patch=lambda module: patches.apply(module, self))
+        self._process = OwnProcess(
+            imports, self.settings, self.lifetime, lambda error: self.on_failure(error)
+        )
+        self._logging = logs.private_logging(imports)
         #: import_library(name): a library written on rospy, such as 'actionlib', for this node
-        self.import_library = modules.load
-        #: run_main(path, argv): see PrivateImports.run_main
-        self.run_main = modules.run_main
-        self.rospy = modules.load('rospy')
-        patches.check_applied(modules.modules)
+        self.import_library = imports.import_library
+        self._run_main = imports.run_main
+        self.rospy = imports.load('rospy')
+        patches.check_applied(imports.modules)
+        self._process.exit_handlers.clear()  # rospy's: the stop does what is in it
         #: rospy's _base_logger; it reports the caller of its caller, who must call it himself
         self.log = self.rospy.core._base_logger
         registries = self.rospy.impl.registration
@@ -94,37 +90,27 @@ class PrivateRospy:
         self.publisher = self.topics.get_publisher_impl
         self.subscriber = self.topics.get_subscriber_impl
 
-    def _private_imports(self):
-        lifetime = self.lifetime
-        proxies = ModuleProxy(xmlrpc.client, ServerProxy=ServerProxy)
-        private_os = ModuleProxy(os, environ=self.settings.environ)
-        modules = PrivateImports(
-            patch=lambda module: patches.apply(module, self),
-            substitutes={
-                'os': private_os,
-                'sys': ModuleProxy(sys, argv=self.settings.argv),
-                'logging': self._logging,
-                # the end of the program stops the node in order
-                'atexit': ModuleProxy(atexit, register=lambda function, *args, **kwargs: function),
-                'threading': ModuleProxy(threading, Thread=lifetime.Thread),
-                '_thread': ModuleProxy(_thread, start_new_thread=lifetime.start_thread),
-                'time': ModuleProxy(time, sleep=lifetime.sleep),
-                # rospy sets the whole process's
-                'socket': ModuleProxy(socket, setdefaulttimeout=lambda timeout: None),
-                'xmlrpc': ModuleProxy(xmlrpc, client=proxies),
-                'xmlrpc.client': proxies,
-            },
-        )
-        self._logging.os = private_os  # the configuration file is evaluated with this
-        self._logging.config = modules.load_single('logging.config', self._logging.__path__)
-        return modules
-
     def wait_for_registration(self, seconds):
         """What rospy waits with until it is registered, in steps of 0.1 s and for ever."""
         self._check_not_ended()
         if time.monotonic() > self._deadline:
             raise self._stopped_answering()
         time.sleep(min(seconds, POLL))
+
+    def run_main(self, path, argv):
+        """Run a program as the node's, in this thread: what it raises, SystemExit too, comes through.
+
+        :param argv: its ``sys.argv``, whole
+        """
+        self.lifetime.main_thread = threading.current_thread()
+        self._run_main(path, argv)
+
+    def exit_main(self):
+        """What Python does when the program's main thread has ended: wait for the threads that are
+        no daemons, and run the handlers of atexit."""
+        self.lifetime.wait_for_threads()
+        self._process.forget_signals()
+        self._process.run_exit_handlers()
 
     # -- life
 
@@ -166,11 +152,6 @@ class PrivateRospy:
         self.domain = self.import_library('rosgraph.network').get_host_name()
         # rospy.signal_shutdown called by the node's own code
         self.rospy.core.add_preshutdown_hook(self.request_stop)
-        if not rosgraph.network.is_local_address(self.domain):
-            self.warn(
-                f'{self.domain}, which {self.name} tells others to come to, is no address of this'
-                ' host: nobody reaches it unless something forwards its ports'
-            )
 
     @contextlib.contextmanager
     def _reached(self):
@@ -200,15 +181,10 @@ class PrivateRospy:
                 target=self._on_stop_request, args=(reason,), name=self.name + ' stop', daemon=True
             ).start()
 
-    def is_in_shutdown_hook(self):
-        """Whether this thread has called the node's ``rospy.signal_shutdown``, and is in a hook;
-        afterwards, that asks for the stop."""
-        core = self.rospy.core
-        return core._in_shutdown and not core._shutdown_flag and core._shutdown_lock._is_owned()
-
     def begin_stop(self):
         """Begin the stop: all that waits ends, ``is_shutdown()`` holds, and nothing more is read
         from sockets; nodes of this process still deliver until the dispatcher closes."""
+        self._process.call_signal_handler()
         self.lifetime.begin_shutdown()
         waiting = [self.rospy.rostime.get_rostime_cond()]  # simulated time may stand still
         handler = self.handler
@@ -235,6 +211,7 @@ class PrivateRospy:
         core.signal_shutdown('stop')
         with core._shutdown_lock:
             pass  # where the node's own code called that, it returned at once
+        self.start_thread(self._process.run_exit_handlers, name='atexit')
         for proxy in list(core._xmlrpc_cache.values()):  # a thread that is left may add one
             proxy('close')()
         left = self.lifetime.finish_shutdown(abandoned)

@@ -8,8 +8,6 @@ import time
 import weakref
 from typing import Any, Callable, Iterable, List, Optional
 
-from pharos import working_directory
-
 # A signal that the kernel gives to another thread, or that comes just before the main thread waits,
 # does not end that wait, after which Python would handle it.
 SIGNAL_LATENCY = 0.2  # seconds that such a wait lasts at the most
@@ -46,10 +44,10 @@ class Lifetime:
         # whether the node has a program of its own, which may do its last things after the stop has
         # begun; until this, when what sleeps in it is cut off
         self.has_program, self.overdue = False, threading.Event()
-        self.folder = None  # the working directory of its threads; None: the process's
         self.hooks_thread = None  # the identifier of the thread that runs the hooks of on_shutdown
         self.interruptions = set()  # of waits under way
         self.threads = weakref.WeakSet()
+        self.main_thread = threading.main_thread()  # or its program's
         self.xmlrpc = None  # the node's XML-RPC server, once it is bound
         self._sockets = weakref.WeakSet()
         lifetime = self
@@ -58,9 +56,18 @@ class Lifetime:
             """A thread that is named after its node, ends with the process, and can be waited
             for."""
 
+            is_waited_for = False  # whether a program goes on until it has ended
+
+            def __init__(self, group=None, target=None, *args, **options):
+                super().__init__(group, target, *args, **options)
+                if options.get('daemon') is None:  # it is what the thread is that makes it
+                    maker = threading.current_thread()
+                    is_programs = maker is lifetime.main_thread or (
+                        getattr(maker, 'is_waited_for', False)
+                    )
+                    self.daemon = not is_programs
+
             def run(self):
-                if self.is_from_elsewhere and lifetime.folder:
-                    working_directory.enter(lifetime.folder)
                 with lifetime.interrupts_waits():
                     super().run()
 
@@ -69,12 +76,17 @@ class Lifetime:
                 self.is_waited_for = not (self.daemon or is_rospys)
                 self.daemon = True
                 self.name = f'{lifetime.name} {self.name}'
-                # one that a thread of the node starts has the working directory of that
-                self.is_from_elsewhere = getattr(_thread, 'lifetime', None) is not lifetime
                 lifetime.threads.add(self)
                 super().start()
 
-        self.Thread = Thread
+        class Timer(threading.Timer, Thread):
+            """``threading.Timer`` of the node, whose stop cancels it."""
+
+            def run(self):
+                with lifetime.interrupts_waits():
+                    super().run()
+
+        self.Thread, self.Timer = Thread, Timer
 
     def rename(self, name):
         """Have the threads be named after the node, which is called so from now on."""
@@ -104,6 +116,9 @@ class Lifetime:
         self.ended.set()
         for interruption in tuple(self.interruptions):
             interruption.wake()
+        for thread in list(self.threads):
+            if isinstance(thread, self.Timer):
+                thread.cancel()
 
     def await_end(self, threads, timeout):
         """Wait for the threads, for up to ``timeout`` seconds; what sleeps in a program still is cut

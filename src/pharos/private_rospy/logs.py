@@ -9,15 +9,12 @@ hooks.
 import contextlib
 import logging
 import logging.handlers
-import types
 import weakref
 
 
-def private_logging():
-    """A module that looks like ``logging`` and shares nothing with it but its classes and
-    functions."""
-    module = types.ModuleType('logging')
-    vars(module).update(vars(logging))
+def private_logging(imports):
+    """A module that looks like ``logging`` and shares nothing with it but its classes, put into the
+    set of private modules."""
 
     class Logger(logging.Logger):
         """``logging.Logger`` with a root and a manager of its own."""
@@ -27,14 +24,18 @@ def private_logging():
     manager.loggerClass = Logger
     for owner in Logger, root:
         owner.root, owner.manager = root, manager
-    module.root, module.Logger = root, Logger
-    module.getLogger = lambda name=None: (
-        manager.getLogger(name) if name and name != 'root' else root
+    module = imports.twin(
+        logging,
+        root=root,
+        Logger=Logger,
+        setLoggerClass=manager.setLoggerClass,
+        getLoggerClass=lambda: manager.loggerClass,
+        # fileConfig clears these two lists, the process's own if they were shared
+        _handlers=weakref.WeakValueDictionary(),
+        _handlerList=[],
     )
-    module.setLoggerClass = manager.setLoggerClass
-    module.getLoggerClass = lambda: manager.loggerClass
-    # fileConfig clears these two lists, the process's own if they were shared
-    module._handlers, module._handlerList = weakref.WeakValueDictionary(), []
+    imports.modules['logging'] = module
+    module.config = imports.load_single('logging.config', module.__path__)
     # They log a traceback for each message or call that cannot be read, whoever sent it.
     for name in 'rospy.msg', 'rospy.impl.masterslave':
         manager.getLogger(name).setLevel(logging.CRITICAL)

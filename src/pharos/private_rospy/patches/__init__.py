@@ -33,6 +33,7 @@ from pharos.private_rospy.patches import (
     subscribers,
     tcpros,
     tcpros_server,
+    times,
     xmlrpc_server,
 )
 from pharos.private_rospy.patches.table import TABLE, apply, check_applied
@@ -53,5 +54,6 @@ __all__ = [
     'subscribers',
     'tcpros',
     'tcpros_server',
+    'times',
     'xmlrpc_server',
 ]

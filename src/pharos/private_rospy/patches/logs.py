@@ -1,7 +1,7 @@
 """What a node logs on the screen."""
 import contextlib
 
-from pharos.private_rospy.loader import ModuleProxy
+from pharos.private_rospy.module_proxy import ModuleProxy
 from pharos.private_rospy.patches.table import patch, substitute
 
 _ESCAPED = '$\0{'  # for '${', by which rosgraph's format names the parts of a line

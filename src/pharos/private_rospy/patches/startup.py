@@ -7,7 +7,7 @@ import traceback
 import rosgraph.names
 
 from pharos.private_rospy.names import unique_name
-from pharos.private_rospy.loader import ModuleProxy
+from pharos.private_rospy.module_proxy import ModuleProxy
 from pharos.private_rospy.patches.table import patch, substitute
 from pharos.private_rospy.process_rospy import rospy
 

@@ -22,8 +22,9 @@ class Patch(NamedTuple):
         """
         class_name, _, name = self.target.rpartition('.')
         owner = getattr(module, class_name, None) if class_name else module
-        original = getattr(owner, name, None)
-        if owner is None or (original is None) is not (self.kind == 'added'):
+        is_added = self.kind == 'added'  # perhaps over one that the class inherits
+        original = vars(owner).get(name) if owner and is_added else getattr(owner, name, None)
+        if owner is None or (original is None) is not is_added:
             raise self.error('is there already' if original else 'is not there')
         checked = None
         if self.kind == 'replaced':

@@ -1,0 +1,150 @@
+"""What a program has of a process of its own, and a node's program, libraries and rospy have of the
+node: environment, arguments, exit handlers, signals, threads and child processes."""
+import atexit
+import os
+import posixpath
+import signal
+import socket
+import threading
+import time
+import xmlrpc
+import xmlrpc.client
+import _posixsubprocess
+import _thread
+
+from pharos.private_rospy.lifetime import JOIN_TIMEOUT
+from pharos.private_rospy.module_proxy import ModuleProxy
+from pharos.private_rospy.proxies import ServerProxy
+
+
+class OwnProcess:
+    """Puts into a set of private modules what stands in for Python's.
+
+    :param imports: the :class:`~.loader.PrivateImports`
+    :param settings: the :class:`~.settings.Settings` of the node
+    :param report: called with what an exit handler or a handler of signals raised
+    """
+
+    def __init__(self, imports, settings, lifetime, report):
+        self._environ, self._lifetime, self._report = settings.environ, lifetime, report
+        self.exit_handlers = []  # (function, arguments, keyword arguments), the first to run last
+        self._signal_handlers = {}
+        proxies = ModuleProxy(xmlrpc.client, ServerProxy=ServerProxy)
+        own_os = self._os(imports)
+        imports.system.argv = settings.argv
+        imports.modules.update(
+            {
+                'os': own_os,
+                'os.path': own_os.path,
+                'posixpath': own_os.path,
+                'atexit': ModuleProxy(atexit, register=self._at_exit, unregister=self._not_at_exit),
+                'signal': ModuleProxy(
+                    signal,
+                    signal=self._set_signal_handler,
+                    getsignal=self._signal_handler,
+                    pause=lifetime.ended.wait,
+                ),
+                'threading': ModuleProxy(
+                    threading,
+                    Thread=lifetime.Thread,
+                    Timer=lifetime.Timer,
+                    main_thread=lambda: lifetime.main_thread,
+                    _register_atexit=self._at_exit,
+                ),
+                '_thread': ModuleProxy(_thread, start_new_thread=lifetime.start_thread),
+                'time': ModuleProxy(time, sleep=lifetime.sleep),
+                # rospy sets the whole process's
+                'socket': ModuleProxy(socket, setdefaulttimeout=lambda timeout: None),
+                'xmlrpc': ModuleProxy(xmlrpc, client=proxies),
+                'xmlrpc.client': proxies,
+                '_posixsubprocess': ModuleProxy(_posixsubprocess, fork_exec=self._fork_exec),
+            }
+        )
+
+    # -- environment and child processes
+
+    def _os(self, imports):
+        own_os = imports.twin(
+            os,
+            environ=self._environ,
+            putenv=self._environ.__setitem__,
+            unsetenv=lambda name: self._environ.pop(name, None),
+            system=self._system,
+            execv=lambda path, arguments: os.execve(path, arguments, self._environ),
+        )
+        own_os.path = imports.twin(posixpath, os=own_os)
+        return own_os
+
+    def _system(self, command):
+        """``os.system``."""
+        child = os.posix_spawn('/bin/sh', ['sh', '-c', command], self._environ)
+        return os.waitpid(child, 0)[1]
+
+    def _fork_exec(self, *arguments):
+        """What subprocess and multiprocessing start programs by."""
+        *before, environ = arguments[:6]
+        if environ is None:
+            environ = [
+                os.fsencode(name) + b'=' + os.fsencode(value)
+                for name, value in self._environ.items()
+            ]
+        return _posixsubprocess.fork_exec(*before, environ, *arguments[6:])
+
+    # -- the end
+
+    def _at_exit(self, function, *args, **kwargs):
+        """``atexit.register``."""
+        self.exit_handlers.append((function, args, kwargs))
+        return function
+
+    def _not_at_exit(self, function):
+        """``atexit.unregister``."""
+        self.exit_handlers[:] = [each for each in self.exit_handlers if each[0] != function]
+
+    def run_exit_handlers(self):
+        """Run the handlers of atexit, the last first, each once."""
+        while self.exit_handlers:
+            function, args, kwargs = self.exit_handlers.pop()
+            self._attempt(function, *args, **kwargs)
+
+    def _attempt(self, function, *args, **kwargs):
+        try:
+            function(*args, **kwargs)
+        except (SystemExit, KeyboardInterrupt):
+            pass  # the node ends already
+        except BaseException as error:
+            self._report(error)
+
+    # -- signals
+
+    def _set_signal_handler(self, number, handler):
+        """``signal.signal``, in whatever thread."""
+        if not callable(handler) and handler not in (signal.SIG_DFL, signal.SIG_IGN):
+            raise TypeError(
+                'signal handler must be signal.SIG_IGN, signal.SIG_DFL, or a callable object'
+            )
+        number = signal.Signals(number)
+        before = self._signal_handler(number)
+        self._signal_handlers[number] = handler
+        return before
+
+    def _signal_handler(self, number):
+        """``signal.getsignal``."""
+        return self._signal_handlers.get(number) or signal.getsignal(number)
+
+    def forget_signals(self):
+        """Call none of the handlers: there is no program any more that they could end."""
+        self._signal_handlers = {}
+
+    def call_signal_handler(self):
+        """Call the handler of SIGINT, or else SIGTERM, as these signals would end the program; what
+        takes longer is not waited for."""
+        handlers, self._signal_handlers = self._signal_handlers, {}
+        for number in signal.SIGINT, signal.SIGTERM:
+            handler = handlers.get(number)
+            if callable(handler):
+                thread = self._lifetime.start_thread(
+                    self._attempt, (handler, number, None), name=number.name
+                )
+                thread.join(JOIN_TIMEOUT)
+                return

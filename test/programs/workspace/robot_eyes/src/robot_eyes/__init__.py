@@ -1,0 +1,2 @@
+"""A package with messages and code."""
+SEEN = []
