@@ -11,6 +11,7 @@ import rosgraph
 from pharos.testing import TIMEOUT
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
+PROGRAMS = ROOT / 'test' / 'programs'
 
 
 def script(name):

@@ -188,6 +188,7 @@ def test_what_is_no_list_of_strings_is_refused(master, arguments):
 @pytest.mark.parametrize(
     'arguments, says',
     [
+        (['1image:=cam'], "'1image:=cam' in argv maps no name"),
         (['a:=b:=c'], "'a:=b:=c' in argv maps to several"),
         (['_p:=b:=c'], "'_p:=b:=c' in argv maps to several"),
         (['__name:=a b'], "'a b' cannot be a node name"),

@@ -97,6 +97,34 @@ def test_the_environment_of_a_node_is_its_own(compose):
     assert 'FOR_ONE' not in os.environ
 
 
+@pytest.mark.parametrize('where, folder', [('node', PACKAGE / 'scripts'), ('ROS_HOME', None)])
+def test_the_working_directory_of_a_node_is_its_own(master, compose, where, folder, tmp_path):
+    before = os.getcwd()
+    mailbox = Mailbox(create(master, '/hearer'), '/reflection', STRING)
+    compose('mirror.launch', cwd=where)
+    told = json.loads(mailbox.next(TIMEOUT).data)
+    assert told['folder'] == str(folder or tmp_path)
+    assert os.getcwd() == before
+
+
+def test_callbacks_and_child_processes_are_in_the_working_directory_too(master, compose):
+    node = create(master, '/asking')
+    mailbox = Mailbox(node, '/reflection', STRING)
+    compose('mirror.launch')
+    mailbox.next(TIMEOUT)
+    node.send_to('/deep/where', typed_as=STRING)
+    assert mailbox.next(TIMEOUT).data == f"{PACKAGE / 'scripts'} {PACKAGE / 'scripts'}"
+
+
+def test_a_node_that_needs_a_working_directory_runs_apart_where_it_cannot_have_one(
+    compose, monkeypatch
+):
+    monkeypatch.setattr(pharos.working_directory, 'is_possible', lambda: False)
+    composed = compose('mirror.launch')
+    assert composed.nodes == []
+    assert composed.process.poll() is None
+
+
 def test_a_stop_ends_all_nodes(master, compose):
     composed = compose('chat.launch')
     master.wait_for_node('/relay', TIMEOUT)
@@ -173,7 +201,7 @@ def test_what_cannot_be_started_is_told_and_the_others_go_on(compose, transcript
     assert "missing.launch: /without_package is not started: there is no ROS package" in package
     assert 'missing.launch: /without_program is not started: Cannot locate node' in program
     assert "missing.launch: /with_syntax_error (composed_robot/broken) is not started" in syntax
-    assert "SyntaxError: 'return' outside function" in syntax
+    assert "'return' outside function" in syntax
 
 
 def test_to_share_connections_is_to_come(compose):

@@ -1,6 +1,9 @@
 """rosrun pharos compose, as a user runs it, and its services of a nodelet manager."""
+import contextlib
 import os
+import pty
 import signal
+import subprocess
 import sys
 
 import pytest
@@ -8,7 +11,7 @@ import pytest
 from helpers import create
 from pharos import Master
 from pharos.testing import Mailbox, TIMEOUT, until
-from programs import ROOT, Program, forget_parameters, run, script
+from programs import ROOT, Program, environment, forget_parameters, run, script
 
 PACKAGES = ROOT / 'test' / 'programs'
 STRING = 'std_msgs/String'
@@ -79,6 +82,41 @@ def test_a_required_node_that_ends_is_told_and_is_the_status(master, compose):
     del master.parameters['/ends/stay']
     program.wait_for('/ends, which is required, has ended: all others end')
     assert program.process.wait(TIMEOUT) == 1
+
+
+@pytest.mark.leaves('the registrations of the nodes in it')
+def test_the_nodes_apart_end_where_it_is_killed(master, compose):
+    program = compose('composed_robot', 'chat.launch')
+    relay = master.wait_for_node('/relay', TIMEOUT)
+    assert program.end(signal.SIGKILL) == -signal.SIGKILL
+    until(lambda: not relay.is_alive())
+
+
+def test_on_a_terminal_the_last_line_alone_says_how_far_it_has_come(master):
+    shown = on_terminal(master.url, 'hangs.launch', until_shown='/hangs: started, but no node yet')
+    assert b'\r\x1b[Kstarting 1 of 2: /hangs\r\x1b[K/hangs has not started within 2 s' in shown
+    assert b'\r\x1b[Kstarting 2 of 2: /talker\r\x1b[K' in shown
+    assert shown.count(b'\n') == 2 + 2  # one that hangs, told twice, and what has become of each
+
+
+def on_terminal(url, file, until_shown):
+    """What compose shows on a terminal of its own; it is ended by Ctrl-C once that is shown."""
+    ours, theirs = pty.openpty()
+    command = [sys.executable, script('compose'), 'composed_robot', file]
+    process = subprocess.Popen(
+        command, env=environment(url), stdin=theirs, stdout=theirs, stderr=theirs
+    )
+    os.close(theirs)
+    shown = b''
+    with contextlib.suppress(OSError):  # the other end is closed
+        while True:
+            shown += os.read(ours, 4096)
+            if until_shown.encode() in shown:
+                process.send_signal(signal.SIGINT)
+                until_shown = '\0'
+    os.close(ours)
+    assert process.wait(TIMEOUT) == 0
+    return shown
 
 
 @pytest.mark.parametrize(
@@ -168,7 +206,7 @@ def test_a_launch_file_of_nodelets_loads_programs(master, compose):
         ('composed_robot/../talker', 'names no program'),
         ('/bin/sh', 'names no program'),
         ('no_such_package/talker', "no ROS package 'no_such_package'"),
-        ('composed_robot/broken', 'SyntaxError'),
+        ('composed_robot/broken', "'return' outside function"),
     ],
 )
 def test_what_cannot_be_loaded_is_said_to_who_asked(master, compose, what, said):

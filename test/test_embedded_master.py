@@ -34,6 +34,14 @@ def test_it_is_a_master_of_its_own(embedded):
     assert run(embedded.url, 'rosnode', 'list').stdout == '/rosout\n'
 
 
+def test_it_is_there_where_ros_uses_ipv6(monkeypatch):
+    monkeypatch.setenv('ROS_IPV6', 'on')
+    for variable in 'ROS_HOSTNAME', 'ROS_IP':
+        monkeypatch.delenv(variable, raising=False)
+    with Master.embedded() as master:
+        assert [node.name for node in master.nodes()] == ['/rosout']
+
+
 def test_nodes_of_this_process_and_others_meet_there(embedded):
     mailbox = Mailbox()
     embedded.create(BlockNode, named='/receiver', delegate=mailbox).interested_in(

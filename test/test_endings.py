@@ -157,6 +157,15 @@ def test_a_stop_that_comes_from_the_node_itself_is_waited_for(master, how):
     assert node.calls == ['begun', 'ended']
 
 
+def test_a_stop_may_be_a_hook_of_rospys(master, transcript):
+    """rospy runs the other hooks, which close the servers, only afterwards."""
+    node = create(master, '/hooked')
+    node.ros.on_shutdown(node.stop)
+    node.ros.signal_shutdown('done')
+    until(lambda: node.lifecycle is Lifecycle.STOPPED)
+    assert transcript == []  # nothing was left behind
+
+
 def test_a_mixins_stop_runs_once_too(master):
     class Mixin:
         calls = 0
@@ -457,8 +466,8 @@ def waiting(master, monkeypatch):
     monkeypatch.setattr('pharos.channel.OutputChannel.connections', [])
     monkeypatch.setattr(
         'pharos.private_rospy.local_services.find',
-        lambda name, uri, cls, find=local_services.find: (
-            find(name, uri, cls) if name == '/sleep' else None
+        lambda name, *rest, find=local_services.find: (
+            find(name, *rest) if name == '/sleep' else None
         ),
     )
     yield waiting

@@ -3,6 +3,7 @@ behind."""
 import socket
 import threading
 
+import genpy
 import pytest
 
 from helpers import create
@@ -216,6 +217,54 @@ def test_a_block_that_returns_a_message_of_its_own_is_told_that_it_would_not_be_
         node.send_to('/t', lambda message: cls('lost'), typed_as=cls)
     assert node.send_to('/t', lambda message: message).data == ''
     assert node.send_to('/t', lambda message: setattr(message, 'data', 'x')).data == 'x'
+
+
+def test_a_block_that_returns_a_value_instead_of_setting_it_is_told_what_to_set(master):
+    """An empty message went out in silence."""
+    node = create(master)
+    with pytest.raises(
+        pharos.MessageTypeError, match=r"returned 'hello' and set no field.*\(data: string\)"
+    ):
+        node.send_to('/t', lambda message: 'hello', typed_as='std_msgs/String')
+
+
+@pytest.mark.parametrize('value', [0, 'x', 5.0], ids=repr)
+def test_what_a_block_that_sets_fields_returns_does_not_matter(master, value):
+    def block(message):
+        message.data = 'set'
+        return value
+
+    node = create(master)
+    assert node.send_to('/t', block, typed_as='std_msgs/String').data == 'set'
+    node.send_to('/empty', lambda message: value, typed_as='std_msgs/Empty')
+
+
+def test_the_base_of_all_messages_is_no_type(master):
+    node = create(master)
+    for use in node.interested_in, node.output_channel:
+        with pytest.raises(pharos.UnknownTypeError, match='malformed message type'):
+            use('/t', genpy.Message)
+
+
+def test_a_service_that_plain_rospy_offers_already(master):
+    with pytest.raises(pharos.PharosError, match='/node offers /node/get_loggers already'):
+        create(master).serve('~get_loggers', 'std_srvs/Empty', lambda request: None)
+
+
+def test_the_namespace_of_all_parameters_holds_a_dict(master):
+    with pytest.raises(ValueError, match='set to a dict of them, not 5'):
+        master.parameters['/'] = 5
+    with pytest.raises(ValueError, match='cannot be deleted'):
+        del master.parameters['/']
+
+
+def test_a_node_taken_for_a_master(master):
+    url = create(master).uri
+    for ask in Master(url).nodes, lambda: Master(url).create(BlockNode, named='/lost'):
+        with pytest.raises(
+            pharos.MasterUnreachableError, match='is no ROS master .*that of a node'
+        ):
+            ask()
 
 
 def test_a_message_of_another_type(master):

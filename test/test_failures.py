@@ -676,6 +676,7 @@ WAYS = {
     'the message in the error': lambda message: throw(
         ValueError('bad image', message, message.height)
     ),
+    'messages in the error': lambda message: throw(ValueError([message], {'image': message})),
     'its data in the error': lambda message: throw(ValueError(message.height, message.data)),
     'the message an attribute': lambda message: throw(with_attribute(message)),
     'in a frozen error': lambda message: throw(Frozen(message)),

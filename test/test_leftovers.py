@@ -15,115 +15,13 @@ import pytest
 from pharos.testing import Mailbox
 import pharos
 from pharos import BlockNode
-from programs import environment
-
-COUNTED = r'''
-import gc, json, os, sys, threading, time
-import pharos
-from pharos import BlockNode, Master
-
-def resident():
-    """Memory of this process in MB."""
-    with open('/proc/self/statm') as file:
-        return int(file.read().split()[1]) * os.sysconf('SC_PAGESIZE') / 1e6
-
-def count():
-    """What a node may leave behind; threads are the kernel's, not only those that Python knows."""
-    gc.collect()
-    for thread in threading.enumerate():
-        if thread.name.startswith('watcher') and not pharos.node_registry.nodes():
-            thread.join(20)    # it watches the master while there are nodes, and ends once it sees that there are none
-    deadline = time.monotonic() + 20
-    while len(os.listdir('/proc/self/task')) > threading.active_count() and time.monotonic() < deadline:
-        threading.Event().wait(0.001)    # a thread that was joined has still to leave the kernel
-    open_files = []
-    for descriptor in os.listdir('/proc/self/fd'):
-        try:
-            open_files.append(os.readlink('/proc/self/fd/' + descriptor).partition(':')[0])
-        except FileNotFoundError:
-            pass    # that of the listing
-    return {'threads': len(os.listdir('/proc/self/task')), 'sockets': open_files.count('socket'),
-            'descriptors': len(open_files), 'registrations': registrations()}
-
-def registrations():
-    return sum(nodes.count(name) for kind in master.system_state() for nodes in kind.values() for name in ours)
-
-def cpu_share():
-    """The share of a core that is used while nothing happens."""
-    begin = time.process_time(), time.monotonic()
-    threading.Event().wait(0.5)
-    return (time.process_time() - begin[0]) / (time.monotonic() - begin[1])
-
-def timed(block):
-    begin = time.monotonic()
-    block()
-    return time.monotonic() - begin
-
-master = Master()
-'''
-
-ROUNDS = (
-    COUNTED
-    + r'''
-import queue
-ours = ['/round']
-received, turned = queue.SimpleQueue(), threading.Event()
-node = master.create(BlockNode, named='/round', domain='127.0.0.1',
-                     delegate=lambda message, channel: received.put(message.data))
-ports = node.tcp_port, node.xmlrpc_port
-
-def soul(me):
-    for _ in me.every(0.01):
-        turned.set()
-
-node.interested_in('/in', 'std_msgs/Int32')
-node.serve('/double', 'roscpp/GetLoggers', lambda request: [])
-node.output_channel('/out', 'std_msgs/Int32')
-stops, counts, memory = [], [], []
-for number in range(ROUNDS):
-    turned.clear()
-    node.fork(soul)
-    node.send_to('/out', data=number)
-    assert received.get(timeout=20) == 7    # from the other process, latched
-    assert turned.wait(20)
-    master.lookup_service('/double', '/round').call(timeout=20)
-    stops.append(timed(node.stop))
-    assert not node.errors, node.errors
-    counts.append(count())
-    memory.append(resident())
-    assert (node.tcp_port, node.xmlrpc_port) == ports
-    if number < ROUNDS - 1:
-        node.start()
-stopped_cpu = cpu_share()
-node.start()
-running_cpu = cpu_share()
-node.stop()
-print(json.dumps({'counts': counts, 'stops': stops, 'memory': memory, 'cpu': [stopped_cpu, running_cpu]}))
-'''
-)
-
-HUNDRED = (
-    COUNTED
-    + r'''
-ours = ['/many/n%d' % number for number in range(100)]
-master.create(BlockNode, named='/first', domain='127.0.0.1').stop()    # what is loaded once per process
-before = count()
-nodes = []
-started = timed(lambda: nodes.extend(master.create(BlockNode, named=name, domain='127.0.0.1') for name in ours))
-running = count()
-stopped = timed(lambda: [node.stop() for node in nodes])
-nodes.clear()
-after = count()
-print(json.dumps({'before': before, 'running': running, 'after': after, 'started': started, 'stopped': stopped}))
-'''
-)
+from programs import PROGRAMS, environment
 
 
-def run(master, code, **constants):
+def run(master, program, *arguments):
     """Run a program, and return what it found out."""
-    lines = ['%s = %r\n' % constant for constant in constants.items()]
     done = subprocess.run(
-        [sys.executable, '-c', ''.join(lines) + code],
+        [sys.executable, PROGRAMS / program, *arguments],
         env=environment(master.url),
         timeout=120,
         stdout=subprocess.PIPE,
@@ -142,7 +40,7 @@ def rounds(ros_master):
     with master.create(BlockNode, named='/peer', domain='127.0.0.1', delegate=heard) as peer:
         peer.output_channel('/in', 'std_msgs/Int32', latch=True).send(data=7)
         peer.interested_in('/out', 'std_msgs/Int32')
-        found = run(master, ROUNDS, ROUNDS=50)
+        found = run(master, 'rounds.py', '50')
         assert [message.data for message in heard.take(50)] == list(range(50))
     return found
 
@@ -174,7 +72,7 @@ def test_a_node_that_was_stopped_or_has_nothing_to_do_uses_no_cpu(rounds):
 
 
 def test_a_hundred_nodes_start_and_stop(master):
-    found = run(master, HUNDRED)
+    found = run(master, 'hundred_nodes.py')
     assert found['running']['registrations'] >= 100
     assert found['after'] == found['before']
     assert found['started'] < 30 and found['stopped'] < 10  # s; the benchmark looks closer

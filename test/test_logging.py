@@ -12,7 +12,7 @@ import pytest
 from helpers import create
 from pharos.testing import Mailbox, TIMEOUT
 import pharos
-from programs import environment
+from programs import PROGRAMS, environment
 
 
 def hear(master):
@@ -40,6 +40,13 @@ def test_each_line_is_on_rosout_once_with_name_file_and_line(master):
         assert own.function.endswith('test_each_line_is_on_rosout_once_with_name_file_and_line')
         assert (through_rospy.msg, through_rospy.line) == ('and through rospy', line + 2)
     assert lines.empty()
+
+
+def test_a_node_that_is_not_started_logs_to_the_transcript(master, transcript):
+    node = create(master)
+    node.stop()
+    node.log('after all', 'warning')
+    assert transcript == ['[WARNING] /node: after all']
 
 
 def test_a_log_level_is_set_per_node(master):
@@ -73,36 +80,8 @@ def test_the_hosts_logging_is_untouched(master):
 
 def test_a_host_that_is_a_rospy_node_itself_stays_one(master):
     """Its name, its log lines and its subscription are its own, beside two nodes of ours."""
-    program = r'''
-import logging, sys
-logging.getLogger().addHandler(logging.StreamHandler(sys.stdout))
-import rospy, std_msgs.msg
-import pharos
-rospy.init_node('host', argv=[])
-master = pharos.Master()
-a, b = (master.create(pharos.BlockNode, named=name) for name in ('/a', '/b'))
-import threading
-heard = threading.Event()
-rospy.Subscriber('/t', std_msgs.msg.String, lambda message: heard.set())
-a.send_to('/t', data='hello', typed_as='std_msgs/String')
-assert heard.wait(20)
-log = rospy.Publisher('/t', std_msgs.msg.String, queue_size=1)
-rospy.loginfo('the host speaks')
-a.log('node a speaks')
-assert rospy.get_name() == '/host' and a.ros.get_name() == '/a'
-try:
-    a.ros.get_param('/none')
-except KeyError:
-    pass
-try:
-    a.ros.wait_for_message('/nothing', std_msgs.msg.String, timeout=0.01)
-except rospy.ROSException:
-    print('caught')
-a.stop(); b.stop()
-assert not rospy.is_shutdown() and a.lifecycle.value == 'stopped'
-'''
     result = subprocess.run(
-        [sys.executable, '-c', program],
+        [sys.executable, PROGRAMS / 'rospy_node_with_others.py'],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

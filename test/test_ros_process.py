@@ -7,12 +7,13 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 
 import pytest
 
 from pharos.testing import Mailbox, TIMEOUT
 from pharos import BlockNode, ExternalNode, RosProcess, UnknownNodeError
-from programs import Program
+from programs import PROGRAMS, Program
 from sockets import wait_for_end
 
 MANIFEST = """<package format="2"><name>%s</name><version>0.0.0</version><description>d</description>
@@ -104,6 +105,38 @@ def test_an_unknown_package_or_program_is_said(master, package):
         master.launch('no_such_robot', 'a.launch')
     with pytest.raises(UnknownNodeError, match="fake_robot has no launch file 'b.launch': is it"):
         master.launch('fake_robot', 'b.launch')
+
+
+@pytest.mark.parametrize('given', [('', ''), (None, 'talker'), ('fake_robot', None), (5, 'talker')])
+def test_what_is_no_name_of_a_package_or_program_is_refused(master, package, given):
+    with pytest.raises(ValueError, match='are given by their names, not'):
+        master.run(*given)
+
+
+@pytest.mark.parametrize(
+    'given, error, says',
+    [
+        ({'params': [1]}, TypeError, r'params is a dict by name, not \[1\]'),
+        ({'remap': 'a:=b'}, TypeError, "remap is a dict by name, not 'a:=b'"),
+        ({'params': {'1st': 2}}, ValueError, "'1st' cannot be a parameter name"),
+        ({'remap': {'talk': 'a b'}}, ValueError, "'a b' cannot be a remapped name"),
+        ({'remap': {'1': '/b'}}, ValueError, "'1' cannot be a remapped name"),
+        ({'name': '/ns/talker'}, ValueError, "'/ns/talker' cannot be a node name"),
+    ],
+)
+def test_names_that_cannot_be_any_are_refused_before_it_starts(master, package, given, error, says):
+    with pytest.raises(error, match=says):
+        master.run('fake_robot', 'talker', **given)
+
+
+def test_a_namespace_is_given_as_a_remapping(master, package):
+    with master.run('fake_robot', 'talker', remap={'__ns': '/robots'}):
+        master.wait_for_node('/robots/talker', TIMEOUT)
+
+
+def test_an_argument_that_is_none_is_refused(master, package):
+    with pytest.raises(TypeError, match='texts or numbers, not None'):
+        master.run('fake_robot', 'talker', None)
 
 
 # -- what they are told, and what they tell
@@ -338,6 +371,30 @@ def test_a_program_that_ignores_ctrl_c_is_terminated(master, package):
     process = master.run('fake_robot', deaf, on_line=lines.put)
     lines.get(timeout=TIMEOUT)
     assert process.terminate(timeout=1) == 5
+
+
+def test_nodes_that_do_not_answer_are_waited_for_no_longer_than_asked(master, package):
+    """Each took a second to be asked, and one more to be looked for afterwards."""
+    shutil.copy(PROGRAMS / 'hung_nodes.py', package / 'scripts' / 'hung')
+    lines = queue.SimpleQueue()
+    process = master.run('fake_robot', 'hung', 6, on_line=lines.put)
+    assert lines.get(timeout=TIMEOUT) == 'registered'
+    begun = time.monotonic()
+    assert process.terminate(timeout=1) == -signal.SIGINT
+    assert time.monotonic() - begun < 6  # seconds; 12 without a limit for all of them together
+    left = names_registered(master)
+    master_api = {name: master.api(name) for name in left if name.startswith('/hung')}
+    for name, api in master_api.items():
+        service = '/hang' + name[len('/hung') :]
+        api.unregisterService(service, api.lookupService(service))
+
+
+@pytest.mark.parametrize('timeout', ['x', float('nan')])
+def test_a_limit_that_is_no_number_of_seconds_is_refused(master, package, timeout):
+    with master.run('fake_robot', 'talker') as process:
+        for wait in process.wait, process.terminate:
+            with pytest.raises(ValueError, match='timeout is a number of seconds, not'):
+                wait(timeout)
 
 
 # -- the end

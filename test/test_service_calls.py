@@ -20,7 +20,7 @@ from helpers import InProcessMaster, create
 from pharos.testing import TIMEOUT, until
 import pharos
 from pharos import messages
-from programs import Program, environment, forget_parameters, run, script
+from programs import PROGRAMS, Program, environment, forget_parameters, run, script
 from sockets import wait_for_end
 
 ECHO = 'diagnostic_msgs/AddDiagnostics'  # load_namespace -> success, message
@@ -34,52 +34,12 @@ MUX_TYPES = {
     'select': ('topic_tools/MuxSelect', 'string topic\n---\nstring prev_topic\n'),
 }
 
-PROVIDER = r'''
-import sys, threading
-import std_srvs.srv
-from diagnostic_msgs.srv import AddDiagnostics
-
-kind, name, port = sys.argv[1], sys.argv[2], int(sys.argv[3])
-if kind == 'rospy':
-    import rospy
-    rospy.init_node(name.strip('/'), tcpros_port=port)
-    serve, spin = rospy.Service, rospy.spin
-else:
-    import pharos
-    node = pharos.Master().create(pharos.BlockNode, named=name, domain='127.0.0.1', tcp_port=port)
-    serve, spin = node.serve, pharos.spin
-
-gate = threading.Event()
-
-def echo(request):
-    return {'success': True, 'message': request.load_namespace}
-
-def fail(request):
-    raise RuntimeError('no room for %s' % request.load_namespace)
-
-def wait(request):
-    sys.stdout.write('called by %s\n' % request.load_namespace)    # at once: print writes the end apart
-    sys.stdout.flush()
-    gate.wait()
-    return echo(request)
-
-def open_gate(request):
-    gate.set() if request.data else gate.clear()
-    return {'success': True}
-
-for block in echo, fail, wait:
-    serve(name + '/' + block.__name__, AddDiagnostics, block)
-serve(name + '/gate', std_srvs.srv.SetBool, open_gate)
-print('ready', flush=True)
-spin()
-'''
-
 
 @contextlib.contextmanager
 def provider(url, name, kind='rospy', port=0):
     """A provider in a process of its own, as a Program. However it ends, it leaves nothing on the
     master."""
-    with Program(url, sys.executable, '-c', PROVIDER, kind, name, str(port)) as program:
+    with Program(url, sys.executable, PROGRAMS / 'provider.py', kind, name, str(port)) as program:
         try:
             program.wait_for('ready')
             yield program
@@ -217,76 +177,6 @@ def threads():
 
 # -- by name and keywords alone
 
-TURTLES = r'''
-import importlib.util, sys
-import pharos
-from pharos import messages
-from pharos.messages import turtlesim
-
-assert importlib.util.find_spec('turtlesim') is None
-master, called = pharos.Master(), {}
-
-def call(name, /, **fields):
-    service = called[name] = master.lookup_service(name)
-    return service.call(timeout=20, **fields)
-
-def pose():
-    """The first pose of turtle2 that has been told since."""
-    with master.create(pharos.BlockNode, named='/looks_on', domain='127.0.0.1') as node:
-        poses = queue.SimpleQueue()
-        node.interested_in('/turtle2/pose', delegate=lambda pose, channel: poses.put((pose.x, pose.y, pose.theta)))
-        return poses.get(timeout=20)
-'''
-
-ALL_SERVICES = (
-    TURTLES
-    + r'''
-import queue
-assert call('/spawn', x=1.0, y=2.0).name == 'turtle2'
-assert pose() == (1.0, 2.0, 0.0)
-call('/turtle2/set_pen', r=255, width=3)
-call('/turtle2/teleport_absolute', x=3.0, y=4.0)
-assert pose() == (3.0, 4.0, 0.0)
-call('/turtle2/teleport_relative', linear=1.0)
-assert pose() == (4.0, 4.0, 0.0)
-for name in 'set_pen', 'teleport_absolute', 'teleport_relative':
-    call('/turtle1/' + name)
-call('/clear')
-assert call('/turtlesim/save_picture').success
-call('/turtlesim/set_logger_level', logger='rosout', level='warn')
-levels = {logger.name: logger.level for logger in call('/turtlesim/get_loggers').loggers}
-assert levels['rosout'] == 'WARN', levels
-offered = set(master.node('/turtlesim').services)
-call('/kill', name='turtle2')
-assert '/turtle2/set_pen' not in master.services()
-call('/spawn', name='bob')
-call('/reset')
-assert '/bob/set_pen' not in master.services()
-assert offered == set(called), offered ^ set(called)
-print('called', *sorted(service.type for service in called.values()))
-'''
-)
-
-UNKNOWN_TYPE = (
-    TURTLES
-    + r'''
-text = turtlesim.DEFINITIONS['srv'].pop('turtlesim/TeleportAbsolute')
-service = master.lookup_service('/turtle1/teleport_absolute')
-print(service.type, service.md5sum)
-try:
-    service.call(x=1.0)
-except pharos.UnknownTypeError as error:
-    print(error)
-pharos.define_service(service.type, text)
-service.call(x=1.0, timeout=20)
-service.md5sum = 'wrong'
-try:
-    service.call()
-except pharos.ServiceTypeError as error:
-    print(error)
-'''
-)
-
 
 @pytest.fixture(scope='module')
 def simulator(ros_master, tmp_path_factory):
@@ -302,7 +192,7 @@ def simulator(ros_master, tmp_path_factory):
 def test_every_service_of_a_turtle_simulator_is_called_from_a_process_that_has_no_turtlesim(
     master, simulator
 ):
-    done = run(master.url, sys.executable, '-c', ALL_SERVICES)
+    done = run(master.url, sys.executable, PROGRAMS / 'all_turtle_services.py')
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == [
         'called',
@@ -322,7 +212,7 @@ def test_every_service_of_a_turtle_simulator_is_called_from_a_process_that_has_n
 def test_a_service_whose_type_nobody_here_knows_tells_it_and_is_called_once_it_is_defined(
     master, simulator
 ):
-    done = run(master.url, sys.executable, '-c', UNKNOWN_TYPE)
+    done = run(master.url, sys.executable, PROGRAMS / 'unknown_service_type.py')
     assert done.returncode == 0, done.stderr
     type_and_md5sum, unknown, wrong = done.stdout.splitlines()
     # turtlesim's own
@@ -770,40 +660,6 @@ def test_each_of_eight_threads_gets_the_answers_to_its_own_requests(
     assert connections_to(service) == 0
 
 
-MANY_CALLS = r'''
-import gc, json, os, sys, threading, tracemalloc
-import pharos
-
-name, persistent, timeout, calls, pid = json.loads(sys.argv[1])
-master = pharos.Master()
-node = master.create(pharos.BlockNode, named='/caller', domain='127.0.0.1')
-node.serve('/caller/echo', 'diagnostic_msgs/AddDiagnostics',
-           lambda request: {'success': True, 'message': request.load_namespace})
-service = master.lookup_service(name, persistent=persistent)
-
-def call(times):
-    for turn in range(times):
-        assert service.call(load_namespace=str(turn), timeout=timeout).message == str(turn)
-
-def resident(pid):
-    """Memory of the process in MB."""
-    with open('/proc/%s/statm' % pid) as file:
-        return int(file.read().split()[1]) * os.sysconf('SC_PAGESIZE') / 1e6
-
-def count():
-    gc.collect()
-    return {'descriptors': len(os.listdir('/proc/self/fd')), 'threads': threading.active_count(),
-            'allocated': tracemalloc.get_traced_memory()[0] / 1e6, 'resident': resident('self'),
-            "provider's descriptors": len(os.listdir('/proc/%s/fd' % pid)), "provider's memory": resident(pid)}
-
-tracemalloc.start()
-call(500)    # what is made once is there then
-before = count()
-call(calls)
-print(json.dumps([before, count()]))
-'''
-
-
 @pytest.mark.parametrize(
     'name, persistent, timeout, calls',
     [
@@ -817,7 +673,7 @@ print(json.dumps([before, count()]))
 def test_thousands_of_calls_leave_nothing_behind(master, counted, name, persistent, timeout, calls):
     parameters = json.dumps([name, persistent, timeout, calls, counted.process.pid])
     done = subprocess.run(
-        [sys.executable, '-c', MANY_CALLS, parameters],
+        [sys.executable, PROGRAMS / 'many_calls.py', parameters],
         env=environment(master.url),
         timeout=120,
         stdout=subprocess.PIPE,

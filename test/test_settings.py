@@ -215,6 +215,13 @@ def test_a_host_whose_name_does_not_resolve_is_reached_by_its_address(master, mo
     assert master.is_node_alive('/here')
 
 
+def test_an_address_of_another_host_is_told(master, capfd):
+    create(master, domain='192.0.2.1')  # nobody's
+    assert (
+        '192.0.2.1, which /node tells others to come to, is no address of' in capfd.readouterr().err
+    )
+
+
 def test_the_hosts_name_is_taken_without_complaint(master, monkeypatch, capfd):
     monkeypatch.delenv('ROS_HOSTNAME')
     monkeypatch.setattr(socket, 'gethostname', lambda: 'localhost')

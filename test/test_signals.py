@@ -10,36 +10,13 @@ import rosmaster.master_api
 from pharos.testing import Mailbox, TIMEOUT
 from helpers import create
 from pharos import BlockNode
-from programs import Program
+from programs import PROGRAMS, Program
 
 SIGNALS = pytest.mark.parametrize(
     'with_signal', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name
 )
 
-PREPARED = '''
-import signal, sys, threading
-import pharos
-from pharos import BlockNode, Master
-
-def node(name='/program', **kwargs):
-    return Master().create(BlockNode, named=name, domain='127.0.0.1', **kwargs)
-
-def ready():
-    print('ready', flush=True)
-
-def wait_for(event):
-    """In short waits: a signal that comes just before one begins does not end it, in Python."""
-    while not event.wait(0.1):
-        pass
-
-def ready_in_wait():
-    """Tell when the main thread waits in something of ours; before that, it runs code of its own."""
-    def tell():
-        while not pharos.signals._waits:
-            threading.Event().wait(0.001)
-        ready()
-    threading.Thread(target=tell, daemon=True).start()
-'''
+PREPARED = (PROGRAMS / 'prepared.py').read_text()
 
 
 @pytest.fixture

@@ -41,7 +41,15 @@ ROS_NAMES = {
     *('_slot_types', '_full_text', '_has_header'),
 }
 ROSPYS_NAMES = {
-    *('_base_logger', '_shutdown_flag', '_shutdown_hooks', '_shutdown_lock', '_TopicImpl'),
+    *(
+        '_base_logger',
+        '_in_shutdown',
+        '_is_owned',
+        '_shutdown_flag',
+        '_shutdown_hooks',
+        '_shutdown_lock',
+        '_TopicImpl',
+    ),
     *('_handlerList', '_handlers', '_marshaled_dispatch', '_tcp_server_callback', '_shutdown'),
     *('_xmlrpc_cache', '_init_node_args', '_preshutdown_hooks'),
 }

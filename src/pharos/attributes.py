@@ -4,7 +4,7 @@ import inspect
 import numbers
 from typing import TYPE_CHECKING, Any, Callable, FrozenSet, List, Optional, TypeVar
 
-from pharos.blocks import attempt, check_delegate, check_runs, check_soul
+from pharos.blocks import attempt, check_delegate, check_runs, check_soul, text_of
 from pharos.failures import Failure, Failures
 from pharos.private_rospy.settings import Settings
 from pharos.seconds import check_seconds
@@ -167,7 +167,7 @@ class NodeAttributes:
 
     def log(self, text: str, level: str = 'info') -> None:
         """Log a line on /rosout, the node's log file and the screen, with the file and line of the
-        caller.
+        caller. Where the node is not started, or has stopped, the Transcript shows it.
 
         :param level: 'debug', 'info', 'warning' (or 'warn'), 'error' or 'fatal'
         """
@@ -175,7 +175,9 @@ class NodeAttributes:
             level = _LEVELS[level]
         except KeyError:
             raise ValueError(f"no log level {level!r}: there are {', '.join(_LEVELS)}") from None
-        if self.latest_run is not None:
+        if self.latest_run is None or self.latest_run.is_over:
+            Transcript.show(f'[{level.upper()}] {self.name}: {text_of(text)}')
+        else:
             log = self.latest_run.rospy.log
             # no wrapper between: rospy looks for the caller of this method
             log('%s', (text,), {}, level=level)

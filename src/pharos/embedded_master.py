@@ -5,9 +5,7 @@ import sys
 from typing import Tuple
 
 from pharos.errors import MasterUnreachableError, PortInUseError
-from pharos.private_rospy.addresses import check_environment
-
-LOOPBACK = '127.0.0.1'
+from pharos.private_rospy.addresses import check_environment, loopback
 
 
 def start(port: int) -> Tuple['subprocess.Popen[str]', str]:
@@ -18,7 +16,7 @@ def start(port: int) -> Tuple['subprocess.Popen[str]', str]:
     """
     environ = dict(os.environ, PYTHONPATH=os.pathsep.join(path for path in sys.path if path))
     if check_environment(environ) is None:
-        environ['ROS_HOSTNAME'] = LOOPBACK  # for this host alone, where nothing else is said
+        environ['ROS_HOSTNAME'] = loopback()  # for this host alone, where nothing else is said
     # Ctrl-C is the program's
     child = subprocess.Popen(
         [sys.executable, '-m', 'pharos.master_program', str(port), str(os.getpid())],

@@ -1,5 +1,6 @@
 """What blocks raised: kept, counted, told once, and run again."""
 import collections
+import numbers
 import pdb
 import sys
 import threading
@@ -277,8 +278,13 @@ def _release(error: BaseException) -> None:
 
 
 def _small(value: Any) -> Any:
-    """The value, or what it was where it is large."""
-    if isinstance(value, genpy.Message):
-        return f'<{value._type}>'
+    """The value where it can hold nothing large, else what it was."""
     size = sys.getsizeof(value, 0)
-    return value if size <= LARGE else f'<{type(value).__name__} of {size} bytes>'
+    if size <= LARGE:
+        if isinstance(value, (str, bytes, numbers.Number, type(None))):
+            return value
+        if type(value) is tuple:
+            return tuple(map(_small, value))
+        if isinstance(value, genpy.Message):
+            return f'<{value._type}>'
+    return f'<{type(value).__name__} of {size} bytes>'

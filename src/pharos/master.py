@@ -184,13 +184,9 @@ class Master(MasterCalls):
         :param on_line: block called as ``on_line(text)`` for each line of its output, in a thread
             of its own
         :raises UnknownNodeError: if there is no such package or program
+        :raises TypeError, ValueError: if an argument or name cannot be one
         """
-        mappings: Dict[str, object] = {**(remap or {})}
-        for key, value in (params or {}).items():
-            mappings['_' + key] = value
-        if name is not None:
-            mappings['__name'] = name
-        arguments = [*map(str, args), *(f'{key}:={value}' for key, value in mappings.items())]
+        arguments = ros_process.arguments_of(args, name, remap, params)
         return ros_process.run(self, package, executable, arguments, on_line)
 
     def launch(

@@ -12,7 +12,7 @@ from pharos.private_rospy.addresses import is_same_master
 from pharos.private_rospy.lifetime import Interruption
 from pharos.private_rospy.deadlines import MARGIN, time_limit
 from pharos.private_rospy.proxies import ServerProxy, interruption, master_api
-from pharos.private_rospy.registration import COMMUNICATION_ERRORS, PING_TIMEOUT
+from pharos.private_rospy.registration import COMMUNICATION_ERRORS, PING_TIMEOUT, unreachable
 from pharos.seconds import check_limit
 
 TIMEOUT = 5.0  # seconds that a question to the master may take
@@ -66,10 +66,7 @@ class MasterCalls:
         try:
             yield
         except COMMUNICATION_ERRORS as error:
-            raise MasterUnreachableError(
-                f'no ROS master answers at {self.url} ({error}): start one with roscore or'
-                ' Master.embedded(), or set ROS_MASTER_URI'
-            ) from error
+            raise unreachable(self.url, error) from error
 
     def system_state(self) -> Tuple[Users, Users, Users]:
         """``(publishers, subscribers, services)``, each ``{name: [node names]}``."""

@@ -24,9 +24,9 @@ def main(port: int, parent: int) -> None:
     # it tells of every node that just stopped
     logging.getLogger('rosmaster').addHandler(logging.NullHandler())
     try:
-        with socket.socket() as probe:  # rosmaster waits for ever where its port is taken
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind((rosgraph.network.get_bind_address(), port))
+        family = socket.AF_INET6 if rosgraph.network.use_ipv6() else socket.AF_INET
+        # rosmaster waits for ever where its port is taken
+        socket.create_server((rosgraph.network.get_bind_address(), port), family=family).close()
     except OSError as error:
         print('busy', error.strerror, file=answers, flush=True)
         return

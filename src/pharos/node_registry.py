@@ -202,6 +202,8 @@ def _begin_stop(node: 'Node') -> 'Optional[Run]':
     if is_superseded(node):
         return None
     if node.latest_run is not None:
+        if node.latest_run.rospy.is_in_shutdown_hook():
+            return None  # after the hooks, which are to run before all else, it is stopped
         node.latest_run.cancel_start()
     with changed:
         run = node.latest_run

@@ -40,21 +40,30 @@ class OfferedService:
         self.closed = False  # whether close() was called
         opened = node.current_run.opened
         if any(isinstance(other, OfferedService) and other.name == name for other in opened):
-            raise PharosError(f'{node.name} offers {name} already: close that one first')
+            raise self._is_offered()
         self.open()
 
     def open(self) -> None:
         """Register with the master, also after a restart of the node."""
-        self._service = local_services.offer(
-            self.node.current_run.rospy,
-            self.name,
-            self.service_class,
-            self._answer,
-            self.node.connect_timeout,
-        )
+        try:
+            self._service = local_services.offer(
+                self.node.current_run.rospy,
+                self.name,
+                self.service_class,
+                self._answer,
+                self.node.connect_timeout,
+            )
+        except rospy.ServiceException as error:  # a plain rospy Service has the name
+            raise self._is_offered() from error
         self.node.latest_run.remember(self)
         if self.closed:  # meanwhile
             self.close()
+
+    def _is_offered(self) -> PharosError:
+        return PharosError(
+            f'{self.node.name} offers {self.name} already: close that one first, or choose another'
+            ' name'
+        )
 
     def node_stopped(self) -> None:
         """The node stops, and its rospy closes all services."""

@@ -25,9 +25,13 @@ class Parameters(MutableMapping[str, Any]):
         return self._call('getParam', self._global_or_there(name))
 
     def __setitem__(self, name: str, value: Any) -> None:
+        if name == '/' and not isinstance(value, dict):
+            raise ValueError(f'/ holds all parameters, and is set to a dict of them, not {value!r}')
         self._call('setParam', _global(name), as_stored(name, value))
 
     def __delitem__(self, name: str) -> None:
+        if name == '/':
+            raise ValueError('/ holds all parameters, and cannot be deleted: set it to {}')
         self._call('deleteParam', self._global_or_there(name))
 
     def __iter__(self) -> Iterator[str]:

@@ -6,9 +6,22 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 import urllib.parse
 import xmlrpc.client
-from typing import TYPE_CHECKING, Any, Callable, Deque, Dict, Iterator, List, Optional, Set
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Callable,
+    Deque,
+    Dict,
+    Iterator,
+    List,
+    Mapping,
+    Optional,
+    Sequence,
+    Set,
+)
 
 import psutil
 import rosgraph.network
@@ -20,8 +33,11 @@ from pharos import node_registry
 from pharos.blocks import check_block, name_of
 from pharos.errors import UnknownNodeError
 from pharos.failures import Failures
+from pharos.private_rospy.deadlines import time_limit
+from pharos.private_rospy.names import check_name
 from pharos.private_rospy.proxies import ServerProxy
 from pharos.private_rospy.registration import COMMUNICATION_ERRORS, unregister_all
+from pharos.seconds import check_limit, check_seconds
 from pharos.transcript import Transcript
 
 if TYPE_CHECKING:
@@ -106,9 +122,10 @@ class RosProcess:
     def wait(self, timeout: Optional[float] = None) -> int:
         """Wait until it ends; returns its exit status.
 
+        :param timeout: seconds, None: no limit
         :raises subprocess.TimeoutExpired: after ``timeout`` seconds
         """
-        status = self._process.wait(timeout)
+        status = self._process.wait(check_limit('timeout', timeout))
         if self._reader is not threading.current_thread():  # which runs on_line
             self._reader.join(1.0)
         return status
@@ -119,18 +136,19 @@ class RosProcess:
 
         The nodes in it are asked through ROS, for where roscpp has no handler, a node ends at a
         signal without unregistering; then the program is asked as by Ctrl-C, and then by SIGTERM.
-        What is still registered of the nodes afterwards goes. Done at the end of this program, too,
-        also where Ctrl-C has cut it off.
+        What is still registered of the nodes afterwards goes, if the master answers. Done at the end
+        of this program, too, also where Ctrl-C has cut it off.
         """
+        timeout = check_seconds('timeout', timeout)
         if self.poll() is None:
-            started = self._look()
-            has_nodes = self._nodes.shut_down()
-            share = timeout / (3 if has_nodes else 2)
-            if not (has_nodes and self._ends_within(share)):
-                for number in (signal.SIGINT, signal.SIGTERM):
+            started, until = self._look(), time.monotonic() + timeout
+            with time_limit(timeout / 3):
+                has_nodes = self._nodes.shut_down()
+            if not (has_nodes and self._ends_within((until - time.monotonic()) / 3)):
+                for number, share in (signal.SIGINT, 2), (signal.SIGTERM, 1):
                     started |= self._look()  # roslaunch may have started some again
                     self._signal(number)
-                    if self._ends_within(share):
+                    if self._ends_within((until - time.monotonic()) / share):
                         break
             for process in started:
                 with contextlib.suppress(psutil.Error):  # it has ended
@@ -139,7 +157,8 @@ class RosProcess:
         if self._reader.is_alive():  # else it has done so
             self._signal(signal.SIGKILL)
         status = self.wait()
-        self._nodes.clear()
+        with time_limit(ANSWER_TIMEOUT):
+            self._nodes.clear()
         node_registry.not_at_end(self.terminate)
         return status
 
@@ -243,6 +262,34 @@ class _Nodes:
         return port in self._ports and rosgraph.network.is_local_address(address.hostname)
 
 
+def arguments_of(
+    args: Sequence[object],
+    name: Optional[str],
+    remap: Optional[Mapping[str, str]],
+    params: Optional[Mapping[str, object]],
+) -> List[str]:
+    """The arguments of a program, as rosrun takes them; see :meth:`Master.run`.
+
+    :raises TypeError, ValueError: if one of them cannot be one
+    """
+    if None in args:
+        raise TypeError(f'the arguments of a program are texts or numbers, not None: {args}')
+    for what, given in ('remap', remap), ('params', params):
+        if not isinstance(given, (Mapping, type(None))):
+            raise TypeError(f'{what} is a dict by name, not {given!r}')
+    mappings: Dict[str, object] = {}
+    for left, right in (remap or {}).items():
+        if not (isinstance(left, str) and left.startswith('__')):  # else it is no name, as __ns
+            check_name(left, 'remapped', private=True)
+            check_name(right, 'remapped', private=True)
+        mappings[left] = right
+    for key, value in (params or {}).items():
+        mappings['_' + check_name(key, 'parameter').lstrip('/')] = value
+    if name is not None:
+        mappings['__name'] = check_name(name, 'node', base=True)
+    return [*map(str, args), *(f'{left}:={right}' for left, right in mappings.items())]
+
+
 def run(
     master: 'Master',
     package: str,
@@ -262,7 +309,7 @@ def find(package: str, executable: str) -> List[str]:
 
     :raises UnknownNodeError: if there is no such package or program
     """
-    with _known(package):
+    with _known(package, executable):
         paths = _find(package, executable)
     if not paths:
         raise UnknownNodeError(
@@ -311,10 +358,10 @@ def find_launch_file(package: Optional[str], file: str) -> str:
     :raises UnknownNodeError: if there is no such package or launch file
     """
     if package is None:
-        if not os.path.isfile(file):
+        if not (isinstance(file, (str, os.PathLike)) and os.path.isfile(file)):
             raise UnknownNodeError(f'there is no launch file {file!r}: is the path spelt so?')
         return file
-    with _known(package):
+    with _known(package, file):
         found = roslib.packages.find_resource(package, file)
     if not found:
         raise UnknownNodeError(
@@ -324,8 +371,13 @@ def find_launch_file(package: Optional[str], file: str) -> str:
 
 
 @contextlib.contextmanager
-def _known(package: str) -> Iterator[None]:
+def _known(package: str, file: str) -> Iterator[None]:
     """Say what to do where there is no such package."""
+    if not all(isinstance(name, str) and name for name in (package, file)):
+        raise ValueError(
+            f'a ROS package and a program or file in it are given by their names, not {package!r}'
+            f' and {file!r}'
+        )
     try:
         yield
     except rospkg.ResourceNotFound:

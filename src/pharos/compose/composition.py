@@ -36,6 +36,8 @@ class Composition:
         self.progress = progress or Progress()
         #: the process in which roslaunch runs the rest; None: there is none
         self.process: Optional[RosProcess] = None
+        #: the names of the nodes in it
+        self.apart: List[str] = []
         #: why it has ended by itself, before all of its nodes had
         self.reason: Optional[str] = None
         #: whether it ends, or has ended
@@ -70,7 +72,8 @@ class Composition:
         if file.apart:
             self._launch_rest(file.rest())
         logs = os.path.join(rospkg.get_log_dir(env=os.environ), run_id)
-        os.makedirs(logs, exist_ok=True)
+        for folder in logs, rospkg.get_ros_home():  # roslaunch makes them, too
+            os.makedirs(folder, exist_ok=True)
         self.start(
             [_with_log(launched, logs, number) for number, launched in enumerate(file.here, 1)]
         )
@@ -93,7 +96,8 @@ class Composition:
 
     def _launch_rest(self, config: Any) -> None:
         self.process = process = rest.start_rest(self.master, config)
-        names = ', '.join(rest.names_of(config))
+        self.apart = rest.names_of(config)
+        names = ', '.join(self.apart)
 
         def wait() -> None:
             status = process.wait()

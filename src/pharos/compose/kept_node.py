@@ -99,6 +99,7 @@ class KeptNode:
                     'env': dict(launched.env),
                     'takes_own_name': launched.takes_own_name,
                     'private_name': launched.private_name,
+                    'cwd': launched.cwd,
                 },
             )
         start_made(self.node)

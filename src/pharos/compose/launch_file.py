@@ -26,6 +26,7 @@ import roslaunch.node_args
 import roslaunch.xmlloader
 import rospkg
 
+from pharos import working_directory
 from pharos.compose.programs import source_of
 from pharos.errors import PharosError, UnknownNodeError, suggest
 from pharos.ros_process import find_launch_file
@@ -169,13 +170,15 @@ class LaunchFile:
                 )
             self.problems.append(Problem(name, node.filename, why))
             return
-        lacking = _lacks(command[0])
-        if lacking:
-            why = f'the first line of {command[0]} names {lacking}, which is not there'
-            self.problems.append(Problem(name, node.filename, why))
-            return
-        if is_kept_apart or node.launch_prefix or not _runs_here(command[0]):
-            self.apart.append(node)
+        needs_own_folder = node.cwd is not None and not working_directory.is_possible()
+        is_kept_apart = is_kept_apart or bool(node.launch_prefix) or needs_own_folder
+        if is_kept_apart or not _runs_here(command[0]):
+            lacking = _lacks(command[0])
+            if lacking:
+                why = f'the first line of {command[0]} names {lacking}, which is not there'
+                self.problems.append(Problem(name, node.filename, why))
+            else:
+                self.apart.append(node)
             return
         self.here.append(
             LaunchedNode(

@@ -1,11 +1,12 @@
 """Scripts: rospy programs that run unmodified as nodes of this process."""
+import os
 import sys
 import threading
 from typing import TYPE_CHECKING, Any, Dict, Optional, Sequence
 
 import rosgraph.names
 
-from pharos import node_registry, signals
+from pharos import node_registry, signals, working_directory
 from pharos.compose.programs import check_source, find_program, source_of
 from pharos.errors import PharosError
 from pharos.node import Node
@@ -32,6 +33,8 @@ class ScriptNode(Node):
     :param takes_own_name: whether it has the name that it gives to ``init_node``, and not the one
         given here
     :param private_name: the node in whose namespace its private names are; None: itself
+    :param cwd: its working directory, where the system lets it have one of its own; None: this
+        process's
     """
 
     #: seconds that :meth:`start` waits for the program to call ``rospy.init_node``, or to end
@@ -46,6 +49,7 @@ class ScriptNode(Node):
         env: Optional[Dict[str, str]] = None,
         takes_own_name: bool = False,
         private_name: Optional[str] = None,
+        cwd: Optional[str] = None,
     ) -> None:
         super().__init__()
         found = find_program(path)
@@ -54,6 +58,9 @@ class ScriptNode(Node):
             found, self.args, remap or {}, params or {}, env or {}, takes_own_name
         )
         self._settings.private_name = private_name
+        if cwd is not None and not os.path.isdir(cwd):
+            raise ValueError(f'{found} cannot run in {cwd!r}: there is no such folder')
+        self.cwd = cwd
 
     def start(self) -> None:
         """Run the program from its first line.
@@ -101,6 +108,8 @@ class ScriptRun(Run):
         self._error: Optional[BaseException] = None  # with which it ended before it was a node
         self.rospy.on_init_node = self._init_node
         self.rospy.lifetime.has_program = True
+        if working_directory.is_possible():
+            self.rospy.lifetime.folder = node.cwd or os.getcwd()
 
     def start(self, reopens: bool) -> None:
         """Run the program in a thread of its own; see :meth:`ScriptNode.start`."""

@@ -27,7 +27,8 @@ def message_class(type_or_class: Union[str, MessageClass]) -> MessageClass:
     :raises UnknownTypeError: if it is not found, or what is found cannot be read
     """
     if isinstance(type_or_class, type) and issubclass(type_or_class, genpy.Message):
-        return type_or_class
+        if type_or_class is not genpy.Message:
+            return type_or_class
     return _class('msg', 'std_msgs/Header' if type_or_class == 'Header' else type_or_class)
 
 

@@ -83,7 +83,8 @@ def build(
     filled.
 
     :raises MessageTypeError: for a field that does not exist, for a value in ``fields`` that does
-        not fit, and for a block that returns a message of its own
+        not fit, and for a block that returns a message of its own, or a value instead of setting
+        fields
     """
     message = cls()
     if block is not None:
@@ -97,7 +98,20 @@ def build(
                 f'the block returned another {message._type} than it was given, which is the one '
                 'that is sent: fill the fields of that'
             )
+        if made is not None and made is not message and _is_empty(message):
+            raise MessageTypeError(
+                f'the block returned {reprlib.repr(made)} and set no field of the {message._type}'
+                f' that it was given ({describe_fields(cls)}): it is to set these'
+            )
     return fill(message, fields) if fields else message
+
+
+def _is_empty(message: genpy.Message) -> bool:
+    """Whether no field of it has been set, and there are any."""
+    try:
+        return bool(message.__slots__) and message == type(message)()
+    except Exception:  # numpy's arrays compare otherwise
+        return False
 
 
 def fill(message: genpy.Message, fields: Dict[str, Any]) -> genpy.Message:

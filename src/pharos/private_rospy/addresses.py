@@ -12,6 +12,7 @@ from rosgraph.rosenv import ROS_HOSTNAME, ROS_IP
 
 _HOST = re.compile(r'\w(?:[\w.-]*\w)?\.?', re.ASCII)  # Docker's names have underscores
 _URL = re.compile(rf'http://({_HOST.pattern}|\[[^]]+\]):(\d{{1,9}})/?', re.ASCII | re.IGNORECASE)
+_LOOPBACK_IPV6 = ipaddress.ip_address('::1')
 # '5' is one of the first, multicast and broadcast are the others
 _UNREACHABLE = [
     ipaddress.ip_network(network)
@@ -97,6 +98,14 @@ def default_domain() -> str:
         return check_domain("the host's name", socket.gethostname())
     except ValueError:
         return rosgraph.network.get_local_address()
+
+
+def loopback() -> str:
+    """An address for this host alone; with ROS_IPV6=on, a name of ::1, or what
+    :func:`default_domain` says where there is none."""
+    if not rosgraph.network.use_ipv6():
+        return '127.0.0.1'
+    return 'localhost' if _LOOPBACK_IPV6 in addresses_of('localhost') else default_domain()
 
 
 def is_same_master(url: str, other: str) -> bool:

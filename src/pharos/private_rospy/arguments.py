@@ -14,6 +14,7 @@ import rosgraph.names
 from pharos.private_rospy.addresses import is_same_master
 
 _FOR_ONE = re.compile(r'([A-Za-z]\w*):(?!=)(.*)', re.ASCII | re.DOTALL)
+_MISTYPED = re.compile(r'\d[\w/]*:=', re.ASCII)  # rosgraph ignores it, and nobody hears of that
 # (master URL, arguments, node that takes the __name in them): for good, since nodes start again
 _takers: List[Any] = []
 _lock = threading.Lock()  # guards it
@@ -27,7 +28,7 @@ def mappings_for(arguments, node):
 
     :param node: the last part of the name that the program gives it
     :raises TypeError: if the arguments are no list of strings
-    :raises ValueError: if a mapping has several right sides
+    :raises ValueError: if a mapping has several right sides, or a left one that begins with a digit
     """
     # an iterator is empty when the next one looks at it
     is_list = isinstance(arguments, (list, tuple))
@@ -43,6 +44,8 @@ def mappings_for(arguments, node):
             if match.group(1) != node:
                 continue
             mappings, argument = for_one, match.group(2)
+        if _MISTYPED.match(argument):
+            raise ValueError(f'{argument!r} in argv maps no name: a name begins with a letter')
         if not rosgraph.names.is_legal_remap(argument):
             continue
         left, right, *more = (side.strip() for side in argument.split(rosgraph.names.REMAP))

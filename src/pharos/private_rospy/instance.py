@@ -5,7 +5,7 @@ import functools
 import threading
 import time
 
-import rosgraph
+import rosgraph.network
 
 from pharos.errors import MasterUnreachableError, NodeStoppedError, PortInUseError
 from pharos.private_rospy import (
@@ -152,6 +152,11 @@ class PrivateRospy:
         self.domain = self.import_library('rosgraph.network').get_host_name()
         # rospy.signal_shutdown called by the node's own code
         self.rospy.core.add_preshutdown_hook(self.request_stop)
+        if not rosgraph.network.is_local_address(self.domain):
+            self.warn(
+                f'{self.domain}, which {self.name} tells others to come to, is no address of this'
+                ' host: nobody reaches it unless something forwards its ports'
+            )
 
     @contextlib.contextmanager
     def _reached(self):
@@ -180,6 +185,12 @@ class PrivateRospy:
             threading.Thread(
                 target=self._on_stop_request, args=(reason,), name=self.name + ' stop', daemon=True
             ).start()
+
+    def is_in_shutdown_hook(self):
+        """Whether this thread has called the node's ``rospy.signal_shutdown``, and is in a hook;
+        afterwards, that asks for the stop."""
+        core = self.rospy.core
+        return core._in_shutdown and not core._shutdown_flag and core._shutdown_lock._is_owned()
 
     def begin_stop(self):
         """Begin the stop: all that waits ends, ``is_shutdown()`` holds, and nothing more is read

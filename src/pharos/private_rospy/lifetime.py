@@ -8,6 +8,8 @@ import time
 import weakref
 from typing import Any, Callable, Iterable, List, Optional
 
+from pharos import working_directory
+
 # A signal that the kernel gives to another thread, or that comes just before the main thread waits,
 # does not end that wait, after which Python would handle it.
 SIGNAL_LATENCY = 0.2  # seconds that such a wait lasts at the most
@@ -44,6 +46,7 @@ class Lifetime:
         # whether the node has a program of its own, which may do its last things after the stop has
         # begun; until this, when what sleeps in it is cut off
         self.has_program, self.overdue = False, threading.Event()
+        self.folder = None  # the working directory of its threads; None: the process's
         self.hooks_thread = None  # the identifier of the thread that runs the hooks of on_shutdown
         self.interruptions = set()  # of waits under way
         self.threads = weakref.WeakSet()
@@ -68,6 +71,8 @@ class Lifetime:
                     self.daemon = not is_programs
 
             def run(self):
+                if self.is_from_elsewhere and lifetime.folder:
+                    working_directory.enter(lifetime.folder)
                 with lifetime.interrupts_waits():
                     super().run()
 
@@ -76,6 +81,8 @@ class Lifetime:
                 self.is_waited_for = not (self.daemon or is_rospys)
                 self.daemon = True
                 self.name = f'{lifetime.name} {self.name}'
+                # one that a thread of the node starts has the working directory of that
+                self.is_from_elsewhere = getattr(_thread, 'lifetime', None) is not lifetime
                 lifetime.threads.add(self)
                 super().start()
 

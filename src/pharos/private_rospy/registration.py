@@ -79,6 +79,19 @@ def keeps_name(node):
     return not node.has_lost_name
 
 
+def unreachable(master_url: str, error: Exception) -> MasterUnreachableError:
+    """What one of the COMMUNICATION_ERRORS at a master is to users."""
+    if isinstance(error, xmlrpc.client.Fault):
+        return MasterUnreachableError(
+            f'what answers at {master_url} is no ROS master ({error.faultString}): give the URL of'
+            ' one, not that of a node'
+        )
+    return MasterUnreachableError(
+        f'no ROS master answers at {master_url} ({error}): start one with roscore or'
+        ' Master.embedded(), or set ROS_MASTER_URI'
+    )
+
+
 def claim_name(master_url, name, timeout):
     """Make sure that no running node has ``name``; what a dead one left with the master goes.
 
@@ -91,10 +104,7 @@ def claim_name(master_url, name, timeout):
     except rosgraph.MasterError:  # unknown to the master, as it should be
         return
     except COMMUNICATION_ERRORS as error:
-        raise MasterUnreachableError(
-            f'no ROS master answers at {master_url} ({error}): start one with roscore or'
-            ' Master.embedded(), or set ROS_MASTER_URI'
-        ) from error
+        raise unreachable(master_url, error) from error
     try:
         ServerProxy(uri, PING_TIMEOUT).getPid(name)
     except ConnectionRefusedError:
