@@ -10,7 +10,7 @@ from pharos.testing import Mailbox, TIMEOUT
 import pharos
 from pharos import BlockNode, Master, PharosError, PortInUseError
 from pharos.errors import MasterUnreachableError
-from programs import Program, run
+from programs import PROGRAMS, Program, run
 from sockets import listening, refused_url, wait_for_end
 
 
@@ -130,15 +130,9 @@ def test_it_outlives_its_own_murder(embedded):
     embedded.stop()
 
 
-PROGRAM = """
-import os, signal, sys, threading
-from pharos import BlockNode, Master
-os.setpgrp()    # as a shell starts it
-master = Master.embedded()
-master.create(BlockNode, named='/n')
-print('URL', master.url, master.pid, flush=True)
-%s
-"""
+def embedding(code=''):
+    """A program with a master of its own, which then runs that code."""
+    return Program(refused_url(), sys.executable, PROGRAMS / 'embedding.py', code)
 
 
 @pytest.mark.parametrize(
@@ -154,7 +148,7 @@ print('URL', master.url, master.pid, flush=True)
     ids=['end', 'exit', 'exception', '_exit', 'abort', 'SIGTERM'],
 )
 def test_it_ends_with_the_program(code, status):
-    with Program(refused_url(), sys.executable, '-c', PROGRAM % code) as program:
+    with embedding(code) as program:
         url, pid = program.wait_for('URL').split()[1:]
         assert program.process.wait(TIMEOUT) == status
         assert wait_for_end(int(pid), TIMEOUT)
@@ -162,24 +156,20 @@ def test_it_ends_with_the_program(code, status):
 
 
 def test_it_is_gone_when_a_program_has_ended_properly():
-    with Program(refused_url(), sys.executable, '-c', PROGRAM % '') as program:
+    with embedding() as program:
         url = program.wait_for('URL').split()[1]
         program.process.wait(TIMEOUT)
         assert is_refused(url)  # so that the next program can have the port
 
 
 def test_it_says_nothing_of_nodes_that_stop():
-    with Program(
-        refused_url(),
-        sys.executable,
-        '-c',
-        PROGRAM
-        % """
+    with embedding(
+        """
 nodes = [master.create(BlockNode, named='/n%d' % number) for number in range(10)]
 for node in nodes:
     node.interested_in('/t', 'std_msgs/String')
     node.output_channel('/t', 'std_msgs/String')
-""",
+"""
     ) as program:
         program.process.wait(TIMEOUT)
         assert len(program.read_to_the_end().splitlines()) == 1  # the URL
@@ -198,7 +188,7 @@ signal.pause()
     ids=['alone', 'with a fork that lives on'],
 )
 def test_it_ends_with_a_program_that_is_killed(code):
-    with Program(refused_url(), sys.executable, '-c', PROGRAM % code) as program:
+    with embedding(code) as program:
         url, pid = program.wait_for('URL').split()[1:]
         fork = int(program.wait_for('FORK').split()[1]) if 'fork' in code else None
         program.process.kill()
@@ -211,18 +201,14 @@ def test_it_ends_with_a_program_that_is_killed(code):
 
 
 def test_ctrl_c_is_the_programs_own():
-    with Program(
-        refused_url(),
-        sys.executable,
-        '-c',
-        PROGRAM
-        % """
+    with embedding(
+        """
 try:
     print('PAUSES', flush=True)
     signal.pause()
 except KeyboardInterrupt:
     print('STILL THERE' if master.is_reachable() else 'GONE', flush=True)
-""",
+"""
     ) as program:
         program.wait_for('PAUSES')
         os.killpg(program.process.pid, signal.SIGINT)  # as a terminal sends it to all of a program
