@@ -6,25 +6,10 @@ import pytest
 from helpers import create
 from pharos.testing import Mailbox
 import pharos
-from programs import ROOT
+from programs import PROGRAMS, ROOT
 from test_ros_process import MANIFEST, write
 
 STRING = 'std_msgs/String'
-
-SCRIPT = """#!/usr/bin/python3
-import sys
-sys.path.insert(0, %r)
-from pharos import BlockNode, Master, spin
-
-master = Master()
-for name in '/talker', '/listener', 'left/eye', 'right/eye':
-    node = master.create(BlockNode, named=name, argv=sys.argv)
-    topic = node.output_channel('image', 'std_msgs/String', latch=True).topic
-    private = [node.parameter('~' + name).value for name in ('given', 'mine', 'threshold')]
-    print('SEEN', node.name, topic, *private, node.ros.get_namespace(), flush=True)
-print('SEEN all', flush=True)
-spin()
-"""
 
 
 @pytest.fixture
@@ -223,7 +208,8 @@ def launch(master, tmp_path, monkeypatch):
     parameters...]}."""
     folder = tmp_path / 'src' / 'two_in_one'
     write(folder / 'package.xml', MANIFEST % 'two_in_one')
-    write(folder / 'scripts' / 'program', SCRIPT % str(ROOT / 'src'), 0o755)
+    write(folder / 'scripts' / 'program', (PROGRAMS / 'four_nodes.py').read_text(), 0o755)
+    monkeypatch.setenv('PYTHONPATH', str(ROOT / 'src'))
     monkeypatch.setenv('ROS_PACKAGE_PATH', str(tmp_path / 'src'))
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
 

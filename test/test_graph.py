@@ -15,28 +15,16 @@ from pharos.testing import TIMEOUT
 import pharos
 from pharos import ExternalNode, Master, UnknownNodeError, UnknownTopicError, watcher
 from pharos.errors import MasterUnreachableError, UnknownServiceError
-from programs import Program
+from programs import PROGRAMS, Program
 from sockets import refused_url, silent_peer
 
 STRING = 'std_msgs/String'
-
-PEER = """
-import sys, rospy, std_msgs.msg, std_srvs.srv
-rospy.init_node(sys.argv[1])
-def hear(message):
-    print(rospy.get_name(), 'heard', message.data, flush=True)
-rospy.Subscriber('/to_peers', std_msgs.msg.String, hear)
-sent = rospy.Publisher('/from_peers', std_msgs.msg.String, queue_size=10)
-rospy.Service('~clear', std_srvs.srv.Empty, lambda request: sent.publish(rospy.get_name()) or {})
-print(rospy.get_name(), 'is ready', flush=True)
-rospy.spin()
-"""
 
 
 def peer(master, name):
     """A rospy node of its own process: hears /to_peers, sends its name on /from_peers when ~clear
     is called."""
-    program = Program(master.url, sys.executable, '-c', PEER, name)
+    program = Program(master.url, sys.executable, PROGRAMS / 'graph_peer.py', name)
     program.wait_for('is ready')
     return program
 

@@ -19,6 +19,7 @@ import std_msgs.msg
 import std_srvs.srv
 from hypothesis import given, settings, strategies as st
 
+from programs import PROGRAMS
 from pharos.messages import classes, definition, lookup
 from pharos.errors import MessageTypeError, UnknownTypeError
 from pharos.messages import (
@@ -491,26 +492,6 @@ def test_a_service_and_a_message_may_share_a_name():
     assert define_service('zoo/Spin', 'int8 y\n---')._request_class._type == 'zoo/SpinRequest'
 
 
-SERVER = '''
-import os, sys
-sys.modules['std_srvs'] = None  # as if not installed
-import rosmaster.master
-import rospy
-from pharos.messages import define_service, fill
-master = rosmaster.master.Master(port=0)
-master.start()
-os.environ['ROS_MASTER_URI'] = master.uri
-SetBool = define_service('std_srvs/SetBool', 'bool data\\n---\\nbool success\\nstring message\\n')
-rospy.init_node('server', disable_signals=True)
-rospy.Service('switch', SetBool, lambda request: fill(SetBool._response_class(), {
-    'success': request.data, 'message': 'made at run time'}))
-print(rospy.ServiceProxy('switch', SetBool)(True).message)
-print(master.uri, flush=True)
-sys.stdin.read()
-os._exit(0)
-'''
-
-
 def test_a_service_made_from_text_answers_rosservice(tmp_path):
     environment = dict(
         os.environ,
@@ -519,7 +500,7 @@ def test_a_service_made_from_text_answers_rosservice(tmp_path):
         ROS_LOG_DIR=str(tmp_path),
     )
     with subprocess.Popen(
-        [sys.executable, '-c', SERVER],
+        [sys.executable, PROGRAMS / 'set_bool_server.py'],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,

@@ -16,27 +16,13 @@ from pharos import MessageTypeError
 from pharos import messages
 from pharos.private_rospy import refusals
 from pharos.intraprocess.link import Link
-from programs import Program
+from programs import PROGRAMS, Program
 from test_graph_types import Publisher
 
 STRING, INT32 = 'std_msgs/String', 'std_msgs/Int32'
 MD5SUM = {STRING: '992ce8a1687cec8c8bd883ec73ca41d1', INT32: 'da5909fbe378aeaf85e547e830cc1bb7'}
 FIELD = {STRING: 'data: string', INT32: 'data: int32'}
 
-PEER = r'''
-import sys, rospy
-from pharos import messages
-kind, name, topic, type_, text = sys.argv[1:]
-cls = messages.class_from_definition(type_, text)
-rospy.init_node(name)
-if kind == 'publisher':
-    end = rospy.Publisher(topic, cls, latch=True, queue_size=1)
-    end.publish(cls(data=cls().data))
-else:
-    end = rospy.Subscriber(topic, cls, lambda message: None)
-print('ready', flush=True)
-rospy.spin()
-'''
 numbers = itertools.count()  # the master never forgets the type of a topic
 
 
@@ -65,7 +51,7 @@ def topic():
 @contextlib.contextmanager
 def rospy_peer(url, topic, type_, text, kind='publisher', name='/far'):
     with Program(
-        url, sys.executable, '-c', PEER, kind, name.strip('/'), topic, type_, text
+        url, sys.executable, PROGRAMS / 'typed_peer.py', kind, name.strip('/'), topic, type_, text
     ) as peer:
         peer.wait_for('ready')
         yield name

@@ -19,15 +19,6 @@ from sockets import wait_for_end
 MANIFEST = """<package format="2"><name>%s</name><version>0.0.0</version><description>d</description>
 <maintainer email="a@b.org">m</maintainer><license>BSD</license></package>"""
 
-TALKER = """#!/usr/bin/python3
-import rospy, std_msgs.msg
-rospy.init_node('talker')
-sent = rospy.Publisher('talk', std_msgs.msg.String, queue_size=1, latch=True)
-sent.publish(rospy.get_param('~text', 'nothing'))
-print('%s talks' % rospy.get_name())
-rospy.spin()
-"""
-
 
 def write(path, text, mode=0o644):
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -40,7 +31,7 @@ def package(tmp_path, monkeypatch):
     """A folder of a ROS package, fake_robot, in a workspace's source space."""
     folder = tmp_path / 'src' / 'fake_robot'
     write(folder / 'package.xml', MANIFEST % 'fake_robot')
-    write(folder / 'scripts' / 'talker', TALKER, 0o755)
+    write(folder / 'scripts' / 'talker', (PROGRAMS / 'talk.py').read_text(), 0o755)
     monkeypatch.setenv('ROS_PACKAGE_PATH', str(tmp_path / 'src'))
     return folder
 

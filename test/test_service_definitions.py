@@ -8,7 +8,7 @@ import pytest
 import pharos
 from pharos import BlockNode, ServiceTypeError
 from pharos import messages
-from programs import Program, script
+from programs import PROGRAMS, Program, script
 
 TYPE = 'layout_srvs/Spawn'
 X_FIRST = 'float32 x\nfloat32 y\n---\nstring name\n'
@@ -19,18 +19,6 @@ FIELDS = {
     Y_FIRST: 'request: y: float32, x: float32; response: name: string',
     MORE: 'request: x: float32, theta: float32, y: float32; response: name: string',
 }
-
-PROVIDER = r'''
-import sys
-import rospy
-from pharos import define_service
-
-rospy.init_node('layouts_there')
-cls = define_service('layout_srvs/Spawn', sys.argv[1])
-rospy.Service('/layouts/spawn', cls, lambda request: '%g %g' % (request.x, request.y))
-print('ready', cls._md5sum, flush=True)
-rospy.spin()
-'''
 
 persistent_or_not = pytest.mark.parametrize(
     'persistent', [False, True], ids=['plain', 'persistent']
@@ -62,7 +50,7 @@ def provide(request, master):
             provided.close()
             if request.param == 'rospy':
                 program = provided.enter_context(
-                    Program(master.url, sys.executable, '-c', PROVIDER, text)
+                    Program(master.url, sys.executable, PROGRAMS / 'spawn_provider.py', text)
                 )
                 assert class_of(text)._md5sum in program.wait_for('ready')
             else:

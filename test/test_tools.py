@@ -10,25 +10,11 @@ import rosbag
 from helpers import InProcessMaster
 from pharos.testing import Mailbox, TIMEOUT, until
 from pharos import BlockNode, Master
-from programs import Program, run
+from programs import PROGRAMS, Program, run
 
 STRING = 'std_msgs/String'
 NAMES = ['/n%d' % number for number in range(10)]
 PADDING = 'x' * 200000
-
-PEER = '''
-import sys
-import rospy
-from std_msgs.msg import String
-from std_srvs.srv import Empty
-
-rospy.init_node(sys.argv[1].strip('/'))
-rospy.Subscriber('/t0', String, lambda message: None)
-publisher = rospy.Publisher('/from_peer', String, queue_size=1)
-rospy.Service('~service', Empty, lambda request: {})
-print('ready')
-rospy.spin()
-'''
 
 
 class Graph:
@@ -76,7 +62,7 @@ def graph(bare):
 
 
 def peer(graph, name):
-    program = Program(graph.master.url, sys.executable, '-c', PEER, name)
+    program = Program(graph.master.url, sys.executable, PROGRAMS / 'tools_peer.py', name)
     program.wait_for('ready')
     return program
 
