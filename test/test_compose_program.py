@@ -71,6 +71,14 @@ def test_it_ends_when_all_nodes_have_ended(master, compose):
     assert program.process.wait(TIMEOUT) == 0
 
 
+def test_of_two_scripts_of_one_name_the_first_runs(master, compose):
+    program = compose('--script', 'composed_robot/mirror.py', 'composed_robot/mirror.py')
+    line = program.wait_for('is not started')
+    assert line.startswith('composed_robot/mirror.py is not started: ')
+    assert 'the node name /mirror is taken' in line
+    assert '/mirror' in nodes(master)
+
+
 def until_nodes(master, count):
     until(lambda: len(nodes(master)) == count)
     return nodes(master)

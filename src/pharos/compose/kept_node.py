@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from pharos.compose.composition import Composition
 
 RETRY = 1.0  # seconds at least from a start that failed to the next one
+POLL = 0.1  # seconds between two looks whether one that is to stop has just started
 
 
 class KeptNode:
@@ -31,15 +32,17 @@ class KeptNode:
         self.settled = threading.Event()
         #: whether it runs no more, and is not started again
         self.is_over = False
-        self._has_ended_itself = False
+        self._was_started = self._has_ended_itself = False
         self._composition = composition
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f'{self.name} kept', daemon=True)
 
     @property
     def name(self) -> str:
-        """The name that it was given, or has."""
-        return self.launched.name if self.node is None else self.node.name
+        """The name that it was given, or has; its program, where that is to name it."""
+        if self._was_started and self.node is not None:
+            return self.node.name
+        return self.launched.program if self.launched.takes_own_name else self.launched.name
 
     def start(self) -> None:
         """Start it, and keep it running; see :attr:`settled`."""
@@ -55,6 +58,7 @@ class KeptNode:
                 least = 0.0 if self.problem is None else RETRY
                 self._ending.wait(max(self.launched.respawn_delay, least))
         finally:
+            self.settled.set()
             self.is_over = True
             self._composition.changed()
 
@@ -64,7 +68,7 @@ class KeptNode:
         self.starts += 1
         try:
             self._start()
-            self.problem = None
+            self.problem, self._was_started = None, True
         except Exception as error:
             self.problem = error
         finally:
@@ -109,10 +113,13 @@ class KeptNode:
         self._ending.set()
 
     def stop(self) -> None:
-        """Stop it."""
+        """Stop it, also where it only is about to start."""
         self.begin_end()
-        if self.node is not None:
-            node_registry.stop(self.node)
+        deadline = time.monotonic() + node_registry.STOP_LIMIT
+        while self._thread.is_alive() and time.monotonic() < deadline:
+            if self.node is not None:
+                node_registry.stop(self.node)
+            self._thread.join(POLL)
 
     @property
     def outcome(self) -> str:

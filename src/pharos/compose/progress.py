@@ -32,7 +32,7 @@ class Progress:
     def failed(self, kept: 'KeptNode', error: Exception) -> None:
         """It did not start."""
         where = f'{kept.launched.file}: ' if kept.launched.file else ''
-        self.tell(f'{where}{kept.name} ({kept.launched.program}) is not started: {error}')
+        self.tell(f'{where}{_described(kept)} is not started: {error}')
 
     def ended(self, kept: 'KeptNode') -> None:
         """It has ended by itself."""
@@ -71,7 +71,7 @@ class PrintedProgress(Progress):
     def started(self, kept: 'KeptNode', seconds: float) -> None:
         """See :class:`Progress`."""
         if not self._is_terminal or kept.starts > 1:
-            self.tell(f'started {kept.name} ({kept.launched.program}) in {seconds:.2f} s')
+            self.tell(f'started {_described(kept)} in {seconds:.2f} s')
 
     def all_begun(self, left: List[str]) -> None:
         """See :class:`Progress`."""
@@ -98,3 +98,9 @@ class PrintedProgress(Progress):
             self._stream.flush()
         except (OSError, ValueError):
             pass  # nobody reads it any more
+
+
+def _described(kept: 'KeptNode') -> str:
+    """The name of a node, and its program."""
+    program = kept.launched.program
+    return program if kept.name == program else f'{kept.name} ({program})'
