@@ -4,6 +4,7 @@ import contextlib
 import os
 import signal
 import socket
+import sys
 import threading
 import xmlrpc.server
 
@@ -17,6 +18,7 @@ from pharos.testing import TIMEOUT, until
 import pharos
 from hosts import MASTER_PORT, network
 from pharos.private_rospy import registration
+from programs import ROOT, script
 from sockets import listening, refused_url
 
 STRING = 'std_msgs/String'
@@ -153,6 +155,20 @@ def test_rospys_tools_talk_with_a_node_of_another_host(one, two, three, programs
         )
     )
     assert echo.wait_for('there and back')
+
+
+def test_only_its_own_host_and_the_masters_have_a_program_loaded(one, two, three, programs):
+    path = str(ROOT / 'test' / 'programs') + ':/usr/share'
+    program = programs(two.start(one, sys.executable, script('compose'), ROS_PACKAGE_PATH=path))
+    call = 'rosservice', 'call', '--wait', '/compose/load_nodelet'
+    for host, said in (
+        (three, "for this host and the master's alone"),
+        (two, 'success: True'),
+        (one, 'success: True'),
+    ):
+        request = f'{{name: /at_{host.name}, type: composed_robot/talker}}'
+        assert said in programs(host.start(one, *call, request)).read_to_the_end()
+    assert program.end() == 0
 
 
 # -- addresses
