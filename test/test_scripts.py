@@ -84,6 +84,19 @@ def test_a_script_is_the_main_program(master):
     report = report_of(master)
     assert report['main'] == '__main__'
     assert report['file'] == str(REPORTER)
+    assert report['helper'] == 'talking'
+
+
+def test_each_run_of_a_script_loads_its_modules_anew(master):
+    mailbox = Mailbox(create(master, '/listener_of_reports'), '/report', 'std_msgs/String')
+    first = master.load(REPORTER, name='first')
+    second = master.load(REPORTER, name='second')
+    messages = mailbox.take(2)
+    first.stop()
+    first.start()
+    messages += mailbox.take(1)
+    assert [json.loads(message.data)['calls'] for message in messages] == [1, 1, 1]
+    second.stop()
 
 
 @pytest.mark.parametrize(
@@ -343,3 +356,43 @@ def test_scripts_are_loaded_from_several_threads_at_once(master):
     assert all(ended(thread) for thread in threads)
     assert sorted(node.name for node in nodes) == ['/' + name for name in names]
     assert {'/' + name for name in names} <= {node.name for node in master.nodes()}
+
+
+# -- within a program
+
+LOADS = ROOT / 'test' / 'programs' / 'loads.py'
+
+
+@pytest.mark.parametrize('how', ['spin', 'wait'])
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_scripts_of_a_program(how, number, master):
+    with Program(master.url, sys.executable, LOADS, how, WORKER, 'spin') as program:
+        program.wait_for('loaded /worker')
+        # 0 where it waited already
+        assert program.end(number) in (0, 128 + number, -number)
+    assert registrations(master, '/worker') == [[], [], []]
+
+
+def test_ctrl_c_ends_a_script_that_is_being_loaded(master, tmp_path):
+    command = LOADS, 'spin', WORKER, 'nameless runs', tmp_path / 'said'
+    with Program(master.url, sys.executable, *command) as program:
+        until((tmp_path / 'said').exists)
+        program.end(signal.SIGINT)
+        assert 'loaded' not in program.read_to_the_end()
+
+
+def test_the_end_of_a_program_ends_its_scripts(master):
+    with Program(master.url, sys.executable, LOADS, 'end', WORKER, 'spin') as program:
+        program.wait_for('ends')
+        assert program.process.wait(30) == 0
+    assert registrations(master, '/worker') == [[], [], []]
+
+
+def test_the_exit_code_is_there_when_a_script_has_ended(master):
+    with Program(master.url, sys.executable, LOADS, 'wait', WORKER, 'exit text') as program:
+        program.wait_for('exit code 1')
+        assert 'cannot go on\n' in program.printed
+
+
+def test_a_nameless_script_is_called_after_its_file(master):
+    assert master.load(WORKER, None, 'nameless').name.startswith('/worker_')

@@ -1,5 +1,6 @@
 """Scripts: rospy programs that run unmodified as nodes of this process."""
 import os
+import re
 import sys
 import threading
 from typing import TYPE_CHECKING, Any, Dict, Optional, Sequence
@@ -16,7 +17,6 @@ from pharos.watcher import watcher_of
 if TYPE_CHECKING:
     from pharos.master import Master
 
-UNNAMED = 'script'  # what a program's node is called until it calls init_node, with a number
 
 
 class ScriptNode(Node):
@@ -206,7 +206,9 @@ def load(
 ) -> ScriptNode:
     """What :meth:`Master.load` does."""
     path = find_program(package, executable)
-    named = name or UNNAMED
+    # until it calls init_node, it is called after its file, with a number
+    base = re.match(r'[A-Za-z]\w*', os.path.basename(path), re.ASCII)
+    named = name or (base.group() if base else 'script')
     if namespace:
         named = rosgraph.names.ns_join(namespace, named)
     return master.create(

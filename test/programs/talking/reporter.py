@@ -4,6 +4,7 @@ import argparse
 import json
 import sys
 
+import helpers
 import rospy
 from std_msgs.msg import String
 
@@ -19,6 +20,8 @@ report = {
     'topic': rospy.resolve_name('image'),
     'main': __name__,
     'file': __file__,
+    'helper': helpers.NAME,
+    'calls': helpers.count(),
 }
 publisher = rospy.Publisher('report', String, queue_size=1, latch=True)
 publisher.publish(json.dumps(report))

@@ -94,5 +94,6 @@ if __name__ == '__main__':
         'thread': wait_in_thread,
         'hook': hook,
         'runs': lambda file: [say(file, len(RUNS)), rospy.spin()],
+        'nameless runs': lambda file: [say(file, len(RUNS)), time.sleep(1000)],
     }
     ends[how](*more)
