@@ -11,12 +11,12 @@ from pharos import node_registry, signals, working_directory
 from pharos.compose.programs import check_source, find_program, source_of
 from pharos.errors import PharosError
 from pharos.node import Node
+from pharos.ros_process import arguments_of
 from pharos.run import Lifecycle, Run
 from pharos.watcher import watcher_of
 
 if TYPE_CHECKING:
     from pharos.master import Master
-
 
 
 class ScriptNode(Node):
@@ -27,7 +27,6 @@ class ScriptNode(Node):
 
     :param path: the file of the program
     :param args: its arguments, ROS's among them
-    :param remap: ``{name: name}`` of remappings
     :param params: ``{name: value}`` of private parameters, set when it calls ``init_node``
     :param env: ``{name: value}`` of further environment variables
     :param takes_own_name: whether it has the name that it gives to ``init_node``, and not the one
@@ -44,7 +43,6 @@ class ScriptNode(Node):
         self,
         path: str,
         args: Sequence[str] = (),
-        remap: Optional[Dict[str, str]] = None,
         params: Optional[Dict[str, Any]] = None,
         env: Optional[Dict[str, str]] = None,
         takes_own_name: bool = False,
@@ -54,9 +52,7 @@ class ScriptNode(Node):
         super().__init__()
         found = find_program(path)
         self.path, self.args = source_of(found), [str(argument) for argument in args]
-        self._settings.for_program(
-            found, self.args, remap or {}, params or {}, env or {}, takes_own_name
-        )
+        self._settings.for_program(found, self.args, dict(params or {}), env or {}, takes_own_name)
         self._settings.private_name = private_name
         if cwd is not None and not os.path.isdir(cwd):
             raise ValueError(f'{found} cannot run in {cwd!r}: there is no such folder')
@@ -199,9 +195,10 @@ def load(
     master: 'Master',
     package: str,
     executable: Optional[str] = None,
-    args: Sequence[str] = (),
+    args: Sequence[object] = (),
     name: Optional[str] = None,
     namespace: Optional[str] = None,
+    remap: Optional[Dict[str, str]] = None,
     **options: Any,
 ) -> ScriptNode:
     """What :meth:`Master.load` does."""
@@ -211,6 +208,7 @@ def load(
     named = name or (base.group() if base else 'script')
     if namespace:
         named = rosgraph.names.ns_join(namespace, named)
+    arguments = arguments_of(args, None, remap, None)
     return master.create(
-        ScriptNode, named, path=path, args=args, takes_own_name=name is None, **options
+        ScriptNode, named, path=path, args=arguments, takes_own_name=name is None, **options
     )

@@ -80,7 +80,7 @@ class Settings:
         self.argv = [self.base_name, *map(rosgraph.names.REMAP.join, mappings.items())]
         _check_private_parameters(self.argv)
 
-    def for_program(self, path, args, remap, params, env, takes_own_name):
+    def for_program(self, path, args, params, env, takes_own_name):
         """Have them be those of a program that calls ``init_node`` itself.
 
         :param path: what it finds as ``sys.argv[0]``
@@ -90,15 +90,11 @@ class Settings:
             has one that is nobody else's
         :raises ValueError: if one of them cannot be
         """
-        mappings = [
-            rosgraph.names.REMAP.join(check_name(name, 'remapped', private=True) for name in names)
-            for names in remap.items()
-        ]
+        self.argv = [path, *args, *self.argv[1:]]
         if takes_own_name:
             self.name = unique_name(self.name)
         elif '__name' not in rosgraph.names.load_mappings(args):  # which roslaunch gives
-            mappings.append(f'__name{rosgraph.names.REMAP}{self.base_name}')
-        self.argv = [path, *args, *self.argv[1:], *mappings]
+            self.argv.append(f'__name{rosgraph.names.REMAP}{self.base_name}')
         self.environ.update(env)
         self.params = {
             check_name(name.lstrip('~'), 'parameter'): as_stored('~' + name, value)
