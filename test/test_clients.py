@@ -25,7 +25,6 @@ from pharos.testing import Mailbox, TIMEOUT, until
 from fuzz import Fuzz
 from pharos import BlockNode
 from pharos.private_rospy import acceptor, xmlrpc_server
-from pharos.private_rospy.patches import tcpros_server
 from programs import Program, run
 
 FUZZ_COUNT = int(os.environ.get('PHAROS_FUZZ_COUNT', 2500))  # bad clients; tools/soak makes it more
@@ -38,6 +37,11 @@ def connect(port):
 
 def threads(node, kind):
     return [thread.name for thread in threading.enumerate() if thread.name == f'{node.name} {kind}']
+
+
+def limits(node):
+    """Those for the clients of the node, which may be set."""
+    return node.latest_run.rospy.limits
 
 
 def address_of(client):
@@ -127,9 +131,9 @@ signal.pause()
 """
 
 
-def test_hundreds_of_silent_clients_keep_nobody_out(master, mailbox, node, warnings, monkeypatch):
+def test_hundreds_of_silent_clients_keep_nobody_out(master, mailbox, node, warnings):
     """400 at each port say nothing, or begin and do not go on."""
-    monkeypatch.setattr(tcpros_server, 'HANDSHAKE_TIMEOUT', TIMEOUT)
+    limits(node).handshake_timeout = TIMEOUT
     with Program(
         master.url, sys.executable, '-c', HANG, str(node.tcp_port), str(node.xmlrpc_port)
     ) as crowd:
@@ -144,11 +148,11 @@ def test_hundreds_of_silent_clients_keep_nobody_out(master, mailbox, node, warni
         assert rosnode.rosnode_ping('/node', max_count=1)
         assert master.lookup_service('/clients/set').call(data=True, timeout=TIMEOUT).success
         for kind in 'TCPROS', 'XML-RPC':
-            until(lambda: len(threads(node, kind)) <= acceptor.CLIENTS)
+            until(lambda: len(threads(node, kind)) <= acceptor.Limits.clients)
             assert len(threads(node, kind)) > 1  # some do hang there
         assert {warnings.next(), warnings.next()} == {
             '%d %s clients say nothing: those that said nothing for longest are closed, to let others in'
-            % (acceptor.CLIENTS, kind)
+            % (acceptor.Limits.clients, kind)
             for kind in ('TCPROS', 'XML-RPC')
         }
         assert warnings.empty()
@@ -167,11 +171,9 @@ print('all were served')
 """
 
 
-def test_of_hundreds_of_good_clients_none_is_taken_for_a_silent_one(
-    master, node, warnings, monkeypatch
-):
+def test_of_hundreds_of_good_clients_none_is_taken_for_a_silent_one(master, node, warnings):
     """Those that come in a rush wait for their turn; it is 0.25 s otherwise until one is silent."""
-    monkeypatch.setattr(acceptor, 'GRACE', TIMEOUT)
+    limits(node).grace = TIMEOUT
     request = post(call('getPid', '/test'), more='Connection: close\r\n')
     for port, said in (node.tcp_port, shake()), (node.xmlrpc_port, request):
         with Program(master.url, sys.executable, '-c', RUSH, str(port), said.hex()) as rush:
@@ -179,9 +181,9 @@ def test_of_hundreds_of_good_clients_none_is_taken_for_a_silent_one(
     assert warnings.empty()
 
 
-def test_a_slow_handshake_ends_after_its_limit(node, warnings, monkeypatch):
+def test_a_slow_handshake_ends_after_its_limit(node, warnings):
     """However steadily it comes, a byte at a time."""
-    monkeypatch.setattr(tcpros_server, 'HANDSHAKE_TIMEOUT', 0.3)
+    limits(node).handshake_timeout = 0.3
     with connect(node.tcp_port) as client:
         dribble(client, struct.pack('<I', 100000))
         assert is_closed(client)
@@ -193,8 +195,8 @@ def test_a_slow_handshake_ends_after_its_limit(node, warnings, monkeypatch):
     assert warnings.empty()
 
 
-def test_a_slow_request_ends_after_its_limit(node, warnings, monkeypatch):
-    monkeypatch.setattr(xmlrpc_server, 'REQUEST_TIMEOUT', 0.3)
+def test_a_slow_request_ends_after_its_limit(node, warnings):
+    limits(node).request_timeout = 0.3
     with connect(node.xmlrpc_port) as client:
         dribble(client, b'POST / HTTP/1.1\r\nContent-Length: 10000\r\n\r\n')
         assert is_closed(client)
@@ -215,8 +217,8 @@ def dribble(client, beginning):
         raise AssertionError('the node listens for ever')
 
 
-def test_a_client_that_has_nothing_more_to_ask_is_no_bad_one(node, warnings, monkeypatch):
-    monkeypatch.setattr(xmlrpc_server, 'REQUEST_TIMEOUT', 0.3)
+def test_a_client_that_has_nothing_more_to_ask_is_no_bad_one(node, warnings):
+    limits(node).request_timeout = 0.3
     with connect(node.xmlrpc_port) as client:
         client.sendall(post(call('getPid', '/test')))
         assert is_closed(client)
@@ -448,10 +450,10 @@ def test_service_clients_that_ask_nothing_keep_nobody_out(master, node, warnings
 
     with contextlib.ExitStack() as clients:
         longest, *_ = [
-            clients.enter_context(call_service(node)) for _ in range(acceptor.CLIENTS + 20)
+            clients.enter_context(call_service(node)) for _ in range(acceptor.Limits.clients + 20)
         ]
         until(ask)
-        assert '%d service clients say nothing' % acceptor.CLIENTS in warnings.next()
+        assert '%d service clients say nothing' % acceptor.Limits.clients in warnings.next()
         assert is_closed(longest)
 
 
@@ -633,19 +635,21 @@ def test_a_parameter_update_for_no_parameter_is_told_to_nobody(node):
     assert told.empty()
 
 
-def test_a_flood_of_bad_clients_does_not_fill_the_log(node, warnings, monkeypatch):
-    monkeypatch.setattr(acceptor, 'REJECTION_PERIOD', 3600)
+def test_a_flood_of_bad_clients_does_not_fill_the_log(node, warnings):
+    limits(node).rejection_period = 3600
     with xmlrpc.client.ServerProxy(node.uri) as proxy:
 
         def refused():
             with contextlib.suppress(xmlrpc.client.Fault):
                 proxy.nothing()
 
-        for _ in range(acceptor.REJECTION_LINES + 5):
+        for _ in range(acceptor.Limits.rejection_lines + 5):
             refused()
-        assert all('call of nothing' in line for line in warnings.take(acceptor.REJECTION_LINES))
+        assert all(
+            'call of nothing' in line for line in warnings.take(acceptor.Limits.rejection_lines)
+        )
         assert warnings.empty()
-        monkeypatch.setattr(acceptor, 'REJECTION_PERIOD', 0)
+        limits(node).rejection_period = 0
         refused()
     assert 'and 5 more' in warnings.next()
 

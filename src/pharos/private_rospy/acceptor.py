@@ -9,17 +9,24 @@ from pharos.private_rospy.lifetime import keep_alive, shutdown_socket
 
 # connections waiting to be accepted; of a rush, those beyond would try again a second later
 BACKLOG = 1024
-CLIENTS = 128  # of one server, that have something to say before they are served
-GRACE = 0.25  # seconds that each of them has in any case
 # seconds until the next attempt to accept a client where there are no descriptors left
 PAUSE = 0.05
-# lines about the clients of one server that the log takes in a period of so many seconds; the rest
-# is counted
-REJECTION_LINES = 100
-REJECTION_PERIOD = 10.0
 TEXT_LIMIT = 300  # characters of a client's in a line of the log
 _EXHAUSTED = errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM
 _SHUT = errno.EINVAL, errno.EBADF
+
+
+class Limits:
+    """What the clients of a node's servers may take; set on an instance, it holds for that node."""
+
+    clients = 128  #: of one server, that have something to say before they are served
+    grace = 0.25  #: seconds that each of them has in any case
+    handshake_timeout = 5.0  #: seconds for a whole TCPROS handshake, however slowly it comes
+    #: seconds from one XML-RPC answer until the next request has come, however slowly
+    request_timeout = 30.0
+    #: lines about the clients of one server that the log takes in a period; the rest is counted
+    rejection_lines = 100
+    rejection_period = 10.0  #: seconds
 
 
 class Acceptor:
@@ -39,7 +46,10 @@ class Acceptor:
         self._changed = threading.Condition()  # guards all below; notified when a handshake ends
         self._handshakes = {}  # socket -> since when; the longest first
         self._is_crowded = False  # and the log says so
-        self._rejections = collections.deque(maxlen=REJECTION_LINES)  # when the last were logged
+        self._limits = node.limits
+        self._rejections = collections.deque(
+            maxlen=node.limits.rejection_lines
+        )  # when the last were logged
         self._not_logged = 0  # since then
 
     def accept(self, listener, serve):
@@ -91,7 +101,7 @@ class Acceptor:
         """It has said it; returns whether it was to, and was not closed for others meanwhile."""
         with self._changed:
             since = self._handshakes.pop(sock, None)
-            if len(self._handshakes) < CLIENTS // 2:
+            if len(self._handshakes) < self._limits.clients // 2:
                 self._is_crowded = False
             self._changed.notify_all()
             return since is not None
@@ -108,7 +118,8 @@ class Acceptor:
             return
         now, logged = time.monotonic(), self._rejections
         with self._changed:
-            if len(logged) == REJECTION_LINES and now - logged[0] < REJECTION_PERIOD:
+            is_full = len(logged) == logged.maxlen
+            if is_full and now - logged[0] < self._limits.rejection_period:
                 self._not_logged += 1
                 return
             logged.append(now)
@@ -118,17 +129,18 @@ class Acceptor:
         self._node.warn(f'{self._kind} client {host}:{port} refused: {brief(why)}{more}')
 
     def _make_room(self, wait):
+        limits = self._limits
         while True:
             with self._changed:
-                if len(self._handshakes) < CLIENTS:
+                if len(self._handshakes) < limits.clients:
                     return
-                left = GRACE - (time.monotonic() - next(iter(self._handshakes.values())))
+                left = limits.grace - (time.monotonic() - next(iter(self._handshakes.values())))
                 if left > 0 and not wait:
                     return
                 if left > 0:
                     self._changed.wait(left)
                     continue
-            self._close_longest(f'{CLIENTS} {self._kind} clients say nothing')
+            self._close_longest(f'{limits.clients} {self._kind} clients say nothing')
 
     def _close_longest(self, why):
         with self._changed:

@@ -16,7 +16,7 @@ from pharos.private_rospy import (
     refusals,
     registration,
 )
-from pharos.private_rospy.acceptor import Acceptor
+from pharos.private_rospy.acceptor import Acceptor, Limits
 from pharos.private_rospy.lifetime import Lifetime
 from pharos.private_rospy.loader import PrivateImports
 from pharos.private_rospy.own_process import OwnProcess
@@ -63,6 +63,7 @@ class PrivateRospy:
         self.start_thread = self.lifetime.start_thread
         #: wait_until(predicate, timeout): see changes.wait_until
         self.wait_until = functools.partial(changes.wait_until, self.lifetime)
+        self.limits = Limits()
         self.service_clients = Acceptor('service', self)
         self.connections = Connections(self)
         self.refusals = refusals.Refusals(self)

@@ -13,7 +13,6 @@ from pharos.private_rospy.acceptor import brief
 from pharos.private_rospy.addresses import addresses_of
 from pharos.private_rospy.deadlines import DeadlineReader
 
-REQUEST_TIMEOUT = 30.0  # seconds from one answer until the next request has come, however slowly
 REQUEST_LIMIT = 1 << 20  # bytes of a request
 
 #: .handler: the RequestHandler whose client's call it answers, .connection: the socket of a client
@@ -43,7 +42,7 @@ class RequestHandler(xmlrpc.server.SimpleXMLRPCRequestHandler):
     def handle_one_request(self):
         """Called by http.server, until close_connection is set."""
         self.server.acceptor.start_handshake(self.connection)
-        self.rfile.raw.deadline = time.monotonic() + REQUEST_TIMEOUT
+        self.rfile.raw.deadline = time.monotonic() + self.server.node.limits.request_timeout
         self.raw_requestline = b''
         try:
             super().handle_one_request()
@@ -97,7 +96,7 @@ class RequestHandler(xmlrpc.server.SimpleXMLRPCRequestHandler):
         _thread.handler = self
         answers_calls_of(self.connection)
         answer = self.server._marshaled_dispatch(body)
-        self.connection.settimeout(REQUEST_TIMEOUT)
+        self.connection.settimeout(self.server.node.limits.request_timeout)
         self.send_response(200)
         self.send_header('Content-type', 'text/xml')
         self.send_header('Content-length', str(len(answer)))

@@ -15,7 +15,6 @@ from pharos.private_rospy.patches.table import patch, substitute
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.xmlrpc_server import answers_calls_of
 
-HANDSHAKE_TIMEOUT = 5.0  # seconds for the whole handshake, however slowly it comes
 HANDSHAKE_LIMIT = 1 << 20  # bytes of a connection header; real ones hold a message definition
 MESSAGE_LIMIT = 1000000000  # bytes of a message; roscpp's limit
 
@@ -46,9 +45,10 @@ def listen(tcpros_base, port):
     'read_ros_handshake_header',
     'listens for ever to a peer that is silent, slow or announces 4 GiB',
 )
-def read_ros_handshake_header(sock, b, buff_size, *, module):
+def read_ros_handshake_header(sock, b, buff_size, *, module, node):
     """Read the header of a connection within limits."""
-    deadline, length = time.monotonic() + HANDSHAKE_TIMEOUT, 4
+    limit, length = node.limits.handshake_timeout, 4
+    deadline = time.monotonic() + limit
     try:
         while b.tell() < length:
             sock.settimeout(seconds_left(deadline))
@@ -63,7 +63,7 @@ def read_ros_handshake_header(sock, b, buff_size, *, module):
                     f'a handshake of {length} bytes; the limit is {HANDSHAKE_LIMIT}'
                 )
     except socket.timeout:
-        raise module.ROSHandshakeException(f'no handshake within {HANDSHAKE_TIMEOUT:g} s') from None
+        raise module.ROSHandshakeException(f'no handshake within {limit:g} s') from None
     finally:
         with contextlib.suppress(OSError):  # closed meanwhile
             sock.settimeout(None)
