@@ -162,6 +162,15 @@ def test_exit_handlers_and_those_of_signals_run_at_the_stop_and_timers_end(node)
     assert ended(main.timer)
 
 
+def test_an_event_loop_of_a_program_hears_of_its_end(master):
+    node = master.load(str(PROGRAMS / 'own' / 'loops.py'))
+    main = node.ros_import('__main__')
+    assert main.begun.wait(TIMEOUT)
+    node.stop()
+    assert node.exit_code == 0
+    assert main.ended == ['by the signal']
+
+
 def test_a_program_ends_as_python_ends_it_after_its_threads(node):
     main = run(node, 'own/threads.py')
     ending = in_thread(node.latest_run.rospy.exit_main)

@@ -104,7 +104,8 @@ class PrivateRospy:
         :param argv: its ``sys.argv``, whole
         """
         self.lifetime.main_thread = threading.current_thread()
-        self._run_main(path, argv)
+        with self._process.main_thread():
+            self._run_main(path, argv)
 
     def exit_main(self):
         """What Python does when the program's main thread has ended: wait for the threads that are

@@ -1,6 +1,8 @@
 """What a program has of a process of its own, and a node's program, libraries and rospy have of the
 node: environment, arguments, exit handlers, signals, threads and child processes."""
 import atexit
+import contextlib
+import functools
 import os
 import posixpath
 import signal
@@ -17,6 +19,28 @@ from pharos.private_rospy.module_proxy import ModuleProxy
 from pharos.private_rospy.proxies import ServerProxy
 
 
+_getsignal = signal.getsignal
+_programs = {}  # identifier of a program's main thread -> its OwnProcess
+
+
+@functools.lru_cache(maxsize=None)
+def _share_signals():
+    """Have what is shared, such as the reactor of Twisted or an event loop of asyncio, set handlers
+    in a program's main thread, too: Python lets only its own one.
+    """
+    for name in 'signal', 'getsignal', 'set_wakeup_fd':
+        setattr(signal, name, _by_program(name, getattr(signal, name)))
+
+
+def _by_program(name, real):
+    @functools.wraps(real)
+    def function(*args, **kwargs):
+        program = _programs.get(threading.get_ident())
+        return (program.signals[name] if program else real)(*args, **kwargs)
+
+    return function
+
+
 class OwnProcess:
     """Puts into a set of private modules what stands in for Python's.
 
@@ -28,7 +52,13 @@ class OwnProcess:
     def __init__(self, imports, settings, lifetime, report):
         self._environ, self._lifetime, self._report = settings.environ, lifetime, report
         self.exit_handlers = []  # (function, arguments, keyword arguments), the first to run last
-        self._signal_handlers = {}
+        self._signal_handlers, self._wakeup_fd = {}, -1
+        #: functions of the module signal, in a program
+        self.signals = {
+            'signal': self._set_signal_handler,
+            'getsignal': self._signal_handler,
+            'set_wakeup_fd': self._set_wakeup_fd,
+        }
         proxies = ModuleProxy(xmlrpc.client, ServerProxy=ServerProxy)
         own_os = self._os(imports)
         imports.system.argv = settings.argv
@@ -38,12 +68,7 @@ class OwnProcess:
                 'os.path': own_os.path,
                 'posixpath': own_os.path,
                 'atexit': ModuleProxy(atexit, register=self._at_exit, unregister=self._not_at_exit),
-                'signal': ModuleProxy(
-                    signal,
-                    signal=self._set_signal_handler,
-                    getsignal=self._signal_handler,
-                    pause=lifetime.ended.wait,
-                ),
+                'signal': ModuleProxy(signal, pause=lifetime.ended.wait, **self.signals),
                 'threading': ModuleProxy(
                     threading,
                     Thread=lifetime.Thread,
@@ -130,19 +155,38 @@ class OwnProcess:
 
     def _signal_handler(self, number):
         """``signal.getsignal``."""
-        return self._signal_handlers.get(number) or signal.getsignal(number)
+        return self._signal_handlers.get(number) or _getsignal(number)
+
+    def _set_wakeup_fd(self, descriptor, *, warn_on_full_buffer=True):
+        """``signal.set_wakeup_fd``."""
+        before, self._wakeup_fd = self._wakeup_fd, descriptor
+        return before
+
+    @contextlib.contextmanager
+    def main_thread(self):
+        """Within this, this is the main thread of the program."""
+        _share_signals()
+        _programs[threading.get_ident()] = self
+        try:
+            yield
+        finally:
+            del _programs[threading.get_ident()]
 
     def forget_signals(self):
         """Call none of the handlers: there is no program any more that they could end."""
-        self._signal_handlers = {}
+        self._signal_handlers, self._wakeup_fd = {}, -1
 
     def call_signal_handler(self):
         """Call the handler of SIGINT, or else SIGTERM, as these signals would end the program; what
         takes longer is not waited for."""
-        handlers, self._signal_handlers = self._signal_handlers, {}
+        handlers, descriptor = self._signal_handlers, self._wakeup_fd
+        self.forget_signals()
         for number in signal.SIGINT, signal.SIGTERM:
             handler = handlers.get(number)
             if callable(handler):
+                if descriptor >= 0:
+                    with contextlib.suppress(OSError):  # it is full, or closed
+                        os.write(descriptor, bytes([number]))
                 thread = self._lifetime.start_thread(
                     self._attempt, (handler, number, None), name=number.name
                 )
