@@ -172,6 +172,19 @@ def test_a_script_that_ignores_its_end_is_named_and_left_behind(master, tmp_path
     (tmp_path / 'end').touch()
 
 
+def test_a_script_that_would_be_a_node_after_its_stop_takes_no_name(master, tmp_path, monkeypatch):
+    monkeypatch.setattr(pharos.ScriptNode, 'init_timeout', 0.1)
+    node = master.load(WORKER, None, 'nameless late', tmp_path / 'end')
+    node.stop_timeout = 0.1
+    node.stop()
+    (tmp_path / 'end').touch()
+    until(lambda: not node.latest_run.rospy.thread_count)
+    monkeypatch.undo()
+    with master.load(WORKER, None, 'spin') as another:
+        assert another.name == '/worker'
+    assert not node.errors
+
+
 def test_a_script_may_do_its_last_things_after_the_stop_has_begun(master, tmp_path):
     node = master.load(WORKER, None, 'last words', tmp_path / 'said')
     node.stop()

@@ -22,7 +22,7 @@ from typing import (
 
 from pharos import signals
 from pharos.blocks import name_of
-from pharos.errors import NodeNameInUseError, PharosError
+from pharos.errors import NodeNameInUseError, NodeStoppedError, PharosError
 from pharos.private_rospy import process_rospy
 from pharos.private_rospy.lifetime import SIGNAL_LATENCY, Interruption, join
 
@@ -99,8 +99,11 @@ def rename(node: 'Node', name: str) -> None:
     """The node, of which the master does not know yet, is called so from now on.
 
     :raises NodeNameInUseError: if another node of this process has the name at its master
+    :raises NodeStoppedError: if the node has been stopped meanwhile
     """
     with changed:
+        if node.latest_run.is_ending:
+            raise NodeStoppedError(f'{node.name} was stopped while it started')
         _claim_name(node, name)
         if name != node.name:
             discard(node)

@@ -86,6 +86,7 @@ class Composition:
         for number, kept in enumerate(started, 1):
             if self.is_ending:
                 kept.is_over = True
+                kept.settled.set()
                 continue
             self.progress.starts(kept.name, number, len(started))
             kept.start()

@@ -169,6 +169,7 @@ class PrivateRospy:
             is_of_this_host = isinstance(error, OSError) and not isinstance(error, ConnectionError)
             if is_of_this_host and not is_time_up():
                 raise  # a port is taken, a disk full
+            self._check_not_ended()
             raise self._stopped_answering() from error
 
     def _stopped_answering(self):

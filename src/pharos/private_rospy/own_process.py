@@ -13,14 +13,14 @@ import xmlrpc
 import xmlrpc.client
 import _posixsubprocess
 import _thread
+from typing import Any, Dict
 
 from pharos.private_rospy.lifetime import JOIN_TIMEOUT
 from pharos.private_rospy.module_proxy import ModuleProxy
 from pharos.private_rospy.proxies import ServerProxy
 
-
 _getsignal = signal.getsignal
-_programs = {}  # identifier of a program's main thread -> its OwnProcess
+_programs: Dict[int, Any] = {}  # identifier of a program's main thread -> its OwnProcess
 
 
 @functools.lru_cache(maxsize=None)

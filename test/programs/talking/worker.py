@@ -82,6 +82,7 @@ if __name__ == '__main__':
         'nameless': lambda: None,
         'nameless raise': divide,
         'nameless exit 4': lambda: sys.exit(4),
+        'nameless late': lambda file: [ignore(file), rospy.init_node('worker')],
         'nameless sleep': lambda: time.sleep(1000),
         'again': lambda: rospy.init_node('worker'),
         'other name': lambda: rospy.init_node('somebody_else'),
