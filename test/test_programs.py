@@ -14,9 +14,10 @@ import threading
 import numpy
 import pytest
 
+import pharos
 from helpers import create, ended, in_thread
 from pharos.private_rospy import ownership
-from pharos.testing import TIMEOUT
+from pharos.testing import TIMEOUT, until
 from workspaces import SPACES, build, forget
 
 PROGRAMS = pathlib.Path(__file__).parent / 'programs'
@@ -59,6 +60,13 @@ def test_a_program_is_main_and_has_its_arguments_and_the_modules_beside_it(maste
         found = node.parameter('~found').value
         assert found == ['__main__', *2 * [str(PROGRAMS / path)], 'one', '--two', name]
         assert exit_.value.code == 3
+
+
+def test_what_a_program_finds_in_a_folder_of_its_own_path_is_its_own(master):
+    for name in '/first_program', '/second_program':
+        main = run(create(master, name), 'own/adds_a_folder.py')
+        assert main.plain_module.USERS == [main.sys.argv[0]]
+        assert main.pharos is pharos
 
 
 def test_a_module_beside_a_program_is_read_anew_when_it_has_changed(node, tmp_path):
@@ -178,6 +186,14 @@ def test_a_program_ends_as_python_ends_it_after_its_threads(node):
     main.go_on.set()
     assert ended(ending)
     assert main.ended == ['thread', 'atexit']
+
+
+def test_a_program_that_goes_on_until_a_signal_ends_with_its_node(master, capfd):
+    script = master.load(str(PROGRAMS / 'own/until_signal.py'))
+    until(lambda: '/until_signal/is_ready' in master.parameters)
+    script.stop()
+    assert script.exit_code == 5
+    assert capfd.readouterr().out == 'the last\n'
 
 
 def test_a_program_that_has_ended_gets_no_signal(node):

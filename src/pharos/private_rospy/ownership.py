@@ -2,7 +2,7 @@
 
 A package is a node's own if it reaches rospy: if one of its files imports rospy, or a package that
 does. So nothing that is shared holds anything of a node's. Also its own is what lies in the folder
-of its program.
+of its program, or in one that only the program has put on ``sys.path``.
 """
 import functools
 import os
@@ -85,9 +85,10 @@ def _is_own(name, path, folder):
     spec = find_spec(name, path)
     if spec is None:
         return None
-    if folder is not None and _home(spec) == folder:
-        return True
-    return not _is_pythons(spec) and _reaches_rospy(name, path)
+    if _is_pythons(spec):
+        return _home(spec) == folder
+    is_known_to_process = _home(spec) in (entry or os.getcwd() for entry in sys.path)
+    return _home(spec) == folder or not is_known_to_process or _reaches_rospy(name, path)
 
 
 def is_one_for_all(spec):
