@@ -40,6 +40,7 @@ class Dispatcher:
         self.inline: Deque[Runnable] = collections.deque()  # that whoever comes by may run
         self.scheduled: Deque[Runnable] = collections.deque()  # for the dispatcher thread
         self.idle = False  # whether that thread waits for inboxes
+        self.is_yielded_to = True  # whether publishers that wake it let it run before they go on
         self._running = threading.Lock()  # held by the thread that runs delegates,
         self._runner: Optional[int] = None  # which is this one, by its identifier
         self._start_thread, self._name = start_thread, name

@@ -117,7 +117,7 @@ class Fanout:
     __slots__ = (
         '_lock',
         '_closed',
-        '_seq',
+        'seq',
         '_has_header',
         '_freeze',
         '_size',
@@ -133,7 +133,8 @@ class Fanout:
         self, message_class: Type[genpy.Message], lock: ContextManager[Any], sockets: Sockets
     ) -> None:
         self._lock, self._sockets = lock, sockets
-        self._closed, self._seq = False, 0
+        self._closed = False
+        self.seq = 0  #: the number of the last message
         self._has_header = getattr(message_class, '_has_header', False)
         self._freeze, self._thaw, self._size = copier_for(message_class)[:3]
         self._latches: Dict[Latch, None] = {}  # those that hold something, in order
@@ -173,10 +174,10 @@ class Fanout:
                 inboxes, remote, dispatchers, inline, mark = self._select(to, connection)
             if not (inboxes or remote or latch):
                 return False
-            self._seq += 1
+            self.seq += 1
             message = self._numbered(message) if self._has_header else message
             frozen = self._freeze(message) if inboxes or latch else b''
-            data = self._sockets.serialize(message, self._seq) if remote else b''
+            data = self._sockets.serialize(message, self.seq) if remote else b''
             if latch:
                 latch.keep(frozen, connection.endpoint_id if connection else to)
                 self._latches[latch] = None
@@ -206,7 +207,7 @@ class Fanout:
         if sharing.Mark.is_used and sharing.is_held(message.header):
             message = sharing.with_own_header(message)
         header = message.header
-        header.seq = self._seq
+        header.seq = self.seq
         if header.frame_id is None:
             header.frame_id = '0'
         return message
@@ -217,7 +218,8 @@ class Fanout:
         for dispatcher in dispatchers:
             if dispatcher.idle:
                 dispatcher.wake()
-                woken = dispatcher
+                if dispatcher.is_yielded_to:
+                    woken = dispatcher
         if woken is not None:
             last, self._last_wake = self._last_wake, _clock()
             if self._last_wake - last > BURST_INTERVAL:

@@ -219,6 +219,9 @@ class ThreadedInbox(Inbox):
         header: Dict[str, str],
     ) -> None:
         super().__init__(receiver, Dispatcher(start_thread, name), thaw, header)
+        # Code that was written for sockets may not be through with what it does at a publish()
+        # when its answer comes.
+        self.dispatcher.is_yielded_to = False
         self.closed = False  # nothing more arrives
         self.dispatcher.need_thread()
 

@@ -143,6 +143,12 @@ class _End(rospy.impl.transport.Transport):
     def __init__(self, link, direction, topic, peer):
         super().__init__(direction, topic)
         self.link, self.endpoint_id, self.header = link, peer, link.header
+        self._first = link.publisher.fanout.seq
+
+    # what getBusStats tells; no bytes go through
+    stat_num_msg = property(
+        lambda self: self.link.publisher.fanout.seq - self._first, lambda self, value: None
+    )
 
     def get_transport_info(self):
         return f'INTRAPROCESS connection to [{self.endpoint_id}]'
