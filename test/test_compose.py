@@ -1,6 +1,7 @@
 """master.compose: launch files whose Python nodes run in this process."""
 import json
 import os
+import pathlib
 
 import pytest
 
@@ -105,6 +106,31 @@ def test_the_working_directory_of_a_node_is_its_own(master, compose, where, fold
     told = json.loads(mailbox.next(TIMEOUT).data)
     assert told['folder'] == str(folder or tmp_path)
     assert os.getcwd() == before
+
+
+def printed_by_mirror(master, compose, output, capfd):
+    """What comes on the screen, on standard output and the errors, and into its file."""
+    mailbox = Mailbox(create(master, '/hearer'), '/reflection', STRING)
+    composed = compose('mirror.launch', output=output)
+    mailbox.next(TIMEOUT)  # printed before this
+    composed.stop()
+    folder = os.path.join(os.environ['ROS_LOG_DIR'], master.parameters['/run_id'])
+    path = pathlib.Path(folder, 'deep-mirror-1-stdout.log')
+    return (*capfd.readouterr(), path.read_text() if path.exists() else '')
+
+
+def test_what_a_node_prints_goes_to_its_log_file_and_errors_to_the_screen(master, compose, capfd):
+    printed, errors, logged = printed_by_mirror(master, compose, 'log', capfd)
+    assert 'mirror' not in printed
+    assert '[/deep/mirror] complained\n' in errors
+    assert logged == 'printed by the mirror\n'
+
+
+def test_what_a_node_prints_comes_on_the_screen_with_its_name(master, compose, capfd):
+    printed, errors, logged = printed_by_mirror(master, compose, 'screen', capfd)
+    assert printed == '[/deep/mirror] printed by the mirror\n'
+    assert '[/deep/mirror] complained\n' in errors
+    assert logged == ''
 
 
 def test_callbacks_and_child_processes_are_in_the_working_directory_too(master, compose):

@@ -11,6 +11,7 @@ from pharos import node_registry, signals
 from pharos.compose import rest, rest_program
 from pharos.compose.kept_node import KeptNode
 from pharos.compose.launch_file import LaunchedNode, LaunchFile
+from pharos.compose.output import SCREEN
 from pharos.compose.progress import Progress
 from pharos.compose.script import ScriptNode
 from pharos.errors import PharosError
@@ -188,10 +189,13 @@ class Composition:
 
 
 def _with_log(launched: LaunchedNode, folder: str, number: int) -> LaunchedNode:
-    """The same, with the log file that roslaunch would give it."""
+    """The same, with the log files that roslaunch would give it."""
     name = launched.name[1:].replace('/', '-')
     log = os.path.join(folder, f'{name}-{number}.log')
-    return dataclasses.replace(launched, args=[*launched.args, f'__log:={log}'])
+    output = launched.output
+    if output != SCREEN:
+        output = os.path.join(folder, f'{name}-{number}-stdout.log')
+    return dataclasses.replace(launched, args=[*launched.args, f'__log:={log}'], output=output)
 
 
 def compose(

@@ -3,6 +3,7 @@ from typing import TYPE_CHECKING, Any, Dict, List
 
 from pharos.compose.kept_node import KeptNode
 from pharos.compose.launch_file import LaunchedNode
+from pharos.compose.output import SCREEN
 from pharos.compose.programs import find_program
 from pharos.errors import PharosError, UnknownNodeError, suggest
 from pharos.node import Node
@@ -57,6 +58,7 @@ class Container(Node):
             path=find_program(package, executable),
             args=[*request.my_argv, *(f'{source}:={target}' for source, target in remaps)],
             private_name=request.name,
+            output=SCREEN,
         )
         (kept,) = self.composition.start([launched])
         kept.settled.wait()

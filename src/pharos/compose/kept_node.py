@@ -104,6 +104,7 @@ class KeptNode:
                     'takes_own_name': launched.takes_own_name,
                     'private_name': launched.private_name,
                     'cwd': launched.cwd,
+                    'output': launched.output,
                 },
             )
         start_made(self.node)

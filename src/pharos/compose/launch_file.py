@@ -48,7 +48,7 @@ class LaunchedNode:
     args: Sequence[str] = ()  # the command line, but for the path, as roslaunch would give it
     env: Mapping[str, str] = dataclasses.field(default_factory=dict)  # of the launch file
     cwd: Optional[str] = None
-    output: str = 'log'  # or 'screen'
+    output: Optional[str] = None  # 'screen' or 'log'; None: as this process prints
     is_required: bool = False
     respawn_delay: Optional[float] = None  # seconds; None: it is not started again
     file: str = ''  # the launch file that it is in

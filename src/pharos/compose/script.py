@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any, Dict, Optional, Sequence
 import rosgraph.names
 
 from pharos import node_registry, signals, working_directory
+from pharos.blocks import attempt
+from pharos.compose.output import redirect
 from pharos.compose.programs import check_source, find_program, source_of
 from pharos.errors import PharosError
 from pharos.node import Node
@@ -34,6 +36,8 @@ class ScriptNode(Node):
     :param private_name: the node in whose namespace its private names are; None: itself
     :param cwd: its working directory, where the system lets it have one of its own; None: this
         process's
+    :param output: 'screen': each line that it prints has its node's name before it; a path: the
+        file for what it prints, and its errors have the name; None: as this process prints
     """
 
     #: seconds that :meth:`start` waits for the program to call ``rospy.init_node``, or to end
@@ -48,6 +52,7 @@ class ScriptNode(Node):
         takes_own_name: bool = False,
         private_name: Optional[str] = None,
         cwd: Optional[str] = None,
+        output: Optional[str] = None,
     ) -> None:
         super().__init__()
         found = find_program(path)
@@ -57,6 +62,7 @@ class ScriptNode(Node):
         if cwd is not None and not os.path.isdir(cwd):
             raise ValueError(f'{found} cannot run in {cwd!r}: there is no such folder')
         self.cwd = cwd
+        self.output = output
 
     def start(self) -> None:
         """Run the program from its first line.
@@ -106,6 +112,8 @@ class ScriptRun(Run):
         self.rospy.lifetime.has_program = True
         if working_directory.is_possible():
             self.rospy.lifetime.folder = node.cwd or os.getcwd()
+        is_again = isinstance(node.latest_run, ScriptRun)
+        self._file = redirect(self.rospy.system, node.output, lambda: node.name, is_again)
 
     def start(self, reopens: bool) -> None:
         """Run the program in a thread of its own; see :meth:`ScriptNode.start`."""
@@ -148,6 +156,8 @@ class ScriptRun(Run):
         if error is not None and not is_for_caller:
             self.report(error, self.node.path, 'script')
         self.rospy.exit_main()
+        for stream in self.rospy.system.stdout, self.rospy.system.stderr:
+            attempt(stream.flush)
         with node_registry.changed:
             self.exit_code, self._has_ended = exit_code, True
             node_registry.changed.notify_all()
@@ -157,6 +167,12 @@ class ScriptRun(Run):
             )
             stop.daemon = True
             stop.start()
+
+    def end(self) -> None:
+        """End it, and close the file that it prints to."""
+        super().end()
+        if self._file is not None and self.is_over:
+            self._file.close()
 
     def _init_node(self, name: str, register: Any, xmlrpc_port: int, tcpros_port: int) -> None:
         """Its program calls ``rospy.init_node``, in whatever thread."""

@@ -76,6 +76,8 @@ class PrivateRospy:
         self._logging = logs.private_logging(imports)
         #: import_library(name): a library written on rospy, such as 'actionlib', for this node
         self.import_library = imports.import_library
+        #: its sys, as its program and libraries import it
+        self.system = imports.system
         self._run_main = imports.run_main
         self.rospy = imports.load('rospy')
         patches.check_applied(imports.modules)

@@ -24,7 +24,8 @@ told = {
     'folder': os.getcwd(),
     'parameters': rospy.get_param('~', {}),
 }
+print('printed by', 'the mirror')
+print('complained', file=sys.stderr)
 publisher.publish(json.dumps(told))
 rospy.Subscriber('where', String, where)
-print('printed by the mirror', flush=True)
 rospy.spin()

@@ -1,0 +1,84 @@
+"""Where what the programs of one process print goes to."""
+import io
+import sys
+import threading
+from typing import IO, Any, Callable, Optional, TextIO
+
+SCREEN = 'screen'  # as launch files say it
+
+
+class NamedLines(io.TextIOBase):
+    """A stream each of whose lines begins with the name of the node that printed it.
+
+    A line goes on when it is complete, or flushed.
+
+    :param stream: ``stream()`` is what it goes on to
+    :param name: ``name()`` is the node's
+    """
+
+    def __init__(self, stream: Callable[[], TextIO], name: Callable[[], str]) -> None:
+        self._stream, self._name = stream, name
+        self._lock = threading.Lock()
+        self._begun = ''  # of a line that is not complete
+        self._is_within = False  # whether the beginning of the line has gone on
+
+    def write(self, text: str) -> int:
+        """See :class:`io.TextIOBase`."""
+        with self._lock:
+            *lines, self._begun = (self._begun + text).split('\n')
+            for line in lines:
+                self._pass_on(line + '\n')
+        return len(text)
+
+    def flush(self) -> None:
+        """See :class:`io.TextIOBase`."""
+        with self._lock:
+            if self._begun:
+                self._pass_on(self._begun)
+                self._begun = ''
+
+    def _pass_on(self, text: str) -> None:
+        stream = self._stream()
+        stream.write(text if self._is_within else f'[{self._name()}] {text}')
+        stream.flush()
+        self._is_within = not text.endswith('\n')
+
+    def isatty(self) -> bool:
+        """Whether it ends on a terminal."""
+        return self._stream().isatty()
+
+    def fileno(self) -> int:
+        """What child processes write to; their lines have no name."""
+        return self._stream().fileno()
+
+    @property
+    def buffer(self) -> Any:
+        """What takes bytes; they have no name."""
+        return getattr(self._stream(), 'buffer', None)
+
+    @property
+    def encoding(self) -> str:  # type: ignore[override]
+        """See :class:`io.TextIOBase`."""
+        return self._stream().encoding
+
+
+def redirect(
+    system: Any, output: Optional[str], name: Callable[[], str], is_again: bool
+) -> Optional[IO[str]]:
+    """Have what a program prints go where it is to; returns the file that was opened for it.
+
+    :param system: the program's ``sys``
+    :param output: 'screen', or the path of a file, or None: as this process prints
+    :param is_again: whether the file goes on where it ended
+    """
+    if output is None:
+        return None
+    file: Optional[IO[str]] = None
+    if output == SCREEN:
+        system.stdout = NamedLines(lambda: sys.stdout, name)
+    else:
+        mode = 'a' if is_again else 'w'
+        file = open(output, mode, buffering=1, encoding='utf-8', errors='backslashreplace')
+        system.stdout = file
+    system.stderr = NamedLines(lambda: sys.stderr, name)
+    return file
