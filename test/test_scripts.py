@@ -1,6 +1,7 @@
 """master.load: rospy programs, unmodified, as nodes of this process."""
 import json
 import pathlib
+import re
 import shutil
 import signal
 import sys
@@ -252,6 +253,37 @@ def test_the_node_of_another_script_is_told_that_a_script_is_not_there_yet(maste
     assert node.is_running
     with pytest.raises(pharos.UnknownNodeError):
         master.wait_for_node('/late', 0)
+
+
+def test_lines_on_the_screen_carry_the_name_of_the_node(master, capsys):
+    master.load(WORKER, None, 'speak', output='screen', name='left', namespace='eye').wait(30)
+    printed = capsys.readouterr()
+    lines = printed.out.splitlines()
+    logged = [line for line in lines if 'logged' in line]
+    assert [line for line in lines if line not in logged] == [
+        *('[/eye/left] two', '[/eye/left] lines', '[/eye/left] one more', '[/eye/left] no enddead')
+    ]
+    assert len(logged) == 1
+    assert re.match(r'\[/eye/left\] \[INFO\] \[.*\]: logged$', logged[0])
+    assert printed.err == '[/eye/left] aside\n'
+
+
+def test_what_a_script_prints_is_as_it_is_unless_asked_for(master, capsys):
+    master.load(WORKER, None, 'speak').wait(30)
+    assert 'two\nlines\none more\n' in capsys.readouterr().out
+
+
+def test_what_a_script_prints_goes_to_a_file(master, capsys, tmp_path):
+    node = master.load(WORKER, None, 'speak', output=tmp_path / 'printed')
+    node.wait(30)
+    node.start()
+    node.wait(30)
+    printed = (tmp_path / 'printed').read_text()
+    assert printed.count('two\nlines\none more\n') == 2
+    assert printed.endswith('no enddead\n')
+    printed = capsys.readouterr()
+    assert 'lines' not in printed.out
+    assert printed.err == '[/worker] aside\n' * 2
 
 
 # -- bad input

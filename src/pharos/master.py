@@ -215,6 +215,7 @@ class Master(MasterCalls):
         namespace: Optional[str] = None,
         remap: Optional[Dict[str, str]] = None,
         params: Optional[Dict[str, object]] = None,
+        output: Optional[str] = None,
     ) -> 'ScriptNode':
         """Run a rospy program, unmodified, as a node of this process; returns the
         :class:`~pharos.ScriptNode`.
@@ -230,12 +231,22 @@ class Master(MasterCalls):
         :param namespace: the namespace of its node, for ``__ns:=``
         :param remap: ``{name: name}`` of remappings
         :param params: ``{name: value}`` of private parameters
+        :param output: 'screen': what it prints has the name of its node before each line; a path:
+            it goes to that file, but for its errors; None: it goes where this program prints
         :raises UnknownNodeError: if there is no such package or program
         :raises NodeNameInUseError: if another node has its name
         :raises PharosError: if it is no Python program, or raised an exception before it was a node
         """
         node: 'ScriptNode' = importlib.import_module('pharos.compose.script').load(
-            self, package, executable, args, name, namespace, remap=remap, params=params
+            self,
+            package,
+            executable,
+            args,
+            name,
+            namespace,
+            remap,
+            params=params,
+            output=output,
         )
         return node
 

@@ -1,7 +1,6 @@
 """Scripts: rospy programs that run unmodified as nodes of this process."""
 import os
 import re
-import sys
 import threading
 from typing import TYPE_CHECKING, Any, Dict, Optional, Sequence
 
@@ -146,7 +145,7 @@ class ScriptRun(Run):
             self.rospy.run_main(self.node.path, self._settings.argv)
             exit_code = 0
         except SystemExit as wanted:
-            exit_code = _exit_code(wanted.code)
+            exit_code = self._exit_code(wanted.code)
         except BaseException as raised:
             exit_code, error = 1, _in_program(raised, self.node.path)
         with node_registry.changed:
@@ -174,6 +173,13 @@ class ScriptRun(Run):
         if self._file is not None and self.is_over:
             self._file.close()
 
+    def _exit_code(self, code: Any) -> int:
+        """What Python makes of the argument of ``sys.exit``."""
+        if code is None or isinstance(code, int):
+            return int(code or 0)
+        print(code, file=self.rospy.system.stderr)
+        return 1
+
     def _init_node(self, name: str, register: Any, xmlrpc_port: int, tcpros_port: int) -> None:
         """Its program calls ``rospy.init_node``, in whatever thread."""
         node, settings = self.node, self._settings
@@ -189,14 +195,6 @@ class ScriptRun(Run):
             self.is_registered = True
             node_registry.changed.notify_all()
         watcher_of(node.master).check()
-
-
-def _exit_code(code: Any) -> int:
-    """What Python makes of the argument of ``sys.exit``."""
-    if code is None or isinstance(code, int):
-        return int(code or 0)
-    print(code, file=sys.stderr)
-    return 1
 
 
 def _in_program(error: BaseException, path: str) -> BaseException:

@@ -67,6 +67,17 @@ def hook(file):
     rospy.spin()
 
 
+def speak():
+    """Print lines, whole and in parts, and log one."""
+    rospy.on_shutdown(lambda: print('dead'))
+    print('two\nlines')
+    print('one', end='')
+    print(' more', flush=True)
+    print('aside', file=sys.stderr)
+    rospy.loginfo('logged')
+    print('no end', end='')
+
+
 if __name__ == '__main__':
     RUNS.append(1)
     how, *more = rospy.myargv()[1:]
@@ -90,6 +101,7 @@ if __name__ == '__main__':
         'sleep': lambda: time.sleep(1000),
         'spin': rospy.spin,
         'loop': loop,
+        'speak': speak,
         'ignore': ignore,
         'last words': speak_last,
         'thread': wait_in_thread,
