@@ -155,7 +155,26 @@ def test_what_spins_or_sleeps_ends_with_its_node(how, master):
     node.stop_timeout = 0.2
     node.stop()
     # a sleep that the stop finds ends with it; one that begins then is cut off when the time is up
-    assert node.exit_code == 0 or node.exit_code == -signal.SIGTERM and how != 'spin'
+    codes = {0, -signal.SIGTERM, -signal.SIGINT} if how != 'spin' else {0}
+    assert node.exit_code in codes
+
+
+@pytest.mark.parametrize('how', ['interrupted', 'nameless interrupted'])
+def test_the_stop_is_ctrl_c_to_a_script_that_has_rospy_handle_no_signals(
+    how, master, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(pharos.ScriptNode, 'init_timeout', 0.5)
+    node = master.load(WORKER, None, how, tmp_path / 'said')
+    node.stop()
+    assert (tmp_path / 'said').read_text() == 'interrupted\n'
+    assert node.exit_code == 0
+
+
+def test_a_script_that_ctrl_c_would_end_has_not_failed(master):
+    node = master.load(WORKER, None, 'interrupted loop')
+    node.stop()
+    assert node.exit_code == -signal.SIGINT
+    assert not node.errors
 
 
 def test_a_script_that_ignores_its_end_is_named_and_left_behind(master, tmp_path):

@@ -1,6 +1,7 @@
 """Scripts: rospy programs that run unmodified as nodes of this process."""
 import os
 import re
+import signal
 import threading
 from typing import TYPE_CHECKING, Any, Dict, Optional, Sequence
 
@@ -108,7 +109,7 @@ class ScriptRun(Run):
         self._has_ended = False  # whether the program has
         self._error: Optional[BaseException] = None  # with which it ended before it was a node
         self.rospy.on_init_node = self._init_node
-        self.rospy.lifetime.has_program = True
+        self.rospy.lifetime.has_program = self.rospy.lifetime.is_interruptible = True
         if working_directory.is_possible():
             self.rospy.lifetime.folder = node.cwd or os.getcwd()
         is_again = isinstance(node.latest_run, ScriptRun)
@@ -146,6 +147,8 @@ class ScriptRun(Run):
             exit_code = 0
         except SystemExit as wanted:
             exit_code = self._exit_code(wanted.code)
+        except KeyboardInterrupt:  # it has no handler for what its stop is to it
+            exit_code = -signal.SIGINT
         except BaseException as raised:
             exit_code, error = 1, _in_program(raised, self.node.path)
         with node_registry.changed:

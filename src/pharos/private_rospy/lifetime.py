@@ -46,6 +46,8 @@ class Lifetime:
         # whether the node has a program of its own, which may do its last things after the stop has
         # begun; until this, when what sleeps in it is cut off
         self.has_program, self.overdue = False, threading.Event()
+        # whether the stop is to the program what Ctrl-C is without a handler: until rospy has one
+        self.is_interruptible = False
         self.folder = None  # the working directory of its threads; None: the process's
         self.hooks_thread = None  # the identifier of the thread that runs the hooks of on_shutdown
         self.interruptions = set()  # of waits under way
@@ -150,6 +152,7 @@ class Lifetime:
         What a program does after the stop has begun, and hooks of rospy.on_shutdown, sleeps for as
         long as it says.
 
+        :raises KeyboardInterrupt: in the main thread of a program for which rospy handles no signals
         :raises ProgramCutOff: in a thread of a program for which the time is up
         """
         if seconds <= 0:
@@ -158,13 +161,21 @@ class Lifetime:
             time.sleep(seconds)
         elif not self.ended.is_set():
             self._sleep_until(self.ended, seconds)
+            self._interrupt()
         elif self.has_program and threading.current_thread() in self.threads:
+            self._interrupt()
             if getattr(_thread, 'was_cut_off', False):
                 time.sleep(seconds)  # it has caught what was raised, and goes on
             self._sleep_until(self.overdue, seconds)
             if self.overdue.is_set():
                 _thread.was_cut_off = True
                 raise ProgramCutOff(-signal.SIGTERM)
+
+    def _interrupt(self):
+        is_main = threading.current_thread() is self.main_thread
+        if self.is_interruptible and is_main and self.ended.is_set():
+            self.is_interruptible = False  # once
+            raise KeyboardInterrupt
 
     @staticmethod
     def _sleep_until(event, seconds):

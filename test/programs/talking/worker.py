@@ -22,6 +22,14 @@ def loop():
         time.sleep(0.01)
 
 
+def be_interrupted(file):
+    """Loop until Ctrl-C."""
+    try:
+        loop()
+    except KeyboardInterrupt:
+        say(file, 'interrupted')
+
+
 def ignore(file):
     """Go on until there is the file."""
     while not os.path.exists(file):
@@ -82,7 +90,7 @@ if __name__ == '__main__':
     RUNS.append(1)
     how, *more = rospy.myargv()[1:]
     if 'nameless' not in how:
-        rospy.init_node('worker')
+        rospy.init_node('worker', disable_signals='interrupted' in how)
     rospy.sleep(0)
     ends = {
         'return': lambda: None,
@@ -103,6 +111,9 @@ if __name__ == '__main__':
         'loop': loop,
         'speak': speak,
         'ignore': ignore,
+        'interrupted': be_interrupted,
+        'nameless interrupted': be_interrupted,
+        'interrupted loop': loop,
         'last words': speak_last,
         'thread': wait_in_thread,
         'hook': hook,

@@ -52,6 +52,7 @@ def init_node(
         # signals are for the threads of the process, which the script does not run in
         original(name, argv, False, *options, True, xmlrpc_port, tcpros_port)
 
+    node.lifetime.is_interruptible = disable_signals
     node.on_init_node(resolved, register, xmlrpc_port, tcpros_port)
     # what a second call has to give
     argv = module.sys.argv if argv is None else argv
