@@ -463,7 +463,7 @@ def waiting(master, monkeypatch):
     monkeypatch.setattr(
         'pharos.private_rospy.connections.Connections.sends_to', lambda self, name, topic: False
     )
-    monkeypatch.setattr('pharos.channel.OutputChannel.connections', [])
+    monkeypatch.setattr('pharos.output_channel.OutputChannel.connections', [])
     monkeypatch.setattr(
         'pharos.private_rospy.local_services.find',
         lambda name, *rest, find=local_services.find: (

@@ -221,7 +221,7 @@ def test_a_start_that_is_interrupted_while_it_opens_what_it_had_loses_nothing(
             patch.setattr('pharos.offered_service.OfferedService.open', interrupt)
         else:
             kind = 'InputChannel' if what == 'interested_in' else 'OutputChannel'
-            patch.setattr(f'pharos.channel.{kind}.open', interrupt)
+            patch.setattr(getattr(pharos, kind), 'open', interrupt)
         for _ in range(2):
             with pytest.raises(type(error)):
                 stopped.start()

@@ -1,7 +1,7 @@
 """PhaROS for Python: many ROS nodes in one process, written with blocks."""
 from typing import TYPE_CHECKING
 
-from pharos.channel import InputChannel, OutputChannel
+from pharos.channel import InputChannel
 from pharos.errors import (
     MasterUnreachableError,
     MessageTypeError,
@@ -18,6 +18,7 @@ from pharos.errors import (
 )
 from pharos.external_node import ExternalNode
 from pharos.failures import Failure
+from pharos.output_channel import OutputChannel
 from pharos.run import Lifecycle
 from pharos.master import Master
 from pharos.messages import (

@@ -7,7 +7,7 @@ from pharos.private_rospy.deadlines import time_limit
 from pharos.private_rospy.registration import REGISTER_TIMEOUT
 
 if TYPE_CHECKING:
-    from pharos.channel import OutputChannel
+    from pharos.output_channel import OutputChannel
 
 # seconds in which the master has told a live subscriber; then it is asked whether it lives
 ANSWER_TIMEOUT = 0.5

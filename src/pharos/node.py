@@ -9,10 +9,11 @@ import genpy
 from pharos import node_registry, signals
 from pharos.attributes import Block, NodeAttributes
 from pharos.blocks import check_block, check_soul
-from pharos.channel import InputChannel, OutputChannel
+from pharos.channel import InputChannel
 from pharos.errors import NodeStoppedError, PharosError
 from pharos.health import Health, health_of
 from pharos.offered_service import OfferedService
+from pharos.output_channel import OutputChannel
 from pharos.parameter import Parameter
 from pharos.private_rospy.process_rospy import rospy
 from pharos.run import Lifecycle, Run

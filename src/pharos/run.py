@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, List, Optional,
 
 from pharos import messages, node_registry, signals
 from pharos.blocks import attempt, name_of
-from pharos.channel import InputChannel, OutputChannel
+from pharos.channel import InputChannel
 from pharos.errors import MessageTypeError, NodeStoppedError
 from pharos.external_node import ExternalNode
 from pharos.intraprocess.dispatcher import Dispatcher
 from pharos.intraprocess.fanout import Latch
+from pharos.output_channel import OutputChannel
 from pharos.private_rospy import changes
 from pharos.private_rospy.instance import PrivateRospy
 from pharos.private_rospy.names import Resolved, check_name

@@ -6,7 +6,7 @@ import genpy
 import rosgraph
 
 from pharos import messages, node_registry
-from pharos.channel import Channel, InputChannel, OutputChannel
+from pharos.channel import Channel, InputChannel
 from pharos.errors import (
     MasterUnreachableError,
     MessageTypeError,
@@ -16,6 +16,7 @@ from pharos.errors import (
     UnknownTypeError,
     suggest,
 )
+from pharos.output_channel import OutputChannel
 from pharos.private_rospy.deadlines import MARGIN, time_limit
 from pharos.private_rospy.tcpros_connection import ask_publisher
 from pharos.seconds import check_seconds
