@@ -1,4 +1,4 @@
-"""The shape of the code, as DESIGN.md and API.md have it.
+"""The shape of the code, as doc/architecture.md has it.
 
 What does not hold yet is in structure_exceptions.txt, whose lines may only become fewer: a line that
 is needed no longer fails here, too, and ``test/test_structure.py`` as a program removes such lines.

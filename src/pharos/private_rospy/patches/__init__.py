@@ -1,7 +1,6 @@
 """What is mended in rospy: one function for each override, in a table that the loader applies.
 
-To add one, write a function at module level in the file here that is about its matter, and import
-that file below:
+To add one, write a function at module level in the file here that is about its matter:
 
     @patch('rospy.impl.registration', 'RegManager.cleanup', 'trips over a time-out (ros_comm #1)')
     def cleanup(self, reason, *, node, original):
@@ -16,44 +15,15 @@ further frame. ``@addition`` gives a class or module of rospy a function that it
 node, never to a module.
 
 A target that is missing, or that has other parameters, is an error when a node is made, or imports
-the library that has it.
-test/test_patches.py compares the sources of the targets with the releases of rospy that are known
+the library that has it. test/test_patches.py compares the sources of the targets with the releases of rospy that are known
 (and says how to know another), and doc/patches.md is this table: ``tools/patches`` writes it.
 """
-from pharos.private_rospy.patches import (
-    libraries,
-    logs,
-    names,
-    parameters,
-    publishers,
-    registration,
-    services,
-    slave,
-    startup,
-    subscribers,
-    tcpros,
-    tcpros_server,
-    times,
-    xmlrpc_server,
-)
+import importlib
+import pkgutil
+
 from pharos.private_rospy.patches.table import TABLE, apply, check_applied
 
-__all__ = [
-    'TABLE',
-    'apply',
-    'check_applied',
-    'libraries',
-    'logs',
-    'names',
-    'parameters',
-    'publishers',
-    'registration',
-    'services',
-    'slave',
-    'startup',
-    'subscribers',
-    'tcpros',
-    'tcpros_server',
-    'times',
-    'xmlrpc_server',
-]
+__all__ = ['TABLE', 'apply', 'check_applied']
+
+for _each in pkgutil.iter_modules(__path__):
+    importlib.import_module(f'{__name__}.{_each.name}')
