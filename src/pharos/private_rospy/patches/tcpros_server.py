@@ -37,6 +37,8 @@ def listen(tcpros_base, port):
     server.tcp_ros_server = tcpros_base.TCPServer(server._tcp_server_callback, port)
     server.tcp_ros_server.server_sock.listen(BACKLOG)
     server.tcp_ros_server.start()
+    if tcpros_base.is_shutdown():  # since just now, where rospy found no server to shut down
+        server.shutdown()
     return server.tcp_ros_server.port
 
 
