@@ -157,6 +157,8 @@ def test_rospy_is_the_nodes_in_whatever_way_it_is_imported(node):
     assert main.names == {'/program_node'}
     assert main.same
     assert main.reloaded
+    assert main.by_file == main.by_run == main.by_code['NAME'] == '/program_node'
+    assert main.examples == (0, 1)
 
 
 # -- the end

@@ -7,16 +7,12 @@ as usual, also for imports that rospy does inside functions later on.
 import builtins
 import collections
 import contextlib
-import dataclasses
 import importlib.util
-import inspect
 import os
 import pickle
-import pkgutil
 import sys
 import threading
 import types
-import typing
 from importlib.machinery import SourceFileLoader
 from typing import Any, Dict, Tuple
 
@@ -26,13 +22,14 @@ from pharos.private_rospy.process_rospy import rospy
 
 # so that ``except rospy.ROSException`` catches every node's
 _SHARED = {'rospy.exceptions': rospy.exceptions}
-# Those of Python's modules with functions that look modules up by name. An own copy of what they
-# import would have other classes.
-_TWINS = {
-    'dataclasses': (dataclasses, {}),
-    'inspect': (inspect, {'modulesbyfile': {}, '_filesbymodname': {}}),
-    'pkgutil': (pkgutil, {}),
-    'typing': (typing, {}),
+# Those of Python's modules with functions that look modules up by name, and what each set has of
+# them. An own copy of what they import would have other classes.
+_TWINS: Dict[str, Dict[str, Any]] = {
+    'dataclasses': {},
+    'doctest': {},
+    'inspect': {'modulesbyfile': {}, '_filesbymodname': {}},
+    'pkgutil': {},
+    'typing': {},
 }
 # file -> (its time of modification, code), the same for all sets
 _codes: Dict[str, Tuple[Any, Any]] = {}
@@ -63,13 +60,15 @@ class PrivateImports:
         # pickle without this is written in Python, and looks modules up in the set
         accelerator = types.ModuleType('_pickle')
         accelerator.PickleBuffer = pickle.PickleBuffer
+        util = ModuleProxy(importlib.util, module_from_spec=self._module_from_spec)
         self.modules.update(
             sys=self.system,
             _pickle=accelerator,
             importlib=ModuleProxy(
-                importlib, import_module=self._import_module, reload=self._reload
+                importlib, import_module=self._import_module, reload=self._reload, util=util
             ),
         )
+        self.modules['importlib.util'] = util
 
     def import_library(self, name):
         """The module ``name`` as private modules import it."""
@@ -114,8 +113,8 @@ class PrivateImports:
         me = threading.get_ident()
         if name not in self.modules or self._loading.get(name, me) != me:
             if name in _TWINS:
-                real, own = _TWINS[name]
-                self.modules[name] = self.twin(real, **own)
+                own = {name: value.copy() for name, value in _TWINS[name].items()}
+                self.modules[name] = self.twin(importlib.import_module(name), **own)
             elif not self._is_private(name.partition('.')[0]):
                 return importlib.import_module(name)
             else:
@@ -173,8 +172,7 @@ class PrivateImports:
     def _run(self, spec, code, parent=None):
         """Run the code of a module, which is found before: rospy's import each other in circles."""
         name = spec.name
-        module = self.modules[name] = importlib.util.module_from_spec(spec)
-        vars(module)['__builtins__'] = self.builtins
+        module = self.modules[name] = self._module_from_spec(spec)
         if parent:
             setattr(parent, name.rpartition('.')[2], module)
         try:
@@ -241,6 +239,12 @@ class PrivateImports:
     def _import_module(self, name, package=None):
         """``importlib.import_module``."""
         return self.load(importlib.util.resolve_name(name, package))
+
+    def _module_from_spec(self, spec):
+        """``importlib.util.module_from_spec``."""
+        module = importlib.util.module_from_spec(spec)
+        vars(module)['__builtins__'] = self.builtins
+        return module
 
     def _reload(self, module):
         """``importlib.reload``; what stands in for one of Python's modules stays as it is."""

@@ -20,7 +20,6 @@ _SHARED = {'genpy', 'genmsg', 'pharos'}
 OWN_OF_PYTHONS = {
     'argparse',
     'contextlib',
-    'doctest',
     'fileinput',
     'multiprocessing',
     'optparse',

@@ -3,7 +3,7 @@
 import os
 import sys
 
-import pharos
+import pharos  # noqa: F401
 
 sys.path.insert(0, os.path.join(os.path.dirname(__file__), 'lib'))
 
