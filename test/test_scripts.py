@@ -77,6 +77,38 @@ def test_a_script_is_in_the_namespace_given(master):
     assert report['name'] == '/robot1/reporter'
 
 
+def test_a_script_is_in_the_namespace_of_its_arguments(master):
+    report = report_of(master, '__ns:=/robot2', name='teller', topic='/robot2/report')
+    assert report['name'] == '/robot2/teller'
+
+
+def test_a_script_may_give_arguments_of_its_own_to_init_node(master):
+    with master.load(WORKER, None, 'own argv', name='worker') as node:
+        assert node.name == '/called_by_itself'
+        assert node.ros.resolve_name('image') == '/camera'
+
+
+def test_a_script_has_the_log_level_that_it_asks_for(master):
+    with master.load(REPORTER):
+        answer = master.lookup_service('/reporter/get_loggers').call()
+    levels = {logger.name: logger.level for logger in answer.loggers}
+    assert levels['rosout'] == 'WARN'
+
+
+def test_a_script_may_do_without_ros_time(master):
+    master.parameters['/use_sim_time'] = True
+    try:
+        with master.load(REPORTER, name='without'), master.load(WORKER, None, 'spin', name='with'):
+            hears_clock = [node.name for node in master.local_nodes() if _hears(node, '/clock')]
+    finally:
+        del master.parameters['/use_sim_time']
+    assert hears_clock == ['/with']
+
+
+def _hears(node, topic):
+    return topic in registrations(node.master, node.name)[1]
+
+
 def test_a_script_finds_its_private_parameters(master):
     assert report_of(master, params={'rate': {'high': [1.5, 'x']}})['rate'] == {'high': [1.5, 'x']}
 

@@ -89,7 +89,9 @@ def speak():
 if __name__ == '__main__':
     RUNS.append(1)
     how, *more = rospy.myargv()[1:]
-    if 'nameless' not in how:
+    if how == 'own argv':
+        rospy.init_node('worker', argv=['__name:=called_by_itself', 'image:=/camera'])
+    elif 'nameless' not in how:
         rospy.init_node('worker', disable_signals='interrupted' in how)
     rospy.sleep(0)
     ends = {
@@ -109,6 +111,7 @@ if __name__ == '__main__':
         'sleep': lambda: time.sleep(1000),
         'spin': rospy.spin,
         'loop': loop,
+        'own argv': rospy.spin,
         'speak': speak,
         'ignore': ignore,
         'interrupted': be_interrupted,
