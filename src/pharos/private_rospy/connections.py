@@ -2,6 +2,7 @@
 import os
 import select
 import threading
+from typing import Any, Dict
 
 from pharos.errors import NodeStoppedError
 from pharos.private_rospy.addresses import is_same_master
@@ -16,7 +17,7 @@ from pharos.private_rospy.socket_callback import SocketCallback
 # bytes read from a socket at once; rospy's 64 KiB let subscribers of images fall behind
 BUFFER_SIZE = 1 << 20
 
-_running = {}  # URI -> the PrivateRospy that runs there, in this process
+_running: Dict[str, Any] = {}  # URI -> the PrivateRospy that runs there, in this process
 
 
 def local_nodes():
