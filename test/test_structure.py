@@ -259,6 +259,31 @@ def test_what_is_loaded_on_demand_is_not_loaded_before():
     assert not [name for name in modules if name.startswith('pharos.compose')]
 
 
+def test_rosrun_finds_each_script_once():
+    """In a devel space it looks through the whole source, and asks which one is meant."""
+    names = {path.name for path in (ROOT / 'scripts').iterdir()}
+    found = subprocess.run(
+        [
+            'find',
+            ROOT,
+            '-path',
+            ROOT / 'build',
+            '-prune',
+            '-o',
+            '-type',
+            'f',
+            '-perm',
+            '/111',
+            '-print',
+        ],
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    ).stdout.splitlines()
+    paths = [path for path in map(pathlib.Path, found) if path.name in names]
+    assert [path for path in paths if path.parent != ROOT / 'scripts'] == []
+
+
 def test_scripts_are_run_by_debians_python():
     scripts = [path for path in (ROOT / 'scripts').iterdir() if path.is_file()]
     for path in scripts:
