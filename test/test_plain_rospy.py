@@ -584,7 +584,10 @@ def test_what_is_put_while_another_thread_takes_is_counted():
     link = types.SimpleNamespace(
         publisher=types.SimpleNamespace(data_class=INT, queue_size=10, queue_bytes=1 << 20),
         subscriber=types.SimpleNamespace(
-            resolved_name='/plain', data_class=INT, queue_size=None, callbacks=None
+            resolved_name='/plain',
+            data_class=INT,
+            queue_size=None,
+            run_callbacks=lambda message: None,
         ),
         header={},
     )

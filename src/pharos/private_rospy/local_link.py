@@ -12,7 +12,7 @@ import uuid
 import rospy.impl.transport
 
 from pharos.intraprocess.link import Link
-from pharos.private_rospy.plain_receivers import PlainCallbacks, Statistics
+from pharos.private_rospy.plain_receivers import PlainCallbacks, Statistics, plain_callbacks
 from pharos.private_rospy.refusals import suits
 from pharos.private_rospy.socket_callback import SocketCallback
 
@@ -65,7 +65,7 @@ class LocalLink(Link):
             for receiver in node.connections.receivers_on(subscriber.resolved_name)
             if receiver.from_ in (None, self._other.name) and self._suits(receiver)
         ]
-        if subscriber.has_plain_callbacks():
+        if plain_callbacks(subscriber):
             if self._open_callbacks() is None:
                 self._callbacks = PlainCallbacks(self, node.start_thread)
             receivers.append(self._callbacks)
@@ -104,7 +104,7 @@ class LocalLink(Link):
     def callback_removed(self):
         """The subscription has a callback less."""
         callbacks = self._open_callbacks()
-        if callbacks is not None and not self.subscriber.has_plain_callbacks():
+        if callbacks is not None and not plain_callbacks(self.subscriber):
             callbacks.close()
         self.publisher.receivers_changed(self)
 

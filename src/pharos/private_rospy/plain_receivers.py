@@ -6,11 +6,17 @@ import threading
 
 from pharos.intraprocess.copier import serialized, thawer
 from pharos.intraprocess.inbox import ThreadedInbox
+from pharos.private_rospy.socket_callback import SocketCallback
 
 # bytes that wait beside a publisher's queue, as they do in the sockets of TCPROS
 UNDER_WAY = 4 << 20
 SMALL = 64  # bytes that a message is taken to have whose size is not told
 WAITING = 1000  # messages that wait to be counted by the statistics
+
+
+def plain_callbacks(subscriber):
+    """``[(callback, arguments)]`` of a rospy subscription that are no channels'."""
+    return [each for each in subscriber.callbacks or () if not isinstance(each[0], SocketCallback)]
 
 
 class PlainReceiver(ThreadedInbox):
@@ -57,11 +63,8 @@ class PlainCallbacks(PlainReceiver):
         if self.closed:
             return
         size = size or SMALL
-        if self._waits_for_room(size):
-            with self._room:
-                self._waiting += 1
-                self._room.wait_for(lambda: not self._waits_for_room(size))
-                self._waiting -= 1
+        if self.link.publisher.queue_size is None:
+            self._wait_for_room(size)
         super().put(value, size)
 
     def is_full(self):
@@ -74,25 +77,30 @@ class PlainCallbacks(PlainReceiver):
             waiting >= (publisher.queue_size or math.inf) or size > publisher.queue_bytes
         )
 
-    def _waits_for_room(self, size):
+    def _wait_for_room(self, size):
+        if not self._has_room(size) and not self.dispatcher.is_run_here():
+            with self._room:
+                self._waiting += 1
+                self._room.wait_for(lambda: self._has_room(size))
+                self._waiting -= 1
+
+    def _has_room(self, size):
         return (
-            self.link.publisher.queue_size is None
-            and self._queue
-            and self.waiting_bytes + size > UNDER_WAY
-            and not self.closed
-            and not self._excused
-            and not self.dispatcher.is_run_here()
+            not self._queue
+            or self.waiting_bytes + size <= UNDER_WAY
+            or self.closed
+            or self._excused
+            or self.link.publisher.queue_size is not None
         )
 
     def deliver(self, message, header):
         """Run the callbacks."""
         if self._waiting:
             self._tell_of_room()
-        if self.subscriber.callbacks:
-            message._connection_header = header
-            if header.get('latching') == '1':
-                self.latched = message
-            self.subscriber.run_callbacks(message)
+        message._connection_header = header
+        if header.get('latching') == '1':
+            self.latched = message
+        self.subscriber.run_callbacks(message)
 
     def _tell_of_room(self):
         with self._room:

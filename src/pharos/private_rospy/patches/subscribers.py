@@ -2,6 +2,7 @@
 import traceback
 
 from pharos.intraprocess.link import links_of
+from pharos.private_rospy.plain_receivers import plain_callbacks
 from pharos.private_rospy.socket_callback import SocketCallback
 from pharos.private_rospy.patches.table import addition, patch
 from pharos.private_rospy import registration
@@ -111,15 +112,8 @@ def limit_reading(self):
             protocol.queue_size = None if is_heard else self.queue_size
 
 
-@addition('rospy.topics', '_SubscriberImpl.has_plain_callbacks', 'links ask for it')
-def has_plain_callbacks(self):
-    """Whether there are callbacks that are no channels'."""
-    return not all(isinstance(callback, SocketCallback) for callback, _ in self.callbacks or ())
-
-
 @addition('rospy.topics', '_SubscriberImpl.run_callbacks', 'links call it')
 def run_callbacks(self, message):
     """Run the callbacks that are no channels' for a message of a link."""
-    for callback, arguments in self.callbacks or ():
-        if not isinstance(callback, SocketCallback):
-            self._invoke_callback(message, callback, arguments)
+    for callback, arguments in plain_callbacks(self):
+        self._invoke_callback(message, callback, arguments)
