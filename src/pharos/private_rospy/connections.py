@@ -78,11 +78,12 @@ class Connections:
                 _unregister,
                 timeout,
             )
-            self._connect(topic, timeout)
+            self._connect_to_neighbours(topic, timeout)
         except BaseException as error:
             self._forget(receiver)
             if endpoint is not None:
                 _unregister(endpoint)
+            # rospy's own words for it; what derives from it says something else
             if type(error) is rospy.ROSException and self._node.ended.is_set():
                 raise NodeStoppedError(
                     f'{self._node.name} stopped while it opened {topic}: start() it first'
@@ -90,7 +91,7 @@ class Connections:
             raise
         return endpoint
 
-    def _connect(self, topic, timeout):
+    def _connect_to_neighbours(self, topic, timeout):
         publishers = [other for other in self._neighbours() if other.publisher(topic)]
         for other in publishers:
             self.connect(topic, other.uri)
@@ -212,8 +213,7 @@ class Connections:
                 self._connecting[key] = True
                 return 1, f'connecting to {uri} already', 0
             self._connecting[key] = False
-        again = True
-        while again:
+        while True:
             try:
                 answer = self._negotiate(topic, uri)
             except BaseException:  # else nobody would ever connect to it again
@@ -221,9 +221,10 @@ class Connections:
                     del self._connecting[key]
                 raise
             with self._lock:
-                again = self._connecting.pop(key) and answer[0] != 1
-                if again:
-                    self._connecting[key] = False
+                if answer[0] == 1 or not self._connecting[key]:
+                    del self._connecting[key]
+                    break
+                self._connecting[key] = False
         subscriber = self._node.subscriber(topic)
         if subscriber is not None:
             if answer[0] == 1:
@@ -252,8 +253,9 @@ class Connections:
                 self._node.ended.wait(registration.RETRY_DELAY)
             if uri not in subscriber.publishers:
                 return 0, f'the master knows no publisher of {topic} at {uri}', 0
-        if code <= 0:
-            return code, text, 0
+        return (code, text, 0) if code <= 0 else self._open(transports, topic, uri, chosen)
+
+    def _open(self, transports, topic, uri, chosen):
         for transport in transports:
             if chosen and transport.supports(chosen[0]):
                 try:

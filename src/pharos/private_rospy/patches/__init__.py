@@ -15,7 +15,9 @@ further frame. ``@addition`` gives a class or module of rospy a function that it
 node, never to a module.
 
 A target that is missing, or that has other parameters, is an error when a node is made, or imports
-the library that has it. test/test_patches.py compares the sources of the targets with the releases of rospy that are known
+the library that has it.
+
+test/test_patches.py compares the sources of the targets with the releases of rospy that are known
 (and says how to know another), and doc/patches.md is this table: ``tools/patches`` writes it.
 """
 import importlib
