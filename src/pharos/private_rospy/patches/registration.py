@@ -1,5 +1,6 @@
 """Registering with the master: once, within a time limit, and not while it holds a lock for
 ever."""
+import contextlib
 import xmlrpc.client
 
 from pharos.private_rospy import registration
@@ -77,17 +78,20 @@ def cleanup(self, reason, *, node, module):
         self.cond.notify_all()
     if not self.master_uri:
         return
-    module.get_registration_listeners().clear()
     topics, services = module.get_topic_manager(), module.get_service_manager()
-    if topics.lock.acquire(timeout=registration.UNREGISTER_TIMEOUT):
-        topics.lock.release()  # what another thread was just registering is registered
     calls = xmlrpc.client.MultiCall(ServerProxy(self.master_uri, registration.UNREGISTER_TIMEOUT))
-    for name, _ in topics.get_subscriptions():
-        calls.unregisterSubscriber(node.name, name, self.uri)
-    for name, _ in topics.get_publications():
-        calls.unregisterPublisher(node.name, name, self.uri)
-    for name, uri in services.get_services():
-        calls.unregisterService(node.name, name, uri)
+    with contextlib.ExitStack() as locks:
+        # what another thread was just registering, or unregistering, is, and nothing more will be
+        for manager in topics, services:
+            if manager.lock.acquire(timeout=registration.UNREGISTER_TIMEOUT):
+                locks.callback(manager.lock.release)
+        module.get_registration_listeners().clear()
+        for name, _ in topics.get_subscriptions():
+            calls.unregisterSubscriber(node.name, name, self.uri)
+        for name, _ in topics.get_publications():
+            calls.unregisterPublisher(node.name, name, self.uri)
+        for name, uri in services.get_services():
+            calls.unregisterService(node.name, name, uri)
     for unregister, name, uri in tuple(node.unsure):
         getattr(calls, unregister)(node.name, name, uri)
     node.parameters.unsubscribe(calls)
