@@ -12,7 +12,7 @@ import time
 import pytest
 
 from pharos.testing import Mailbox, TIMEOUT
-from pharos import BlockNode, ExternalNode, RosProcess, UnknownNodeError
+from pharos import PharosError, BlockNode, ExternalNode, RosProcess, UnknownNodeError
 from programs import PROGRAMS, Program
 from sockets import wait_for_end
 
@@ -96,6 +96,16 @@ def test_an_unknown_package_or_program_is_said(master, package):
         master.launch('no_such_robot', 'a.launch')
     with pytest.raises(UnknownNodeError, match="fake_robot has no launch file 'b.launch': is it"):
         master.launch('fake_robot', 'b.launch')
+
+
+def test_a_broken_manifest_of_another_package_is_named(master, tmp_path, monkeypatch):
+    broken = tmp_path / 'src' / 'broken' / 'package.xml'
+    write(broken, (MANIFEST % 'broken').replace('a@b.org', 'nobody'))
+    write(tmp_path / 'devel' / '.catkin', str(tmp_path / 'src'))
+    monkeypatch.setenv('CMAKE_PREFIX_PATH', str(tmp_path / 'devel'))
+    monkeypatch.setenv('ROS_PACKAGE_PATH', str(tmp_path / 'src'))
+    with pytest.raises(PharosError, match=f'^broken/talker cannot be looked up: .*{broken}'):
+        master.run('broken', 'talker')
 
 
 @pytest.mark.parametrize('given', [('', ''), (None, 'talker'), ('fake_robot', None), (5, 'talker')])

@@ -31,7 +31,7 @@ from catkin.find_in_workspaces import find_in_workspaces
 
 from pharos import node_registry
 from pharos.blocks import check_block, name_of
-from pharos.errors import UnknownNodeError
+from pharos.errors import PharosError, UnknownNodeError
 from pharos.failures import Failures
 from pharos.private_rospy.deadlines import time_limit
 from pharos.private_rospy.names import check_name
@@ -385,3 +385,5 @@ def _known(package: str, file: str) -> Iterator[None]:
             f'no ROS package {package!r} on ROS_PACKAGE_PATH: install it, or source its'
             ' workspace\'s setup.bash'
         ) from None
+    except Exception as error:  # catkin reads the package.xml of every package in a workspace
+        raise PharosError(f'{package}/{file} cannot be looked up: {error}; mend that') from error

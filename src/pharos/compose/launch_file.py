@@ -112,7 +112,7 @@ class LaunchFile:
             config = roslaunch.config.load_config_default(
                 [(self.path, argv)], None, loader=loader, verbose=False
             )
-        except (roslaunch.core.RLException, rospkg.ResourceNotFound, ValueError) as error:
+        except Exception as error:  # those of roslaunch, or of what it asks for the packages
             raise self._unreadable(error) from error
         declared = loader.root_context.resolve_dict.get('arg_doc', {})
         with open(self.path, encoding='utf-8', errors='replace') as file:
@@ -161,7 +161,7 @@ class LaunchFile:
             return
         try:
             command = _command(node)
-        except (roslaunch.node_args.NodeParamsException, ValueError) as error:
+        except Exception as error:  # likewise
             why = str(error).partition('\n')[0]
             if isinstance(error.__context__, rospkg.ResourceNotFound):
                 why = (
