@@ -236,6 +236,16 @@ def test_messages_of_a_package_with_code_are_the_same_for_all(master, space, imp
     assert left.robot_eyes.SEEN == [('/left_eye', nodes[0].ros.core.sys.argv[0])]
 
 
+def test_a_message_class_of_a_package_with_code_is_one_also_by_the_name_of_its_module(node, space):
+    looking = node.ros_import('robot_eyes.looking')
+    for name in 'msg._Look', 'srv._Find':
+        assert node.ros_import(f'robot_eyes.{name}') is importlib.import_module(
+            f'robot_eyes.{name}'
+        )
+    own_pickle = node.ros_import('pickle')
+    assert isinstance(own_pickle.loads(own_pickle.dumps(looking.Look())), looking.Look)
+
+
 def test_a_module_of_a_subpackage_finds_its_package(node, space):
     deep = node.ros_import('robot_eyes.nested.deep')
     assert deep.looking is node.ros_import('robot_eyes.looking')

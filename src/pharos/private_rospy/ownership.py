@@ -97,8 +97,9 @@ def is_one_for_all(spec):
         return False
     if spec.origin.endswith(tuple(EXTENSION_SUFFIXES)):
         return True
-    if re.fullmatch(r'\w+\.(msg|srv)', spec.name) and spec.submodule_search_locations:
-        return _GENERATED.fullmatch(_text(spec.origin)) is not None
+    if re.fullmatch(r'\w+\.(msg|srv)(\._\w+)?', spec.name):
+        package = os.path.join(os.path.dirname(spec.origin), '__init__.py')
+        return _GENERATED.fullmatch(_text(package)) is not None
     return False
 
 
