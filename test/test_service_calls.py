@@ -276,8 +276,11 @@ def test_no_kind_of_failure_is_another():
 
 
 @pytest.fixture(params=['rospy', 'roscpp', 'here'])
-def any_provider(request, master):
-    """``(service name, type, what is said of its fields)`` of providers of each kind."""
+def any_provider(request):
+    """``(service name, type, what is said of its fields)`` of providers of each kind.
+
+    To be used before ``master``, which takes what starts after itself for left behind.
+    """
     if request.param == 'roscpp':
         request.getfixturevalue('mux')
         return (
@@ -288,13 +291,13 @@ def any_provider(request, master):
     if request.param == 'rospy':
         request.getfixturevalue('there')
         return '/there/echo', ECHO, ECHO_FIELDS
-    create(master, '/here').serve('/here/echo', ECHO, echo)
+    create(request.getfixturevalue('master'), '/here').serve('/here/echo', ECHO, echo)
     return '/here/echo', ECHO, ECHO_FIELDS
 
 
 @persistent_or_not
 def test_an_md5sum_set_by_hand_that_does_not_fit_is_answered_with_all_that_is_known(
-    master, any_provider, persistent
+    any_provider, master, persistent
 ):
     name, type_, fields = any_provider
     service = master.lookup_service(name, persistent=persistent)
