@@ -192,6 +192,28 @@ def test_a_required_node_that_ends_apart_ends_all(master, compose, transcript):
     )
 
 
+def test_a_required_node_that_cannot_start_ends_all(compose, transcript):
+    composed = compose('required_broken.launch')
+    assert composed.wait(TIMEOUT) == 1
+    assert not any(node.is_running for node in composed.nodes)
+    assert '/broken, which is required, did not start: all others end' in transcript
+
+
+def test_a_required_node_that_the_system_cannot_start_ends_all(compose, transcript):
+    composed = compose('unstartable.launch', required=True)
+    assert composed.wait(TIMEOUT) == 1
+    assert transcript[-1] == (
+        '/no_first_line, which is required, cannot be started: all others end'
+    )
+
+
+def test_programs_that_the_system_cannot_start_do_not_end_those_apart(master, compose, transcript):
+    composed = compose('unstartable.launch')
+    master.wait_for_node('/relay', TIMEOUT)
+    assert composed.process.poll() is None
+    until(lambda: any('/unknown_kind is not started: Unable' in line for line in transcript))
+
+
 def test_a_node_that_is_to_be_started_again_is(master, compose):
     compose('respawn.launch')
     until(lambda: master.parameters.get('/ends/starts', 0) > 2)

@@ -149,6 +149,15 @@ def test_a_script_whose_interpreter_is_missing_is_told():
     assert problem.why.endswith('scripts/old names /usr/bin/python2.0, which is not there')
 
 
+def test_what_the_system_cannot_start_is_told():
+    file = read('unstartable.launch')
+    assert names_apart(file) == ['relay', 'unknown_kind']
+    script, prefixed, quoted = [problem.why for problem in file.problems]
+    assert 'scripts/no_first_line does not begin with a line such as #!/usr/bin/python3' in script
+    assert prefixed == 'its launch-prefix names no_such_prefix, which is not there'
+    assert quoted == """args="'open" or launch-prefix=None: No closing quotation"""
+
+
 def test_nodes_of_other_machines_run_there_and_tests_not_at_all():
     file = read('machines.launch')
     assert (names_here(file), names_apart(file), file.problems) == (['/here'], ['there'], [])

@@ -70,6 +70,9 @@ class Composition:
         rest.ParameterSetter(run_id, file.config).set_all()
         for problem in (*file.config.config_errors, *file.problems):
             self.progress.tell(str(problem))
+        for problem in file.problems:
+            if problem.ends_all:
+                return self.end_because(f'{problem.name}, which is required, cannot be started')
         if file.apart:
             self._launch_rest(file.rest())
         logs = os.path.join(rospkg.get_log_dir(env=os.environ), run_id)

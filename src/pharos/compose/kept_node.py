@@ -77,6 +77,8 @@ class KeptNode:
         if self.problem is not None:
             if not self._ending.is_set():
                 progress.failed(self, self.problem)
+                if self.launched.is_required:
+                    self._composition.end_because(f'{self.name}, which is required, did not start')
         else:
             assert self.node
             progress.started(self, time.monotonic() - begun)

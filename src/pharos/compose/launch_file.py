@@ -62,6 +62,7 @@ class Problem(NamedTuple):
     name: str
     file: str
     why: str
+    ends_all: bool = False  # whether it is required, and roslaunch would end all others for that
 
     def __str__(self) -> str:
         return f'{self.file}: {self.name} is not started: {self.why}'
@@ -163,6 +164,8 @@ class LaunchFile:
             command = _command(node)
         except Exception as error:  # likewise
             why = str(error).partition('\n')[0]
+            if isinstance(error, ValueError):  # of shlex
+                why = f'args={node.args!r} or launch-prefix={node.launch_prefix!r}: {why}'
             if isinstance(error.__context__, rospkg.ResourceNotFound):
                 why = (
                     f'there is no ROS package {node.package!r} on ROS_PACKAGE_PATH: install it, or'
@@ -173,10 +176,9 @@ class LaunchFile:
         needs_own_folder = node.cwd is not None and not working_directory.is_possible()
         is_kept_apart = is_kept_apart or bool(node.launch_prefix) or needs_own_folder
         if is_kept_apart or not _runs_here(command[0]):
-            lacking = _lacks(command[0])
-            if lacking:
-                why = f'the first line of {command[0]} names {lacking}, which is not there'
-                self.problems.append(Problem(name, node.filename, why))
+            why = _lacks(command[0], node)
+            if why:
+                self.problems.append(Problem(name, node.filename, why, bool(node.required)))
             else:
                 self.apart.append(node)
             return
@@ -234,17 +236,35 @@ def _interpreter(path: str) -> List[str]:
     return line[2:].split() if line.startswith('#!') else []
 
 
-def _lacks(path: str) -> str:
-    """What of the interpreter of a script is not there; roslaunch would start nothing at all for
-    that."""
+def _lacks(path: str, node: Any) -> str:
+    """Why the system cannot start the program of a node, as far as that can be seen."""
+    environment = dict(node.env_args)
+    prefix = shlex.split(node.launch_prefix or '')[:1]
+    if (
+        prefix
+        and '/' not in prefix[0]
+        and not shutil.which(prefix[0], path=environment.get('PATH'))
+    ):
+        return f'its launch-prefix names {prefix[0]}, which is not there'
+    with open(path, 'rb') as file:
+        begin = file.read(2000)
     words = _interpreter(path)
     if not words:
-        return ''
-    if not os.path.exists(words[0]):
-        return words[0]
+        # what is not text may be of a kind that the system knows
+        if b'\0' in begin:
+            return ''
+        return (
+            f'{path} does not begin with a line such as #!/usr/bin/python3: the system does not know'
+            ' what is to run it'
+        )
     named = [word for word in words[1:] if not word.startswith('-') and '=' not in word]
-    is_env = os.path.basename(words[0]) == 'env'
-    return named[0] if is_env and named and shutil.which(named[0]) is None else ''
+    if os.path.exists(words[0]):
+        is_env = os.path.basename(words[0]) == 'env'
+        if not (is_env and named and shutil.which(named[0]) is None):
+            return ''
+    else:
+        named = words
+    return f'the first line of {path} names {named[0]}, which is not there'
 
 
 def _runs_here(path: str) -> bool:

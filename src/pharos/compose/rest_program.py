@@ -14,6 +14,7 @@ import time
 from typing import Any
 
 import roslaunch
+import roslaunch.launch
 import roslaunch.parent
 import roslaunch.pmon
 import roslaunch.rlutil
@@ -35,6 +36,18 @@ class _Required(roslaunch.pmon.ProcessListener):
         self.has_ended = self.has_ended or process is not None and process.required
 
 
+class _Runner(roslaunch.launch.ROSLaunchRunner):
+    """roslaunch's, for which a program that the system cannot start is no reason to start no other."""
+
+    def launch_node(self, node: Any, core: bool = False) -> Any:
+        """See roslaunch; its monitor finds the process dead, and ends all if it is required."""
+        try:
+            return super().launch_node(node, core)
+        except roslaunch.pmon.FatalProcessLaunch as error:
+            print(f'{node.namespace}{node.name} is not started: {error}', file=sys.stderr)
+            return node.name, False
+
+
 def _end_with(parent: int) -> None:
     while os.getppid() == parent:
         time.sleep(POLL)
@@ -49,6 +62,7 @@ def main(path: str, parent: int) -> int:
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     run_id = roslaunch.rlutil.get_or_generate_uuid(None, False)
     roslaunch.configure_logging(run_id)
+    roslaunch.launch.ROSLaunchRunner = _Runner
     required = _Required()
     launch = required.launch = roslaunch.parent.ROSLaunchParent(
         run_id, [], process_listeners=[required], show_summary=False
