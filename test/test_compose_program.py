@@ -182,6 +182,18 @@ def test_nodelet_loads_a_program_which_ends_with_it(master, compose):
     until(lambda: nodes(master) == {'/compose', '/hearer'})
 
 
+def test_a_program_is_loaded_by_a_relative_name(master, compose):
+    compose('__name:=manager', '__ns:=/robot')
+    until(lambda: '/robot/manager/list' in master.services())
+    load = master.lookup_service('/robot/manager/load_nodelet')
+    assert load.call(name='relative', type='composed_robot/talker').success
+    listed = master.lookup_service('/robot/manager/list').call().nodelets
+    assert listed == ['/robot/relative']
+    assert '/robot/relative' in nodes(master)
+    assert master.lookup_service('/robot/manager/unload_nodelet').call(name='relative').success
+    assert nodes(master) == {'/robot/manager'}
+
+
 def test_a_program_that_is_unloaded_ends_and_nodelet_with_it(master, compose):
     compose()
     with Program(master.url, *LOAD) as loader:

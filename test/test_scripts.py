@@ -433,6 +433,10 @@ def test_without_a_master_a_script_is_not_loaded():
         ({'namespace': 'n s', 'name': 'x'}, "'n s/x' cannot be a node name"),
         ({'params': {'rate': object()}}, '~rate cannot be <object'),
         ({'params': {'a b': 1}}, "'a b' cannot be a parameter name"),
+        ({'params': {1: 1}}, 'a parameter name is a string, not 1'),
+        ({'params': {'': 1}}, "a parameter name is one such as '/robot1/rate', not ''"),
+        ({'params': {'/rate': 1}}, r"'/rate' is not private to the node: set it by master.param"),
+        ({'remap': {'': 'a'}}, "a remapped name is one such as '/robot1/image', not ''"),
         ({'remap': {'a': 'b c'}}, "'b c' cannot be a remapped name"),
     ],
 )
@@ -440,6 +444,39 @@ def test_what_cannot_be_given_to_a_script_is_refused(options, text, master):
     with pytest.raises(ValueError, match=text):
         master.load(WORKER, None, 'spin', **options)
     assert master.local_nodes() == []
+
+
+@pytest.mark.parametrize(
+    'options, text',
+    [
+        ({'params': [1]}, r'params is a dict by name, not \[1\]'),
+        ({'namespace': 5}, 'namespace is a name, not 5'),
+        ({'package': 42}, 'by its package and its name, or by its path, not 42'),
+        ({'package': None}, 'by its package and its name, or by its path, not None'),
+    ],
+)
+def test_what_is_of_a_type_that_cannot_be_is_refused(options, text, master):
+    with pytest.raises(TypeError, match=text):
+        master.load(**{'package': WORKER, **options})
+    assert master.local_nodes() == []
+
+
+@pytest.mark.parametrize(
+    'argument, text',
+    [
+        ('_rate:=[1', r"'_rate:=\[1' sets no private parameter, for its value is no YAML"),
+        ('__master:=http://127.0.0.1:1/', '__master:=http://127.0.0.1:1/ is not obeyed'),
+    ],
+)
+def test_what_an_argument_cannot_ask_for_is_said(argument, text, master):
+    with pytest.raises(ValueError, match=text):
+        master.load(WORKER, None, 'spin', argument)
+    assert master.local_nodes() == []
+
+
+def test_the_master_that_it_has_anyway_may_be_among_the_arguments(master):
+    with master.load(WORKER, None, 'spin', f'__master:={master.url}') as node:
+        assert node.name == '/worker'
 
 
 def test_scripts_are_loaded_from_several_threads_at_once(master):

@@ -1,6 +1,8 @@
 """The node that a composition is for others: it loads and unloads programs by nodelet's services."""
 from typing import TYPE_CHECKING, Any, Dict, List
 
+import rosgraph.names
+
 from pharos.compose.kept_node import KeptNode
 from pharos.compose.launch_file import LaunchedNode
 from pharos.compose.output import SCREEN
@@ -43,12 +45,13 @@ class Container(Node):
         package, _, executable = request.type.partition('/')
         if not package or not executable or '/' in executable:
             raise PharosError(f'{request.type!r} names no program: it is to be PACKAGE/EXECUTABLE')
-        if request.name in self._running():
-            raise PharosError(f'{request.name} is loaded already: unload it first, or name another')
+        full_name = self._full_name(request.name)
+        if full_name in self._running():
+            raise PharosError(f'{full_name} is loaded already: unload it first, or name another')
         if len(request.remap_source_args) != len(request.remap_target_args):
             raise PharosError('there are not as many sources of remappings as targets')
         remaps = zip(request.remap_source_args, request.remap_target_args)
-        name = request.name
+        name = full_name
         if request._connection_header.get('callerid') == name:
             # `nodelet load` has that name itself, for as long as this is loaded
             name += f"_in_{self.name.rpartition('/')[2]}"
@@ -57,21 +60,26 @@ class Container(Node):
             program=request.type,
             path=find_program(package, executable),
             args=[*request.my_argv, *(f'{source}:={target}' for source, target in remaps)],
-            private_name=request.name,
+            private_name=full_name,
             output=SCREEN,
         )
         (kept,) = self.composition.start([launched])
         kept.settled.wait()
         if kept.problem is not None:
             raise kept.problem
-        self._loaded[request.name] = kept
+        self._loaded[full_name] = kept
         if request.bond_id:
             try:
-                self._bind(request.name, request.bond_id)
+                self._bind(full_name, request.bond_id)
             except BaseException:
-                self._drop(request.name)
+                self._drop(full_name)
                 raise
         return True
+
+    def _full_name(self, name: str) -> str:
+        """A name, in the namespace of this node if it does not say in which."""
+        may_be_one = name and name[0] not in '~/'  # else it is told what is wrong with it
+        return str(rosgraph.names.resolve_name(name, self.name)) if may_be_one else name
 
     def _bind(self, name: str, bond_id: str) -> None:
         """Unload it when whoever loaded it has gone, and have them know when it has ended."""
@@ -95,11 +103,10 @@ class Container(Node):
             bond.shutdown()
 
     def _unload(self, request: Any) -> bool:
-        if request.name not in self._loaded:
-            raise UnknownNodeError(
-                f'{request.name} is not loaded here{suggest(request.name, self._loaded)}'
-            )
-        self._drop(request.name)
+        name = self._full_name(request.name)
+        if name not in self._loaded:
+            raise UnknownNodeError(f'{name!r} is not loaded here{suggest(name, self._loaded)}')
+        self._drop(name)
         return True
 
     def _list(self, request: Any) -> List[str]:

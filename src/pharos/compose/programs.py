@@ -19,9 +19,14 @@ _ELF = b'\x7fELF'  # how compiled programs begin
 def find_program(package: Any, executable: Optional[str] = None) -> str:
     """The path of a program, as rosrun looks it up; without ``executable``, the file ``package``.
 
+    :raises TypeError: if that is no text, nor a path
     :raises UnknownNodeError: if there is none, or several
     """
     if executable is None:
+        if not isinstance(package, (str, os.PathLike)):
+            raise TypeError(
+                f'a program is given by its package and its name, or by its path, not {package!r}'
+            )
         path = os.path.abspath(os.fspath(package))
         if not os.path.isfile(path):
             raise UnknownNodeError(

@@ -57,7 +57,9 @@ class ScriptNode(Node):
         super().__init__()
         found = find_program(path)
         self.path, self.args = source_of(found), [str(argument) for argument in args]
-        self._settings.for_program(found, self.args, dict(params or {}), env or {}, takes_own_name)
+        self._settings.for_program(
+            found, self.args, {} if params is None else params, env or {}, takes_own_name
+        )
         self._settings.private_name = private_name
         if cwd is not None and not os.path.isdir(cwd):
             raise ValueError(f'{found} cannot run in {cwd!r}: there is no such folder')
@@ -223,6 +225,8 @@ def load(
     # until it calls init_node, it is called after its file, with a number
     base = re.match(r'[A-Za-z]\w*', os.path.basename(path), re.ASCII)
     named = name or (base.group() if base else 'script')
+    if not isinstance(namespace, (str, type(None))):
+        raise TypeError(f'namespace is a name, not {namespace!r}')
     if namespace:
         named = rosgraph.names.ns_join(namespace, named)
     arguments = arguments_of(args, None, remap, None)

@@ -14,7 +14,7 @@ _LEGAL = re.compile(r'(?:~/?|/)?(?:(?:[A-Za-z]|(?<=[~/])_)\w*(?:/\w+)*)?', re.AS
 _EMPTY = '', '/', '~', '~/'
 NAME_LIMIT = 1000  # characters of a name, also in what other nodes send
 NODE_LIMIT = 250  # of that of a node of ours: its log file is named after it
-_numbers = itertools.count(1)  # of the anonymous nodes of this process
+_EXAMPLES = {'node': 'driver', 'parameter': 'rate', 'namespace': 'left'}
 _numbers = itertools.count(1)  # of the anonymous nodes of this process
 
 
@@ -30,9 +30,9 @@ def check_name(name, what, private=False, base=False, limit=NAME_LIMIT):
     if not isinstance(name, str):
         raise ValueError(f'a {what} name is a string, not {name!r}')
     if name in _EMPTY:
+        last = _EXAMPLES.get(what, 'image')
         raise ValueError(
-            f"a {what} needs a name, such as '{'driver' if base else '/robot1/driver'}', not"
-            f" {name!r}"
+            f"a {what} name is one such as '{last if base else '/robot1/' + last}', not {name!r}"
         )
     if len(name) > limit:
         raise ValueError(

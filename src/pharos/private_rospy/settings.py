@@ -4,7 +4,7 @@ rospy takes them from ``os.environ`` and ``sys.argv``; a node gets private ones,
 function need be overridden and the process's own stay untouched.
 """
 import os
-from typing import List, Optional
+from typing import List, Mapping, Optional
 
 import rosgraph.names
 from rosgraph.rosenv import ROS_HOSTNAME, ROS_IP, ROS_MASTER_URI, ROS_NAMESPACE
@@ -14,6 +14,7 @@ from pharos.private_rospy.addresses import (
     check_environment,
     check_port,
     default_domain,
+    is_same_master,
 )
 from pharos.private_rospy.arguments import mappings_for, takes_name
 from pharos.private_rospy.process_rospy import rospy
@@ -88,18 +89,31 @@ class Settings:
         :param env: ``{name: value}`` of further environment variables
         :param takes_own_name: whether it has the name that it gives to ``init_node``; until then it
             has one that is nobody else's
-        :raises ValueError: if one of them cannot be
+        :raises TypeError, ValueError: if one of them cannot be
         """
+        if not isinstance(params, Mapping):
+            raise TypeError(f'params is a dict by name, not {params!r}')
+        _check_private_parameters(args)
+        mappings = rosgraph.names.load_mappings(args)
+        if not is_same_master(mappings.get('__master', self.master_url), self.master_url):
+            raise ValueError(
+                f"__master:={mappings['__master']} is not obeyed: the script is a node at"
+                f' {self.master_url}, whose Master loads it; load it by the Master of the other URL'
+            )
         self.argv = [path, *args, *self.argv[1:]]
         if takes_own_name:
             self.name = unique_name(self.name)
-        elif '__name' not in rosgraph.names.load_mappings(args):  # which roslaunch gives
+        elif '__name' not in mappings:  # which roslaunch gives
             self.argv.append(f'__name{rosgraph.names.REMAP}{self.base_name}')
         self.environ.update(env)
-        self.params = {
-            check_name(name.lstrip('~'), 'parameter'): as_stored('~' + name, value)
-            for name, value in params.items()
-        }
+        self.params = {}
+        for name, value in params.items():
+            key = name[1:] if isinstance(name, str) and name.startswith('~') else name
+            if check_name(key, 'parameter').startswith('/'):
+                raise ValueError(
+                    f'{name!r} is not private to the node: set it by master.parameters[{name!r}]'
+                )
+            self.params[key] = as_stored('~' + key, value)
 
     def _set_domain(self, domain, mappings):
         """Have rosgraph find the address to advertise, which is checked."""
