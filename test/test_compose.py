@@ -76,6 +76,11 @@ def test_parameters_are_cleared_where_the_file_says_so(master, compose):
     assert master.parameters['/kept/old'] == 1
 
 
+def test_what_the_master_refuses_is_told_with_the_file(compose):
+    with pytest.raises(pharos.PharosError, match='parameters.launch: Failed to clear parameter'):
+        compose('parameters.launch', cleared='/')
+
+
 def test_a_node_finds_what_roslaunch_would_have_given_it(master, compose):
     mailbox = Mailbox(create(master, '/hearer'), '/reflection', STRING)
     compose('mirror.launch')

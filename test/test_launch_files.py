@@ -125,6 +125,30 @@ def test_a_file_that_cannot_be_read_is_an_error_that_names_it(error, match, argu
         LaunchFile(MASTER, *arguments)
 
 
+@pytest.mark.parametrize(
+    'argument, said',
+    [
+        ({'text': 'yes: 1'}, 'True in / is no text, as a name is: put it in quotes'),
+        ({'text': 'deep: {1: 2}'}, '1 in /deep is no text'),
+        ({'text': 'a: null'}, '/a cannot be None: the parameter server holds'),
+        ({'text': 'a: 2020-01-01'}, r'/a cannot be datetime.date\(2020, 1, 1\): the parameter'),
+        ({'text': 'a: 99999999999'}, '/a cannot be 99999999999: the parameter server holds'),
+        ({'value': 99999999999}, 'value cannot be 99999999999: the parameter server holds'),
+        ({'value': 0}, r'int\(value\)\) raised ZeroDivisionError'),
+        ({'text_file': '/no/such'}, "file cannot be read: .* '/no/such'"),
+    ],
+)
+def test_a_parameter_that_cannot_be_set_is_named_with_its_file(argument, said):
+    with pytest.raises(PharosError, match=f'(?s)parameters.launch: .*{said}'):
+        read('parameters.launch', **argument)
+
+
+def test_a_file_that_includes_itself_is_told_in_a_few_words():
+    with pytest.raises(PharosError, match='circle.launch') as raised:
+        read('circle.launch')
+    assert len(str(raised.value)) < 1000
+
+
 @pytest.mark.parametrize('choice', ['only', 'apart'])
 def test_a_node_that_is_not_in_the_file_is_an_error_that_names_those_that_are(choice):
     with pytest.raises(UnknownNodeError, match="no node 'talkr'.*it has .*/r2/mirror"):

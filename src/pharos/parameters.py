@@ -5,7 +5,7 @@ import rosgraph
 
 from pharos.errors import suggest
 from pharos.private_rospy.names import global_name
-from pharos.private_rospy.parameters import as_stored
+from pharos.private_rospy.parameters import as_stored as as_stored  # for compose, too
 
 if TYPE_CHECKING:
     from pharos.master import Master

@@ -5,6 +5,7 @@ import threading
 import time
 from typing import TYPE_CHECKING, Any, Collection, Dict, List, Optional
 
+import roslaunch.core
 import rospkg
 
 from pharos import node_registry, signals
@@ -64,10 +65,13 @@ class Composition:
         """Set the parameters of a launch file, and start its nodes.
 
         :raises MasterUnreachableError: if the master does not answer
-        :raises roslaunch.core.RLException: if it refuses a parameter
+        :raises PharosError: if it refuses a parameter
         """
         run_id = rest.run_id_of(self.master)
-        rest.ParameterSetter(run_id, file.config).set_all()
+        try:
+            rest.ParameterSetter(run_id, file.config).set_all()
+        except roslaunch.core.RLException as error:
+            raise PharosError(f'{file.path}: {error}') from error
         for problem in (*file.config.config_errors, *file.problems):
             self.progress.tell(str(problem))
         for problem in file.problems:

@@ -25,10 +25,12 @@ import roslaunch.core
 import roslaunch.node_args
 import roslaunch.xmlloader
 import rospkg
+from roslaunch.substitution_args import SubstitutionException
 
 from pharos import working_directory
 from pharos.compose.programs import source_of
 from pharos.errors import PharosError, UnknownNodeError, suggest
+from pharos.parameters import as_stored
 from pharos.ros_process import find_launch_file
 
 _PYTHON = re.compile(r'python(3(\.\d+)?)?')
@@ -66,6 +68,47 @@ class Problem(NamedTuple):
 
     def __str__(self) -> str:
         return f'{self.file}: {self.name} is not started: {self.why}'
+
+
+class _Loader(roslaunch.xmlloader.XmlLoader):
+    """roslaunch's, which also says what parameter the server cannot hold, and where a parameter is
+    whose value cannot be read or computed.
+    """
+
+    def add_param(self, config: Any, name: str, value: Any, verbose: bool = True) -> None:
+        """See roslaunch: of what is in a rosparam tag.
+
+        :raises ValueError: as roslaunch expects it, who adds the tag
+        """
+        if isinstance(value, dict):
+            for key in value:
+                if not isinstance(key, str):
+                    raise ValueError(
+                        f'{key!r} in {name} is no text, as a name is: put it in quotes'
+                    )
+        else:
+            as_stored(name, value)
+        super().add_param(config, name, value, verbose=verbose)
+
+    def param_value(self, verbose: bool, name: str, *given: Any) -> Any:
+        """See roslaunch; likewise."""
+        try:
+            value = super().param_value(verbose, name, *given)
+        except OSError as error:
+            raise ValueError(f'{name} cannot be read: {error}') from error
+        as_stored(name, value)
+        return value
+
+    def resolve_args(self, args: Any, context: Any) -> Any:
+        """See roslaunch."""
+        try:
+            return super().resolve_args(args, context)
+        except (roslaunch.core.RLException, SubstitutionException, rospkg.ResourceNotFound):
+            raise
+        except Exception as error:  # of any kind, in an $(eval)
+            raise roslaunch.xmlloader.XmlParseException(
+                f'{context.filename}: {args} raised {type(error).__name__}: {error}'
+            ) from error
 
 
 class LaunchFile:
@@ -107,7 +150,7 @@ class LaunchFile:
                 self._sort(name, node, name in kept_apart)
 
     def _read(self, args: Dict[str, object]) -> Any:
-        loader = roslaunch.xmlloader.XmlLoader()
+        loader = _Loader()
         argv = [f'{name}:={_as_text(value)}' for name, value in args.items()]
         try:
             config = roslaunch.config.load_config_default(
@@ -134,7 +177,10 @@ class LaunchFile:
                 f'{self.path} needs the ROS package {package!r}, which is not on ROS_PACKAGE_PATH:'
                 " install it, or source its workspace's setup.bash"
             )
-        text = '; '.join(line for line in str(error).splitlines() if line)
+        lines = dict.fromkeys(
+            line.strip() for line in str(error).splitlines() if line
+        )  # once, in a circle
+        text = '; '.join(lines)
         missing = _MISSING_ARG.search(text)
         if missing:
             text += f': give it with {missing.group(1)}:=VALUE'
