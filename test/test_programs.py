@@ -1,7 +1,9 @@
 """Programs and libraries of ROS as a node's own: they find what they would in a process of their
 own."""
+import builtins
 import concurrent.futures
 import importlib
+import io
 import logging
 import os
 import pathlib
@@ -152,6 +154,18 @@ def test_arguments_are_the_programs_own_after_star_imports_too(node, master):
     assert main.variable == master.url
 
 
+def test_a_program_has_builtins_of_its_own_and_its_exit_closes_nothing(node, capsys, monkeypatch):
+    monkeypatch.setattr(sys, 'stdin', io.StringIO('a line'))
+    before = dict(vars(builtins))
+    with pytest.raises(SystemExit, match='enough'):
+        run(node, 'own/changes_builtins.py')
+    main = node.ros_import('__main__')
+    assert main.said == [('hello', 42)]
+    assert main.found == 'what'
+    assert vars(builtins) == before
+    assert sys.stdin.read() == 'a line'
+
+
 def test_rospy_is_the_nodes_in_whatever_way_it_is_imported(node):
     main = run(node, 'own/imports_rospy.py')
     assert main.names == {'/program_node'}
@@ -250,6 +264,10 @@ def test_a_module_of_a_subpackage_finds_its_package(node, space):
     deep = node.ros_import('robot_eyes.nested.deep')
     assert deep.looking is node.ros_import('robot_eyes.looking')
     assert deep.Spot is importlib.import_module('robot_eyes.msg').Spot
+
+
+def test_a_module_in_a_folder_without_init_is_the_nodes(node, space):
+    assert node.ros_import('robot_eyes.plain.deeper').NAME == node.name
 
 
 def test_a_package_that_reaches_rospy_through_another_one_is_the_nodes(master, space):

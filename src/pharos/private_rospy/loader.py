@@ -53,7 +53,11 @@ class PrivateImports:
         self._loading = {}  # name of a module -> the thread that loads it
         self._awaited = {}  # thread -> name of the module that it waits for
         self._folder = None  # the program's
-        self.builtins = dict(vars(builtins), __import__=self._import, print=self._print)
+        own_builtins = types.ModuleType('builtins', builtins.__doc__)
+        self.builtins = vars(own_builtins)
+        self.builtins.update(
+            vars(builtins), __import__=self._import, print=self._print, exit=_exit, quit=_exit
+        )
         self.system = ModuleProxy(
             sys, path=list(sys.path), modules=collections.ChainMap(self.modules, sys.modules)
         )
@@ -62,6 +66,7 @@ class PrivateImports:
         accelerator.PickleBuffer = pickle.PickleBuffer
         util = ModuleProxy(importlib.util, module_from_spec=self._module_from_spec)
         self.modules.update(
+            builtins=own_builtins,
             sys=self.system,
             _pickle=accelerator,
             importlib=ModuleProxy(
@@ -89,7 +94,10 @@ class PrivateImports:
         loader = SourceFileLoader('__main__', path)
         main = types.ModuleType('__main__')
         vars(main).update(
-            __file__=path, __loader__=loader, __cached__=None, __builtins__=self.builtins
+            __file__=path,
+            __loader__=loader,
+            __cached__=None,
+            __builtins__=self.modules['builtins'],
         )
         self.modules['__main__'] = main
         exec(loader.source_to_code(loader.get_data(path), path), vars(main))
@@ -256,6 +264,11 @@ class PrivateImports:
     def _print(self, *values, file=None, **options):
         """``print``, to the ``sys.stdout`` of the set."""
         print(*values, file=self.system.stdout if file is None else file, **options)
+
+
+def _exit(code=None):
+    """``exit()``; Python's closes standard input, which nodes share."""
+    raise SystemExit(code)
 
 
 def _find(name, path):

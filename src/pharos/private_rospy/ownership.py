@@ -9,7 +9,7 @@ import os
 import re
 import site
 import sys
-from importlib.machinery import EXTENSION_SUFFIXES, PathFinder
+from importlib.machinery import EXTENSION_SUFFIXES, ModuleSpec, PathFinder
 
 #: what a node's copies are made for; rosunit reads the arguments of the program
 _ROOTS = {'rospy', 'rosgraph', 'rosunit'}
@@ -21,6 +21,7 @@ OWN_OF_PYTHONS = {
     'argparse',
     'contextlib',
     'fileinput',
+    'gettext',
     'multiprocessing',
     'optparse',
     'pickle',
@@ -47,9 +48,15 @@ _SITES = {*site.getsitepackages(), site.getusersitepackages()}
 def find_spec(name, path):
     """The spec of a module on the path, a tuple of folders; None where there is none yet."""
     if (name, path) not in _specs:
-        spec = PathFinder.find_spec(name, path)
+        try:
+            spec = PathFinder.find_spec(name, path)
+        except KeyError:  # for a folder without __init__.py, Python looks for its parent's module
+            spec = ModuleSpec(name, None, is_package=True)
         if spec is None:
             return None
+        if spec.origin is None and spec.submodule_search_locations is not None:
+            places = [os.path.join(folder, name.rpartition('.')[2]) for folder in path]
+            spec.submodule_search_locations = [place for place in places if os.path.isdir(place)]
         # catkin's file in a devel space, once imported, puts what it stands for before itself
         known = getattr(sys.modules.get(name), '__spec__', None)
         is_relayed = known is not None and _home(spec) in _relayed(known)
