@@ -14,6 +14,7 @@ from pharos import ros_process
 from pharos.testing import Mailbox, until
 from programs import ROOT, Program, run
 from sockets import refused_url
+from std_msgs.msg import String
 
 TALKING = ROOT / 'test' / 'programs' / 'talking'
 TALKER, REPORTER, WORKER = (TALKING / f'{name}.py' for name in ('talker', 'reporter', 'worker'))
@@ -268,6 +269,53 @@ def test_what_a_hook_of_on_shutdown_publishes_arrives(master, tmp_path):
         node.stop()
         program.wait_for('data: "stopping"')
     assert mailbox.next().data == 'stopping'
+
+
+def test_the_stop_runs_hooks_before_the_script_ends(master, tmp_path):
+    said = tmp_path / 'said'
+    node = master.load(WORKER, None, 'order', said)
+    until(lambda: node.ros.core._client_shutdown_hooks)
+    node.stop()
+    assert said.read_text().split() == ['hook', 'main', 'atexit']
+
+
+def test_a_hook_of_on_shutdown_may_end_what_the_script_waits_for(master, capsys):
+    node = master.load(WORKER, None, 'queue')
+    node.stop_timeout = 0
+    until(lambda: node.ros.core._client_shutdown_hooks)
+    node.stop()
+    assert node.exit_code == 0
+    assert 'left behind' not in capsys.readouterr().err
+
+
+def test_a_hook_of_on_shutdown_may_call_a_service_of_its_node(master, tmp_path):
+    said = tmp_path / 'said'
+    node = master.load(WORKER, None, 'calls itself', said)
+    until(lambda: node.ros.core._client_shutdown_hooks)
+    node.stop()
+    assert said.read_text() == 'GetLoggersResponse\n'
+
+
+def test_a_callback_of_a_script_may_stop_its_node(master, tmp_path, monkeypatch):
+    monkeypatch.setenv('ROS_MASTER_URI', master.url)
+    said = tmp_path / 'said'
+    node = master.load(WORKER, None, 'stops itself', said)
+    publisher = create(master, '/asks').output_channel('/stop', 'std_msgs/String')
+    publisher.wait_for_subscribers()
+    publisher.publish(String('now'))
+    assert node.wait(30) == 0
+    until(said.exists)
+    until(lambda: not node.latest_run.rospy.thread_count)
+
+
+def test_a_script_goes_on_after_its_signal_shutdown_for_as_long_as_it_takes(master, tmp_path):
+    node = master.load(WORKER, None, 'late', tmp_path / 'end')
+    node.stop_timeout = 0
+    until(node.ros.is_shutdown)
+    with pytest.raises(TimeoutError):
+        node.wait(0.2)
+    (tmp_path / 'end').touch()
+    assert node.wait(30) == 3
 
 
 def test_signal_shutdown_ends_the_node(master):

@@ -46,6 +46,7 @@ ROSPYS_NAMES = {
         '_in_shutdown',
         '_is_owned',
         '_shutdown_flag',
+        '_client_shutdown_hooks',
         '_shutdown_hooks',
         '_shutdown_lock',
         '_TopicImpl',

@@ -151,8 +151,8 @@ class Run:
             (self.rospy.begin_stop,),  # what waits
             (self._end_souls, timeout),
             (self.dispatcher.close,),
-            # In this order: the node leaves the local ones, messages under way are flushed, the hooks
-            # of on_shutdown run, all is unregistered (watched parameters, too), links and topics
+            # In this order: the hooks of on_shutdown run, the node leaves the local ones, messages
+            # under way are flushed, all is unregistered (watched parameters, too), links and topics
             # close, then services, servers, XML-RPC proxies and sockets; threads are joined, and
             # handlers of the log closed.
             (self._end_rospy, timeout),

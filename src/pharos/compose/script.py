@@ -42,6 +42,8 @@ class ScriptNode(Node):
 
     #: seconds that :meth:`start` waits for the program to call ``rospy.init_node``, or to end
     init_timeout = 10.0
+    #: seconds that :meth:`stop` waits for the program, as long as roslaunch waits after its SIGINT
+    stop_timeout = 15.0
 
     def __init__(
         self,
@@ -177,6 +179,9 @@ class ScriptRun(Run):
         super().end()
         if self._file is not None and self.is_over:
             self._file.close()
+
+    def _end_rospy(self, timeout: float) -> None:
+        super()._end_rospy(min(timeout, Node.stop_timeout))
 
     def _exit_code(self, code: Any) -> int:
         """What Python makes of the argument of ``sys.exit``."""

@@ -140,7 +140,7 @@ class PrivateRospy:
         with time_limit(timeout), self._reached():
             registration.claim_name(settings.master_url, self.name, timeout)
         # the first, so that the threads that rospy waits for end at once
-        self.rospy.core._shutdown_hooks.insert(0, lambda reason: self.begin_stop())
+        self.rospy.core._shutdown_hooks.insert(0, lambda reason: self._end_waits())
         try:
             with _ports_checked('tcp_port', settings.tcp_port):
                 self.tcp_port = tcpros_server.listen(self.rospy.impl.tcpros_base, settings.tcp_port)
@@ -154,8 +154,9 @@ class PrivateRospy:
             raise
         self.xmlrpc_port = self.lifetime.xmlrpc.port
         self.domain = self.import_library('rosgraph.network').get_host_name()
-        # rospy.signal_shutdown called by the node's own code
-        self.rospy.core.add_preshutdown_hook(self.request_stop)
+        if not self.lifetime.has_program:  # which goes on after that, to its end
+            # rospy.signal_shutdown called by the node's own code
+            self.rospy.core.add_preshutdown_hook(self.request_stop)
         if not rosgraph.network.is_local_address(self.domain):
             self.warn(
                 f'{self.domain}, which {self.name} tells others to come to, is no address of this'
@@ -199,8 +200,17 @@ class PrivateRospy:
 
     def begin_stop(self):
         """Begin the stop: all that waits ends, ``is_shutdown()`` holds, and nothing more is read
-        from sockets; nodes of this process still deliver until the dispatcher closes."""
+        from sockets; nodes of this process still deliver until the dispatcher closes.
+
+        To a program this is what Ctrl-C is: before, the hooks of on_shutdown run, unless rospy
+        handles no signals for it.
+        """
         self._process.call_signal_handler()
+        if self.lifetime.has_program and not self.lifetime.is_interruptible:
+            self._run_hooks()
+        self._end_waits()
+
+    def _end_waits(self):
         self.lifetime.begin_shutdown()
         waiting = [self.rospy.rostime.get_rostime_cond()]  # simulated time may stand still
         handler = self.handler
@@ -219,11 +229,11 @@ class PrivateRospy:
         """
         if not self._stopping.acquire(blocking=False):
             return []
+        self._run_hooks()
         self.connections.withdraw()
         core = self.rospy.core
         self._flush(flush_timeout)
-        self.lifetime.hooks_thread = threading.get_ident()
-        core._preshutdown_hooks.insert(0, lambda reason: self._end_hooks(flush_timeout))
+        self.lifetime.ending_thread = threading.get_ident()
         core.signal_shutdown('stop')
         with core._shutdown_lock:
             pass  # where the node's own code called that, it returned at once
@@ -232,12 +242,30 @@ class PrivateRospy:
             proxy('close')()
         left = self.lifetime.finish_shutdown(abandoned)
         logs.close_handlers(self._logging)
+        self.lifetime.ending_thread = None
         return [thread.name for thread in left]
 
-    def _end_hooks(self, flush_timeout):
-        """The hooks of rospy.on_shutdown have run."""
-        self.lifetime.hooks_thread = None
-        self._flush(flush_timeout)
+    def _run_hooks(self):
+        """Do what rospy's signal_shutdown does first: run the hooks of on_shutdown, each once.
+
+        Where the node's own code has called that, this waits until it is through.
+        """
+        core = self.rospy.core
+        with core._shutdown_lock:
+            core._in_shutdown, self.lifetime.hooks_thread = True, threading.get_ident()
+            try:
+                while core._client_shutdown_hooks:
+                    self._run_hook(core._client_shutdown_hooks.pop(0))
+            finally:
+                # what the node does last may be logged on /rosout
+                core._in_shutdown = core._shutdown_flag
+                self.lifetime.hooks_thread = None
+
+    def _run_hook(self, hook):
+        try:
+            hook()
+        except BaseException as error:  # the others run
+            self.on_failure(error)
 
     def _flush(self, timeout):
         """Wait until what the node published is with the sockets, up to ``timeout`` seconds."""

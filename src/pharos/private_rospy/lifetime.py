@@ -50,6 +50,7 @@ class Lifetime:
         self.is_interruptible = False
         self.folder = None  # the working directory of its threads; None: the process's
         self.hooks_thread = None  # the identifier of the thread that runs the hooks of on_shutdown
+        self.ending_thread = None  # likewise of the one that ends all when the program has ended
         self.interruptions = set()  # of waits under way
         self.threads = weakref.WeakSet()
         self.main_thread = threading.main_thread()  # or its program's
@@ -162,7 +163,7 @@ class Lifetime:
         elif not self.ended.is_set():
             self._sleep_until(self.ended, seconds)
             self._interrupt()
-        elif self.has_program and threading.current_thread() in self.threads:
+        elif self.has_program and self._is_programs():
             self._interrupt()
             if getattr(_thread, 'was_cut_off', False):
                 time.sleep(seconds)  # it has caught what was raised, and goes on
@@ -170,6 +171,10 @@ class Lifetime:
             if self.overdue.is_set():
                 _thread.was_cut_off = True
                 raise ProgramCutOff(-signal.SIGTERM)
+
+    def _is_programs(self):
+        is_ending = threading.get_ident() == self.ending_thread
+        return threading.current_thread() in self.threads and not is_ending
 
     def _interrupt(self):
         is_main = threading.current_thread() is self.main_thread

@@ -1,11 +1,15 @@
 #!/usr/bin/python3
 """Ends as it is told to: ``worker.py HOW [FILE]``."""
+import atexit
 import os
+import queue
 import sys
 import threading
 import time
 
+import pharos
 import rospy
+from roscpp.srv import GetLoggers
 from std_msgs.msg import String
 
 RUNS = []  # of this program, in the module that this is
@@ -75,6 +79,39 @@ def hook(file):
     rospy.spin()
 
 
+def tell_order(file):
+    """Say what comes after what at the end."""
+    atexit.register(say, file, 'atexit')
+    rospy.on_shutdown(lambda: say(file, 'hook'))
+    rospy.spin()
+    say(file, 'main')
+
+
+def wait_for_hook():
+    """Wait for what a hook of on_shutdown does."""
+    ended = queue.Queue()
+    rospy.on_shutdown(lambda: ended.put(None))
+    ended.get()
+
+
+def call_itself(file):
+    """Call a service of its own in a hook of on_shutdown."""
+    loggers = rospy.ServiceProxy('~get_loggers', GetLoggers)
+    rospy.on_shutdown(lambda: say(file, type(loggers()).__name__))
+    rospy.spin()
+
+
+def stop_itself(file):
+    """Stop the node in a callback."""
+
+    def stop(message):
+        pharos.Master().node('/worker').stop()
+        say(file, 'stopped')
+
+    rospy.Subscriber('stop', String, stop)
+    rospy.spin()
+
+
 def speak():
     """Print lines, whole and in parts, and log one."""
     rospy.on_shutdown(lambda: print('dead'))
@@ -119,6 +156,11 @@ if __name__ == '__main__':
         'interrupted loop': loop,
         'last words': speak_last,
         'thread': wait_in_thread,
+        'order': tell_order,
+        'queue': wait_for_hook,
+        'calls itself': call_itself,
+        'stops itself': stop_itself,
+        'late': lambda file: [rospy.signal_shutdown('enough'), ignore(file), sys.exit(3)],
         'hook': hook,
         'runs': lambda file: [say(file, len(RUNS)), rospy.spin()],
         'nameless runs': lambda file: [say(file, len(RUNS)), time.sleep(1000)],
