@@ -2,6 +2,7 @@
 import json
 import os
 import pathlib
+import signal
 
 import pytest
 
@@ -154,6 +155,17 @@ def test_a_node_that_needs_a_working_directory_runs_apart_where_it_cannot_have_o
     composed = compose('mirror.launch')
     assert composed.nodes == []
     assert composed.process.poll() is None
+
+
+@pytest.mark.leaves('the registrations of a node that was killed')
+def test_the_nodes_apart_end_where_roslaunch_is_killed(master, compose):
+    composed = compose('chat.launch')
+    relay = master.wait_for_node('/relay', TIMEOUT)
+    os.kill(composed.process.pid, signal.SIGKILL)
+    until(lambda: not relay.is_alive())
+    assert dict(composed.outcomes())['/relay'] == (
+        'in a process of its own, asked to end, as roslaunch was killed'
+    )
 
 
 def test_a_stop_ends_all_nodes(master, compose):

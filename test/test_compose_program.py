@@ -60,7 +60,8 @@ def test_it_tells_how_far_it_has_come_and_what_has_become_of_each(compose):
     program.end(signal.SIGINT)
     printed = program.read_to_the_end().splitlines()
     assert 'starting 1 of 2: /talker' in printed
-    assert printed[-2:] == ['/talker: stopped', '/with_syntax_error: did not start']
+    failed = '/with_syntax_error', '/without_package', '/without_program'
+    assert printed[-4:] == ['/talker: stopped', *(f'{name}: did not start' for name in failed)]
 
 
 def test_it_ends_when_all_nodes_have_ended(master, compose):
@@ -69,6 +70,36 @@ def test_it_ends_when_all_nodes_have_ended(master, compose):
     (talker,) = [name for name in until_nodes(master, 2) if name.startswith('/talker_')]
     assert run(master.url, 'rosnode', 'kill', talker).returncode == 0
     assert program.process.wait(TIMEOUT) == 0
+
+
+def test_a_script_without_package_or_without_name_is_told_and_the_others_go_on(compose):
+    program = compose('--script', 'composed_robot', 'composed_robot/talker')
+    program.wait_for('composed_robot is not started: it is neither PACKAGE/EXECUTABLE nor')
+    program.wait_for('started /talker')
+
+
+@pytest.mark.parametrize('what', ['no_such_package/talker', 'composed_robot/broken'])
+def test_the_status_says_that_nothing_could_be_started(compose, what):
+    assert compose('--script', what).process.wait(TIMEOUT) == 1
+
+
+def test_a_program_that_is_no_node_is_told_as_such(compose, tmp_path):
+    path = tmp_path / 'never'
+    path.write_text('print("no node")')
+    program = compose('--script', str(path))
+    assert program.process.wait(TIMEOUT) == 0
+    assert f'{path} has run, and never called rospy.init_node' in program.read_to_the_end()
+
+
+def test_nodes_are_chosen_of_a_file_alone(compose):
+    assert compose('--only', 'talker').process.wait(TIMEOUT) == 2
+
+
+def test_ctrl_c_while_it_imports_ends_it_without_a_word(master):
+    path = os.pathsep.join([str(PACKAGES / 'interrupting'), str(ROOT / 'src')])
+    with Program(master.url, sys.executable, script('compose'), PYTHONPATH=path) as program:
+        assert program.process.wait(TIMEOUT) == -signal.SIGINT
+        assert program.read_to_the_end() == ''
 
 
 def test_of_two_scripts_of_one_name_the_first_runs(master, compose):
@@ -230,8 +261,10 @@ def test_a_launch_file_of_nodelets_loads_programs(master, compose):
     ],
 )
 def test_what_cannot_be_loaded_is_said_to_who_asked(master, compose, what, said):
-    compose()
+    program = compose()
     until(lambda: '/compose/load_nodelet' in master.services())
     request = f'{{name: /x, type: "{what}"}}'
     answer = run(master.url, 'rosservice', 'call', '/compose/load_nodelet', request)
     assert said in answer.stderr
+    program.end()
+    assert 'Traceback' not in program.read_to_the_end()

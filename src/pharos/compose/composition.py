@@ -3,7 +3,7 @@ import dataclasses
 import os
 import threading
 import time
-from typing import TYPE_CHECKING, Any, Collection, Dict, List, Optional
+from typing import TYPE_CHECKING, Any, Collection, Dict, Iterator, List, Optional, Tuple
 
 import roslaunch.core
 import rospkg
@@ -11,7 +11,7 @@ import rospkg
 from pharos import node_registry, signals
 from pharos.compose import rest, rest_program
 from pharos.compose.kept_node import KeptNode
-from pharos.compose.launch_file import LaunchedNode, LaunchFile
+from pharos.compose.launch_file import LaunchedNode, LaunchFile, Problem
 from pharos.compose.output import SCREEN
 from pharos.compose.progress import Progress
 from pharos.compose.script import ScriptNode
@@ -44,6 +44,8 @@ class Composition:
         self.reason: Optional[str] = None
         #: whether it ends, or has ended
         self.is_ending = False
+        #: why nodes of it were not even tried to start
+        self.problems: List[Problem] = []
         self._kept: List[KeptNode] = []
         self._changed = threading.Condition()  # guards what is above
         self._stopping = threading.RLock()
@@ -72,8 +74,10 @@ class Composition:
             rest.ParameterSetter(run_id, file.config).set_all()
         except roslaunch.core.RLException as error:
             raise PharosError(f'{file.path}: {error}') from error
-        for problem in (*file.config.config_errors, *file.problems):
-            self.progress.tell(str(problem))
+        for text in file.config.config_errors:
+            self.progress.tell(str(text))
+        for problem in file.problems:
+            self.refuse(problem)
         for problem in file.problems:
             if problem.ends_all:
                 return self.end_because(f'{problem.name}, which is required, cannot be started')
@@ -85,6 +89,11 @@ class Composition:
         self.start(
             [_with_log(launched, logs, number) for number, launched in enumerate(file.here, 1)]
         )
+
+    def refuse(self, problem: Problem) -> None:
+        """Keep and tell why a node cannot be started; the others go on."""
+        self.problems.append(problem)
+        self.progress.tell(str(problem))
 
     def start(self, nodes: List[LaunchedNode]) -> List[KeptNode]:
         """Start nodes, one after the other; one that takes long does not keep the next from it."""
@@ -113,9 +122,13 @@ class Composition:
             if status == rest_program.REQUIRED_ENDED:
                 self.end_because(f'a required one of {names}, which run apart, has ended')
             elif status and not self.is_ending:
+                left = '' if status > 0 else ' and its nodes are asked to end'
                 self.progress.tell(
-                    f'roslaunch, which runs {names} apart, has ended with {status}: the others go on'
+                    f'roslaunch, which runs {names} apart, has ended with {status}:'
+                    f' the others go on{left}'
                 )
+                if status < 0:  # killed, it has not ended them
+                    rest.shut_down(self.master, self.apart)
             self.changed()
 
         threading.Thread(target=wait, name=f'{names} apart', daemon=True).start()
@@ -133,9 +146,20 @@ class Composition:
         is_rest_over = self.process is None or self.process.poll() is not None
         return is_rest_over and all(kept.is_over for kept in self._kept)
 
+    def outcomes(self) -> Iterator[Tuple[str, str]]:
+        """What has become of each node, in a few words: ``(name, outcome)``."""
+        for kept in self._kept:
+            yield kept.name, kept.outcome
+        is_killed = self.process is not None and (self.process.poll() or 0) < 0
+        by = 'asked to end, as roslaunch was killed' if is_killed else 'ended by roslaunch'
+        for name in self.apart:
+            yield name, f'in a process of its own, {by}'
+        for problem in self.problems:
+            yield problem.name, 'did not start'
+
     def wait(self, timeout: Optional[float] = None) -> int:
         """Wait until all nodes have ended, of themselves or by a signal; returns 0, or 1 where a
-        required one has.
+        required one has, or none of them could be started.
 
         :param timeout: seconds, None: without limit
         :raises TimeoutError: if they have not in that time
@@ -148,7 +172,9 @@ class Composition:
                     raise TimeoutError(f'{left} have not ended within {timeout:g} s: stop() them')
                 self._changed.wait(POLL)
         self.stop()
-        return 0 if self.reason is None else 1
+        failed = [*self.problems, *(kept for kept in self._kept if kept.problem is not None)]
+        has_any = len(failed) < len(self._kept) + len(self.apart) + len(self.problems)
+        return 0 if self.reason is None and (has_any or not failed) else 1
 
     def end_because(self, reason: str) -> None:
         """End all of it, in a thread of its own, for a reason that is told."""

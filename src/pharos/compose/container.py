@@ -41,6 +41,10 @@ class Container(Node):
         self.serve('~unload_nodelet', 'nodelet/NodeletUnload', self._unload, self._only_nearby)
         self.serve('~list', 'nodelet/NodeletList', self._list)
 
+    def _tell_failure(self, line: str, details: str) -> None:
+        """Without a traceback: what is refused is no error of ours."""
+        super()._tell_failure(line, '')
+
     def _load(self, request: Any) -> bool:
         package, _, executable = request.type.partition('/')
         if not package or not executable or '/' in executable:

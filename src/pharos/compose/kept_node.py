@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Optional
 
 from pharos import attributes, node_registry
 from pharos.compose.launch_file import LaunchedNode
-from pharos.compose.script import ScriptNode
+from pharos.compose.script import ScriptNode, ScriptRun
 from pharos.node import start_made
 
 if TYPE_CHECKING:
@@ -40,9 +40,16 @@ class KeptNode:
     @property
     def name(self) -> str:
         """The name that it was given, or has; its program, where that is to name it."""
-        if self._was_started and self.node is not None:
+        is_node = self._was_started and not self.has_ended_without_node
+        if is_node and self.node is not None:
             return self.node.name
         return self.launched.program if self.launched.takes_own_name else self.launched.name
+
+    @property
+    def has_ended_without_node(self) -> bool:
+        """Whether it has ended, and was no node."""
+        run = self.node and self.node.latest_run
+        return isinstance(run, ScriptRun) and run.has_ended and not run.is_registered
 
     def start(self) -> None:
         """Start it, and keep it running; see :attr:`settled`."""
@@ -81,7 +88,8 @@ class KeptNode:
                     self._composition.end_because(f'{self.name}, which is required, did not start')
         else:
             assert self.node
-            progress.started(self, time.monotonic() - begun)
+            if not self._ending.is_set():
+                progress.started(self, time.monotonic() - begun)
             self.node.wait()
             self._has_ended_itself = not self._ending.is_set()
             if self._has_ended_itself:

@@ -67,7 +67,8 @@ class Problem(NamedTuple):
     ends_all: bool = False  # whether it is required, and roslaunch would end all others for that
 
     def __str__(self) -> str:
-        return f'{self.file}: {self.name} is not started: {self.why}'
+        where = f'{self.file}: ' if self.file else ''
+        return f'{where}{self.name} is not started: {self.why}'
 
 
 class _Loader(roslaunch.xmlloader.XmlLoader):

@@ -70,7 +70,9 @@ class PrintedProgress(Progress):
 
     def started(self, kept: 'KeptNode', seconds: float) -> None:
         """See :class:`Progress`."""
-        if not self._is_terminal or kept.starts > 1:
+        if kept.has_ended_without_node:
+            self.tell(f'{_described(kept)} has run, and never called rospy.init_node')
+        elif not self._is_terminal or kept.starts > 1:
             self.tell(f'started {_described(kept)} in {seconds:.2f} s')
 
     def all_begun(self, left: List[str]) -> None:

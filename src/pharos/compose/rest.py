@@ -14,6 +14,8 @@ import roslaunch.launch
 import roslaunch.pmon
 
 from pharos.compose import rest_program
+from pharos.errors import PharosError
+from pharos.external_node import ExternalNode
 from pharos.ros_process import RosProcess
 from pharos.transcript import Transcript
 
@@ -63,6 +65,13 @@ def stop_rest(process: RosProcess) -> None:
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(END_TIMEOUT)
     process.terminate()
+
+
+def shut_down(master: 'Master', names: List[str]) -> None:
+    """Ask nodes to end, as rosnode kill does."""
+    for name in names:
+        with contextlib.suppress(PharosError):  # it is none, or is gone
+            ExternalNode(master, name).shutdown()
 
 
 def names_of(config: Any) -> List[str]:

@@ -110,7 +110,7 @@ class ScriptRun(Run):
         super().__init__(node, settings)
         self.exit_code: Optional[int] = None
         self.is_registered = False
-        self._has_ended = False  # whether the program has
+        self.has_ended = False  # whether the program has
         self._error: Optional[BaseException] = None  # with which it ended before it was a node
         self.rospy.on_init_node = self._init_node
         self.rospy.lifetime.has_program = self.rospy.lifetime.is_interruptible = True
@@ -126,13 +126,13 @@ class ScriptRun(Run):
             self._become(Lifecycle.RUNNING)
             self.fork(self._run, 'script')
             node_registry.wait_until(
-                lambda: self.is_registered or self._has_ended or self.is_over,
+                lambda: self.is_registered or self.has_ended or self.is_over,
                 self.node.init_timeout,
             )
             with node_registry.changed:
                 error, self._error = self._error, None
                 self._is_awaited = False
-            if self._has_ended:
+            if self.has_ended:
                 self.node.stop()
         if error is not None:
             kind = type(error) if isinstance(error, PharosError) else PharosError
@@ -165,7 +165,7 @@ class ScriptRun(Run):
         for stream in self.rospy.system.stdout, self.rospy.system.stderr:
             attempt(stream.flush)
         with node_registry.changed:
-            self.exit_code, self._has_ended = exit_code, True
+            self.exit_code, self.has_ended = exit_code, True
             node_registry.changed.notify_all()
         if not self.is_ending:
             stop = threading.Thread(
