@@ -367,6 +367,13 @@ def test_lines_on_the_screen_carry_the_name_of_the_node(master, capsys):
     assert printed.err == '[/eye/left] aside\n'
 
 
+def test_a_script_may_print_by_a_stream_of_its_own_and_close_it(master, capsys):
+    node = master.load(TALKING / 'wrapping.py', name='wrapping', output='screen')
+    assert node.exit_code == 0
+    assert not sys.stdout.closed
+    assert capsys.readouterr().out == '[/wrapping] wrapped: ü\n'
+
+
 def test_what_a_script_prints_is_as_it_is_unless_asked_for(master, capsys):
     master.load(WORKER, None, 'speak').wait(30)
     assert 'two\nlines\none more\n' in capsys.readouterr().out

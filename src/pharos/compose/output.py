@@ -1,10 +1,40 @@
 """Where what the programs of one process print goes to."""
+import codecs
 import io
 import sys
 import threading
 from typing import IO, Any, Callable, Optional, TextIO
 
 SCREEN = 'screen'  # as launch files say it
+
+
+class _Bytes(io.BufferedIOBase):
+    """Takes the bytes of lines; whoever closes it, closes nothing else."""
+
+    def __init__(self, lines: 'NamedLines') -> None:
+        self._lines = lines
+        self._decoder = codecs.getincrementaldecoder('utf-8')('backslashreplace')
+
+    def writable(self) -> bool:
+        """See :class:`io.IOBase`."""
+        return True
+
+    def write(self, data: Any) -> int:
+        """See :class:`io.BufferedIOBase`."""
+        self._lines.write(self._decoder.decode(bytes(data)))
+        return len(data)
+
+    def flush(self) -> None:
+        """See :class:`io.IOBase`."""
+        self._lines.flush()
+
+    def isatty(self) -> bool:
+        """See :class:`io.IOBase`."""
+        return self._lines.isatty()
+
+    def fileno(self) -> int:
+        """See :class:`io.IOBase`."""
+        return self._lines.fileno()
 
 
 class NamedLines(io.TextIOBase):
@@ -21,6 +51,8 @@ class NamedLines(io.TextIOBase):
         self._lock = threading.Lock()
         self._begun = ''  # of a line that is not complete
         self._is_within = False  # whether the beginning of the line has gone on
+        #: what takes bytes, as UTF-8
+        self.buffer = _Bytes(self)
 
     def write(self, text: str) -> int:
         """See :class:`io.TextIOBase`."""
@@ -51,10 +83,8 @@ class NamedLines(io.TextIOBase):
         """What child processes write to; their lines have no name."""
         return self._stream().fileno()
 
-    @property
-    def buffer(self) -> Any:
-        """What takes bytes; they have no name."""
-        return getattr(self._stream(), 'buffer', None)
+    def reconfigure(self, **options: Any) -> None:
+        """Nothing: its lines go on at once, and text as the process prints it."""
 
     @property
     def encoding(self) -> str:  # type: ignore[override]
