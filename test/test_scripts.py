@@ -10,8 +10,10 @@ import pytest
 
 import pharos
 from helpers import create, ended, in_thread, registrations
-from pharos import ros_process
+from pharos import node_registry, ros_process
+from pharos.private_rospy import registration
 from pharos.testing import Mailbox, until
+from pharos.watcher import watcher_of
 from programs import ROOT, Program, run
 from sockets import refused_url
 from std_msgs.msg import String
@@ -316,6 +318,51 @@ def test_a_script_goes_on_after_its_signal_shutdown_for_as_long_as_it_takes(mast
         node.wait(0.2)
     (tmp_path / 'end').touch()
     assert node.wait(30) == 3
+
+
+@pytest.mark.parametrize('when', ['starts', 'ends'])
+def test_nobody_registers_a_script_that_is_half_registered(when, master, monkeypatch):
+    repaired, seen = [], []
+    monkeypatch.setattr(registration, 'repair', lambda node, *more: repaired.append(node.name))
+
+    def look(*reason):
+        if not seen:
+            seen.append('looked')
+            del repaired[:]
+            watcher_of(master)._look()
+            seen.extend(repaired)
+        return False
+
+    with create(master, '/another'):
+        if when == 'starts':
+            monkeypatch.setattr(registration, 'is_awaited', look)
+        node = master.load(WORKER, None, 'spin')
+        if when == 'ends':
+            node.ros.core.add_preshutdown_hook(look)
+            node.ros.signal_shutdown('enough')
+        node.stop()
+    assert 'looked' in seen
+    assert '/worker' not in seen
+
+
+def test_who_loads_a_script_is_told_that_another_has_stopped_it(master, tmp_path):
+    refused = []
+
+    def load():
+        with pytest.raises(
+            pharos.NodeStoppedError, match='was stopped before it was a node'
+        ) as error:
+            master.load(WORKER, None, 'nameless late', tmp_path / 'end')
+        refused.append(error)
+
+    loading = in_thread(load)
+    until(lambda: [node for node in node_registry.nodes() if node.latest_run.rospy.thread_count])
+    (node,) = node_registry.nodes()
+    node.stop_timeout = 0
+    node.stop()
+    (tmp_path / 'end').touch()
+    assert ended(loading)
+    assert refused
 
 
 def test_signal_shutdown_ends_the_node(master):

@@ -113,6 +113,8 @@ class Watcher:
         """The graph, None if the master does not answer; and repairs registrations."""
         # asked for first: the state may lack one that starts meanwhile
         nodes = [node for node in self._master.local_nodes() if node.is_running]
+        # a program runs before it is registered
+        runs = [node.latest_run for node in nodes if node.latest_run.rospy.is_registered]
         try:
             state = self._master.system_state()
         except MasterUnreachableError:
@@ -121,8 +123,7 @@ class Watcher:
         was_away, self._is_away = self._is_away, False
         if self.reachable_since is None:
             self.reachable_since = time.time()
-        for node in nodes:
-            run = node.latest_run
+        for run in runs:
             try:
                 run.rospy.repair(state, was_away)
             except Exception as error:  # the watch over the other nodes goes on

@@ -11,7 +11,7 @@ from pharos import node_registry, signals, working_directory
 from pharos.blocks import attempt
 from pharos.compose.output import redirect
 from pharos.compose.programs import check_source, find_program, source_of
-from pharos.errors import PharosError
+from pharos.errors import NodeStoppedError, PharosError
 from pharos.node import Node
 from pharos.ros_process import arguments_of
 from pharos.run import Lifecycle, Run
@@ -75,6 +75,7 @@ class ScriptNode(Node):
         :attr:`init_timeout` seconds.
 
         :raises PharosError: if the program raised an exception by then, its cause
+        :raises NodeStoppedError: if :meth:`stop` was called before it was a node
         """
         check_source(self.path)
         ScriptRun(self, self._settings).start(reopens=False)
@@ -132,6 +133,8 @@ class ScriptRun(Run):
             with node_registry.changed:
                 error, self._error = self._error, None
                 self._is_awaited = False
+            if self._is_stopped_early:
+                raise NodeStoppedError(f'{self.node.path} was stopped before it was a node')
             if self.has_ended:
                 self.node.stop()
         if error is not None:
@@ -141,6 +144,7 @@ class ScriptRun(Run):
                 f' {type(error).__name__}: {error}'
             ) from error
 
+    _is_stopped_early = False  # whether that is by another's stop, before it was a node
     _is_awaited = True  # whether start() waits still, whose caller gets what the program raises
 
     def _run(self) -> None:
@@ -176,6 +180,9 @@ class ScriptRun(Run):
 
     def end(self) -> None:
         """End it, and close the file that it prints to."""
+        with node_registry.changed:
+            if self._is_awaited and not (self.is_registered or self.has_ended or self.is_ending):
+                self._is_stopped_early = True
         super().end()
         if self._file is not None and self.is_over:
             self._file.close()

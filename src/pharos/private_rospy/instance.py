@@ -278,7 +278,7 @@ class PrivateRospy:
     def repair(self, state, was_away):
         """Register with the master what it has forgotten; see :func:`.registration.repair`. Raises
         nothing."""
-        if self.handler is None or self.ended.is_set():
+        if not self.is_registered:
             return
         try:
             if registration.repair(self, state, was_away):
@@ -292,6 +292,12 @@ class PrivateRospy:
             self.rospy.logdebug(
                 'cannot register with the master %s: %s', self.settings.master_url, error
             )
+
+    @property
+    def is_registered(self):
+        """Whether the start is through, and neither a stop nor rospy's own shutdown has begun."""
+        is_ending = self.ended.is_set() or self.rospy.core._in_shutdown
+        return self.domain is not None and not is_ending
 
     # -- what others need of rospy's inside
 
