@@ -273,6 +273,16 @@ def test_what_a_hook_of_on_shutdown_publishes_arrives(master, tmp_path):
     assert mailbox.next().data == 'stopping'
 
 
+@pytest.mark.parametrize('how, is_shutdown', [('handles', False), ('nameless handles', True)])
+def test_what_a_handler_of_signals_raises_ends_the_script(how, is_shutdown, master, tmp_path):
+    said = tmp_path / 'said'
+    node = master.load(WORKER, None, how, said)
+    until(lambda: said.exists() and 'ready' in said.read_text())
+    node.stop()
+    assert said.read_text() == f'ready\nis_shutdown {is_shutdown}\nfinally\n'
+    assert node.exit_code == 4
+
+
 def test_the_stop_runs_hooks_before_the_script_ends(master, tmp_path):
     said = tmp_path / 'said'
     node = master.load(WORKER, None, 'order', said)

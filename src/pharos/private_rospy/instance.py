@@ -108,6 +108,7 @@ class PrivateRospy:
         self.lifetime.main_thread = threading.current_thread()
         with self._process.main_thread():
             self._run_main(path, argv)
+            self.lifetime.raise_pending()
 
     def exit_main(self):
         """What Python does when the program's main thread has ended: wait for the threads that are
@@ -115,6 +116,10 @@ class PrivateRospy:
         self.lifetime.wait_for_threads()
         self._process.forget_signals()
         self._process.run_exit_handlers()
+
+    def leave_signals_to_rospy(self):
+        """The program has rospy handle signals from now on."""
+        self._process.leave_signals_to_rospy()
 
     # -- life
 
@@ -206,9 +211,12 @@ class PrivateRospy:
         handles no signals for it.
         """
         self._process.call_signal_handler()
-        if self.lifetime.has_program and not self.lifetime.is_interruptible:
+        if self.lifetime.has_program and not (
+            self.lifetime.is_interruptible or self.lifetime.raised
+        ):
             self._run_hooks()
         self._end_waits()
+        self._process.call_former_signal_handler()
 
     def _end_waits(self):
         self.lifetime.begin_shutdown()

@@ -38,6 +38,8 @@ class Lifetime:
     :param name: the node's, for the names of its threads
     """
 
+    raised = None  # what a handler of signals raised, and the main thread is to
+
     def __init__(self, name):
         self.name = name
         self.ended = threading.Event()  # set when the node stops
@@ -49,8 +51,8 @@ class Lifetime:
         # whether the stop is to the program what Ctrl-C is without a handler: until rospy has one
         self.is_interruptible = False
         self.folder = None  # the working directory of its threads; None: the process's
-        self.hooks_thread = None  # the identifier of the thread that runs the hooks of on_shutdown
-        self.ending_thread = None  # likewise of the one that ends all when the program has ended
+        # identifiers of the thread that runs the hooks of on_shutdown, and that ends all in the end
+        self.hooks_thread = self.ending_thread = None
         self.interruptions = set()  # of waits under way
         self.threads = weakref.WeakSet()
         self.main_thread = threading.main_thread()  # or its program's
@@ -178,9 +180,18 @@ class Lifetime:
 
     def _interrupt(self):
         is_main = threading.current_thread() is self.main_thread
-        if self.is_interruptible and is_main and self.ended.is_set():
+        if not (is_main and self.ended.is_set()):
+            return
+        self.raise_pending()
+        if self.is_interruptible:
             self.is_interruptible = False  # once
             raise KeyboardInterrupt
+
+    def raise_pending(self):
+        """Raise what a handler of signals has raised, once."""
+        raised, self.raised = self.raised, None
+        if raised is not None:
+            raise raised
 
     @staticmethod
     def _sleep_until(event, seconds):

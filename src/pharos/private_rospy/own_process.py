@@ -52,7 +52,8 @@ class OwnProcess:
     def __init__(self, imports, settings, lifetime, report):
         self._environ, self._lifetime, self._report = settings.environ, lifetime, report
         self.exit_handlers = []  # (function, arguments, keyword arguments), the first to run last
-        self._signal_handlers, self._wakeup_fd = {}, -1
+        self._wakeup_fd, self._signal_handlers = -1, {}
+        self._former_handlers = {}  # those of before rospy had its own, which calls them in the end
         #: functions of the module signal, in a program
         self.signals = {
             'signal': self._set_signal_handler,
@@ -128,6 +129,7 @@ class OwnProcess:
 
     def run_exit_handlers(self):
         """Run the handlers of atexit, the last first, each once."""
+        self._attempt(self._lifetime.raise_pending)  # where it could not, report it
         while self.exit_handlers:
             function, args, kwargs = self.exit_handlers.pop()
             self._attempt(function, *args, **kwargs)
@@ -174,12 +176,25 @@ class OwnProcess:
 
     def forget_signals(self):
         """Call none of the handlers: there is no program any more that they could end."""
-        self._signal_handlers, self._wakeup_fd = {}, -1
+        self._signal_handlers, self._former_handlers, self._wakeup_fd = {}, {}, -1
+
+    def leave_signals_to_rospy(self):
+        """rospy.init_node sets handlers, which call those that are there when it has shut down."""
+        self._former_handlers, self._signal_handlers = self._signal_handlers, {}
 
     def call_signal_handler(self):
-        """Call the handler of SIGINT, or else SIGTERM, as these signals would end the program; what
-        takes longer is not waited for."""
-        handlers, descriptor = self._signal_handlers, self._wakeup_fd
+        """Call the handler of SIGINT, or else SIGTERM, as these signals would end the program."""
+        handlers = self._signal_handlers
+        if handlers:
+            self._call_one_of(handlers)
+
+    def call_former_signal_handler(self):
+        """Likewise, for one that the program set before rospy.init_node."""
+        self._call_one_of(self._former_handlers)
+
+    def _call_one_of(self, handlers):
+        """What takes longer is not waited for."""
+        descriptor = self._wakeup_fd
         self.forget_signals()
         for number in signal.SIGINT, signal.SIGTERM:
             handler = handlers.get(number)
@@ -188,7 +203,14 @@ class OwnProcess:
                     with contextlib.suppress(OSError):  # it is full, or closed
                         os.write(descriptor, bytes([number]))
                 thread = self._lifetime.start_thread(
-                    self._attempt, (handler, number, None), name=number.name
+                    self._call_handler, (handler, number), name=number.name
                 )
                 thread.join(JOIN_TIMEOUT)
                 return
+
+    def _call_handler(self, handler, number):
+        self._lifetime.is_interruptible = False  # it is instead of KeyboardInterrupt
+        try:
+            handler(number, None)
+        except BaseException as error:  # the main thread is to raise it, as in a process
+            self._lifetime.raised = error

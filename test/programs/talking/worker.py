@@ -3,6 +3,7 @@
 import atexit
 import os
 import queue
+import signal
 import sys
 import threading
 import time
@@ -112,6 +113,23 @@ def stop_itself(file):
     rospy.spin()
 
 
+def handle_signal(file, is_before):
+    """Exit in a handler of SIGINT."""
+
+    def handle(number, frame):
+        say(file, f'is_shutdown {rospy.is_shutdown()}')
+        sys.exit(4)
+
+    signal.signal(signal.SIGINT, handle)
+    if is_before:
+        rospy.init_node('worker')
+    say(file, 'ready')
+    try:
+        loop()
+    finally:
+        say(file, 'finally')
+
+
 def speak():
     """Print lines, whole and in parts, and log one."""
     rospy.on_shutdown(lambda: print('dead'))
@@ -157,6 +175,8 @@ if __name__ == '__main__':
         'last words': speak_last,
         'thread': wait_in_thread,
         'order': tell_order,
+        'handles': lambda file: handle_signal(file, False),
+        'nameless handles': lambda file: handle_signal(file, True),
         'queue': wait_for_hook,
         'calls itself': call_itself,
         'stops itself': stop_itself,

@@ -53,6 +53,8 @@ def init_node(
         original(name, argv, False, *options, True, xmlrpc_port, tcpros_port)
 
     node.lifetime.is_interruptible = disable_signals
+    if not disable_signals:
+        node.leave_signals_to_rospy()
     node.on_init_node(resolved, register, xmlrpc_port, tcpros_port)
     # what a second call has to give
     argv = module.sys.argv if argv is None else argv
