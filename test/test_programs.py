@@ -9,6 +9,8 @@ import os
 import pathlib
 import pickle
 import shutil
+import signal
+import socket
 import sys
 import termios
 import threading
@@ -171,8 +173,25 @@ def test_rospy_is_the_nodes_in_whatever_way_it_is_imported(node):
     assert main.names == {'/program_node'}
     assert main.same
     assert main.reloaded
+    assert main.known == [True, True, True, False]
     assert main.by_file == main.by_run == main.by_code['NAME'] == '/program_node'
     assert main.examples == (0, 1)
+
+
+def test_a_programs_time_limit_of_sockets_holds_and_rospys_own_does_not(node):
+    try:
+        main = run(node, 'own/limits_sockets.py')
+        exec('socket.setdefaulttimeout(60)', vars(node.ros_import('rospy.impl.masterslave')))
+        assert socket.getdefaulttimeout() == main.found == 1.5
+    finally:
+        socket.setdefaulttimeout(None)
+
+
+@pytest.mark.parametrize('how, code', [('fork', 1), ('spawn', 0)])
+def test_a_forked_child_of_a_program_is_told_that_it_cannot_be_a_node(how, code, master, capfd):
+    script = master.load(str(PROGRAMS / 'own/has_a_child.py'), None, how)
+    assert script.wait(TIMEOUT) == code
+    assert ('which has the thread that forked alone' in capfd.readouterr().err) == bool(code)
 
 
 # -- the end
@@ -210,6 +229,55 @@ def test_a_program_that_goes_on_until_a_signal_ends_with_its_node(master, capfd)
     script.stop()
     assert script.exit_code == 5
     assert capfd.readouterr().out == 'the last\n'
+
+
+@pytest.mark.parametrize(
+    'how, name',
+    [('timer', 'SIGALRM'), ('raise', 'SIGUSR1'), ('kill', 'SIGUSR2'), ('outside', 'SIGUSR1')],
+)
+def test_a_signal_calls_the_handler_of_a_program(how, name, master):
+    with master.load(str(PROGRAMS / 'own/signals.py'), None, how) as script:
+        main = script.ros_import('__main__')
+        assert main.is_ready.wait(TIMEOUT)
+        if how == 'outside':
+            os.kill(os.getpid(), signal.SIGUSR1)
+        assert main.came.wait(TIMEOUT)
+        assert main.names[0] == name
+        assert script.is_running
+
+
+def test_what_a_handler_of_signals_raises_is_a_failure_of_its_node(master, transcript):
+    with master.load(str(PROGRAMS / 'own/signals.py'), None, 'fail') as script:
+        until(lambda: script.errors)
+        assert isinstance(script.errors[0], ZeroDivisionError)
+        until(lambda: 'the handler of SIGALRM of /signals' in '\n'.join(transcript))
+        assert script.is_running
+
+
+def test_a_handler_of_signals_that_exits_ends_its_node_alone(node, master):
+    script = master.load(str(PROGRAMS / 'own/signals.py'), None, 'exit')
+    script.wait(TIMEOUT)
+    assert not script.errors
+    assert node.is_running
+
+
+def test_an_alarm_that_a_program_does_not_handle_ends_its_node_alone(node, master):
+    script = master.load(str(PROGRAMS / 'own/signals.py'), None, 'unhandled')
+    script.wait(TIMEOUT)
+    assert 'SIGALRM' in str(script.errors[0])
+    assert node.is_running
+
+
+def test_an_alarm_tells_how_much_was_left_of_the_one_before(master):
+    with master.load(str(PROGRAMS / 'own/signals.py'), None, 'alarm') as script:
+        main = script.ros_import('__main__')
+        assert main.is_ready.wait(TIMEOUT)
+        assert main.left == (0, 100)
+
+
+def test_the_main_thread_of_a_program_has_an_event_loop(master):
+    master.load(str(PROGRAMS / 'own/event_loop.py')).wait(TIMEOUT)
+    assert master.parameters['/event_loop/said'] == 'done'
 
 
 def test_a_program_that_has_ended_gets_no_signal(node):

@@ -382,8 +382,8 @@ class Run:
             again = channel.run_again
         self.node.errors.report(error, block, where, channel, message, again)
 
-    def _hook_failed(self, error: BaseException) -> None:
-        self.node.errors.report(error, None, f'a hook of on_shutdown of {self.node.name}')
+    def _hook_failed(self, error: BaseException, what: str = 'a hook of on_shutdown') -> None:
+        self.node.errors.report(error, None, f'{what} of {self.node.name}')
 
     def _report_refusal(self, refusal: Any) -> None:
         """Keep and tell, once, that a publisher's messages do not come, for they are of another

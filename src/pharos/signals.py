@@ -16,6 +16,8 @@ import rosgraph
 
 from pharos.private_rospy.process_rospy import rospy
 
+_main_thread = threading.main_thread  # Python's, also where a script is told that it is in its own
+
 _DEFAULTS = {
     signal.SIGINT: signal.default_int_handler,
     signal.SIGTERM: signal.SIG_DFL,
@@ -71,7 +73,7 @@ class _Signal:
     def remind(self) -> None:
         """Have the main thread's handler look again and again, until it has raised an exception."""
         global _is_reminded
-        main_thread = threading.main_thread().ident
+        main_thread = _main_thread().ident
         while signal.getsignal(self.number) is _on_signal:
             time.sleep(REMINDER)  # first: mostly it is cut off at once, and needs none
             if _coming is not self:
@@ -127,7 +129,7 @@ def is_from_signal(error: BaseException) -> bool:
     # not by hasattr: the exception may have a __getattr__ of its own
     if _MARK in object.__getattribute__(error, '__dict__'):
         return True
-    if threading.current_thread() is not threading.main_thread():
+    if threading.current_thread() is not _main_thread():
         return False
     handlers = [signal.getsignal(number) for number in signal.valid_signals()]
     if isinstance(error, KeyboardInterrupt) and signal.default_int_handler in handlers:
@@ -159,7 +161,7 @@ def serve(is_needed: Callable[[], bool], stop_all: Callable[[], None]) -> None:
 def _take_on(*numbers: signal.Signals) -> None:
     """Handle the signals for which the program has no handlers, where this is the main thread,
     which alone can."""
-    if threading.current_thread() is threading.main_thread():
+    if threading.current_thread() is _main_thread():
         for number in numbers:
             if signal.getsignal(number) is _DEFAULTS[number]:
                 signal.signal(number, _on_signal)
@@ -171,7 +173,7 @@ def interruptible_wait() -> Iterator[None]:
     """Within this, a signal raises nothing in the main thread: the wait ends because the nodes
     stop."""
     global _waits
-    if threading.current_thread() is not threading.main_thread():
+    if threading.current_thread() is not _main_thread():
         yield
         return
     _waits += 1
@@ -193,7 +195,7 @@ def held(is_end: bool = False) -> Iterator[None]:
         afterwards
     """
     global _coming, _holds
-    if threading.current_thread() is not threading.main_thread():
+    if threading.current_thread() is not _main_thread():
         yield
         return
     _take_on(*_DEFAULTS)

@@ -110,11 +110,13 @@ class ScriptRun(Run):
     def __init__(self, node: ScriptNode, settings: Any) -> None:
         super().__init__(node, settings)
         self.exit_code: Optional[int] = None
+        self._process = os.getpid()
         self.is_registered = False
         self.has_ended = False  # whether the program has
         self._error: Optional[BaseException] = None  # with which it ended before it was a node
         self.rospy.on_init_node = self._init_node
         self.rospy.lifetime.has_program = self.rospy.lifetime.is_interruptible = True
+        self.rospy.hear_signals()
         if working_directory.is_possible():
             self.rospy.lifetime.folder = node.cwd or os.getcwd()
         is_again = isinstance(node.latest_run, ScriptRun)
@@ -200,6 +202,12 @@ class ScriptRun(Run):
     def _init_node(self, name: str, register: Any, xmlrpc_port: int, tcpros_port: int) -> None:
         """Its program calls ``rospy.init_node``, in whatever thread."""
         node, settings = self.node, self._settings
+        if os.getpid() != self._process:
+            raise PharosError(
+                f'{name} is to be a node in a process forked off that of {node.name}, which has the'
+                " thread that forked alone, and no node: start it by subprocess, or multiprocessing's"
+                " get_context('spawn'), or run its script as a process of its own"
+            )
         node_registry.rename(node, name)
         settings.xmlrpc_port = xmlrpc_port or settings.xmlrpc_port
         settings.tcp_port = tcpros_port or settings.tcp_port

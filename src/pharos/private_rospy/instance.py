@@ -19,7 +19,7 @@ from pharos.private_rospy import (
 from pharos.private_rospy.acceptor import Acceptor, Limits
 from pharos.private_rospy.lifetime import Lifetime
 from pharos.private_rospy.loader import PrivateImports
-from pharos.private_rospy.own_process import OwnProcess
+from pharos.private_rospy.own_process import OwnProcess, hear_signals
 from pharos.private_rospy.patches import tcpros_server
 from pharos.private_rospy.parameters import WatchedParameters
 from pharos.private_rospy.deadlines import is_time_up, time_limit
@@ -49,8 +49,8 @@ class PrivateRospy:
         self.unsure = set()
         #: names of the services of this node that another one offers, as the master last said
         self.services_of_others = set()
-        #: called with what a hook of rospy.on_shutdown raised
-        self.on_failure = lambda error: None
+        #: called as ``on_failure(error, what='a hook of on_shutdown')`` with what that raised
+        self.on_failure = lambda *failure: None
         #: called as ``on_init_node(name, register, xmlrpc_port, tcpros_port)`` when the program of
         #: the node calls rospy.init_node; None: the node has no program of its own
         self.on_init_node = None
@@ -71,7 +71,7 @@ class PrivateRospy:
 
         imports = PrivateImports(patch=lambda module: patches.apply(module, self))
         self._process = OwnProcess(
-            imports, self.settings, self.lifetime, lambda error: self.on_failure(error)
+            imports, self.settings, self.lifetime, self._fail, self.request_stop
         )
         self._logging = logs.private_logging(imports)
         #: import_library(name): a library written on rospy, such as 'actionlib', for this node
@@ -92,6 +92,12 @@ class PrivateRospy:
         #: publisher(topic), subscriber(topic): rospy's _PublisherImpl or _SubscriberImpl, or None
         self.publisher = self.topics.get_publisher_impl
         self.subscriber = self.topics.get_subscriber_impl
+
+    #: hear_signals(): in Python's main thread, have SIGUSR1 and SIGUSR2 be for programs
+    hear_signals = staticmethod(hear_signals)
+
+    def _fail(self, *failure):
+        self.on_failure(*failure)
 
     def wait_for_registration(self, seconds):
         """What rospy waits with until it is registered, in steps of 0.1 s and for ever."""

@@ -21,6 +21,8 @@ KEEPALIVE_IDLE = 10  # seconds of silence after which the peer's host is asked w
 KEEPALIVE_INTERVAL = 5  # seconds between two such questions
 KEEPALIVE_COUNT = 4  # of them without an answer, and the connection is broken
 
+_main_thread = threading.main_thread  # Python's, also within a program: see own_process
+
 # .lifetime: of the node on whose behalf the thread runs; .interruption: the innermost it is within;
 # .was_cut_off: whether a ProgramCutOff was raised in it
 _thread = threading.local()
@@ -195,7 +197,7 @@ class Lifetime:
 
     @staticmethod
     def _sleep_until(event, seconds):
-        is_main = threading.current_thread() is threading.main_thread()
+        is_main = threading.current_thread() is _main_thread()
         longest = SIGNAL_LATENCY if is_main else seconds
         until = time.monotonic() + seconds
         while seconds > 0 and not event.wait(min(seconds, longest)):

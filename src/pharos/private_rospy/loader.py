@@ -64,7 +64,11 @@ class PrivateImports:
         # pickle without this is written in Python, and looks modules up in the set
         accelerator = types.ModuleType('_pickle')
         accelerator.PickleBuffer = pickle.PickleBuffer
-        util = ModuleProxy(importlib.util, module_from_spec=self._module_from_spec)
+        util = ModuleProxy(
+            importlib.util,
+            module_from_spec=self._module_from_spec,
+            find_spec=self._find_spec,
+        )
         self.modules.update(
             builtins=own_builtins,
             sys=self.system,
@@ -247,6 +251,15 @@ class PrivateImports:
     def _import_module(self, name, package=None):
         """``importlib.import_module``."""
         return self.load(importlib.util.resolve_name(name, package))
+
+    def _find_spec(self, name, package=None):
+        """``importlib.util.find_spec``."""
+        name = importlib.util.resolve_name(name, package)
+        if self.modules.get(name) is not None:
+            return self.modules[name].__spec__
+        parent = name.rpartition('.')[0]
+        path = self.load(parent).__path__ if parent else self.system.path
+        return ownership.find_spec(name, tuple(path)) or importlib.util.find_spec(name)
 
     def _module_from_spec(self, spec):
         """``importlib.util.module_from_spec``."""

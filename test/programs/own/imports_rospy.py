@@ -15,6 +15,10 @@ by_modules = sys.modules['rospy']
 names = {each.get_name() for each in (rospy, by_function, by_modules)}
 same = by_name.Publisher is publisher is rospy.Publisher
 reloaded = importlib.reload(importlib.import_module('logging')) is sys.modules['logging']
+known = [
+    importlib.util.find_spec(name) is not None
+    for name in ('names_its_node', 'rospy.topics', 'json', 'not_there')
+]
 beside = __file__.replace('imports_rospy', 'names_its_node')
 spec = importlib.util.spec_from_file_location('a_plug_in', beside)
 plug_in = importlib.util.module_from_spec(spec)
