@@ -10,7 +10,6 @@ import time
 
 import pharos
 import rospy
-from roscpp.srv import GetLoggers
 from std_msgs.msg import String
 
 RUNS = []  # of this program, in the module that this is
@@ -97,7 +96,7 @@ def wait_for_hook():
 
 def call_itself(file):
     """Call a service of its own in a hook of on_shutdown."""
-    loggers = rospy.ServiceProxy('~get_loggers', GetLoggers)
+    loggers = rospy.ServiceProxy('~get_loggers', pharos.service_class('roscpp/GetLoggers'))
     rospy.on_shutdown(lambda: say(file, type(loggers()).__name__))
     rospy.spin()
 
