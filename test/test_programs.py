@@ -1,6 +1,7 @@
 """Programs and libraries of ROS as a node's own: they find what they would in a process of their
 own."""
 import builtins
+import asyncio
 import concurrent.futures
 import importlib
 import io
@@ -297,6 +298,25 @@ def test_an_exit_handler_that_raises_or_hangs_is_told_and_the_stop_goes_on(node,
     go_on.set()
     assert [type(error) for error in node.errors] == [ZeroDivisionError]
     assert any('/program_node left behind' in line and 'atexit' in line for line in transcript)
+
+
+def test_the_threads_of_an_executor_end_with_their_node(node, transcript):
+    pool = node.ros_import('concurrent.futures').ThreadPoolExecutor(1)
+    worker = pool.submit(threading.current_thread).result(TIMEOUT)
+    node.stop()
+    assert ended(worker)
+    assert transcript == []
+
+
+def test_asyncio_takes_an_executor_of_a_node(node):
+    pool = node.ros_import('concurrent.futures').ThreadPoolExecutor(1)
+
+    async def main():
+        loop = asyncio.get_running_loop()
+        loop.set_default_executor(pool)
+        return await loop.run_in_executor(None, threading.current_thread)
+
+    assert asyncio.run(main()).name.startswith('/program_node')
 
 
 # -- packages

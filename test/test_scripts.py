@@ -189,7 +189,7 @@ def test_what_spins_or_sleeps_ends_with_its_node(how, master):
     pharos.ScriptNode.init_timeout = before
     node.stop_timeout = 0.2
     node.stop()
-    # a sleep that the stop finds ends with it; one that begins then is cut off when the time is up
+    # its sleeps are cut off when the time is up
     codes = {0, -signal.SIGTERM, -signal.SIGINT} if how != 'spin' else {0}
     assert node.exit_code in codes
 
@@ -247,10 +247,28 @@ def test_a_script_may_do_its_last_things_after_the_stop_has_begun(master, tmp_pa
     assert node.exit_code == 0
 
 
-def test_a_script_ends_with_its_threads(master, tmp_path):
-    node = master.load(WORKER, None, 'thread', tmp_path / 'said')
+def test_a_scripts_own_sleep_is_as_long_as_it_says_also_when_its_node_stops(master, tmp_path):
+    node = master.load(WORKER, None, 'sleep long', tmp_path / 'said')
+    until((tmp_path / 'said').exists)
+    node.stop()
+    assert (tmp_path / 'said').read_text() == 'opened\nclosed in time: True\n'
+    assert node.exit_code == 0
+
+
+@pytest.mark.parametrize('how', ['daemon', 'daemon alone'])
+def test_what_sleeps_in_a_daemon_when_a_script_ends_does_nothing_more(how, master, tmp_path, capfd):
+    node = master.load(WORKER, None, how, tmp_path / 'said')
+    until((tmp_path / 'said').exists)
+    node.stop()
+    assert (tmp_path / 'said').read_text() == 'armed\n'
+    assert 'Traceback' not in capfd.readouterr().err
+
+
+@pytest.mark.parametrize('how, times', [('thread', 1), ('timer', 1), ('executor', 2)])
+def test_a_script_ends_with_its_threads(how, times, master, tmp_path):
+    node = master.load(WORKER, None, how, tmp_path / 'said')
     node.wait(30)
-    assert (tmp_path / 'said').read_text() == 'done\n'
+    assert (tmp_path / 'said').read_text() == times * 'done\n'
 
 
 def test_a_hook_of_on_shutdown_sleeps_as_long_as_it_says(master, tmp_path):

@@ -119,6 +119,7 @@ class PrivateRospy:
     def exit_main(self):
         """What Python does when the program's main thread has ended: wait for the threads that are
         no daemons, and run the handlers of atexit."""
+        self._process.end_pools()
         self.lifetime.wait_for_threads()
         self._process.forget_signals()
         self._process.run_exit_handlers()

@@ -1,6 +1,7 @@
 """What a node's rospy holds while it runs, so that its stop leaves nothing behind: threads and
 sockets."""
 import contextlib
+import inspect
 import signal
 import socket
 import threading
@@ -70,17 +71,11 @@ class Lifetime:
 
             def __init__(self, group=None, target=None, *args, **options):
                 super().__init__(group, target, *args, **options)
-                if options.get('daemon') is None:  # it is what the thread is that makes it
-                    maker = threading.current_thread()
-                    is_programs = maker is lifetime.main_thread or (
-                        getattr(maker, 'is_waited_for', False)
-                    )
-                    self.daemon = not is_programs
+                if options.get('daemon') is None:
+                    self.daemon = lifetime.makes_daemons()
 
             def run(self):
-                if self.is_from_elsewhere and lifetime.folder:
-                    working_directory.enter(lifetime.folder)
-                with lifetime.interrupts_waits():
+                with lifetime.runs(self.is_from_elsewhere):
                     super().run()
 
             def start(self):
@@ -94,10 +89,14 @@ class Lifetime:
                 super().start()
 
         class Timer(threading.Timer, Thread):
-            """``threading.Timer`` of the node, whose stop cancels it."""
+            """``threading.Timer`` of the node, whose stop cancels it, at the end of its program."""
+
+            def __init__(self, *args, **options):
+                super().__init__(*args, **options)
+                self.daemon = lifetime.makes_daemons()
 
             def run(self):
-                with lifetime.interrupts_waits():
+                with lifetime.runs(self.is_from_elsewhere):
                     super().run()
 
         self.Thread, self.Timer = Thread, Timer
@@ -113,6 +112,23 @@ class Lifetime:
         thread = self.Thread(target=target, args=args, name=name, daemon=True)
         thread.start()
         return thread
+
+    def makes_daemons(self):
+        """Whether threads that this one makes are daemons, unless they are told otherwise."""
+        maker = threading.current_thread()
+        return not (maker is self.main_thread or getattr(maker, 'is_waited_for', False))
+
+    @contextlib.contextmanager
+    def runs(self, is_from_elsewhere):
+        """Within this, a thread of the node runs what it is for.
+
+        :param is_from_elsewhere: whether none of the node's has started it
+        """
+        if is_from_elsewhere and self.folder:
+            working_directory.enter(self.folder)
+        # threading keeps silent about SystemExit itself alone
+        with contextlib.suppress(ProgramCutOff), self.interrupts_waits():
+            yield
 
     @contextlib.contextmanager
     def interrupts_waits(self):
@@ -130,15 +146,20 @@ class Lifetime:
         self.ended.set()
         for interruption in tuple(self.interruptions):
             interruption.wake()
+        if not self.has_program:
+            self._cancel_timers()
+
+    def _cancel_timers(self):
         for thread in list(self.threads):
             if isinstance(thread, self.Timer):
                 thread.cancel()
 
     def await_end(self, threads, timeout):
         """Wait for the threads, for up to ``timeout`` seconds; what sleeps in a program still is cut
-        off then."""
+        off then, in threads that are daemons as soon as the program has ended."""
         join(threads, timeout)
         self.overdue.set()
+        self._cancel_timers()
         if self.has_program:
             join(threads, CUT_OFF_TIMEOUT)
 
@@ -154,27 +175,34 @@ class Lifetime:
         """``time.sleep`` that ends with the node; ``sleep(0)`` yields, as rospy's publishers mean
         it to.
 
-        What a program does after the stop has begun, and hooks of rospy.on_shutdown, sleeps for as
-        long as it says.
+        What a program calls itself sleeps for as long as it says, also after the stop has begun, as
+        do hooks of rospy.on_shutdown: what comes next is not to happen too early.
 
         :raises KeyboardInterrupt: in the main thread of a program for which rospy handles no signals
-        :raises ProgramCutOff: in a thread of a program for which the time is up
+        :raises ProgramCutOff: in a thread of a program that has ended, or for which the time is up
         """
+        is_programs = self.has_program and self._is_programs()
         if seconds <= 0:
             time.sleep(0)
         elif threading.get_ident() == self.hooks_thread:
             time.sleep(seconds)
+        elif is_programs and (self.ended.is_set() or not _is_rospys(inspect.currentframe().f_back)):
+            self._sleep_in_program(seconds)
         elif not self.ended.is_set():
             self._sleep_until(self.ended, seconds)
             self._interrupt()
-        elif self.has_program and self._is_programs():
+
+    def _sleep_in_program(self, seconds):
+        until = time.monotonic() + seconds
+        if threading.current_thread() is self.main_thread:
+            self._sleep_until(self.ended, seconds)
             self._interrupt()
-            if getattr(_thread, 'was_cut_off', False):
-                time.sleep(seconds)  # it has caught what was raised, and goes on
-            self._sleep_until(self.overdue, seconds)
-            if self.overdue.is_set():
-                _thread.was_cut_off = True
-                raise ProgramCutOff(-signal.SIGTERM)
+        if getattr(_thread, 'was_cut_off', False):
+            time.sleep(seconds)  # it has caught what was raised, and goes on
+        self._sleep_until(self.overdue, until - time.monotonic())
+        if self.overdue.is_set():
+            _thread.was_cut_off = True
+            raise ProgramCutOff(-signal.SIGTERM)
 
     def _is_programs(self):
         is_ending = threading.get_ident() == self.ending_thread
@@ -223,6 +251,11 @@ class Lifetime:
         others = set(self.threads) - {threading.current_thread(), *abandoned}
         # One that is not alive has ended, or is just being started, and will see that all has.
         return join(others, JOIN_TIMEOUT)
+
+
+def _is_rospys(frame: Any) -> bool:
+    """Whether it is rospy's code that runs there."""
+    return str(frame.f_globals.get('__name__')).startswith('rospy.')
 
 
 def join(threads: Iterable[threading.Thread], timeout: float) -> List[threading.Thread]:

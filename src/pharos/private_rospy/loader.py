@@ -193,7 +193,7 @@ class PrivateImports:
             elif spec.loader:
                 spec.loader.exec_module(module)
             if name.partition('.')[0] in ownership.OWN_OF_PYTHONS:
-                _share_exceptions(module)
+                _join_kinds(module)
             self._patch(module)
         except BaseException:
             del self.modules[name]
@@ -317,9 +317,12 @@ def _shared(spec):
     return None
 
 
-def _share_exceptions(module):
-    """Have a copy of one of Python's modules raise and catch the same as the others."""
+def _join_kinds(module):
+    """Have a copy of one of Python's modules raise and catch the same as the others, and its
+    executors be such for asyncio."""
     real = importlib.import_module(module.__name__)
     for name, value in vars(real).items():
         if isinstance(value, type) and issubclass(value, BaseException):
             vars(module)[name] = value
+    if module.__name__ == 'concurrent.futures.thread':
+        module.ThreadPoolExecutor.__bases__ = (real.ThreadPoolExecutor,)

@@ -92,6 +92,7 @@ class OwnProcess:
         self._environ, self._lifetime, self._report = settings.environ, lifetime, report
         self._request_stop = request_stop
         self.exit_handlers = []  # (function, arguments, keyword arguments), the first to run last
+        self._before_threads_end = []  # likewise, what threading calls
         self._wakeup_fd, self._signal_handlers = -1, {}
         self._former_handlers = {}  # those of before rospy had its own, which calls them in the end
         self._alarm_timer, self._alarm_due, self._alarm_interval = None, 0.0, 0.0
@@ -122,7 +123,7 @@ class OwnProcess:
                     Thread=lifetime.Thread,
                     Timer=lifetime.Timer,
                     main_thread=self.functions['main_thread'],
-                    _register_atexit=self._at_exit,
+                    _register_atexit=self._before_threads_end.append,
                 ),
                 '_thread': ModuleProxy(_thread, start_new_thread=lifetime.start_thread),
                 'time': ModuleProxy(time, sleep=lifetime.sleep),
@@ -174,12 +175,18 @@ class OwnProcess:
         """``atexit.unregister``."""
         self.exit_handlers[:] = [each for each in self.exit_handlers if each[0] != function]
 
+    def end_pools(self):
+        """Have the threads of executors end when their work is done, as Python does at its end."""
+        while self._before_threads_end:
+            self._attempt(self._before_threads_end.pop())
+
     def run_exit_handlers(self):
         """Run the handlers of atexit, the last first, each once."""
         self._attempt(self._lifetime.raise_pending)  # where it could not, report it
         while self.exit_handlers:
             function, args, kwargs = self.exit_handlers.pop()
             self._attempt(function, *args, **kwargs)
+        self.end_pools()  # of a library, and of a program that has not come to its end
 
     def _attempt(self, function, *args, **kwargs):
         try:

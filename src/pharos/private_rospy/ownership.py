@@ -15,10 +15,11 @@ from importlib.machinery import EXTENSION_SUFFIXES, ModuleSpec, PathFinder
 _ROOTS = {'rospy', 'rosgraph', 'rosunit'}
 #: message classes are made of these, and this package makes the nodes
 _SHARED = {'genpy', 'genmsg', 'pharos'}
-#: modules of Python's that act for the program that they are in (its arguments, output and child
-#: processes), or that look modules up by name
+#: modules of Python's that act for the program that they are in (its arguments, output, threads and
+#: child processes), or that look modules up by name
 OWN_OF_PYTHONS = {
     'argparse',
+    'concurrent',
     'contextlib',
     'fileinput',
     'gettext',
@@ -98,11 +99,11 @@ def _is_own(name, path, folder):
 
 
 def is_one_for_all(spec):
-    """Whether a module of a package that is a node's own cannot be so: a C extension, or generated
-    messages, whose classes are to be the same for all."""
+    """Whether a module of a package that is a node's own cannot be so: a C extension, or classes that
+    are to be the same for all, such as generated messages and, for asyncio, futures."""
     if spec.origin is None:
         return False
-    if spec.origin.endswith(tuple(EXTENSION_SUFFIXES)):
+    if spec.origin.endswith(tuple(EXTENSION_SUFFIXES)) or spec.name == 'concurrent.futures._base':
         return True
     if re.fullmatch(r'\w+\.(msg|srv)(\._\w+)?', spec.name):
         package = os.path.join(os.path.dirname(spec.origin), '__init__.py')

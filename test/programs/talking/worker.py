@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pharos
 import rospy
@@ -54,14 +55,36 @@ def speak_last(file):
     say(file, 'put away')
 
 
-def wait_in_thread(file):
-    """Leave work to a thread."""
+def sleep_long(file):
+    """Do something that takes its time, and note whether it got that."""
+    say(file, 'opened')
+    begun = time.monotonic()
+    time.sleep(0.3)
+    say(file, f'closed in time: {time.monotonic() - begun >= 0.3}')
 
-    def work():
-        time.sleep(0.05)
-        say(file, 'done')
 
-    threading.Thread(target=work).start()
+def leave_sleeping(file):
+    """Have a daemon sleep when the program ends."""
+
+    def fire():
+        say(file, 'armed')
+        time.sleep(1000)
+        say(file, 'fired')
+
+    threading.Thread(target=fire, daemon=True).start()
+
+
+def work_late(file):
+    """Do something a little later."""
+    time.sleep(0.05)
+    say(file, 'done')
+
+
+def leave_to_executor(file):
+    """Leave more work to an executor than it has threads."""
+    executor = ThreadPoolExecutor(1)
+    for _ in range(2):
+        executor.submit(work_late, file)
 
 
 def hook(file):
@@ -172,7 +195,6 @@ if __name__ == '__main__':
         'nameless interrupted': be_interrupted,
         'interrupted loop': loop,
         'last words': speak_last,
-        'thread': wait_in_thread,
         'order': tell_order,
         'handles': lambda file: handle_signal(file, False),
         'nameless handles': lambda file: handle_signal(file, True),
@@ -180,6 +202,12 @@ if __name__ == '__main__':
         'calls itself': call_itself,
         'stops itself': stop_itself,
         'late': lambda file: [rospy.signal_shutdown('enough'), ignore(file), sys.exit(3)],
+        'sleep long': sleep_long,
+        'daemon': lambda file: [leave_sleeping(file), rospy.spin()],
+        'daemon alone': leave_sleeping,
+        'thread': lambda file: threading.Thread(target=work_late, args=[file]).start(),
+        'timer': lambda file: threading.Timer(0.05, say, [file, 'done']).start(),
+        'executor': leave_to_executor,
         'hook': hook,
         'runs': lambda file: [say(file, len(RUNS)), rospy.spin()],
         'nameless runs': lambda file: [say(file, len(RUNS)), time.sleep(1000)],
