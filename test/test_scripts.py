@@ -136,7 +136,16 @@ def test_each_run_of_a_script_loads_its_modules_anew(master):
 
 
 @pytest.mark.parametrize(
-    'how, code', [('return', 0), ('exit', 0), ('exit 3', 3), ('exit text', 1), ('raise', 1)]
+    'how, code',
+    [
+        ('return', 0),
+        ('exit', 0),
+        ('exit 3', 3),
+        ('exit -1', 255),
+        ('exit text', 1),
+        ('exit unprintable', 1),
+        ('raise', 1),
+    ],
 )
 def test_a_script_that_ends_stops_its_node(how, code, master):
     node = master.load(WORKER, None, how)

@@ -156,7 +156,7 @@ class ScriptRun(Run):
             self.rospy.run_main(self.node.path, self._settings.argv)
             exit_code = 0
         except SystemExit as wanted:
-            exit_code = self._exit_code(wanted.code)
+            exit_code = self._exit_code(wanted)
         except KeyboardInterrupt:  # it has no handler for what its stop is to it
             exit_code = -signal.SIGINT
         except BaseException as raised:
@@ -192,11 +192,14 @@ class ScriptRun(Run):
     def _end_rospy(self, timeout: float) -> None:
         super()._end_rospy(min(timeout, Node.stop_timeout))
 
-    def _exit_code(self, code: Any) -> int:
-        """What Python makes of the argument of ``sys.exit``."""
+    def _exit_code(self, wanted: SystemExit) -> int:
+        """What Python makes of the argument of ``sys.exit``; what cuts a program off has another
+        class, and the number of a signal."""
+        code = wanted.code
         if code is None or isinstance(code, int):
-            return int(code or 0)
-        print(code, file=self.rospy.system.stderr)
+            status = int(code or 0)
+            return status & 0xFF if type(wanted) is SystemExit else status
+        attempt(lambda: print(code, file=self.rospy.system.stderr))
         return 1
 
     def _init_node(self, name: str, register: Any, xmlrpc_port: int, tcpros_port: int) -> None:

@@ -16,6 +16,13 @@ from std_msgs.msg import String
 RUNS = []  # of this program, in the module that this is
 
 
+class Unprintable:
+    """Fails when it is printed."""
+
+    def __str__(self):
+        return str(divide())
+
+
 def divide():
     """Fail."""
     return 1 / 0
@@ -175,6 +182,8 @@ if __name__ == '__main__':
         'return': lambda: None,
         'exit': sys.exit,
         'exit 3': lambda: sys.exit(3),
+        'exit -1': lambda: sys.exit(-1),
+        'exit unprintable': lambda: sys.exit(Unprintable()),
         'exit text': lambda: sys.exit('cannot go on'),
         'raise': divide,
         'nameless': lambda: None,
