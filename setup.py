@@ -8,6 +8,7 @@ setup(
             'pharos',
             'pharos.compose',
             'pharos.intraprocess',
+            'pharos.live',
             'pharos.messages',
             'pharos.private_rospy',
             'pharos.private_rospy.patches',

@@ -12,7 +12,7 @@ ROOMS = {
     'pharos.messages': 'messages',
     'pharos.intraprocess': 'intraprocess',
     'pharos.private_rospy': 'private_rospy',
-    'pharos.compose': ABOVE,  # to come, as pharos.live is
+    'pharos.compose': ABOVE,
     'pharos.live': ABOVE,
     'pharos.testing': ABOVE,
     'pharos_turtle': ABOVE,

@@ -13,6 +13,12 @@ if TYPE_CHECKING:
 TIMEOUT = 2.0  # seconds that a node may take to answer
 
 
+def node_api(uri: str, timeout: float = TIMEOUT) -> Any:
+    """ROS's slave API of the node at that URI, by XML-RPC: each call of it ends with an error after
+    ``timeout`` seconds."""
+    return ServerProxy(uri, timeout)
+
+
 class ExternalNode:
     """An interface to any ROS node outside this process, written in any language."""
 
@@ -72,7 +78,7 @@ class ExternalNode:
     def _ask(self, method: str, *args: str) -> Any:
         uri = self.uri
         try:
-            return getattr(ServerProxy(uri, TIMEOUT), method)('/pharos', *args)[2]
+            return getattr(node_api(uri), method)('/pharos', *args)[2]
         except COMMUNICATION_ERRORS as error:
             raise UnknownNodeError(
                 f'{self.name} is registered at {uri} but does not answer ({error}): if it is gone,'

@@ -1,0 +1,204 @@
+"""One look at the graph: processes, hosts, connections, and nodes that do not answer."""
+import contextlib
+import dataclasses
+import json
+import os
+import signal
+import time
+import xmlrpc.server
+
+import pytest
+
+from helpers import create, in_thread
+from pharos import Master, MasterUnreachableError
+from pharos.live import snapshot
+from pharos.live.snapshot import ALIVE, DEAD, SILENT, Connection
+from pharos.testing import TIMEOUT, until
+from sockets import refused_url, silent_peer
+
+STRING = 'std_msgs/String'
+
+
+@contextlib.contextmanager
+def registered(master, name, uri, topic='/snapshot_strange'):
+    """A node of that name, of which the master knows this URI and that it publishes a topic."""
+    master.api(name).registerPublisher(topic, STRING, uri)
+    yield
+    master.api(name).unregisterPublisher(topic, uri)
+
+
+@contextlib.contextmanager
+def answering(**methods):
+    """The URI of a node that has only these methods of the slave API."""
+    server = xmlrpc.server.SimpleXMLRPCServer(('127.0.0.1', 0), logRequests=False)
+    for name, method in methods.items():
+        server.register_function(method, name)
+    thread = in_thread(server.serve_forever)
+    yield 'http://127.0.0.1:%d/' % server.server_address[1]
+    server.shutdown()
+    server.server_close()
+    thread.join(TIMEOUT)
+
+
+def test_nodes_of_one_process_are_together_and_others_apart(master):
+    create(master, '/snapshot_one')
+    create(master, '/snapshot_two')
+    with master.run(
+        'topic_tools', 'relay', '/snapshot_a', '/snapshot_b', name='snapshot_cpp'
+    ) as cpp:
+        master.wait_for_node('/snapshot_cpp', TIMEOUT)
+        seen = snapshot.take(master)
+        (host,) = seen.hosts
+        assert host.is_here
+        assert {process.pid: process.nodes for process in host.processes} == {
+            os.getpid(): ['/snapshot_one', '/snapshot_two'],
+            cpp.pid: ['/snapshot_cpp'],
+        }
+        assert [seen.nodes[name].is_own for name in sorted(seen.nodes)] == [False, True, True]
+        assert {node.state for node in seen.nodes.values()} == {ALIVE}
+
+
+def test_connections_have_a_direction_and_a_transport(master):
+    one, two = create(master, '/snapshot_one'), create(master, '/snapshot_two')
+    sent = one.output_channel('/snapshot_a', STRING)
+    two.interested_in('/snapshot_a', STRING)
+    with master.run('topic_tools', 'relay', '/snapshot_a', '/snapshot_b', name='snapshot_cpp'):
+        assert sent.wait_for_subscribers(2, TIMEOUT)
+        seen = snapshot.take(master)
+        assert seen.connections == [
+            Connection('/snapshot_a', '/snapshot_one', '/snapshot_cpp', 'TCPROS'),
+            Connection('/snapshot_a', '/snapshot_one', '/snapshot_two', 'INTRAPROCESS'),
+        ]
+        assert seen.transports('/snapshot_a', '/snapshot_one') == {'INTRAPROCESS', 'TCPROS'}
+        assert seen.transports('/snapshot_a', '/snapshot_two') == {'INTRAPROCESS'}
+
+
+def test_topics_and_services_are_those_of_the_master(master):
+    node = create(master, '/snapshot_one')
+    node.output_channel('/snapshot_a', STRING)
+    node.interested_in('/snapshot_any', 'std_msgs/Empty')
+    node.serve('/snapshot_service', 'std_srvs/Empty', lambda request: {})
+    seen = snapshot.take(master)
+    topic = seen.topics['/snapshot_a']
+    assert (topic.type, topic.publishers, topic.subscribers) == (STRING, [node.name], [])
+    assert seen.topics['/snapshot_any'].subscribers == [node.name]
+    assert seen.services['/snapshot_service'].providers == [node.name]
+    assert '/snapshot_a' in seen.nodes[node.name].publishes
+    assert seen.nodes[node.name].hears == ['/snapshot_any']
+    assert '/snapshot_service' in seen.nodes[node.name].offers
+
+
+def test_a_topic_of_any_type_has_none(master):
+    node = create(master, '/snapshot_one')
+    node.ros.Subscriber('/snapshot_untyped', node.ros.AnyMsg)
+    assert snapshot.take(master).topics['/snapshot_untyped'].type is None
+
+
+def test_dead_and_silent_nodes_are_marked_and_cost_no_more_than_the_time_limit(master):
+    create(master, '/snapshot_one')
+    with contextlib.ExitStack() as stack:
+        for number in range(10):
+            silent = stack.enter_context(silent_peer())
+            stack.enter_context(registered(master, f'/snapshot_silent_{number}', silent))
+            stack.enter_context(registered(master, f'/snapshot_dead_{number}', refused_url()))
+        before = time.monotonic()
+        seen = snapshot.take(master, timeout=0.5)
+        assert time.monotonic() - before < 10 * 0.5
+    states = {name: node.state for name, node in seen.nodes.items() if 'snapshot' in name}
+    assert states == {
+        '/snapshot_one': ALIVE,
+        **{f'/snapshot_silent_{number}': SILENT for number in range(10)},
+        **{f'/snapshot_dead_{number}': DEAD for number in range(10)},
+    }
+    assert 'refused' in seen.nodes['/snapshot_dead_0'].problem
+    assert seen.nodes['/snapshot_silent_0'].problem
+    assert seen.nodes['/snapshot_silent_0'].pid is None
+    alone = [process.nodes for process in seen.hosts[0].processes if process.pid is None]
+    assert sorted(alone) == sorted([name] for name in states if name != '/snapshot_one')
+
+
+def test_a_node_that_is_stopped_by_a_debugger_is_silent_and_alive_afterwards(master):
+    with master.run('topic_tools', 'relay', '/snapshot_a', name='snapshot_cpp') as program:
+        master.wait_for_node('/snapshot_cpp', TIMEOUT)
+        os.kill(program.pid, signal.SIGSTOP)
+        try:
+            assert snapshot.take(master, 0.3).nodes['/snapshot_cpp'].state == SILENT
+        finally:
+            os.kill(program.pid, signal.SIGCONT)
+        until(lambda: snapshot.take(master).nodes['/snapshot_cpp'].state == ALIVE)
+
+
+def test_a_host_that_nobody_knows_is_dead_under_its_own_name(master):
+    uri = 'http://nobody.invalid:1234/'
+    with registered(master, '/snapshot_lost', uri):
+        seen = snapshot.take(master, 5)
+        assert seen.nodes['/snapshot_lost'].host == 'nobody.invalid'
+        assert seen.nodes['/snapshot_lost'].state == DEAD
+        assert 'nobody.invalid' in [host.name for host in seen.hosts]
+
+
+def test_what_a_subscriber_alone_tells_is_a_connection_too_whatever_its_transport(master):
+    node = create(master, '/snapshot_one')
+    bus_info = [
+        [1, node.uri, 'i', 'UDPROS', '/snapshot_a', 1],
+        [2, node.uri.rstrip('/'), 'i', 'UDPROS', '/snapshot_b'],  # as older nodes tell it
+        [3, node.uri, 'i', 'UDPROS', '/snapshot_c', 0],  # not connected
+    ]
+    methods = {'getPid': lambda caller: [1, '', 42], 'getBusInfo': lambda caller: [1, '', bus_info]}
+    with answering(**methods) as uri, registered(master, '/snapshot_udp', uri):
+        seen = snapshot.take(master)
+        assert seen.connections == [
+            Connection('/snapshot_a', node.name, '/snapshot_udp', 'UDPROS'),
+            Connection('/snapshot_b', node.name, '/snapshot_udp', 'UDPROS'),
+        ]
+        assert seen.nodes['/snapshot_udp'].pid == 42
+
+
+def test_a_node_that_answers_nonsense_is_marked_with_what_it_said(master):
+    methods = {'getPid': lambda caller: [1, '', 42], 'getBusInfo': lambda caller: [-1, 'no', 0]}
+    with answering(**methods) as uri, registered(master, '/snapshot_odd', uri):
+        node = snapshot.take(master).nodes['/snapshot_odd']
+        assert (node.pid, node.state, node.problem) == (42, SILENT, 'no')
+
+
+def test_nodes_of_another_master_are_not_in_it(master):
+    create(master, '/snapshot_one')
+    with Master.embedded() as other:
+        create(other, '/snapshot_other')
+        assert '/snapshot_other' not in snapshot.take(master).nodes
+        assert snapshot.take(other).nodes['/snapshot_other'].is_own
+
+
+def test_it_is_ready_for_json(master):
+    node = create(master, '/snapshot_one')
+    node.output_channel('/snapshot_a', STRING)
+    text = json.dumps(dataclasses.asdict(snapshot.take(master)))
+    assert json.loads(text)['topics']['/snapshot_a']['type'] == STRING
+
+
+def test_without_a_master_it_says_so():
+    with pytest.raises(MasterUnreachableError, match='roscore'):
+        snapshot.take(Master(refused_url()))
+
+
+def test_a_killed_node_is_dead(master):
+    program = master.run('topic_tools', 'relay', '/snapshot_a', name='snapshot_cpp')
+    master.wait_for_node('/snapshot_cpp', TIMEOUT)
+    uri = master.uri_of('/snapshot_cpp')
+    os.kill(program.pid, signal.SIGKILL)
+    program.wait(TIMEOUT)
+    try:
+        until(lambda: snapshot.take(master).nodes['/snapshot_cpp'].state == DEAD)
+    finally:
+        api = master.api('/snapshot_cpp')
+        publishers, subscribers, services = master.system_state()
+        for topics, unregister in (publishers, api.unregisterPublisher), (
+            subscribers,
+            api.unregisterSubscriber,
+        ):
+            for topic, nodes in topics.items():
+                if '/snapshot_cpp' in nodes:
+                    unregister(topic, uri)
+        for service, nodes in services.items():
+            if '/snapshot_cpp' in nodes:
+                api.unregisterService(service, api.lookupService(service))
