@@ -18,8 +18,8 @@ from pharos.errors import (
 )
 from pharos.external_node import ExternalNode
 from pharos.failures import Failure
+from pharos.lifecycle import Lifecycle
 from pharos.output_channel import OutputChannel
-from pharos.run import Lifecycle
 from pharos.master import Master
 from pharos.messages import (
     define_message,

@@ -5,7 +5,10 @@ import numbers
 from typing import TYPE_CHECKING, Any, Callable, FrozenSet, List, Optional, TypeVar
 
 from pharos.blocks import attempt, check_delegate, check_runs, check_soul, text_of
+from pharos import node_registry
+from pharos.errors import NodeStoppedError
 from pharos.failures import Failure, Failures
+from pharos.lifecycle import Lifecycle
 from pharos.private_rospy.settings import Settings
 from pharos.seconds import check_seconds
 from pharos.transcript import Transcript
@@ -52,9 +55,10 @@ class NodeAttributes:
                 f'a node is made by a master: Master().create({name}, named=...), not {name}()'
             )
 
-    def __init_subclass__(cls, **kwargs: Any) -> None:
+    def __init_subclass__(cls, is_base: bool = False, **kwargs: Any) -> None:
+        """:param is_base: whether it is one of those that make up Node"""
         super().__init_subclass__(**kwargs)
-        if NodeAttributes in cls.__bases__:  # Node itself
+        if is_base:
             methods = inspect.getmembers(cls, inspect.isfunction)
             cls._methods = frozenset(name for name, _ in methods)
             return
@@ -97,6 +101,32 @@ class NodeAttributes:
         self.soul, self.delegate = soul, delegate
 
     @property
+    def lifecycle(self) -> Lifecycle:
+        """A :class:`Lifecycle`."""
+        return Lifecycle.NEW if self.latest_run is None else self.latest_run.lifecycle
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the node is started and no stop has begun."""
+        return self.lifecycle is Lifecycle.RUNNING
+
+    @property
+    def current_run(self) -> 'Run':
+        """The :class:`~pharos.run.Run` of the present start.
+
+        :raises NodeStoppedError: if the node is not started
+        """
+        if node_registry.is_superseded(self):
+            raise NodeStoppedError(f'{self.name} was stopped while it started, and started again')
+        run, lifecycle = self.latest_run, self.lifecycle
+        if run is not None and lifecycle in (Lifecycle.RUNNING, Lifecycle.STOPPING):
+            return run
+        hint = ''
+        if lifecycle is Lifecycle.NEW:
+            hint = '; a start() of its own has to call super().start() before anything else'
+        raise NodeStoppedError(f'{self.name} is {lifecycle.value}: start() it first{hint}')
+
+    @property
     def name(self) -> str:
         """The node's name, as the master knows it: '/robot1/driver'."""
         return self._settings.name
@@ -124,7 +154,8 @@ class NodeAttributes:
         """The block that says what the node does, called as ``soul(node)`` by :meth:`execute` and
         :meth:`fork`.
 
-        May be replaced while the node runs, and takes effect with the next run.
+        May be replaced while the node runs, and takes effect with the next run; :meth:`renew` has
+        one that loops go on as the new one.
         """
         return self._soul
 

@@ -17,12 +17,12 @@ from typing import (
 import rosgraph
 from rosgraph.rosenv import ROS_MASTER_URI
 
-from pharos import attributes, embedded_master, node_registry, ros_process
+from pharos import attributes, embedded_master, node_registry, ros_process, starts
 from pharos.blocks import check_block
 from pharos.errors import PharosError, UnknownNodeError, suggest
 from pharos.external_node import ExternalNode
 from pharos.master_calls import MasterCalls
-from pharos.node import Node, start_made
+from pharos.node import Node
 from pharos.parameters import Parameters
 from pharos.private_rospy.addresses import check_port, check_url
 from pharos.private_rospy.names import check_name, global_name
@@ -162,7 +162,7 @@ class Master(MasterCalls):
             xmlrpc_port=xmlrpc_port,
             argv=argv,
         )
-        start_made(node)
+        starts.start_made(node)
         return node
 
     def run(

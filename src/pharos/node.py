@@ -1,23 +1,20 @@
 """Nodes: real ROS nodes of this process, written with blocks."""
-import contextlib
-import functools
-import threading
-from typing import TYPE_CHECKING, Any, Callable, Iterator, List, Optional, Type, Union
+from typing import TYPE_CHECKING, Any, Callable, List, Optional, Type, Union
 
 import genpy
 
-from pharos import node_registry, signals
-from pharos.attributes import Block, NodeAttributes
-from pharos.blocks import check_block, check_soul
+from pharos import node_registry
+from pharos.attributes import Block
+from pharos.blocks import check_block
 from pharos.channel import InputChannel
-from pharos.errors import NodeStoppedError, PharosError
 from pharos.health import Health, health_of
 from pharos.offered_service import OfferedService
 from pharos.output_channel import OutputChannel
 from pharos.parameter import Parameter
-from pharos.private_rospy.process_rospy import rospy
-from pharos.run import Lifecycle, Run
+from pharos.run import Run
 from pharos.seconds import check_seconds
+from pharos.souls import NodeWithSouls
+from pharos.starts import of_one_run
 from pharos.topic import QUEUE_SIZE, Topic
 
 if TYPE_CHECKING:
@@ -29,7 +26,7 @@ TypedAs = Union[str, Type[genpy.Message], None]
 Channel = Union[InputChannel, OutputChannel]
 
 
-class Node(NodeAttributes):
+class Node(NodeWithSouls, is_base=True):
     """A ROS node of this process: made by :meth:`Master.create`, subclassed to override
     :meth:`start` and :meth:`stop`.
 
@@ -51,7 +48,7 @@ class Node(NodeAttributes):
         super().__init_subclass__(**kwargs)
         cls._reopens = cls.start is Node.start
         if 'start' in vars(cls):
-            cls.start = _of_one_run(cls.start)  # type: ignore[assignment]
+            cls.start = of_one_run(cls.start)  # type: ignore[assignment]
         cls.stop = node_registry.one_stop_at_a_time(cls.stop)  # type: ignore[assignment]
 
     # -- life
@@ -85,85 +82,11 @@ class Node(NodeAttributes):
         """
         self.current_run.end()
 
-    @property
-    def lifecycle(self) -> Lifecycle:
-        """A :class:`Lifecycle`."""
-        return Lifecycle.NEW if self.latest_run is None else self.latest_run.lifecycle
-
-    @property
-    def is_running(self) -> bool:
-        """Whether the node is started and no stop has begun."""
-        return self.lifecycle is Lifecycle.RUNNING
-
-    @property
-    def current_run(self) -> Run:
-        """The :class:`~pharos.run.Run` of the present start.
-
-        :raises NodeStoppedError: if the node is not started
-        """
-        if node_registry.is_superseded(self):
-            raise NodeStoppedError(f'{self.name} was stopped while it started, and started again')
-        run, lifecycle = self.latest_run, self.lifecycle
-        if run is not None and lifecycle in (Lifecycle.RUNNING, Lifecycle.STOPPING):
-            return run
-        hint = ''
-        if lifecycle is Lifecycle.NEW:
-            hint = '; a start() of its own has to call super().start() before anything else'
-        raise NodeStoppedError(f'{self.name} is {lifecycle.value}: start() it first{hint}')
-
     def __enter__(self) -> 'Node':
         return self
 
     def __exit__(self, *error: Any) -> None:
         self.stop()
-
-    def sleep(self, seconds: float) -> None:
-        """Wait for ``seconds`` of ROS time, or until the node stops; a soul is ended by that.
-
-        The report: ``(Delay forSeconds: 1) wait``.
-        """
-        seconds = check_seconds('a sleep', seconds)
-        run = self.current_run
-        run.end_soul()
-        with signals.interruptible_wait(), contextlib.suppress(rospy.ROSInterruptException):
-            run.rospy.rospy.sleep(seconds)
-        run.end_soul()
-
-    def every(self, seconds: float) -> Iterator[None]:
-        """An iterator that turns at once and then every ``seconds`` of ROS time, without drift,
-        until the node stops.
-
-        A turn that takes longer than ``seconds`` delays the next, which then comes at once.
-        """
-        seconds = check_seconds('a period', seconds, above=0)
-        return self.current_run.turns(self.ros.Rate(1.0 / seconds, reset=True))
-
-    # -- blocks
-
-    def execute(self) -> Any:
-        """Run the soul once, in the calling thread, and return its value.
-
-        The report (listing 3.7): ``node execute``. An exception in the soul is reported (see
-        :attr:`errors`) and ends only this run, which then returns None.
-        """
-        return self._soul_runner(None)()
-
-    def fork(self, block: Block = None, name: Optional[str] = None) -> threading.Thread:
-        """Run the soul, or ``block(node)``, in a thread of its own, and return the thread.
-
-        The report (listing 3.8): ``[node execute] fork``. :meth:`stop` ends it at its next
-        :meth:`sleep` or turn of :meth:`every`.
-        """
-        return self.current_run.fork(self._soul_runner(block), name or 'soul')
-
-    def _soul_runner(self, block: Block) -> Callable[[], Any]:
-        """What runs the soul, or ``block``, as it is now; run again later, as it is then."""
-        run, soul = self.current_run, self._soul if block is None else check_soul(block)
-        if soul is None:
-            raise PharosError(
-                f'{self.name} has no soul to run: give it one with soul= or node.soul ='
-            )
-        return lambda: run.run_soul(soul, again=lambda nothing: self._soul_runner(block)())
 
     # -- topics
 
@@ -363,30 +286,3 @@ class BlockNode(Node):
         node = master.create(BlockNode, named='/myNode', soul=lambda me: ...)
         node.execute()
     """
-
-
-def _of_one_run(start: Callable[..., Any]) -> Callable[..., Any]:
-    @functools.wraps(start)
-    def start_in_run(node: Node, *args: Any, **kwargs: Any) -> Any:
-        with node_registry.start_of(node):
-            return start(node, *args, **kwargs)
-
-    return start_in_run
-
-
-def start_made(node: Node) -> None:
-    """Start a node that has just been made; where that fails, nothing of it is left.
-
-    :raises PharosError: if its own start() does not start it
-    """
-    with node_registry.start_of(node):
-        try:
-            node.start()
-            if node.latest_run is None:
-                raise PharosError(
-                    f'{node.name} did not start: {type(node).__name__}.start() has to call '
-                    'super().start() before anything else'
-                )
-        except BaseException:
-            node_registry.stop(node)
-            raise

@@ -184,7 +184,12 @@ def start_of(node: 'Node') -> 'Iterator[None]':
             _starts.pop(key, None)
 
 
-def is_superseded(node: 'Node') -> bool:
+def is_in_start(node: 'Node') -> bool:
+    """Whether this thread is in a :func:`start_of` the node."""
+    return (node, threading.get_ident()) in _starts
+
+
+def is_superseded(node: Any) -> bool:
     """Whether this thread is in a :func:`start_of` a run that is not the node's latest."""
     mine = _starts.get((node, threading.get_ident())) if _starts else None
     return mine is not None and mine is not node.latest_run

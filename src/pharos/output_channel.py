@@ -163,7 +163,7 @@ class OutputChannel(Channel):
             self._rospy.wait_until(
                 lambda: len(self.connections) >= count or not self.is_open, timeout
             )
-        self._run.end_soul()
+        self._run.souls.end()
         return self.is_open and len(self.connections) >= count
 
     def node_stopped(self) -> None:

@@ -1,9 +1,8 @@
 """One run of a node: all that a start makes, and its stop ends."""
 import contextlib
-import enum
 import threading
 import weakref
-from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, List, Optional, Tuple
+from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Tuple
 
 from pharos import messages, node_registry, signals
 from pharos.blocks import attempt, name_of
@@ -12,6 +11,7 @@ from pharos.errors import MessageTypeError, NodeStoppedError
 from pharos.external_node import ExternalNode
 from pharos.intraprocess.dispatcher import Dispatcher
 from pharos.intraprocess.fanout import Latch
+from pharos.lifecycle import Lifecycle
 from pharos.output_channel import OutputChannel
 from pharos.private_rospy import changes
 from pharos.private_rospy.instance import PrivateRospy
@@ -19,22 +19,13 @@ from pharos.private_rospy.names import Resolved, check_name
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.settings import Settings
 from pharos.seconds import check_seconds
+from pharos.souls import Souls
 from pharos.topic import Topic
 from pharos.transcript import Transcript
 from pharos.watcher import watcher_of
 
 if TYPE_CHECKING:
     from pharos.node import Node
-
-
-class Lifecycle(enum.Enum):
-    """Where a node is in its life; see :attr:`Node.lifecycle`."""
-
-    NEW = 'new'
-    STARTING = 'starting'
-    RUNNING = 'running'
-    STOPPING = 'stopping'
-    STOPPED = 'stopped'
 
 
 class Run:
@@ -62,7 +53,7 @@ class Run:
         self._is_cancelled = False  # whether a stop() came while the node started
         self._forked: 'weakref.WeakSet[threading.Thread]' = weakref.WeakSet()  # they run souls
         self._ignoring: List[threading.Thread] = []  # those of them that went on after the stop
-        self._soul_threads: List[int] = []  # identifiers of threads, once for each soul they run
+        self.souls = Souls(self)
         self.rospy = PrivateRospy(settings, self._stop_for_ros, lambda: node.allow_remote_shutdown)
         self.dispatcher = Dispatcher(self.rospy.start_thread)
         self.rospy.on_received = self.dispatcher.run
@@ -320,42 +311,12 @@ class Run:
             raise ValueError(f'from_= and to= are a node or its name, not {peer!r}')
         return Resolved(self.resolve(peer, 'node'))
 
-    # -- souls
-
-    def run_soul(self, block: Callable[['Node'], Any], again: Callable[[Any], Any]) -> Any:
-        """Run a soul in this thread; an exception in it is reported and ends nothing else.
-
-        :param again: ``again(None)`` runs the soul as it is then
-        """
-        self._soul_threads.append(threading.get_ident())
-        try:
-            with self.rospy.lifetime.interrupts_waits():
-                return block(self.node)
-        except BaseException as error:
-            self.report(error, block, 'soul', again=again)
-            return None
-        finally:
-            self._soul_threads.remove(threading.get_ident())
-
-    def turns(self, rate: Any) -> Iterator[None]:
-        """What :meth:`Node.every` returns, by a Rate of rospy's."""
-        while self.lifecycle is Lifecycle.RUNNING:
-            yield
-            if self.lifecycle is not Lifecycle.RUNNING:
-                return
-            with signals.interruptible_wait(), contextlib.suppress(rospy.ROSInterruptException):
-                rate.sleep()
-
     def fork(self, run: Callable[[], Any], name: str) -> threading.Thread:
-        """Run a soul by ``run()`` in a thread of its own, and return the thread."""
+        """Call ``run()`` in a thread of its own, which the stop waits for as for a soul's; returns
+        the thread."""
         thread: threading.Thread = self.rospy.start_thread(run, name=name)
         self._forked.add(thread)
         return thread
-
-    def end_soul(self) -> None:
-        """End the soul that runs in this thread, if one does and the node stops."""
-        if self.lifecycle is not Lifecycle.RUNNING and threading.get_ident() in self._soul_threads:
-            raise NodeStoppedError(f'{self.node.name} stops, and this soul with it')
 
     # -- what goes wrong
 

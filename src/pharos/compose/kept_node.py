@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Optional
 from pharos import attributes, node_registry
 from pharos.compose.launch_file import LaunchedNode
 from pharos.compose.script import ScriptNode, ScriptRun
-from pharos.node import start_made
+from pharos.starts import start_made
 
 if TYPE_CHECKING:
     from pharos.compose.composition import Composition

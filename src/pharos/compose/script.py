@@ -12,9 +12,10 @@ from pharos.blocks import attempt
 from pharos.compose.output import redirect
 from pharos.compose.programs import check_source, find_program, source_of
 from pharos.errors import NodeStoppedError, PharosError
+from pharos.lifecycle import Lifecycle
 from pharos.node import Node
 from pharos.ros_process import arguments_of
-from pharos.run import Lifecycle, Run
+from pharos.run import Run
 from pharos.watcher import watcher_of
 
 if TYPE_CHECKING:

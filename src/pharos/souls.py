@@ -1,0 +1,187 @@
+"""Souls: what nodes do by themselves."""
+import contextlib
+import threading
+from typing import TYPE_CHECKING, Any, Callable, Iterator, List, Optional
+
+from pharos import node_registry, signals
+from pharos.attributes import Block, NodeAttributes
+from pharos.blocks import check_soul
+from pharos.errors import NodeStoppedError, PharosError
+from pharos.lifecycle import Lifecycle
+from pharos.private_rospy.process_rospy import rospy
+from pharos.seconds import check_seconds
+
+if TYPE_CHECKING:
+    from pharos.run import Run
+
+
+class Soul:
+    """A soul that was forked, in its thread."""
+
+    def __init__(self, block: Block, name: str, maker: Any) -> None:
+        self.block = block  # None: the node's own soul, whatever that is when it begins
+        self.name = name
+        self.maker = maker  # START, the Soul in whose thread it was forked, or None
+        self.is_asked = False  # whether it is to begin anew
+        self.begins_anew = False  # whether it has ended for that
+
+
+#: the maker of souls that the ``start()`` of the node's class forks
+START = 'start'
+
+
+class Souls:
+    """The souls of one run of a node."""
+
+    def __init__(self, run: 'Run') -> None:
+        self._run = run
+        #: those that are forked and have not ended; after the stop, those that it has ended
+        self.forked: List[Soul] = []
+        self._here = threading.local()  # .soul: the one whose thread this is
+        self._threads: List[int] = []  # identifiers of threads, once for each soul they run
+
+    def execute(self, block: Block) -> Any:
+        """Run the node's soul, or ``block``, in this thread; an exception in it is reported and
+        ends nothing else."""
+        return self._execute(Soul(block, '', None), self.block_of(block))
+
+    def block_of(self, block: Block) -> Callable[..., Any]:
+        """What is run: the node's soul, as it is now, or ``block``.
+
+        :raises PharosError: if there is none
+        """
+        node = self._run.node
+        soul = node.soul if block is None else check_soul(block)
+        if soul is None:
+            raise PharosError(
+                f'{node.name} has no soul to run: give it one with soul= or node.soul ='
+            )
+        return soul
+
+    def _execute(self, soul: Soul, block: Callable[..., Any]) -> Any:
+        def again(nothing: Any) -> None:
+            self._run.node.current_run.souls.execute(soul.block)
+
+        self._threads.append(threading.get_ident())
+        try:
+            with self._run.rospy.lifetime.interrupts_waits():
+                return block(self._run.node)
+        except BaseException as error:
+            self._run.report(error, block, 'soul', again=again)
+            return None
+        finally:
+            self._threads.remove(threading.get_ident())
+
+    def fork(self, block: Block, name: str) -> threading.Thread:
+        """Run the node's soul, or ``block``, in a thread of its own, and return the thread."""
+        maker = getattr(self._here, 'soul', None)
+        if node_registry.is_in_start(self._run.node):
+            maker = START
+        soul, first = Soul(block, name, maker), self.block_of(block)
+        self.forked.append(soul)
+        return self._run.fork(lambda: self._run_forked(soul, first), name)
+
+    def _run_forked(self, soul: Soul, block: Optional[Callable[..., Any]]) -> None:
+        self._here.soul = soul
+        while block is not None:
+            self._execute(soul, block)
+            block = None
+            if soul.begins_anew:
+                soul.is_asked = soul.begins_anew = False
+                block = self._run.node.soul if soul.block is None else soul.block
+        if self._run.lifecycle is Lifecycle.RUNNING:
+            self.forked.remove(soul)
+
+    def renew(self) -> None:
+        """Have those that are forked begin anew.
+
+        :raises PharosError: if there are none
+        """
+        forked = list(self.forked)
+        if not forked:
+            raise PharosError(
+                f'no soul of {self._run.node.name} runs in a thread of its own: fork() it'
+            )
+        for soul in forked:
+            soul.is_asked = True
+
+    def turns(self, rate: Any) -> Iterator[None]:
+        """What :meth:`Node.every` returns, by a Rate of rospy's."""
+        soul = getattr(self._here, 'soul', None)
+        while self._run.lifecycle is Lifecycle.RUNNING:
+            if soul is not None and soul.is_asked:
+                soul.begins_anew = True
+                return
+            yield
+            if self._run.lifecycle is not Lifecycle.RUNNING:
+                return
+            with signals.interruptible_wait(), contextlib.suppress(rospy.ROSInterruptException):
+                rate.sleep()
+
+    def end(self) -> None:
+        """End the soul that runs in this thread, if one does and the node stops."""
+        is_running = self._run.lifecycle is Lifecycle.RUNNING
+        if not is_running and threading.get_ident() in self._threads:
+            raise NodeStoppedError(f'{self._run.node.name} stops, and this soul with it')
+
+
+class NodeWithSouls(NodeAttributes, is_base=True):
+    """The part of a Node that is about souls."""
+
+    def execute(self) -> Any:
+        """Run the soul once, in the calling thread, and return its value.
+
+        The report (listing 3.7): ``node execute``. An exception in the soul is reported (see
+        :attr:`errors`) and ends only this run, which then returns None.
+        """
+        return self.current_run.souls.execute(None)
+
+    def fork(self, block: Block = None, name: Optional[str] = None) -> threading.Thread:
+        """Run the soul, or ``block(node)``, in a thread of its own, and return the thread.
+
+        The report (listing 3.8): ``[node execute] fork``. :meth:`stop` ends it at its next
+        :meth:`sleep` or turn of :meth:`every`.
+        """
+        return self.current_run.souls.fork(block, name or 'soul')
+
+    def renew(self) -> None:
+        """Have the souls that were forked begin anew at their next turn of :meth:`every`: that loop
+        ends there, and when what follows it has run, the soul runs from its first line, in the same
+        thread.
+
+        A soul that loops goes on as it was written when it began; this has it go on as it is now,
+        when :attr:`soul` was replaced, or its code edited and reloaded::
+
+            driver.soul = lambda me: [me.send_to('/cmd_vel', angular=-1.0) for _ in me.every(1)]
+            driver.renew()
+
+        A soul that was forked as a ``block`` begins with that block again, and one whose node has no
+        soul any more ends. Without :meth:`every` a soul does not begin anew.
+
+        :raises PharosError: if no soul runs in a thread of its own: it has ended, or failed, and is
+            to be forked again
+        :raises NodeStoppedError: if the node is not started
+        """
+        self.current_run.souls.renew()
+
+    def sleep(self, seconds: float) -> None:
+        """Wait for ``seconds`` of ROS time, or until the node stops; a soul is ended by that.
+
+        The report: ``(Delay forSeconds: 1) wait``.
+        """
+        seconds = check_seconds('a sleep', seconds)
+        run = self.current_run
+        run.souls.end()
+        with signals.interruptible_wait(), contextlib.suppress(rospy.ROSInterruptException):
+            run.rospy.rospy.sleep(seconds)
+        run.souls.end()
+
+    def every(self, seconds: float) -> Iterator[None]:
+        """An iterator that turns at once and then every ``seconds`` of ROS time, without drift,
+        until the node stops, or its soul begins anew (see :meth:`renew`).
+
+        A turn that takes longer than ``seconds`` delays the next, which then comes at once.
+        """
+        seconds = check_seconds('a period', seconds, above=0)
+        run = self.current_run
+        return run.souls.turns(run.rospy.rospy.Rate(1.0 / seconds, reset=True))

@@ -1,0 +1,38 @@
+"""The starts of nodes: of those just made, and by a start() of a class's own."""
+import functools
+from typing import TYPE_CHECKING, Any, Callable
+
+from pharos import node_registry
+from pharos.errors import PharosError
+
+if TYPE_CHECKING:
+    from pharos.node import Node
+
+
+def start_made(node: 'Node') -> None:
+    """Start a node that has just been made; where that fails, nothing of it is left.
+
+    :raises PharosError: if its own start() does not start it
+    """
+    with node_registry.start_of(node):
+        try:
+            node.start()
+            if node.latest_run is None:
+                raise PharosError(
+                    f'{node.name} did not start: {type(node).__name__}.start() has to call '
+                    'super().start() before anything else'
+                )
+        except BaseException:
+            node_registry.stop(node)
+            raise
+
+
+def of_one_run(start: Callable[..., Any]) -> Callable[..., Any]:
+    """A ``start`` method of a class's own: what it does is for the run that it starts."""
+
+    @functools.wraps(start)
+    def start_in_run(node: 'Node', *args: Any, **kwargs: Any) -> Any:
+        with node_registry.start_of(node):
+            return start(node, *args, **kwargs)
+
+    return start_in_run
