@@ -14,6 +14,7 @@ KEYS = {
     'PIL': 'python3-pil',
     'hypothesis': 'python3-hypothesis',
     'numpy': 'python3-numpy',
+    'pexpect': 'python3-pexpect',
     'psutil': 'python3-psutil',
     'pytest': 'python3-pytest',
     'rospkg': 'python3-rospkg',

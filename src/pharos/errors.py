@@ -26,7 +26,7 @@ class UnknownNodeError(PharosError):
 
 
 class UnknownTopicError(PharosError):
-    """The master knows no topic of that name, or no type for it."""
+    """The master knows no topic of that name, or no type for it, or nobody publishes on it."""
 
 
 class UnknownTypeError(PharosError):

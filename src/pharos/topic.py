@@ -1,4 +1,5 @@
 """Topics: named buses, and the dispatchers that hand a node its channel."""
+import importlib
 import time
 from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, List, Optional, Tuple, Type, Union
 
@@ -22,6 +23,7 @@ from pharos.private_rospy.tcpros_connection import ask_publisher
 from pharos.seconds import check_seconds
 
 if TYPE_CHECKING:
+    from pharos.live.watching import Bandwidth, Rate
     from pharos.master import Master
     from pharos.node import Node
 
@@ -84,6 +86,49 @@ class Topic:
             for channel in node.channels
             if channel.topic == self.name
         ]
+
+    # -- for looking, at no cost while nobody does: :mod:`pharos.live.watching`
+
+    def hz(self, seconds: float = 3.0) -> 'Rate':
+        """How often messages come on it, counted for ``seconds`` of wall time: ``rostopic hz``.
+
+        :returns: ``rate, min, max, std_dev, window``; 0 messages a second where fewer than two came
+        :raises UnknownTopicError: if nobody publishes on it
+        :raises NodeStoppedError: if the node whose soul or delegate asks stops meanwhile
+        """
+        rate: 'Rate' = _watching().hz(self, seconds)
+        return rate
+
+    def bw(self, seconds: float = 3.0) -> 'Bandwidth':
+        """How many bytes a second come on it, counted as :meth:`hz` does: ``rostopic bw``.
+
+        :returns: ``rate, mean, min, max, window``, in bytes; for INTRAPROCESS the bytes that TCPROS
+            would have
+        """
+        bandwidth: 'Bandwidth' = _watching().bw(self, seconds)
+        return bandwidth
+
+    @property
+    def last(self) -> genpy.Message:
+        """The last message: at once where it is latched, else the next, within 3 s.
+
+        :raises UnknownTopicError: if nobody publishes on it
+        :raises TimeoutError: if none comes in time
+        """
+        return _watching().last(self)
+
+    def watch(
+        self, count: Optional[int] = None, block: Optional[Callable[[genpy.Message], Any]] = None
+    ) -> None:
+        """Show the next messages as they come, with long arrays cut: ``rostopic echo --noarr``.
+
+        Ctrl-C ends it, and where this is no prompt, stops all nodes, as in :func:`spin`.
+
+        :param count: how many, None: without end
+        :param block: run ``block(message)`` in this thread instead of showing it on the Transcript
+        :raises UnknownTopicError: if nobody publishes on it
+        """
+        _watching().watch(self, count, block)
 
     def input_channel(
         self,
@@ -266,3 +311,7 @@ class Topic:
 
     def __repr__(self) -> str:
         return f'<Topic {self.name} of {self.master.url}>'
+
+
+def _watching() -> Any:
+    return importlib.import_module('pharos.live.watching')

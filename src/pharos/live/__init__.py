@@ -1,6 +1,8 @@
 """What is going on at a master, looked at while it runs; loaded only when used.
 
 - snapshot: one look at hosts, processes, nodes, topics, services and connections
+- watching: Topic.hz, bw, last and watch
+- message_text: messages as text, long arrays cut
 
 It stands on the facade.
 """

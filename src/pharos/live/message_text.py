@@ -1,0 +1,45 @@
+"""Messages as text, to be read as they come."""
+from typing import Any
+
+import genpy
+
+LONGEST = 12  # values of an array that are shown; of longer ones, the first alone
+FIRST = 3  # these many
+
+
+class _Text:
+    """A value that genpy writes as it is, and not as YAML has it."""
+
+    def __init__(self, text: str) -> None:
+        self._text = text
+
+    def __str__(self) -> str:
+        return self._text
+
+
+def text_of(message: genpy.Message) -> str:
+    """A message as ``rostopic echo`` prints it, but for long arrays: the first values, and how many
+    there are."""
+    return str(genpy.message.strify_message(_cut(message)))
+
+
+def _cut(value: Any) -> Any:
+    """The value, with long arrays cut."""
+    if isinstance(value, genpy.Message):
+        copy = object.__new__(type(value))
+        for name in value.__slots__:
+            setattr(copy, name, _cut(getattr(value, name)))
+        return copy
+    if not isinstance(value, (list, tuple, bytes)):
+        return value
+    if len(value) > LONGEST:
+        return _shortened(value)
+    return value if isinstance(value, bytes) else [_cut(each) for each in value]
+
+
+def _shortened(values: Any) -> Any:
+    first = [_cut(each) for each in values[:FIRST]]
+    rest = f'... {len(values)} in all'
+    if isinstance(values[0], (genpy.Message, genpy.TVal)):
+        return [*first, _Text(rest)]
+    return _Text(f"[{', '.join(map(str, first))}, {rest}]")
