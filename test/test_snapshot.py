@@ -11,9 +11,10 @@ import pytest
 
 from helpers import create, in_thread
 from pharos import Master, MasterUnreachableError
+from pharos.external_node import node_api
 from pharos.live import snapshot
 from pharos.live.snapshot import ALIVE, DEAD, SILENT, Connection
-from pharos.testing import TIMEOUT, until
+from pharos.testing import TIMEOUT, Mailbox, until
 from sockets import refused_url, silent_peer
 
 STRING = 'std_msgs/String'
@@ -202,3 +203,71 @@ def test_a_killed_node_is_dead(master):
         for service, nodes in services.items():
             if '/snapshot_cpp' in nodes:
                 api.unregisterService(service, api.lookupService(service))
+
+
+def test_each_connection_counts_its_messages_within_the_process_and_to_cpp_and_from_it(master):
+    one, two = create(master, '/snapshot_one'), create(master, '/snapshot_two')
+    mailbox = Mailbox()
+    two.interested_in('/snapshot_counted', STRING, mailbox)
+    sent = one.output_channel('/snapshot_counted', STRING)
+    two.interested_in('/snapshot_relayed', STRING, mailbox)
+    arguments = '/snapshot_counted', '/snapshot_relayed'
+    with master.run('topic_tools', 'relay', *arguments, name='snapshot_cpp'):
+        assert sent.wait_for_subscribers(2, TIMEOUT)
+        sent.send(data='the first, after which relay advertises')
+        until(lambda: master.topic('/snapshot_relayed').publishers)
+        until(lambda: two.channels[1].connections)
+        before = snapshot.take(master, counts=True)
+        for _ in range(10):
+            sent.send(data='one')
+        mailbox.wait_for(lambda message: message.data == 'one')
+        until(lambda: two.channels[1].received >= 10)
+        after = snapshot.take(master, counts=True)
+    former = {connection.key: connection for connection in before.connections}
+    counted = {
+        (each.topic, each.subscriber): (each.messages_since(former[each.key]), each.transport)
+        for each in after.connections
+    }
+    assert counted == {
+        ('/snapshot_counted', '/snapshot_two'): (10, 'INTRAPROCESS'),
+        ('/snapshot_counted', '/snapshot_cpp'): (10, 'TCPROS'),
+        ('/snapshot_relayed', '/snapshot_two'): (10, 'TCPROS'),
+    }
+    relayed = next(each for each in after.connections if each.topic == '/snapshot_relayed')
+    assert relayed.sent >= 10 and relayed.received >= 10
+    assert relayed.bytes_sent > 10 * len('one') and relayed.bytes_received > 10 * len('one')
+
+
+def test_rates_are_those_of_all_publishers_whoever_hears_them():
+    def look(seconds, **received):
+        connections = [
+            Connection('/t', '/' + ends[0], '/' + ends[1], 'TCPROS', received=count)
+            for ends, count in received.items()
+        ]
+        return snapshot.Snapshot('', seconds, [], {}, {}, {}, connections)
+
+    before = look(10.0, ax=100, ay=200, bx=300, cx=400)
+    after = look(12.0, ax=120, ay=210, bx=302, cx=5, dx=7)  # c has connected anew, d is new
+    assert snapshot.rates(before, after) == {'/t': 10.0 + 1.0}
+
+
+def test_a_node_that_does_not_count_is_alive_all_the_same(master):
+    bus_info = [[1, 'http://elsewhere/', 'i', 'TCPROS', '/snapshot_a', 1]]
+    methods = {'getPid': lambda caller: [1, '', 42], 'getBusInfo': lambda caller: [1, '', bus_info]}
+    with answering(**methods) as uri, registered(master, '/snapshot_plain', uri):
+        seen = snapshot.take(master, counts=True)
+        assert seen.connections == [
+            Connection('/snapshot_a', 'http://elsewhere/', '/snapshot_plain', 'TCPROS')
+        ]
+        assert seen.nodes['/snapshot_plain'].state == ALIVE
+
+
+def test_the_connections_of_a_node_have_different_numbers(master):
+    one, two = create(master, '/snapshot_one'), create(master, '/snapshot_two')
+    for node in one, two:
+        node.interested_in('/snapshot_a', STRING)
+        node.output_channel('/snapshot_a', STRING)
+    with master.run('topic_tools', 'relay', '/snapshot_a', name='snapshot_cpp'):
+        until(lambda: len(one.channels[1].connections) == 3)
+        numbers = [each[0] for each in node_api(one.uri).getBusInfo('/test')[2]]
+        assert len(numbers) == 5 and len(set(numbers)) == 5

@@ -1,6 +1,7 @@
 """What is going on at a master, looked at while it runs; loaded only when used.
 
 - snapshot: one look at hosts, processes, nodes, topics, services and connections
+- answers: what the nodes say to that
 - watching: Topic.hz, bw, last and watch
 - message_text: messages as text, long arrays cut
 

@@ -1,29 +1,18 @@
 """One look at the graph of a ROS master: hosts, processes, nodes, topics, services, connections."""
 import dataclasses
-import os
 import socket
-import threading
 import time
-import urllib.parse
 from typing import Any, Dict, Iterable, List, Optional, Set, Tuple
 
 import rosgraph
-import rosgraph.network
 
-from pharos.errors import PharosError
-from pharos.external_node import node_api
+from pharos.live.answers import ALIVE, DEAD, SILENT, Answer, ask_all
 from pharos.master import Master
-from pharos.node import Node
+
+__all__ = ['ALIVE', 'DEAD', 'SILENT', 'Snapshot', 'take', 'rates']
 
 TIMEOUT = 1.0  # seconds that all nodes have to answer, together
-
-ALIVE = 'alive'
-SILENT = 'silent'  # it does not answer in time: too busy, stopped by a debugger, or out of reach
-DEAD = 'dead'  # nobody is at its address any more, though the master has it still
-
-CALLER = '/pharos'
 HERE = socket.gethostname()  # the name of the host that this program runs on
-INBOUND = 'i'  # the direction of a connection, in getBusInfo
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +23,30 @@ class Connection:
     publisher: str  # the name of a node; its URI where the master knows none there
     subscriber: str
     transport: str  # 'INTRAPROCESS', 'TCPROS' or 'UDPROS'
+    # messages and bytes since it was made, as each end counts them; None: it does not say, or was
+    # not asked
+    sent: Optional[int] = None
+    received: Optional[int] = None
+    bytes_sent: Optional[int] = None
+    bytes_received: Optional[int] = None
+
+    @property
+    def key(self) -> Tuple[str, str, str, str]:
+        """What it has in common with itself in another snapshot."""
+        return self.topic, self.publisher, self.subscriber, self.transport
+
+    def messages_since(self, before: Optional['Connection']) -> Optional[int]:
+        """How many messages have come through since an earlier look; None: it is not known.
+
+        What one end counts is compared with what the same counted before. One that counts less is
+        connected anew.
+        """
+        if before is None:
+            return None
+        for count, former in (self.received, before.received), (self.sent, before.sent):
+            if count is not None and former is not None and count >= former:
+                return count - former
+        return None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +58,7 @@ class SeenNode:
     host: str  # the name of a :class:`Host`
     pid: Optional[int]  # on its host; None: it does not say
     state: str  # ALIVE, SILENT or DEAD
-    problem: str  # why it is not ALIVE, or does not tell its connections; '' for nothing
+    problem: str  # why it is not ALIVE; '' for nothing
     is_own: bool  # whether it runs in this process
     publishes: List[str]  # topics
     hears: List[str]  # topics
@@ -114,37 +127,13 @@ class Snapshot:
         }
 
 
-@dataclasses.dataclass
-class _Answer:
-    """What a node has said so far; filled in by a thread of its own."""
-
-    host: str  # as the node calls it
-    address: Optional[str] = None  # of the host; None: not known
-    is_here: bool = False
-    pid: Optional[int] = None
-    bus_info: Optional[List[List[Any]]] = None  # as of getBusInfo
-    error: Optional[Exception] = None
-
-    @property
-    def state(self) -> str:
-        if self.bus_info is not None:
-            return ALIVE
-        is_dead = isinstance(self.error, (ConnectionRefusedError, socket.gaierror))
-        return DEAD if is_dead else SILENT
-
-    @property
-    def problem(self) -> str:
-        if self.bus_info is not None:
-            return ''
-        return 'it has not answered in time' if self.error is None else str(self.error)
-
-
-def take(master: Master, timeout: float = TIMEOUT) -> Snapshot:
+def take(master: Master, timeout: float = TIMEOUT, counts: bool = False) -> Snapshot:
     """Ask the master, and all nodes at once; returns the :class:`Snapshot`.
 
     Nodes that do not answer are in it, too, and marked so. It may be called in any thread.
 
     :param timeout: seconds that all nodes have to answer, together
+    :param counts: ask them, too, what has come through their connections; nodes count that anyway
     :raises MasterUnreachableError: if the master does not answer
     """
     publishers, subscribers, services = master.system_state()
@@ -154,7 +143,7 @@ def take(master: Master, timeout: float = TIMEOUT) -> Snapshot:
     names = sorted({name for kind in kinds for users in kind.values() for name in users})
     uris = _uris_of(master, names)
     own = {node.name: node for node in master.local_nodes() if uris.get(node.name) == node.uri}
-    answers = _ask_all(uris, own, timeout)
+    answers = ask_all(uris, own, timeout, counts)
     hosts = _names_of_hosts(answers)
     nodes = {
         name: SeenNode(
@@ -201,74 +190,7 @@ def _uris_of(master: Master, names: Iterable[str]) -> Dict[str, Optional[str]]:
     return uris
 
 
-# -- what the nodes say
-
-
-def _ask_all(
-    uris: Dict[str, Optional[str]], own: Dict[str, Node], timeout: float
-) -> Dict[str, _Answer]:
-    """What the nodes at these URIs say until ``timeout`` seconds are over.
-
-    Each has a thread, which is left to itself where it takes longer: looking up the name of a host
-    has no limit of its own.
-    """
-    deadline = time.monotonic() + timeout
-    answers = {name: _Answer(_host_name(uri)) for name, uri in uris.items()}
-    threads = [
-        threading.Thread(
-            target=_ask,
-            args=(answers[name], uri, own.get(name), timeout),
-            name=f'snapshot of {name}',
-            daemon=True,
-        )
-        for name, uri in uris.items()
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(max(0.0, deadline - time.monotonic()))
-    return {name: dataclasses.replace(answer) for name, answer in answers.items()}
-
-
-def _ask(answer: _Answer, uri: Optional[str], own: Optional[Node], timeout: float) -> None:
-    """Fill in the answer of a node, for up to ``timeout`` seconds a call."""
-    try:
-        if uri is None:
-            raise ConnectionRefusedError('the master does not know it any more')
-        if own is not None:
-            answer.is_here, answer.pid = True, os.getpid()
-            answer.bus_info = own.current_run.rospy.topics.get_pub_sub_info()
-            return
-        answer.is_here, answer.address = _locate(answer.host)
-        api = node_api(uri, timeout)
-        answer.pid = int(_value(api.getPid(CALLER)))
-        answer.bus_info = list(_value(api.getBusInfo(CALLER)))
-    except Exception as error:  # whatever it answers, it is one node of many
-        answer.error = error
-
-
-def _value(answer: Any) -> Any:
-    """The value in an answer of ROS's slave API: a code (1: done), a text, the value."""
-    code, text, value = answer
-    if code != 1:
-        raise PharosError(str(text))
-    return value
-
-
-def _host_name(uri: Optional[str]) -> str:
-    return urllib.parse.urlsplit(uri or '').hostname or 'unknown'
-
-
-def _locate(host: str) -> Tuple[bool, str]:
-    """``(whether it is this computer, its address)``."""
-    address = str(socket.getaddrinfo(host, None)[0][4][0])
-    return rosgraph.network.is_local_address(host), address
-
-
-# -- what is made of it
-
-
-def _names_of_hosts(answers: Dict[str, _Answer]) -> Dict[str, str]:
+def _names_of_hosts(answers: Dict[str, Answer]) -> Dict[str, str]:
     """The name of the host of each node: one for all names of an address."""
     names: Dict[Optional[str], str] = {}
     for answer in answers.values():
@@ -295,18 +217,38 @@ def _hosts(nodes: Dict[str, SeenNode]) -> List[Host]:
     ]
 
 
-def _connections(uris: Dict[str, Optional[str]], answers: Dict[str, _Answer]) -> List[Connection]:
+def _connections(uris: Dict[str, Optional[str]], answers: Dict[str, Answer]) -> List[Connection]:
     """The connections, of which one end says at least that it has them.
 
     A publisher calls the other end by the name of the node, a subscriber by the URI.
     """
     names = {uri.rstrip('/'): name for name, uri in uris.items() if uri}
-    found = set()
+    found: Dict[Tuple[str, str, str, str], Dict[str, Any]] = {}
     for name, answer in answers.items():
-        for _, other, direction, transport, topic, *more in answer.bus_info or ():
-            if more and not more[0]:  # it is not connected (yet)
-                continue
-            other = names.get(str(other).rstrip('/'), other)
-            ends = (other, name) if direction == INBOUND else (name, other)
-            found.add((topic, *ends, transport))
-    return [Connection(*each) for each in sorted(found)]
+        for end in answer.ends or ():
+            other = names.get(end.other.rstrip('/'), end.other)
+            ends = (other, name) if end.is_inbound else (name, other)
+            counted = found.setdefault((end.topic, ends[0], ends[1], end.transport), {})
+            for what, count in end.counts.items():
+                counted[what] = counted.get(what, 0) + count  # there may be two
+    return [Connection(*each, **counted) for each, counted in sorted(found.items())]
+
+
+def rates(before: Snapshot, after: Snapshot) -> Dict[str, float]:
+    """``{topic: messages a second}`` between two snapshots taken with ``counts``.
+
+    Of a topic that nobody hears nothing is counted, and so nothing told; of one with several
+    publishers, those of all of them are.
+    """
+    seconds = after.time - before.time
+    former = {each.key: each for each in before.connections}
+    fastest: Dict[Tuple[str, str], float] = {}  # (topic, publisher) -> rate, of its best connection
+    for connection in after.connections:
+        count = connection.messages_since(former.get(connection.key))
+        if count is not None and seconds > 0:
+            ends = connection.topic, connection.publisher
+            fastest[ends] = max(fastest.get(ends, 0.0), count / seconds)
+    found: Dict[str, float] = {}
+    for (topic, _), rate in fastest.items():
+        found[topic] = found.get(topic, 0.0) + rate
+    return found

@@ -40,9 +40,11 @@ class LocalLink(Link):
         self.publisher, self.subscriber = publisher, subscriber
         self._node, self._other = node, other
         self._callbacks = self._statistics = None  # the receivers that are no channels
-        self.sending = _End(self, rospy.impl.transport.OUTBOUND, publisher.resolved_name, node.name)
+        self.sending = _End(
+            self, rospy.impl.transport.OUTBOUND, publisher.resolved_name, node.name, other
+        )
         self.receiving = _End(
-            self, rospy.impl.transport.INBOUND, subscriber.resolved_name, other.uri
+            self, rospy.impl.transport.INBOUND, subscriber.resolved_name, other.uri, node
         )
 
     def open(self):
@@ -140,8 +142,10 @@ class _End(rospy.impl.transport.Transport):
     latch = None  # those who come late get latched messages from the link
     is_heard = True  # its publisher is of the right type
 
-    def __init__(self, link, direction, topic, peer):
+    def __init__(self, link, direction, topic, peer, node):
         super().__init__(direction, topic)
+        # getBusStats tells the connections of a node apart by this, which its own rospy counts
+        self.id = node.rospy.impl.transport.Transport(direction).id
         self.link, self.endpoint_id, self.header = link, peer, link.header
         self._first = link.publisher.fanout.seq
 
