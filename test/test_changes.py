@@ -5,6 +5,7 @@ import threading
 import pytest
 
 import pharos
+from pharos import node_registry
 from helpers import create, ended, speak_tcpros_only
 from pharos.testing import Mailbox, TIMEOUT, until
 
@@ -156,3 +157,266 @@ def test_only_souls_that_run_begin_anew(master, transcript):
     node.stop()
     with pytest.raises(pharos.NodeStoppedError):
         node.renew()
+
+
+# -- restart
+
+
+def soul_of(taken, name):
+    """A soul that tells that it has begun, and turns."""
+
+    def soul(me):
+        taken.put((name, threading.current_thread().name))
+        for _ in me.every(0.001):
+            pass
+
+    return soul
+
+
+def test_a_restart_brings_back_what_the_node_had(master, mailbox):
+    node, begun = create(master), queue.SimpleQueue()
+    node.soul = soul_of(begun, 'soul')
+    node.fork()
+    node.fork(soul_of(begun, 'block'), name='another')
+    assert ended(node.fork(lambda me: begun.put('ended')))
+    first = {begun.get(timeout=TIMEOUT) for _ in range(3)}
+    node.soul = soul_of(begun, 'new soul')
+    channel = node.interested_in('/changed', 'std_msgs/Int32', delegate=mailbox)
+    node.serve('/served', 'std_srvs/Empty', lambda request: {})
+    changes = Mailbox()
+    node.parameter('~changed').on_change(lambda value: changes(value, None))
+    ports, numbers = (node.tcp_port, node.xmlrpc_port), publisher(master)
+    node.restart()
+    assert node.is_running
+    assert ports == (node.tcp_port, node.xmlrpc_port)
+    assert first == {'ended', ('soul', '/node soul'), ('block', '/node another')}
+    second = {begun.get(timeout=TIMEOUT) for _ in range(2)}
+    assert second == {('new soul', '/node soul'), ('block', '/node another')}
+    assert channel in node.channels
+    numbers.send(data=7)
+    assert mailbox.next().data == 7
+    master.lookup_service('/served').call()
+    master.parameters['/node/changed'] = 5
+    assert changes.next() == 5
+    assert begun.empty()
+    assert not node.errors
+
+
+class Looping(pharos.Node):
+    """Forks in its start(), as listing 3.1 does."""
+
+    def __init__(self, begun):
+        super().__init__()
+        self.begun = begun
+
+    def start(self):
+        super().start()
+        self.fork(Looping.loop)
+
+    def loop(self):
+        self.begun.put('loop')
+        for _ in self.every(0.001):
+            pass
+
+
+def test_what_a_start_forks_is_not_forked_twice_by_a_restart(master):
+    begun = queue.SimpleQueue()
+    node = create(master, node_class=Looping, begun=begun)
+    node.fork(soul_of(begun, 'later'), name='later')
+    assert {begun.get(timeout=TIMEOUT) for _ in range(2)} == {'loop', ('later', '/node later')}
+    for _ in range(2):
+        node.restart()
+        assert {begun.get(timeout=TIMEOUT) for _ in range(2)} == {'loop', ('later', '/node later')}
+    assert len(node.latest_run.souls.forked) == 2
+    assert begun.empty()
+
+
+@pytest.mark.parametrize('again', ['restart', 'renew'])
+def test_what_a_soul_forks_is_not_forked_twice(master, again):
+    node, begun = create(master), queue.SimpleQueue()
+
+    def outer(me):
+        me.fork(soul_of(begun, 'inner'), name='inner')
+        begun.put('outer')
+        for _ in me.every(0.001):
+            pass
+
+    node.fork(outer, name='outer')
+    assert {begun.get(timeout=TIMEOUT) for _ in range(2)} == {'outer', ('inner', '/node inner')}
+    getattr(node, again)()
+    assert {begun.get(timeout=TIMEOUT) for _ in range(2)} == {'outer', ('inner', '/node inner')}
+    until(lambda: len(node.latest_run.souls.forked) == 2)
+    assert begun.empty()
+
+
+def test_a_restart_of_a_stopped_node_starts_it_with_the_souls_that_the_stop_ended(master):
+    node, begun = create(master), queue.SimpleQueue()
+    node.fork(soul_of(begun, 'soul'))
+    begun.get(timeout=TIMEOUT)
+    node.stop()
+    node.restart()
+    assert node.is_running
+    assert begun.get(timeout=TIMEOUT) == ('soul', '/node soul')
+
+
+def restarts_in(node, where, master):
+    """Have a block of the node restart it, once; returns once that has been done."""
+    runs, restarted = [node.latest_run], threading.Event()
+
+    def restart(*args):
+        if node.latest_run is runs[0]:
+            try:
+                node.restart()
+            finally:
+                restarted.set()
+        return {}
+
+    if where == 'soul':
+        node.fork(restart)
+    elif where == 'executed soul':
+        node.soul = restart
+        assert node.execute() is None
+    elif where == 'service':
+        node.serve('/restarts', 'std_srvs/Empty', restart)
+        master.lookup_service('/restarts').call()
+    elif where == 'parameter':
+        node.parameter('~restarts').on_change(restart)
+        master.parameters[f'{node.name}/restarts'] = 1
+    else:
+        node.interested_in('/restarts', 'std_msgs/Empty', restart, inline=where == 'inline')
+        sender = create(master, '/sender')
+        if where == 'TCPROS':
+            speak_tcpros_only(sender)
+        sender.send_to('/restarts')
+    assert restarted.wait(TIMEOUT)
+    assert node.latest_run is not runs[0]
+
+
+BLOCKS = [
+    *('soul', 'executed soul', 'delegate', 'inline', 'TCPROS', 'service', 'parameter'),
+]
+
+
+@pytest.mark.parametrize('where', BLOCKS)
+def test_a_block_restarts_its_node(master, where, mailbox):
+    node, begun = create(master), queue.SimpleQueue()
+    node.stop_timeout = 60.0  # which no thread uses up
+    node.fork(soul_of(begun, 'other'), name='other')
+    node.interested_in('/changed', 'std_msgs/Int32', delegate=mailbox)
+    begun.get(timeout=TIMEOUT)
+    restarts_in(node, where, master)
+    assert begun.get(timeout=TIMEOUT) == ('other', '/node other')
+    publisher(master).send(data=3)
+    assert mailbox.next().data == 3
+    assert node.is_running
+    assert not node.errors
+
+
+def test_a_soul_that_restarts_its_node_begins_again_itself(master):
+    node, begun = create(master), queue.SimpleQueue()
+
+    def restart(me):
+        begun.put(threading.current_thread())
+        if begun.qsize() == 1:
+            me.restart()
+            begun.put('goes on')
+        for _ in me.every(0.001):
+            pass
+
+    first = node.fork(restart)
+    assert ended(first)
+    until(lambda: begun.qsize() == 2)
+    assert begun.get() is first
+    assert begun.get() is not first
+    assert not node.errors
+
+
+def test_threads_that_restart_a_node_at_once_leave_it_running_with_each_soul_once(master):
+    node, begun = create(master), queue.SimpleQueue()
+    node.fork(soul_of(begun, 'soul'))
+    for _ in range(5):
+        go, raised = threading.Barrier(4), []
+
+        def restart():
+            go.wait(TIMEOUT)
+            try:
+                node.restart()
+            except BaseException as error:
+                raised.append(error)
+
+        threads = [threading.Thread(target=restart, daemon=True) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        assert all(map(ended, threads))
+        assert not raised
+        assert node.is_running
+        assert len(node.latest_run.souls.forked) == 1
+    assert not node.errors
+
+
+def test_a_node_runs_on_where_the_master_is_away_at_a_restart(mortal_master, mailbox):
+    master = pharos.Master(mortal_master.url)
+    node, begun = create(master), queue.SimpleQueue()
+    node.fork(soul_of(begun, 'soul'))
+    node.interested_in('/changed', 'std_msgs/Int32', delegate=mailbox)
+    numbers = publisher(master)
+    begun.get(timeout=TIMEOUT)
+    mortal_master.end()
+    with pytest.raises(pharos.MasterUnreachableError):
+        node.restart()
+    numbers.send(data=1)
+    assert mailbox.next().data == 1
+    node.stop()
+    with pytest.raises(pharos.MasterUnreachableError):
+        node.restart()
+    mortal_master.come_back()
+    node.restart()
+    assert begun.get(timeout=TIMEOUT) == ('soul', '/node soul')
+
+
+def test_a_node_that_is_restarted_keeps_its_name_and_spin_waiting(master):
+    class Slow(pharos.Node):
+        def start(self):
+            if self.latest_run is not None:
+                between.append(node_registry.nodes() == [self])
+                with pytest.raises(pharos.NodeNameInUseError):
+                    create(master, '/slow')
+                between.append(spinning.is_alive())
+            super().start()
+
+    between = []
+    node = create(master, '/slow', Slow)
+    spinning = threading.Thread(target=pharos.spin, daemon=True)
+    spinning.start()
+    node.restart()
+    assert between == [True, True]
+    node.stop()
+    assert ended(spinning)
+
+
+def test_a_node_that_is_restarted_when_all_are_stopped_stays_stopped(master):
+    class Slow(pharos.Node):
+        def start(self):
+            if self.latest_run is not None:
+                node_registry.stop_all()
+            super().start()
+
+    node = create(master, '/slow', Slow)
+    node.restart()
+    assert not node.is_running
+    assert not node_registry.nodes()
+
+
+def test_a_restart_within_a_start_is_refused(master):
+    class Again(pharos.Node):
+        tries = 0
+
+        def start(self):
+            super().start()
+            self.tries += 1
+            if self.tries == 2:
+                self.restart()
+
+    node = create(master, '/again', Again)
+    with pytest.raises(pharos.PharosError, match='/again cannot be restarted by its own start'):
+        node.restart()

@@ -198,6 +198,19 @@ def test_a_required_node_that_ends_here_ends_all(master, compose, transcript):
     assert '/ends, which is required, has ended: all others end' in transcript
 
 
+def test_a_required_node_that_is_restarted_has_not_ended(master, compose, transcript):
+    composed = compose('required.launch', only=['ends'])
+    (node,) = composed.nodes
+    node.restart()
+    assert node.is_running
+    until(lambda: master.parameters['/ends/starts'] == 2)
+    assert not composed.is_over
+    assert not [line for line in transcript if 'ended' in line]
+    del master.parameters['/ends/stay']
+    assert composed.wait(TIMEOUT) == 1
+    assert '/ends, which is required, has ended: all others end' in transcript
+
+
 def test_a_required_node_that_ends_apart_ends_all(master, compose, transcript):
     composed = compose('required.launch', apart=['ends'])
     master.wait_for_node('/ends', TIMEOUT)

@@ -123,6 +123,46 @@ def test_a_script_is_the_main_program(master):
     assert report['helper'] == 'talking'
 
 
+def test_a_script_that_is_restarted_runs_again_from_its_first_line(master):
+    mailbox = Mailbox(create(master, '/listener_of_reports'), '/report', 'std_msgs/String')
+    with master.load(REPORTER, name='teller') as node:
+        waiting = in_thread(node.wait)
+        mailbox.next()
+        first = node.latest_run
+        node.restart()
+        assert json.loads(mailbox.next().data)['calls'] == 1
+        assert node.latest_run is not first
+        assert waiting.is_alive()  # for its end, which a restart is not
+    assert ended(waiting)
+
+
+def test_a_script_with_an_anonymous_name_is_restarted(master):
+    node = master.load(TALKER)
+    before = node.name
+    node.restart()
+    assert node.is_running
+    assert node.name.startswith('/talker_')
+    assert [each.name for each in master.local_nodes()] == [node.name]
+    assert before == node.name or before not in [each.name for each in master.nodes()]
+    node.stop()
+
+
+def test_a_script_that_failed_to_start_at_a_restart_is_stopped(master, tmp_path):
+    path = tmp_path / 'edited.py'
+    path.write_text(TALKER.read_text())
+    node = master.load(path, name='edited')
+    waiting = in_thread(node.wait)
+    path.write_text('1 / 0\n')
+    with pytest.raises(pharos.PharosError, match='ZeroDivisionError'):
+        node.restart()
+    assert ended(waiting)
+    assert not node.is_running
+    path.write_text(TALKER.read_text())
+    node.restart()
+    assert node.is_running
+    node.stop()
+
+
 def test_each_run_of_a_script_loads_its_modules_anew(master):
     mailbox = Mailbox(create(master, '/listener_of_reports'), '/report', 'std_msgs/String')
     first = master.load(REPORTER, name='first')

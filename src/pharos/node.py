@@ -11,6 +11,7 @@ from pharos.health import Health, health_of
 from pharos.offered_service import OfferedService
 from pharos.output_channel import OutputChannel
 from pharos.parameter import Parameter
+from pharos.restarts import restart
 from pharos.run import Run
 from pharos.seconds import check_seconds
 from pharos.souls import NodeWithSouls
@@ -81,6 +82,26 @@ class Node(NodeWithSouls, is_base=True):
         stopped, too: its start raises NodeStoppedError.
         """
         self.current_run.end()
+
+    def restart(self) -> None:
+        """Stop the node and start it again, under its name and ports; returns when it runs.
+
+        What it had comes back as after :meth:`start`, and the souls that were forked and had not
+        ended run from their beginnings, each by the block and name that :meth:`fork` got; what a
+        ``start()`` of the class's own forks, that forks again. A node that has stopped starts, with
+        the souls that its stop has ended. Of several threads that ask at once, one does it, and the
+        others wait.
+
+        It may be called in a block of the node: a soul is ended by it; a delegate, or the block of
+        a service or parameter, goes on to its end, but no connection of the former run carries what
+        it answers.
+
+        :raises MasterUnreachableError: if the master does not answer, and the node then runs on; or
+            if it has gone since, and the node is then stopped
+        :raises NodeStoppedError: if another thread stops the node meanwhile, or all nodes are
+        :raises NodeNameInUseError, PortInUseError: and the node is then stopped
+        """
+        restart(self, not self._reopens)
 
     def __enter__(self) -> 'Node':
         return self

@@ -3,7 +3,6 @@ program."""
 import atexit
 import contextlib
 import functools
-import gc
 import os
 import sys
 import threading
@@ -32,11 +31,6 @@ if TYPE_CHECKING:
 
 #: seconds from its beginning on that anybody waits for a stop() that another thread runs
 STOP_LIMIT = 30.0
-# A stopped node's rospy is a web of cycles of 0.7 MB, which only the collector frees. It looks at
-# the running nodes, too, so it runs after as many stops as there are nodes left, and at least so
-# many:
-COLLECT_EVERY = 20
-
 
 changed = threading.Condition()  # guards the life cycles of all nodes, and what follows
 # (master, name) -> those that the master may know, in the order of their starts
@@ -46,8 +40,9 @@ _nodes: 'Dict[Tuple[Any, str], Node]' = {}
 _stops: 'Dict[Node, Tuple[int, float]]' = {}
 # (node, identifier of the thread that is in its start()) -> the run that it has begun there
 _starts: 'Dict[Tuple[Node, int], Optional[Run]]' = {}
+# node that is stopped to be started again, and keeps its name -> the thread that does it
+restarts: 'Dict[Node, int]' = {}
 _waiting: 'Dict[int, Node]' = {}  # identifier of a thread -> the node for whose stop it waits
-_runs_ended = 0  # since the collector ran
 _finalizer: Any = None  # what multiprocessing runs at the end of its processes
 _others: List[Callable[[], Any]] = []  # they end what else was started: programs, masters
 _starters: List[Callable[[], Any]] = []  # they have nodes started no more
@@ -126,18 +121,6 @@ def discard(node: 'Node') -> None:
             del _nodes[node.master, node.name]
 
 
-def collect() -> None:
-    """One more run has ended: free what such leave in memory, now and then."""
-    global _runs_ended
-    with changed:
-        _runs_ended += 1
-        due = _runs_ended >= max(COLLECT_EVERY, len(_nodes))
-        if due:
-            _runs_ended = 0
-    if due:
-        gc.collect()
-
-
 def one_stop_at_a_time(method: Callable[..., Any]) -> Callable[..., Any]:
     """A ``stop`` method that runs once for each run of its node, whoever calls it in whatever
     thread.
@@ -182,6 +165,11 @@ def start_of(node: 'Node') -> 'Iterator[None]':
     finally:
         if is_outermost:
             _starts.pop(key, None)
+
+
+def is_restarting(node: 'Node') -> bool:
+    """Whether the node is stopped to be started again."""
+    return node in restarts
 
 
 def is_in_start(node: 'Node') -> bool:
@@ -386,7 +374,7 @@ def _forget() -> None:
     changed = threading.Condition()
     _finalizer = None  # its parent's, which multiprocessing has dropped
     former = list(_nodes.values())
-    for known in (_nodes, _stops, _starts, _waiting, _others, _starters):
+    for known in (_nodes, _stops, _starts, restarts, _waiting, _others, _starters):
         known.clear()  # type: ignore[attr-defined]
     for node in former:
         node.latest_run.abandon()

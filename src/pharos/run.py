@@ -4,7 +4,7 @@ import threading
 import weakref
 from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Tuple
 
-from pharos import messages, node_registry, signals
+from pharos import memory, messages, node_registry, signals
 from pharos.blocks import attempt, name_of
 from pharos.channel import InputChannel
 from pharos.errors import MessageTypeError, NodeStoppedError
@@ -54,6 +54,8 @@ class Run:
         self._forked: 'weakref.WeakSet[threading.Thread]' = weakref.WeakSet()  # they run souls
         self._ignoring: List[threading.Thread] = []  # those of them that went on after the stop
         self.souls = Souls(self)
+        #: the one that began when :meth:`Node.restart` had ended this one
+        self.successor: Optional[Run] = None
         self.rospy = PrivateRospy(settings, self._stop_for_ros, lambda: node.allow_remote_shutdown)
         self.dispatcher = Dispatcher(self.rospy.start_thread)
         self.rospy.on_received = self.dispatcher.run
@@ -132,7 +134,7 @@ class Run:
                     ends.callback(end, *limit)
         finally:
             self._become(Lifecycle.STOPPED)
-            node_registry.collect()
+            memory.collect(len(node_registry.nodes()))
             watcher_of(self.node.master).check()
 
     def _ends(self) -> List[Tuple[Any, ...]]:
@@ -188,7 +190,7 @@ class Run:
         with node_registry.changed:
             self.lifecycle = lifecycle
             self._starter = None
-            if lifecycle is Lifecycle.STOPPED:
+            if lifecycle is Lifecycle.STOPPED and not node_registry.is_restarting(self.node):
                 node_registry.discard(self.node)
             node_registry.changed.notify_all()
 

@@ -86,7 +86,8 @@ class Souls:
         while block is not None:
             self._execute(soul, block)
             block = None
-            if soul.begins_anew:
+            # what another soul has forked, that forks anew
+            if soul.begins_anew and soul.maker not in self.forked:
                 soul.is_asked = soul.begins_anew = False
                 block = self._run.node.soul if soul.block is None else soul.block
         if self._run.lifecycle is Lifecycle.RUNNING:
@@ -104,6 +105,17 @@ class Souls:
             )
         for soul in forked:
             soul.is_asked = True
+
+    def resume(self, former: 'Souls', starts_some: bool) -> None:
+        """Fork again what was forked in a former run of the node, and what its stop has ended.
+
+        :param starts_some: whether the start has forked those that it forks already
+        """
+        for soul in former.forked:
+            is_back = soul.maker is START and starts_some or soul.maker in former.forked
+            has_block = soul.block is not None or self._run.node.soul is not None
+            if has_block and not is_back:
+                self.fork(soul.block, soul.name)
 
     def turns(self, rate: Any) -> Iterator[None]:
         """What :meth:`Node.every` returns, by a Rate of rospy's."""

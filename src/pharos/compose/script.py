@@ -26,7 +26,8 @@ class ScriptNode(Node):
     """A rospy program, unmodified, as a node of this process: made by :meth:`Master.load`.
 
     :meth:`start` runs it from its first line, in a thread of its own; its ``rospy.init_node``
-    registers the node. :meth:`stop` ends it, and the node stops when it has ended by itself.
+    registers the node. :meth:`stop` ends it, :meth:`restart` also runs it again, and the node stops
+    when it has ended by itself.
 
     :param path: the file of the program
     :param args: its arguments, ROS's among them
@@ -93,8 +94,15 @@ class ScriptNode(Node):
         :raises TimeoutError: if it has not in that time
         """
         run = self.latest_run
+
+        def has_ended() -> bool:
+            nonlocal run
+            while run.successor is not None:
+                run = run.successor
+            return run.is_over and not node_registry.is_restarting(self)
+
         with signals.interruptible_wait():
-            if not node_registry.wait_until(lambda: run.is_over, timeout):
+            if not node_registry.wait_until(has_ended, timeout):
                 raise TimeoutError(f'{self.name} has not ended within {timeout:g} s: stop() it')
         return self.exit_code
 

@@ -33,6 +33,17 @@ class ProgramCutOff(SystemExit):
     """Ends a thread of a program that goes on when the time that it has after the stop is up."""
 
 
+@contextlib.contextmanager
+def on_nobodys_behalf():
+    """Within this, what waits in this thread ends with no node, whose thread it may be."""
+    before = getattr(_thread, 'lifetime', None)
+    _thread.lifetime = None
+    try:
+        yield
+    finally:
+        _thread.lifetime = before
+
+
 class Lifetime:
     """The threads and sockets of one run of a node, and the event that ends it.
 
