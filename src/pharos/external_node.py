@@ -1,11 +1,13 @@
 """Nodes outside this process."""
 import contextlib
+import importlib
 import urllib.parse
 from typing import TYPE_CHECKING, Any, Dict, List, Optional
 
 from pharos.errors import UnknownNodeError
 from pharos.private_rospy.proxies import ServerProxy
 from pharos.private_rospy.registration import COMMUNICATION_ERRORS
+from pharos.seconds import check_seconds
 
 if TYPE_CHECKING:
     from pharos.master import Master
@@ -17,6 +19,13 @@ def node_api(uri: str, timeout: float = TIMEOUT) -> Any:
     """ROS's slave API of the node at that URI, by XML-RPC: each call of it ends with an error after
     ``timeout`` seconds."""
     return ServerProxy(uri, timeout)
+
+
+def describe(node: Any, seconds: float) -> str:
+    """A node of this process or another one in words; see :meth:`Node.describe`."""
+    seconds = check_seconds('seconds', seconds, least=0)
+    text: str = importlib.import_module('pharos.live.description').describe(node, seconds)
+    return text
 
 
 class ExternalNode:
@@ -84,6 +93,13 @@ class ExternalNode:
                 f'{self.name} is registered at {uri} but does not answer ({error}): if it is gone,'
                 ' rosnode cleanup removes it'
             ) from error
+
+    def describe(self, seconds: float = 1.0) -> str:
+        """The node in words, as far as it and the master tell; see :meth:`Node.describe`.
+
+        :raises UnknownNodeError: if the master knows it no more
+        """
+        return describe(self, seconds)
 
     def __eq__(self, other: object) -> bool:
         return (

@@ -7,6 +7,7 @@ from pharos import node_registry
 from pharos.attributes import Block
 from pharos.blocks import check_block
 from pharos.channel import InputChannel
+from pharos.external_node import describe
 from pharos.health import Health, health_of
 from pharos.offered_service import OfferedService
 from pharos.output_channel import OutputChannel
@@ -288,6 +289,14 @@ class Node(NodeWithSouls, is_base=True):
         Asks the master, for up to 5 s; ``str()`` of it is one line, which ``repr(node)`` shows too.
         """
         return health_of(self, ask=True)
+
+    def describe(self, seconds: float = 1.0) -> str:
+        """The node in words: where it runs, its souls, topics with type, rate, counts and peers,
+        services, parameters and failures.
+
+        :param seconds: for which messages are counted, for the rates; 0: no rates are told
+        """
+        return describe(self, seconds)
 
     def __repr__(self) -> str:
         health = f': {health_of(self, ask=False)}' if self.is_running else ''

@@ -4,7 +4,7 @@ import sys
 import rospy
 from std_msgs.msg import String
 
-topic, rate, *size = sys.argv[1:4]
+topic, rate, *size = rospy.myargv()[1:4]
 rospy.init_node('publishes', anonymous=True, disable_signals=False)
 publisher = rospy.Publisher(topic, String, queue_size=10)
 print('publishing', flush=True)

@@ -3,6 +3,7 @@
 - snapshot: one look at hosts, processes, nodes, topics, services and connections
 - answers: what the nodes say to that
 - watching: Topic.hz, bw, last and watch
+- description: Node.describe
 - message_text: messages as text, long arrays cut
 
 It stands on the facade.

@@ -46,10 +46,10 @@ class Rate:
         return self.rate
 
     def __repr__(self) -> str:
-        found = f'{_number(self.rate)} Hz'
+        found = f'{number_text(self.rate)} Hz'
         if self.rate:
-            found += f' ({_number(self.min)} to {_number(self.max)} s apart'
-            found += f', std dev {_number(self.std_dev)} s)'
+            found += f' ({number_text(self.min)} to {number_text(self.max)} s apart'
+            found += f', std dev {number_text(self.std_dev)} s)'
         return f'{found}, {_counted(self)}'
 
 
@@ -204,7 +204,7 @@ def _show(message: genpy.Message) -> None:
 
 def _counted(result: Any) -> str:
     """How many messages a Rate or Bandwidth is of, and what to keep in mind of that."""
-    words: List[str] = [_messages(result.window), f'in {_number(result.seconds)} s']
+    words: List[str] = [_messages(result.window), f'in {number_text(result.seconds)} s']
     if result.is_time_simulated:
         words.append('of wall time, though time is simulated')
     return ' '.join(words)
@@ -216,7 +216,7 @@ def _messages(count: int) -> str:
     return f"{count or 'no'} messages"
 
 
-def _number(value: float) -> str:
+def number_text(value: float) -> str:
     """A number with three digits that matter, and never an exponent."""
     if abs(value) >= 100:
         return f'{value:.0f}'
@@ -227,6 +227,6 @@ def size_text(count: float) -> str:
     """A number of bytes as people read it: '6.2 MB'; units are thousands, as rostopic has them."""
     for unit in ('B', 'kB', 'MB'):
         if abs(count) < 999.5:
-            return f'{_number(count)} {unit}'
+            return f'{number_text(count)} {unit}'
         count /= 1000
-    return f'{_number(count)} GB'
+    return f'{number_text(count)} GB'
