@@ -498,6 +498,15 @@ def test_a_script_may_print_by_a_stream_of_its_own_and_close_it(master, capsys):
     assert capsys.readouterr().out == '[/wrapping] wrapped: ü\n'
 
 
+@pytest.mark.parametrize('how', ['close', 'detach', 'wrap'])
+def test_a_script_that_closes_what_it_prints_to_closes_it_for_nobody_else(how, master, capsys):
+    node = master.load(TALKING / 'closing.py', None, how)
+    assert node.exit_code == 0
+    print('goes on')
+    print('goes on', file=sys.stderr)
+    assert capsys.readouterr() == ('printed\ngoes on\n', 'goes on\n')
+
+
 def test_what_a_script_prints_is_as_it_is_unless_asked_for(master, capsys):
     master.load(WORKER, None, 'speak').wait(30)
     assert 'two\nlines\none more\n' in capsys.readouterr().out

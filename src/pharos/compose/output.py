@@ -3,17 +3,26 @@ import codecs
 import io
 import sys
 import threading
-from typing import IO, Any, Callable, Optional, TextIO
+from typing import IO, Any, Callable, Optional
 
 SCREEN = 'screen'  # as launch files say it
 
 
-class _Bytes(io.BufferedIOBase):
-    """Takes the bytes of lines; whoever closes it, closes nothing else."""
+class _NamedLines(io.BufferedIOBase):
+    """Lines each of which begins with the name of the node that printed it, as UTF-8.
 
-    def __init__(self, lines: 'NamedLines') -> None:
-        self._lines = lines
-        self._decoder = codecs.getincrementaldecoder('utf-8')('backslashreplace')
+    A line goes on when it is complete, or flushed. Whoever closes it, closes nothing else.
+
+    :param stream: ``stream()`` is what it goes on to
+    :param name: ``name()`` is the node's
+    """
+
+    def __init__(self, stream: Callable[[], IO[str]], name: Callable[[], str]) -> None:
+        self._stream, self._name = stream, name
+        self._lock = threading.Lock()
+        self._decode = codecs.getincrementaldecoder('utf-8')('backslashreplace').decode
+        self._begun = ''  # of a line that is not complete
+        self._is_within = False  # whether the beginning of the line has gone on
 
     def writable(self) -> bool:
         """See :class:`io.IOBase`."""
@@ -21,49 +30,14 @@ class _Bytes(io.BufferedIOBase):
 
     def write(self, data: Any) -> int:
         """See :class:`io.BufferedIOBase`."""
-        self._lines.write(self._decoder.decode(bytes(data)))
+        with self._lock:
+            *lines, self._begun = (self._begun + self._decode(bytes(data))).split('\n')
+            for line in lines:
+                self._pass_on(line + '\n')
         return len(data)
 
     def flush(self) -> None:
         """See :class:`io.IOBase`."""
-        self._lines.flush()
-
-    def isatty(self) -> bool:
-        """See :class:`io.IOBase`."""
-        return self._lines.isatty()
-
-    def fileno(self) -> int:
-        """See :class:`io.IOBase`."""
-        return self._lines.fileno()
-
-
-class NamedLines(io.TextIOBase):
-    """A stream each of whose lines begins with the name of the node that printed it.
-
-    A line goes on when it is complete, or flushed.
-
-    :param stream: ``stream()`` is what it goes on to
-    :param name: ``name()`` is the node's
-    """
-
-    def __init__(self, stream: Callable[[], TextIO], name: Callable[[], str]) -> None:
-        self._stream, self._name = stream, name
-        self._lock = threading.Lock()
-        self._begun = ''  # of a line that is not complete
-        self._is_within = False  # whether the beginning of the line has gone on
-        #: what takes bytes, as UTF-8
-        self.buffer = _Bytes(self)
-
-    def write(self, text: str) -> int:
-        """See :class:`io.TextIOBase`."""
-        with self._lock:
-            *lines, self._begun = (self._begun + text).split('\n')
-            for line in lines:
-                self._pass_on(line + '\n')
-        return len(text)
-
-    def flush(self) -> None:
-        """See :class:`io.TextIOBase`."""
         with self._lock:
             if self._begun:
                 self._pass_on(self._begun)
@@ -83,13 +57,27 @@ class NamedLines(io.TextIOBase):
         """What child processes write to; their lines have no name."""
         return self._stream().fileno()
 
-    def reconfigure(self, **options: Any) -> None:
-        """Nothing: its lines go on at once, and text as the process prints it."""
+
+class _Unclosed:
+    """A stream of this process, whatever that is at the time; whoever closes it, closes nothing."""
+
+    def __init__(self, stream: Callable[[], Any]) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream(), name)
 
     @property
-    def encoding(self) -> str:  # type: ignore[override]
+    def buffer(self) -> '_Unclosed':
+        """What takes bytes."""
+        return _Unclosed(lambda: self._stream().buffer)
+
+    def detach(self) -> '_Unclosed':
         """See :class:`io.TextIOBase`."""
-        return self._stream().encoding
+        return self.buffer
+
+    def close(self) -> None:
+        """Nothing: others print there, too."""
 
 
 def redirect(
@@ -101,14 +89,24 @@ def redirect(
     :param output: 'screen', or the path of a file, or None: as this process prints
     :param is_again: whether the file goes on where it ended
     """
-    if output is None:
-        return None
     file: Optional[IO[str]] = None
-    if output == SCREEN:
-        system.stdout = NamedLines(lambda: sys.stdout, name)
-    else:
-        mode = 'a' if is_again else 'w'
-        file = open(output, mode, buffering=1, encoding='utf-8', errors='backslashreplace')
-        system.stdout = file
-    system.stderr = NamedLines(lambda: sys.stderr, name)
+    stdout: Any = _Unclosed(lambda: sys.stdout)
+    stderr: Any = _Unclosed(lambda: sys.stderr)
+    if output is not None:
+        stderr = _named(lambda: sys.stderr, name)
+        if output == SCREEN:
+            stdout = _named(lambda: sys.stdout, name)
+        else:
+            mode = 'a' if is_again else 'w'
+            stdout = file = open(output, mode, 1, encoding='utf-8', errors='backslashreplace')
+    # under both names, as in a process: what nobody has any more closes itself
+    system.stdout = system.__stdout__ = stdout
+    system.stderr = system.__stderr__ = stderr
     return file
+
+
+def _named(stream: Callable[[], IO[str]], name: Callable[[], str]) -> IO[str]:
+    # not line by line, which would flush the beginning of a line, too
+    return io.TextIOWrapper(
+        _NamedLines(stream, name), 'utf-8', 'backslashreplace', write_through=True
+    )
