@@ -269,6 +269,23 @@ def test_an_alarm_that_a_program_does_not_handle_ends_its_node_alone(node, maste
     assert node.is_running
 
 
+@pytest.mark.parametrize('how, code', [('interrupt', 0), ('interrupt early', -signal.SIGINT)])
+def test_a_program_may_interrupt_itself_alone(how, code, node, master):
+    script = master.load(str(PROGRAMS / 'own/signals.py'), None, how)
+    assert script.wait(TIMEOUT) == code
+    assert node.is_running
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason='asyncio does not handle SIGINT itself')
+def test_the_stop_interrupts_what_asyncio_runs(master):
+    node = master.load(str(PROGRAMS / 'own' / 'runs_a_coroutine.py'))
+    main = node.ros_import('__main__')
+    assert main.begun.wait(TIMEOUT)
+    node.stop()
+    assert main.ended == ['in order']
+    assert node.exit_code == -signal.SIGINT
+
+
 def test_an_alarm_tells_how_much_was_left_of_the_one_before(master):
     with master.load(str(PROGRAMS / 'own/signals.py'), None, 'alarm') as script:
         main = script.ros_import('__main__')
@@ -317,6 +334,24 @@ def test_asyncio_takes_an_executor_of_a_node(node):
         return await loop.run_in_executor(None, threading.current_thread)
 
     assert asyncio.run(main()).name.startswith('/program_node')
+
+
+def test_hooks_and_finalizers_of_a_program_run_as_in_a_process(master, tmp_path, monkeypatch):
+    monkeypatch.setenv('TMPDIR', str(tmp_path))
+    node = master.load(str(PROGRAMS / 'own' / 'hooks.py'))
+    assert node.wait(TIMEOUT) == 1
+    main = node.latest_run.rospy.import_library('__main__')
+    assert main.told == [('worker', 'in vain'), ('main thread', 'in vain'), 'finalized']
+    assert pathlib.Path(main.folder.name).parent == tmp_path
+    assert list(tmp_path.iterdir()) == []
+    assert [str(error) for error in node.errors] == ['in vain']
+
+
+def test_what_pythons_library_prints_for_a_program_goes_where_that_prints(master, capsys):
+    master.load(str(PROGRAMS / 'own' / 'prints.py'), output='screen', name='prints')
+    printed = capsys.readouterr()
+    assert printed.out == "[/prints] ['shown']\n"
+    assert printed.err.splitlines()[-1] == '[/prints] ValueError: in vain'
 
 
 # -- packages

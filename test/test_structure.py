@@ -45,6 +45,7 @@ ROSPYS_NAMES = {
         '_base_logger',
         '_in_shutdown',
         '_is_owned',
+        '_ros_signal',
         '_shutdown_flag',
         '_client_shutdown_hooks',
         '_shutdown_hooks',

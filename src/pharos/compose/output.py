@@ -106,7 +106,6 @@ def redirect(
 
 
 def _named(stream: Callable[[], IO[str]], name: Callable[[], str]) -> IO[str]:
+    lines: Any = _NamedLines(stream, name)
     # not line by line, which would flush the beginning of a line, too
-    return io.TextIOWrapper(
-        _NamedLines(stream, name), 'utf-8', 'backslashreplace', write_through=True
-    )
+    return io.TextIOWrapper(lines, 'utf-8', 'backslashreplace', write_through=True)

@@ -124,10 +124,8 @@ class ScriptRun(Run):
         self.has_ended = False  # whether the program has
         self._error: Optional[BaseException] = None  # with which it ended before it was a node
         self.rospy.on_init_node = self._init_node
-        self.rospy.lifetime.has_program = self.rospy.lifetime.is_interruptible = True
-        self.rospy.hear_signals()
-        if working_directory.is_possible():
-            self.rospy.lifetime.folder = node.cwd or os.getcwd()
+        folder = (node.cwd or os.getcwd()) if working_directory.is_possible() else None
+        self.rospy.expect_program(folder)
         is_again = isinstance(node.latest_run, ScriptRun)
         self._file = redirect(self.rospy.system, node.output, lambda: node.name, is_again)
 
@@ -170,6 +168,7 @@ class ScriptRun(Run):
             exit_code = -signal.SIGINT
         except BaseException as raised:
             exit_code, error = 1, _in_program(raised, self.node.path)
+            self._call_hook(error)
         with node_registry.changed:
             is_for_caller = self._is_awaited and not self.is_registered
             if is_for_caller:
@@ -188,6 +187,12 @@ class ScriptRun(Run):
             )
             stop.daemon = True
             stop.start()
+
+    def _call_hook(self, error: BaseException) -> None:
+        """Call the program's ``sys.excepthook``, if it has set one."""
+        hook = vars(self.rospy.system).get('excepthook')
+        if hook is not None:
+            attempt(lambda: hook(type(error), error, error.__traceback__))
 
     def end(self) -> None:
         """End it, and close the file that it prints to."""

@@ -19,7 +19,7 @@ from pharos.private_rospy import (
 from pharos.private_rospy.acceptor import Acceptor, Limits
 from pharos.private_rospy.lifetime import Lifetime
 from pharos.private_rospy.loader import PrivateImports
-from pharos.private_rospy.own_process import OwnProcess, hear_signals
+from pharos.private_rospy.own_process import OwnProcess
 from pharos.private_rospy.patches import tcpros_server
 from pharos.private_rospy.parameters import WatchedParameters
 from pharos.private_rospy.deadlines import is_time_up, time_limit
@@ -93,9 +93,6 @@ class PrivateRospy:
         self.publisher = self.topics.get_publisher_impl
         self.subscriber = self.topics.get_subscriber_impl
 
-    #: hear_signals(): in Python's main thread, have SIGUSR1 and SIGUSR2 be for programs
-    hear_signals = staticmethod(hear_signals)
-
     def _fail(self, *failure):
         self.on_failure(*failure)
 
@@ -106,27 +103,36 @@ class PrivateRospy:
             raise self._stopped_answering()
         time.sleep(min(seconds, POLL))
 
+    def expect_program(self, folder):
+        """The node is to be one of a program; called by the thread that loads it.
+
+        :param folder: the working directory of its threads; None: the process's
+        """
+        self.lifetime.has_program, self.lifetime.folder = True, folder
+        self._process.signals.begin()
+
     def run_main(self, path, argv):
         """Run a program as the node's, in this thread: what it raises, SystemExit too, comes through.
 
         :param argv: its ``sys.argv``, whole
         """
         self.lifetime.main_thread = threading.current_thread()
-        with self._process.main_thread():
+        with self._process.signals.of_this_thread():
             self._run_main(path, argv)
-            self.lifetime.raise_pending()
+            if not isinstance(self.lifetime.raised, KeyboardInterrupt):  # it has ended without
+                self.lifetime.raise_pending()
 
     def exit_main(self):
         """What Python does when the program's main thread has ended: wait for the threads that are
         no daemons, and run the handlers of atexit."""
         self._process.end_pools()
         self.lifetime.wait_for_threads()
-        self._process.forget_signals()
+        self._process.signals.forget()
         self._process.run_exit_handlers()
 
     def leave_signals_to_rospy(self):
         """The program has rospy handle signals from now on."""
-        self._process.leave_signals_to_rospy()
+        self._process.signals.leave_to_rospy(self.rospy.core._ros_signal)
 
     # -- life
 
@@ -217,13 +223,11 @@ class PrivateRospy:
         To a program this is what Ctrl-C is: before, the hooks of on_shutdown run, unless rospy
         handles no signals for it.
         """
-        self._process.call_signal_handler()
-        if self.lifetime.has_program and not (
-            self.lifetime.is_interruptible or self.lifetime.raised
-        ):
+        self._process.signals.call_handler()
+        if self.lifetime.has_program and not self.lifetime.raised:
             self._run_hooks()
         self._end_waits()
-        self._process.call_former_signal_handler()
+        self._process.signals.call_former_handler()
 
     def _end_waits(self):
         self.lifetime.begin_shutdown()

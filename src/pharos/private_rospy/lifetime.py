@@ -4,12 +4,14 @@ import contextlib
 import inspect
 import signal
 import socket
+import sys
 import threading
 import time
 import weakref
 from typing import Any, Callable, Iterable, List, Optional
 
 from pharos import working_directory
+from pharos.private_rospy.module_proxy import ModuleProxy
 
 # A signal that the kernel gives to another thread, or that comes just before the main thread waits,
 # does not end that wait, after which Python would handle it.
@@ -22,7 +24,7 @@ KEEPALIVE_IDLE = 10  # seconds of silence after which the peer's host is asked w
 KEEPALIVE_INTERVAL = 5  # seconds between two such questions
 KEEPALIVE_COUNT = 4  # of them without an answer, and the connection is broken
 
-_main_thread = threading.main_thread  # Python's, also within a program: see own_process
+_main_thread = threading.main_thread  # Python's, also within a program: see own_signals
 
 # .lifetime: of the node on whose behalf the thread runs; .interruption: the innermost it is within;
 # .was_cut_off: whether a ProgramCutOff was raised in it
@@ -62,8 +64,6 @@ class Lifetime:
         # whether the node has a program of its own, which may do its last things after the stop has
         # begun; until this, when what sleeps in it is cut off
         self.has_program, self.overdue = False, threading.Event()
-        # whether the stop is to the program what Ctrl-C is without a handler: until rospy has one
-        self.is_interruptible = False
         self.folder = None  # the working directory of its threads; None: the process's
         # identifiers of the thread that runs the hooks of on_shutdown, and that ends all in the end
         self.hooks_thread = self.ending_thread = None
@@ -80,8 +80,8 @@ class Lifetime:
 
             is_waited_for = False  # whether a program goes on until it has ended
 
-            def __init__(self, group=None, target=None, *args, **options):
-                super().__init__(group, target, *args, **options)
+            def __init__(self, *args, **options):
+                super().__init__(*args, **options)
                 if options.get('daemon') is None:
                     self.daemon = lifetime.makes_daemons()
 
@@ -99,18 +99,20 @@ class Lifetime:
                 lifetime.threads.add(self)
                 super().start()
 
-        class Timer(threading.Timer, Thread):
+        class Timer(Thread, threading.Timer):
             """``threading.Timer`` of the node, whose stop cancels it, at the end of its program."""
 
-            def __init__(self, *args, **options):
-                super().__init__(*args, **options)
-                self.daemon = lifetime.makes_daemons()
-
-            def run(self):
-                with lifetime.runs(self.is_from_elsewhere):
-                    super().run()
-
         self.Thread, self.Timer = Thread, Timer
+        #: what threading calls before it waits for threads, the first to be called last
+        self.before_threads_end = []
+        #: the module, as the node's program and libraries have it
+        self.threading = ModuleProxy(
+            threading,
+            Thread=Thread,
+            Timer=Timer,
+            main_thread=lambda: self.main_thread,
+            _register_atexit=self.before_threads_end.append,
+        )
 
     def rename(self, name):
         """Have the threads be named after the node, which is called so from now on."""
@@ -137,9 +139,16 @@ class Lifetime:
         """
         if is_from_elsewhere and self.folder:
             working_directory.enter(self.folder)
-        # threading keeps silent about SystemExit itself alone
-        with contextlib.suppress(ProgramCutOff), self.interrupts_waits():
-            yield
+        try:
+            with self.interrupts_waits():
+                yield
+        except ProgramCutOff:
+            pass  # threading keeps silent about SystemExit itself alone
+        except BaseException:
+            hook = vars(self.threading).get('excepthook')  # the program's, if it has set one
+            if hook is None:
+                raise
+            hook(threading.ExceptHookArgs([*sys.exc_info(), threading.current_thread()]))
 
     @contextlib.contextmanager
     def interrupts_waits(self):
@@ -220,13 +229,8 @@ class Lifetime:
         return threading.current_thread() in self.threads and not is_ending
 
     def _interrupt(self):
-        is_main = threading.current_thread() is self.main_thread
-        if not (is_main and self.ended.is_set()):
-            return
-        self.raise_pending()
-        if self.is_interruptible:
-            self.is_interruptible = False  # once
-            raise KeyboardInterrupt
+        if threading.current_thread() is self.main_thread and self.ended.is_set():
+            self.raise_pending()
 
     def raise_pending(self):
         """Raise what a handler of signals has raised, once."""

@@ -31,6 +31,9 @@ _TWINS: Dict[str, Dict[str, Any]] = {
     'pkgutil': {},
     'typing': {},
 }
+# Packages that do with the process's copies of Python's modules: their own would slow the start of
+# each node down.
+_WITHOUT_OWN = 'rospy', 'rosgraph', 'logging'
 # file -> (its time of modification, code), the same for all sets
 _codes: Dict[str, Tuple[Any, Any]] = {}
 
@@ -206,8 +209,9 @@ class PrivateImports:
         if level:
             absolute = importlib.util.resolve_name('.' * level + name, globals['__package__'])
         top = absolute.partition('.')[0]
-        if top in ownership.OWN_OF_PYTHONS and globals and globals['__name__'] == 'rospy.core':
-            return builtins.__import__(name)  # one that each node has would slow its start down
+        user = (globals or {}).get('__name__', '').partition('.')[0]
+        if top in ownership.OWN_OF_PYTHONS and user in _WITHOUT_OWN:
+            return builtins.__import__(name, globals, locals, fromlist, level)
         module = self.load(absolute)
         if not fromlist:
             return module if level else self.load(top)

@@ -26,10 +26,14 @@ OWN_OF_PYTHONS = {
     'multiprocessing',
     'optparse',
     'pickle',
+    'pprint',
     'runpy',
     'shelve',
     'subprocess',
+    'tempfile',
+    'traceback',
     'unittest',
+    'weakref',
 }
 _IMPORT = re.compile(
     rb'(?:^|[;:])[ \t]*(?:from[ \t]+(\w+)|import[ \t]+(\w[\w., \t]*))'

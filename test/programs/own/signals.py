@@ -22,6 +22,9 @@ def on_signal(number, frame):
     came.set()
 
 
+if HOW == 'interrupt early':
+    os.kill(os.getpid(), signal.SIGINT)
+
 if HOW == 'kill':
     signal.signal(signal.SIGUSR2, on_signal)
 rospy.init_node('signals')
@@ -40,6 +43,8 @@ elif HOW == 'raise':
     signal.raise_signal(signal.SIGUSR1)
 elif HOW == 'kill':
     os.kill(os.getpid(), signal.SIGUSR2)
+elif HOW == 'interrupt':
+    os.kill(os.getpid(), signal.SIGINT)
 elif HOW in ('fail', 'exit', 'unhandled'):
     signal.setitimer(signal.ITIMER_REAL, 0.01)
 is_ready.set()

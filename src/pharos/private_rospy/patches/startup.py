@@ -52,7 +52,6 @@ def init_node(
         # signals are for the threads of the process, which the script does not run in
         original(name, argv, False, *options, True, xmlrpc_port, tcpros_port)
 
-    node.lifetime.is_interruptible = disable_signals
     if not disable_signals:
         node.leave_signals_to_rospy()
     node.on_init_node(resolved, register, xmlrpc_port, tcpros_port)
