@@ -45,7 +45,14 @@ class OwnProcess:
                 'os': own_os,
                 'os.path': own_os.path,
                 'posixpath': own_os.path,
-                'atexit': ModuleProxy(atexit, register=self._at_exit, unregister=self._not_at_exit),
+                'atexit': ModuleProxy(
+                    atexit,
+                    register=self._at_exit,
+                    unregister=self._not_at_exit,
+                    # a process of multiprocessing begins and ends by these, since Python 3.13
+                    _clear=self.exit_handlers.clear,
+                    _run_exitfuncs=self.run_exit_handlers,
+                ),
                 'signal': signals.module,
                 'threading': lifetime.threading,
                 '_thread': ModuleProxy(_thread, start_new_thread=lifetime.start_thread),
@@ -68,6 +75,8 @@ class OwnProcess:
             system=self._system,
             kill=self.signals.kill,
             execv=lambda path, arguments: os.execve(path, arguments, self._environ),
+            posix_spawn=functools.partial(self._spawn, os.posix_spawn),
+            posix_spawnp=functools.partial(self._spawn, os.posix_spawnp),
         )
         own_os.path = imports.twin(posixpath, os=own_os)
         return own_os
@@ -76,6 +85,11 @@ class OwnProcess:
         """``os.system``."""
         child = os.posix_spawn('/bin/sh', ['sh', '-c', command], self._environ)
         return os.waitpid(child, 0)[1]
+
+    def _spawn(self, spawn, path, arguments, environ, **options):
+        """``os.posix_spawn`` and its like, by which subprocess starts programs, without an
+        environment since Python 3.13."""
+        return spawn(path, arguments, self._environ if environ is None else environ, **options)
 
     def _fork_exec(self, *arguments):
         """What subprocess and multiprocessing start programs by."""
