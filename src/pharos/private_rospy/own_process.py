@@ -1,6 +1,7 @@
 """What a program has of a process of its own, and a node's program, libraries and rospy have of the
 node: environment, arguments, exit handlers, signals, threads and child processes."""
 import atexit
+import functools
 import inspect
 import os
 import posixpath
