@@ -1,5 +1,8 @@
 """What is changed of a node while it runs: its blocks, its souls, a restart, its class."""
+import importlib
+import itertools
 import queue
+import sys
 import threading
 
 import pytest
@@ -8,6 +11,7 @@ import pharos
 from pharos import node_registry
 from helpers import create, ended, speak_tcpros_only
 from pharos.testing import Mailbox, TIMEOUT, until
+from programs import PROGRAMS
 
 
 def publisher(master, topic='/changed', over=None, name='/publisher'):
@@ -420,3 +424,277 @@ def test_a_restart_within_a_start_is_refused(master):
     node = create(master, '/again', Again)
     with pytest.raises(pharos.PharosError, match='/again cannot be restarted by its own start'):
         node.restart()
+
+
+# -- another class
+
+
+class First(pharos.Node):
+    """Tells what it hears, and by which class."""
+
+    def __init__(self):
+        super().__init__()
+        self.heard = []
+
+    def hear(self, message, channel):
+        self.heard.append((message.data, 'first'))
+
+    def answer(self, request):
+        return {'message': 'first'}
+
+    def change(self, value):
+        self.heard.append((value, 'first'))
+
+    def turn(self):
+        for _ in self.every(0.001):
+            self.turned = 'first'
+
+    @classmethod
+    def of_class(cls, message, channel):
+        channel.node.heard.append((message.data, cls.__name__))
+
+    @staticmethod
+    def static(message, channel):
+        channel.node.heard.append((message.data, 'first'))
+
+
+class Second(pharos.Node):
+    """The same, otherwise."""
+
+    def __init__(self):
+        raise AssertionError('this is not run')
+
+    def hear(self, message, channel):
+        self.heard.append((message.data, 'second'))
+
+    def answer(self, request):
+        return {'message': 'second'}
+
+    def change(self, value):
+        self.heard.append((value, 'second'))
+
+    def turn(self):
+        for _ in self.every(0.001):
+            self.turned = 'second'
+
+    @classmethod
+    def of_class(cls, message, channel):
+        channel.node.heard.append((message.data, cls.__name__))
+
+    @staticmethod
+    def static(message, channel):
+        channel.node.heard.append((message.data, 'second'))
+
+
+class Lacking(pharos.Node):
+    """Lacks the methods of the others."""
+
+    def change(self, value):
+        pass
+
+
+def test_a_node_becomes_one_of_another_class_with_all_of_its_blocks(master):
+    node = create(master, node_class=First)
+    node.delegate, node.soul = node.hear, First.turn
+    node.fork()
+    node.fork(First.turn, name='block')
+    own = lambda message, channel: node.heard.append((message.data, 'own'))  # noqa: E731
+    delegates = [None, node.hear, node.of_class, node.static, First.static, own]
+    channels = [node.interested_in('/changed', 'std_msgs/Int32', each) for each in delegates]
+    node.serve('/answers', 'std_srvs/Trigger', node.answer)
+    node.parameter('~changed').on_change(node.change)
+    numbers = publisher(master)
+    numbers.send(data=1)
+    until(lambda: len(node.heard) == 6)
+    uri, connections = node.uri, [channel.connections for channel in channels]
+    node.become(Second)
+    assert type(node) is Second
+    assert (node.uri, node.channels) == (uri, channels)
+    assert [channel.connections for channel in channels] == connections
+    numbers.send(data=2)
+    until(lambda: len(node.heard) == 12)
+    by = [name for _, name in node.heard]
+    assert sorted(by) == sorted([*['first'] * 4, 'First', 'own', *['second'] * 4, 'Second', 'own'])
+    assert [channel.received for channel in channels] == [2] * 6
+    assert master.lookup_service('/answers').call().message == 'second'
+    master.parameters['/node/changed'] = 5
+    until(lambda: node.heard[-1] == (5, 'second'))
+    assert node.soul is Second.turn
+    until(lambda: [soul.is_asked for soul in node.latest_run.souls.forked] == [False, False])
+    node.turned = None
+    until(lambda: node.turned)
+    assert node.turned == 'second'
+    assert not node.errors
+
+
+@pytest.mark.parametrize('inline', [False, True])
+@pytest.mark.parametrize('over', ['INTRAPROCESS', 'TCPROS'])
+def test_nothing_is_lost_nor_doubled_while_a_node_changes_its_class(master, over, inline):
+    node = create(master, node_class=First)
+    channel = node.interested_in(
+        '/changed', 'std_msgs/Int32', node.hear, queue_size=100000, inline=inline
+    )
+    numbers = publisher(master, over=over)
+    changed, sent = threading.Event(), []
+
+    def flood():
+        while not changed.is_set():
+            for _ in range(20):
+                numbers.send(data=len(sent))
+                sent.append(len(sent))
+            until(lambda: len(sent) - channel.received < 1000)  # over TCPROS, it is slower
+
+    thread = threading.Thread(target=flood, daemon=True)
+    thread.start()
+    for number in range(300):
+        node.become((Second, First)[number % 2])
+        if number % 3:  # else at once into another
+            until(lambda: node.heard and node.heard[-1][1] == type(node).__name__.lower())
+    changed.set()
+    assert ended(thread)
+    until(lambda: len(node.heard) >= len(sent))
+    assert [number for number, _ in node.heard] == sent
+    assert len([*itertools.groupby(node.heard, key=lambda heard: heard[1])]) >= 100
+    assert channel.connections == [('/publisher', over)]
+    assert (channel.received, channel.dropped) == (len(sent), 0)
+    assert not node.errors
+
+
+def test_a_node_waits_for_its_delegate_to_become_another(master):
+    node, go_on, changed = create(master, node_class=First), threading.Event(), Mailbox()
+    classes, begun = [], threading.Event()
+
+    def hear(message, channel):
+        begun.set()
+        go_on.wait(TIMEOUT)
+        classes.append(type(node))
+
+    node.interested_in('/changed', 'std_msgs/Int32', hear)
+    publisher(master).send(data=1)
+    assert begun.wait(TIMEOUT)
+    thread = threading.Thread(target=lambda: changed(node.become(Second), None), daemon=True)
+    thread.start()
+    assert changed.empty()
+    assert type(node) is First
+    go_on.set()
+    assert ended(thread)
+    assert type(node) is Second
+    assert classes == [First]
+
+
+def test_a_delegate_has_its_node_become_another(master):
+    class Turns(First):
+        def hear(self, message, channel):
+            super().hear(message, channel)
+            self.become(Second)
+
+    node = create(master, node_class=Turns)
+    node.interested_in('/changed', 'std_msgs/Int32', node.hear)
+    numbers = publisher(master)
+    for number in range(3):
+        numbers.send(data=number)
+    until(lambda: len(node.heard) == 3)
+    assert node.heard == [(0, 'first'), (1, 'second'), (2, 'second')]
+
+
+class WithSlots(pharos.Node):
+    """Instances of another layout."""
+
+    __slots__ = ('further',)
+
+
+class WrongHear(Second):
+    """A delegate that cannot be called as one."""
+
+    def hear(self):
+        pass
+
+
+def test_a_class_that_lacks_a_method_is_refused_before_anything_changes(master):
+    node = create(master, node_class=First)
+    node.delegate, node.soul = node.hear, First.turn
+    node.fork(First.turn, name='turning')
+    channel = node.interested_in('/changed', 'std_msgs/Int32', node.static)
+    node.serve('/answers', 'std_srvs/Trigger', node.answer)
+    node.parameter('~changed').on_change(node.change)
+    with pytest.raises(pharos.PharosError) as raised:
+        node.become(Lacking)
+    assert str(raised.value) == (
+        '/node cannot become a Lacking, which has no hear, the delegate of /node; no turn, the soul'
+        ' of /node; no static, the delegate of /changed; no answer, the service block of /answers;'
+        ' no turn, the soul of the thread turning: define it, or give the node another block first'
+    )
+    with pytest.raises(TypeError, match=r'called as delegate\(message, channel\).*hear'):
+        node.become(WrongHear)
+    assert type(node) is First
+    assert node.delegate == node.hear
+    assert channel.delegate == First.static
+    publisher(master).send(data=1)
+    until(lambda: node.heard == [(1, 'first')])
+
+
+def test_what_is_no_class_that_a_node_can_have_is_refused(master):
+    node = create(master)
+    for wrong in pharos.Master, node, 'Driver', None:
+        with pytest.raises(TypeError, match='/node becomes a node of another subclass of Node'):
+            node.become(wrong)
+    with pytest.raises(TypeError, match='/node cannot become a WithSlots.*same __slots__'):
+        node.become(WithSlots)
+    with pytest.raises(TypeError, match='/node is a node, and ScriptNode is the class of a script'):
+        node.become(pharos.ScriptNode)
+    assert type(node) is pharos.BlockNode
+    with pytest.raises(AttributeError):
+        node.become(Second)
+        node.heard
+
+
+def test_a_stopped_node_becomes_another_and_starts_as_that(master):
+    node = create(master, node_class=First)
+    node.interested_in('/changed', 'std_msgs/Int32', node.hear)
+    node.fork(First.turn)
+    node.stop()
+    node.become(Second)
+    node.restart()
+    publisher(master).send(data=1)
+    until(lambda: node.heard == [(1, 'second')])
+    until(lambda: getattr(node, 'turned', None) == 'second')
+
+
+@pytest.fixture
+def reloading(monkeypatch, tmp_path):
+    """The module ``driver`` of programs/reloading, and what writes it with each 'first' replaced
+    by another word."""
+    source = PROGRAMS / 'reloading' / 'driver.py'
+    path = tmp_path / 'driver.py'
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(sys, 'dont_write_bytecode', True)
+
+    def write(word):
+        text = source.read_text().replace('first', word).replace('STEP = 1', f'STEP = {len(word)}')
+        path.write_text(text)
+
+    write('first')
+    yield importlib.import_module('driver'), write
+    del sys.modules['driver']
+
+
+def test_a_node_becomes_what_a_reload_has_made_of_its_class(master, reloading):
+    module, write = reloading
+    node = create(master, node_class=module.Driver)
+    sums = Mailbox(create(master, '/hearer'), '/sums', 'std_msgs/Int32')
+    steps = publisher(master, '/steps')
+    node.changed = None
+    steps.send(data=2)
+    assert sums.next().data == 10
+    for word in 'second', 'third':
+        write(word)
+        importlib.reload(module)
+        node.become(module.Driver)
+        assert master.lookup_service('/step').call().message == word
+        master.parameters['/node/step'] = word
+        until(lambda: node.changed == word)
+        until(lambda: word in node.turned)
+    steps.send(data=1)
+    assert sums.next().data == 15
+    assert {*node.turned[-3:]} == {'third'}
+    assert not node.errors

@@ -1,7 +1,7 @@
 """Blocks: the callables that a node is made of."""
 import functools
 import inspect
-from typing import Any, Callable, Sequence
+from typing import Any, Callable, Optional, Sequence
 
 from pharos.signals import code_of, is_from_signal
 
@@ -89,3 +89,42 @@ def name_of(block: Any) -> str:
     """How logs name a block."""
     name = attempt(lambda: getattr(block, '__qualname__', None) or repr(block))
     return text_of(name or f'a {type(block).__name__}')
+
+
+class BlockOf:
+    """A block that was given to a node: where it is a method of the node's class, the one of that
+    name of the class that the node has by now."""
+
+    def __init__(self, node: Any, block: Any) -> None:
+        self._node, self._block = node, block
+        #: the name of the method; None: it is none of the class
+        self.method = _method_name(node, block)
+
+    @property
+    def now(self) -> Any:
+        """The block; the one that was given where the class has no such method any more."""
+        block = self.as_of(type(self._node))
+        return self._block if block is None else block
+
+    def as_of(self, node_class: type) -> Any:
+        """What it is when the node has that class; None where that has no such method."""
+        if self.method is None:
+            return self._block
+        value = inspect.getattr_static(node_class, self.method, None)
+        is_bound = inspect.ismethod(self._block) and self._block.__self__ is self._node
+        bind = getattr(type(value), '__get__', None)
+        return bind(value, self._node if is_bound else None, node_class) if bind else value
+
+
+def _method_name(node: Any, block: Any) -> Optional[str]:
+    function = block
+    if inspect.ismethod(block):
+        function = block.__func__
+        if block.__self__ is not node and not isinstance(block.__self__, type):
+            return None  # a method of something else
+    for owner in type(node).__mro__:
+        for name, value in vars(owner).items():
+            is_wrapped = isinstance(value, (staticmethod, classmethod))
+            if (value.__func__ if is_wrapped else value) is function:
+                return name
+    return None

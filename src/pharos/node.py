@@ -5,6 +5,7 @@ import genpy
 
 from pharos import node_registry
 from pharos.attributes import Block
+from pharos.becoming import become
 from pharos.blocks import check_block
 from pharos.channel import InputChannel
 from pharos.external_node import describe
@@ -45,6 +46,8 @@ class Node(NodeWithSouls, is_base=True):
 
     #: whether a start opens again what the last run had; a start() of one's own opens it itself
     _reopens = True
+    #: what starts and stops in its own way
+    _kind = 'a node'
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -103,6 +106,40 @@ class Node(NodeWithSouls, is_base=True):
         :raises NodeNameInUseError, PortInUseError: and the node is then stopped
         """
         restart(self, not self._reopens)
+
+    def become(self, node_class: type) -> None:
+        """Be a node of another class from now on, such as the one that a reload of its module has
+        made of its own: its behaviour changes, its name, ports, connections, queues, counts and
+        attributes stay::
+
+            importlib.reload(turtles)
+            driver.become(turtles.TurtleDriver)
+
+        It happens when no delegate of the node runs, for which this waits: no message is lost, or
+        comes twice. What are methods of the present class become those of the same names: the
+        soul, delegates, blocks of services and parameters, and souls that are forked, which begin
+        anew at their next turn of :meth:`every` (see :meth:`renew`). What runs goes on to its end
+        as it was. What others were given, such as rospy's Timer, stays as it is.
+
+        Neither ``__init__`` nor ``start`` of the new class runs: attributes that only it has are to
+        be set before, or have their values in the class.
+
+        :raises PharosError: if the new class lacks one of those methods; nothing has changed then,
+            nor after the others
+        :raises TypeError: if it is no subclass of Node, one of scripts (where this is none, or the
+            other way round), has other ``__slots__``, or a method that cannot be called as the
+            former
+        """
+        if not (isinstance(node_class, type) and issubclass(node_class, Node)):
+            raise TypeError(
+                f'{self.name} becomes a node of another subclass of Node, not {node_class!r}'
+            )
+        if node_class._kind != self._kind:
+            raise TypeError(
+                f'{self.name} is {self._kind}, and {node_class.__name__} is the class of'
+                f' {node_class._kind}, which starts in another way: create() one'
+            )
+        become(self, node_class)
 
     def __enter__(self) -> 'Node':
         return self

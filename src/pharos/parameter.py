@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any, Callable, List
 
 import rosgraph
 
-from pharos.blocks import check_block
+from pharos.blocks import BlockOf, check_block
 from pharos.private_rospy.parameters import as_stored
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ class Parameter:
         self.name = name
         self._initialized = None if initialized is None else as_stored(name, initialized)
         self._kind = type(self._initialized)
-        self._blocks: List[Block] = []
+        self.blocks: List[BlockOf] = []
         if self._initialized is not None:
             watched = node.current_run.rospy.parameters
             with node.master.reached():
@@ -84,20 +84,22 @@ class Parameter:
             )
         check_block(block, 'parameter block', ('value',))
         watched = self.node.current_run.rospy.parameters
-        self._blocks.append(block)
+        given = BlockOf(self.node, block)
+        self.blocks.append(given)
         try:
             with self.node.master.reached():
                 watched.watch(self.name, self._changed)
         except BaseException:
-            self._blocks.remove(block)
+            self.blocks.remove(given)
             raise
         return block
 
     def _changed(self, value: Any) -> None:
-        for block in tuple(self._blocks):
+        for block in tuple(self.blocks):
             self._run(block, value)
 
-    def _run(self, block: Block, value: Any) -> None:
+    def _run(self, given: BlockOf, value: Any) -> None:
+        block = given.now
         try:
             if value == {}:
                 value = self._get()  # a master says so of a deleted one, too
@@ -108,7 +110,7 @@ class Parameter:
                 block,
                 f'parameter {self.name}',
                 message=value,
-                again=functools.partial(self._run, block),
+                again=functools.partial(self._run, given),
             )
 
     def _checked(self, value: Any) -> Any:

@@ -257,6 +257,11 @@ class Run:
         return Latch()
 
     @property
+    def parameters(self) -> List[Any]:
+        """The parameters whose changes are watched."""
+        return [listener.__self__ for listener in self.rospy.parameters.listeners]
+
+    @property
     def channels(self) -> List[Any]:
         """The channels that are open."""
         channels = (InputChannel, OutputChannel)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, Callable, Iterator, List, Optional
 
 from pharos import node_registry, signals
 from pharos.attributes import Block, NodeAttributes
-from pharos.blocks import check_soul
+from pharos.blocks import BlockOf, check_soul
 from pharos.errors import NodeStoppedError, PharosError
 from pharos.lifecycle import Lifecycle
 from pharos.private_rospy.process_rospy import rospy
@@ -18,12 +18,16 @@ if TYPE_CHECKING:
 class Soul:
     """A soul that was forked, in its thread."""
 
-    def __init__(self, block: Block, name: str, maker: Any) -> None:
+    def __init__(self, block: Optional[BlockOf], name: str, maker: Any) -> None:
         self.block = block  # None: the node's own soul, whatever that is when it begins
         self.name = name
         self.maker = maker  # START, the Soul in whose thread it was forked, or None
         self.is_asked = False  # whether it is to begin anew
         self.begins_anew = False  # whether it has ended for that
+
+    def block_of(self, node: NodeAttributes) -> Block:
+        """What it runs when it begins now; None: nothing."""
+        return node.soul if self.block is None else self.block.now
 
 
 #: the maker of souls that the ``start()`` of the node's class forks
@@ -40,48 +44,54 @@ class Souls:
         self._here = threading.local()  # .soul: the one whose thread this is
         self._threads: List[int] = []  # identifiers of threads, once for each soul they run
 
-    def execute(self, block: Block) -> Any:
-        """Run the node's soul, or ``block``, in this thread; an exception in it is reported and
-        ends nothing else."""
-        return self._execute(Soul(block, '', None), self.block_of(block))
+    def execute(self) -> Any:
+        """Run the node's soul in this thread; an exception in it is reported and ends nothing
+        else."""
+        return self.run(Soul(None, '', None))
 
-    def block_of(self, block: Block) -> Callable[..., Any]:
-        """What is run: the node's soul, as it is now, or ``block``.
+    def _checked(self, soul: Soul) -> Callable[..., Any]:
+        """What it runs.
 
         :raises PharosError: if there is none
         """
         node = self._run.node
-        soul = node.soul if block is None else check_soul(block)
-        if soul is None:
+        block = check_soul(soul.block_of(node))
+        if block is None:
             raise PharosError(
                 f'{node.name} has no soul to run: give it one with soul= or node.soul ='
             )
-        return soul
+        return block
 
     def _execute(self, soul: Soul, block: Callable[..., Any]) -> Any:
-        def again(nothing: Any) -> None:
-            self._run.node.current_run.souls.execute(soul.block)
-
         self._threads.append(threading.get_ident())
         try:
             with self._run.rospy.lifetime.interrupts_waits():
                 return block(self._run.node)
         except BaseException as error:
+            node = self._run.node
+
+            def again(nothing: Any) -> None:
+                node.current_run.souls.run(soul)
+
             self._run.report(error, block, 'soul', again=again)
             return None
         finally:
             self._threads.remove(threading.get_ident())
 
+    def run(self, soul: Soul) -> Any:
+        """Run a soul, as it is now, in this thread."""
+        return self._execute(soul, self._checked(soul))
+
     def fork(self, block: Block, name: str) -> threading.Thread:
         """Run the node's soul, or ``block``, in a thread of its own, and return the thread."""
-        maker = getattr(self._here, 'soul', None)
-        if node_registry.is_in_start(self._run.node):
-            maker = START
-        soul, first = Soul(block, name, maker), self.block_of(block)
+        node = self._run.node
+        maker = START if node_registry.is_in_start(node) else getattr(self._here, 'soul', None)
+        soul = Soul(None if block is None else BlockOf(node, block), name, maker)
+        first = self._checked(soul)
         self.forked.append(soul)
         return self._run.fork(lambda: self._run_forked(soul, first), name)
 
-    def _run_forked(self, soul: Soul, block: Optional[Callable[..., Any]]) -> None:
+    def _run_forked(self, soul: Soul, block: Block) -> None:
         self._here.soul = soul
         while block is not None:
             self._execute(soul, block)
@@ -89,7 +99,7 @@ class Souls:
             # what another soul has forked, that forks anew
             if soul.begins_anew and soul.maker not in self.forked:
                 soul.is_asked = soul.begins_anew = False
-                block = self._run.node.soul if soul.block is None else soul.block
+                block = soul.block_of(self._run.node)
         if self._run.lifecycle is Lifecycle.RUNNING:
             self.forked.remove(soul)
 
@@ -113,9 +123,8 @@ class Souls:
         """
         for soul in former.forked:
             is_back = soul.maker is START and starts_some or soul.maker in former.forked
-            has_block = soul.block is not None or self._run.node.soul is not None
-            if has_block and not is_back:
-                self.fork(soul.block, soul.name)
+            if not is_back and soul.block_of(self._run.node) is not None:
+                self.fork(None if soul.block is None else soul.block.now, soul.name)
 
     def turns(self, rate: Any) -> Iterator[None]:
         """What :meth:`Node.every` returns, by a Rate of rospy's."""
@@ -146,7 +155,7 @@ class NodeWithSouls(NodeAttributes, is_base=True):
         The report (listing 3.7): ``node execute``. An exception in the soul is reported (see
         :attr:`errors`) and ends only this run, which then returns None.
         """
-        return self.current_run.souls.execute(None)
+        return self.current_run.souls.execute()
 
     def fork(self, block: Block = None, name: Optional[str] = None) -> threading.Thread:
         """Run the soul, or ``block(node)``, in a thread of its own, and return the thread.

@@ -42,6 +42,7 @@ class ScriptNode(Node):
         file for what it prints, and its errors have the name; None: as this process prints
     """
 
+    _kind = 'a script'
     #: seconds that :meth:`start` waits for the program to call ``rospy.init_node``, or to end
     init_timeout = 10.0
     #: seconds that :meth:`stop` waits for the program, as long as roslaunch waits after its SIGINT

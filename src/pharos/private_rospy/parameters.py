@@ -60,6 +60,11 @@ class WatchedParameters:
                 self._watched.remove(entry)
             raise
 
+    @property
+    def listeners(self):
+        """Those that :meth:`watch` was given."""
+        return [listener for _, listener in self._watched]
+
     def _subscribe(self, name):
         master, uri = self._master(), self._node.uri
         with self._subscribing:

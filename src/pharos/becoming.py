@@ -1,0 +1,93 @@
+"""How a node becomes one of another class while it runs."""
+from typing import TYPE_CHECKING, Any, Callable, Iterator, List, NamedTuple, Sequence, Tuple
+
+from pharos.blocks import BlockOf, check_block
+from pharos.channel import InputChannel
+from pharos.errors import PharosError
+from pharos.offered_service import OfferedService
+
+if TYPE_CHECKING:
+    from pharos.node import Node
+
+
+class Place(NamedTuple):
+    """Where a node has a block."""
+
+    kind: str  # such as 'delegate'
+    of: str  # what that is of
+    given: BlockOf
+    parameters: Sequence[str]  # that it is called with
+    take: Callable[[Any], Any]  # takes what it becomes
+
+
+def become(node: 'Node', node_class: type) -> None:
+    """What :meth:`Node.become` does, when no delegate of the node runs."""
+    run = node.latest_run
+    if run is None:
+        _change(node, node_class)
+    else:
+        run.dispatcher.run_in_turn(lambda: _change(node, node_class))
+
+
+def _change(node: 'Node', node_class: type) -> None:
+    changes = _changes(node, node_class)
+    souls = node.latest_run.souls.forked if node.latest_run else []
+    before = [(soul, soul.block_of(node)) for soul in list(souls)]
+    try:
+        object.__setattr__(node, '__class__', node_class)
+    except TypeError as error:
+        raise TypeError(
+            f'{node.name} cannot become a {node_class.__name__}, whose instances are laid out in'
+            f' another way ({error}): give both classes the same __slots__, or create() a node'
+        ) from error
+    for take, block in changes:
+        take(block)
+    for soul, block in before:
+        if soul.block_of(node) is not block:
+            soul.is_asked = True
+
+
+def _changes(node: 'Node', node_class: type) -> List[Tuple[Callable[[Any], Any], Any]]:
+    """Who is to take which block, all of them looked up, and checked."""
+    changes, gone = [], []
+    for place in _places(node):
+        block = place.given.as_of(node_class)
+        if block is None:
+            gone.append(f'{place.given.method}, the {place.kind} of {place.of}')
+        elif place.given.method is not None:
+            changes.append((place.take, check_block(block, place.kind, place.parameters)))
+    if gone:
+        raise PharosError(
+            f'{node.name} cannot become a {node_class.__name__}, which has no {"; no ".join(gone)}:'
+            ' define it, or give the node another block first'
+        )
+    return changes
+
+
+def _places(node: 'Node') -> Iterator[Place]:
+    """The blocks of a node that there are."""
+
+    def held(holder: Any, kind: str, of: str, *parameters: str) -> Iterator[Place]:
+        attribute = kind.split()[-1]
+        block = getattr(holder, attribute)
+        if block is not None:
+            given = BlockOf(node, block)
+            yield Place(kind, of, given, parameters, lambda new: setattr(holder, attribute, new))
+
+    yield from held(node, 'delegate', node.name, 'message', 'channel')
+    yield from held(node, 'soul', node.name, 'node')
+    run = node.latest_run
+    if run is None:
+        return
+    for opened in run.opened:
+        if isinstance(opened, InputChannel):
+            yield from held(opened, 'delegate', opened.topic, 'message', 'channel')
+        elif isinstance(opened, OfferedService):
+            yield from held(opened, 'service block', opened.name, 'request')
+    # those look up by themselves what their blocks have become
+    for soul in run.souls.forked:
+        if soul.block is not None:
+            yield Place('soul', f'the thread {soul.name}', soul.block, ('node',), bool)
+    for parameter in run.parameters:
+        for given in parameter.blocks:
+            yield Place('parameter block', parameter.name, given, ('value',), bool)
