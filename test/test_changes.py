@@ -1,8 +1,6 @@
 """What is changed of a node while it runs: its blocks, its souls, a restart, its class."""
-import importlib
 import itertools
 import queue
-import sys
 import threading
 
 import pytest
@@ -11,7 +9,6 @@ import pharos
 from pharos import node_registry
 from helpers import create, ended, speak_tcpros_only
 from pharos.testing import Mailbox, TIMEOUT, until
-from programs import PROGRAMS
 
 
 def publisher(master, topic='/changed', over=None, name='/publisher'):
@@ -658,43 +655,3 @@ def test_a_stopped_node_becomes_another_and_starts_as_that(master):
     publisher(master).send(data=1)
     until(lambda: node.heard == [(1, 'second')])
     until(lambda: getattr(node, 'turned', None) == 'second')
-
-
-@pytest.fixture
-def reloading(monkeypatch, tmp_path):
-    """The module ``driver`` of programs/reloading, and what writes it with each 'first' replaced
-    by another word."""
-    source = PROGRAMS / 'reloading' / 'driver.py'
-    path = tmp_path / 'driver.py'
-    monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(sys, 'dont_write_bytecode', True)
-
-    def write(word):
-        text = source.read_text().replace('first', word).replace('STEP = 1', f'STEP = {len(word)}')
-        path.write_text(text)
-
-    write('first')
-    yield importlib.import_module('driver'), write
-    del sys.modules['driver']
-
-
-def test_a_node_becomes_what_a_reload_has_made_of_its_class(master, reloading):
-    module, write = reloading
-    node = create(master, node_class=module.Driver)
-    sums = Mailbox(create(master, '/hearer'), '/sums', 'std_msgs/Int32')
-    steps = publisher(master, '/steps')
-    node.changed = None
-    steps.send(data=2)
-    assert sums.next().data == 10
-    for word in 'second', 'third':
-        write(word)
-        importlib.reload(module)
-        node.become(module.Driver)
-        assert master.lookup_service('/step').call().message == word
-        master.parameters['/node/step'] = word
-        until(lambda: node.changed == word)
-        until(lambda: word in node.turned)
-    steps.send(data=1)
-    assert sums.next().data == 15
-    assert {*node.turned[-3:]} == {'third'}
-    assert not node.errors

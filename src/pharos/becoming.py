@@ -50,7 +50,7 @@ def _change(node: 'Node', node_class: type) -> None:
 def _changes(node: 'Node', node_class: type) -> List[Tuple[Callable[[Any], Any], Any]]:
     """Who is to take which block, all of them looked up, and checked."""
     changes, gone = [], []
-    for place in _places(node):
+    for place in places(node):
         block = place.given.as_of(node_class)
         if block is None:
             gone.append(f'{place.given.method}, the {place.kind} of {place.of}')
@@ -64,7 +64,7 @@ def _changes(node: 'Node', node_class: type) -> List[Tuple[Callable[[Any], Any],
     return changes
 
 
-def _places(node: 'Node') -> Iterator[Place]:
+def places(node: 'Node') -> Iterator[Place]:
     """The blocks of a node that there are."""
 
     def held(holder: Any, kind: str, of: str, *parameters: str) -> Iterator[Place]:

@@ -125,6 +125,15 @@ def _method_name(node: Any, block: Any) -> Optional[str]:
     for owner in type(node).__mro__:
         for name, value in vars(owner).items():
             is_wrapped = isinstance(value, (staticmethod, classmethod))
-            if (value.__func__ if is_wrapped else value) is function:
+            other = value.__func__ if is_wrapped else value
+            if other is function or _is_reloaded(function, other):
                 return name
     return None
+
+
+def _is_reloaded(function: Any, other: Any) -> bool:
+    """Whether the other function comes from the same place, and a reload of that has made it."""
+    if not (inspect.isfunction(function) and inspect.isfunction(other)):
+        return False
+    names = function.__module__, function.__qualname__
+    return names == (other.__module__, other.__qualname__)

@@ -121,6 +121,9 @@ class Node(NodeWithSouls, is_base=True):
         anew at their next turn of :meth:`every` (see :meth:`renew`). What runs goes on to its end
         as it was. What others were given, such as rospy's Timer, stays as it is.
 
+        IPython's ``%autoreload 2`` does the same by itself when a module was edited, but for souls
+        that loop, which :meth:`renew` has begin anew.
+
         Neither ``__init__`` nor ``start`` of the new class runs: attributes that only it has are to
         be set before, or have their values in the class.
 

@@ -2,7 +2,7 @@
 import functools
 from typing import TYPE_CHECKING, Any, Callable
 
-from pharos import node_registry
+from pharos import node_registry, reloading
 from pharos.errors import PharosError
 
 if TYPE_CHECKING:
@@ -14,6 +14,7 @@ def start_made(node: 'Node') -> None:
 
     :raises PharosError: if its own start() does not start it
     """
+    reloading.follow()
     with node_registry.start_of(node):
         try:
             node.start()
