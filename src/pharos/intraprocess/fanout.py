@@ -21,8 +21,6 @@ from pharos.intraprocess.dispatcher import BURST_INTERVAL, Dispatcher
 from pharos.intraprocess.inbox import Inbox
 from pharos.intraprocess.link import links_of
 
-# seconds after the start in which log lines are kept for listeners that connect later
-STARTUP = 2.0
 _clock = time.perf_counter
 
 
@@ -70,28 +68,6 @@ class Latch:
     def of(self, receiver: str) -> Tuple[Frozen, ...]:
         """What a node of that name is to get when it connects."""
         return self._to_one.get(receiver, self._to_all)
-
-
-class StartupLogBuffer(Latch):
-    """The latch of /rosout, with the first lines of a node.
-
-    Its listeners connect a tenth of a second after the start, and would miss them.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._until = time.monotonic() + STARTUP
-        self._lines: Tuple[Frozen, ...] = ()
-
-    def keep(self, frozen: Frozen, receiver: Optional[str]) -> None:
-        """Keep the line, and those before it while the node is young."""
-        super().keep(frozen, receiver)
-        self._lines = (*self._lines, frozen) if time.monotonic() < self._until else ()
-
-    def of(self, receiver: str) -> Tuple[Frozen, ...]:
-        """All lines so far, later the last one."""
-        is_young = time.monotonic() < self._until
-        return self._lines if is_young and self._lines else super().of(receiver)
 
 
 # Some connections, by how a message goes to them: inboxes in this process; other connections; the
@@ -227,7 +203,8 @@ class Fanout:
 
     def run(self) -> None:
         """Run the delegates that are inline, without the lock, which others may wait for."""
-        for dispatcher in self._ways[3]:
+        _, _, _, inline, _ = self._ways
+        for dispatcher in inline:
             dispatcher.run()
 
     def reaches(self, name: str) -> bool:

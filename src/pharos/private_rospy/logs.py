@@ -9,7 +9,13 @@ hooks.
 import contextlib
 import logging
 import logging.handlers
+import time
 import weakref
+
+from pharos.intraprocess.fanout import Latch
+
+# seconds after the start in which log lines are kept for listeners that connect later
+STARTUP = 2.0
 
 
 def private_logging(imports):
@@ -50,3 +56,25 @@ def close_handlers(module):
             logger.removeHandler(handler)
             with contextlib.suppress(OSError):
                 handler.close()
+
+
+class StartupLines(Latch):
+    """The latch of /rosout, with the first lines of a node.
+
+    Its listeners connect a tenth of a second after the start, and would miss them.
+    """
+
+    def __init__(self):
+        super().__init__()
+        self._until = time.monotonic() + STARTUP
+        self._lines = ()
+
+    def keep(self, frozen, receiver):
+        """Keep the line, and those before it while the node is young."""
+        super().keep(frozen, receiver)
+        self._lines = (*self._lines, frozen) if time.monotonic() < self._until else ()
+
+    def of(self, receiver):
+        """All lines so far, later the last one."""
+        is_young = time.monotonic() < self._until
+        return self._lines if is_young and self._lines else super().of(receiver)

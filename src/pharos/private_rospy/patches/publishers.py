@@ -5,10 +5,11 @@ import math
 import struct
 import traceback
 
-from pharos.intraprocess.fanout import ClosedError, Fanout, Latch, StartupLogBuffer
+from pharos.intraprocess.fanout import ClosedError, Fanout, Latch
 from pharos.intraprocess.link import links_of
 from pharos.private_rospy.patches.table import addition, patch
 from pharos.private_rospy.changes import notify
+from pharos.private_rospy.logs import StartupLines
 from pharos.private_rospy.sender import Sender, Sockets
 from pharos.signals import is_from_signal
 
@@ -26,7 +27,7 @@ def init_publisher(self, name, data_class, *, original, module):
     self.fanout = Fanout(data_class, self.publock, Sockets(self, module))
     is_log = self.resolved_name == '/rosout'
     # of all Publishers of rospy on the topic; each OutputChannel has its own
-    self.own_latch = StartupLogBuffer() if is_log else Latch()
+    self.own_latch = StartupLines() if is_log else Latch()
     self.refused = {}  # name of each subscriber that was refused -> what was said
 
 
