@@ -2,9 +2,9 @@
 set of it, in its class or on it."""
 import inspect
 import numbers
-from typing import TYPE_CHECKING, Any, Callable, FrozenSet, List, Optional, TypeVar
+from typing import TYPE_CHECKING, Any, Callable, Dict, FrozenSet, List, Optional, TypeVar
 
-from pharos.blocks import attempt, check_delegate, check_runs, check_soul, text_of
+from pharos.blocks import Block, attempt, check_delegate, check_runs, check_soul, text_of
 from pharos import node_registry
 from pharos.errors import NodeStoppedError
 from pharos.failures import Failure, Failures
@@ -17,12 +17,25 @@ if TYPE_CHECKING:
     from pharos.master import Master
     from pharos.run import Run
 
-#: what a node runs, or None
-Block = Optional[Callable[..., Any]]
 NodeType = TypeVar('NodeType', bound='NodeAttributes')
 _SET_ONCE = frozenset(['master', '_settings', '_errors'])
-_SECONDS = frozenset(['connect_timeout', 'stop_timeout'])
-_NUMBERS = _SECONDS | {'queue_bytes'}
+
+
+def _check_bytes(name: str, value: Any) -> Any:
+    is_number = isinstance(value, numbers.Real)
+    if not (is_number and value > 0):
+        raise ValueError(f'{name} is a number of bytes above 0, not {value!r}')
+    return value
+
+
+# name of an attribute -> check(name, value) returns the value that it gets
+_CHECKS: Dict[str, Callable[[str, Any], Any]] = {
+    'connect_timeout': check_seconds,
+    'stop_timeout': check_seconds,
+    'queue_bytes': _check_bytes,
+    'soul': lambda name, block: check_soul(block),
+    'delegate': lambda name, block: check_delegate(block),
+}
 # names of levels -> rospy's
 _LEVELS = {level: level for level in ('debug', 'info', 'warning', 'error', 'critical')}
 _LEVELS.update(warn='warning', err='error', fatal='critical')
@@ -42,6 +55,14 @@ class NodeAttributes:
     allow_remote_shutdown = False
     #: seconds that :meth:`stop` waits for souls, and for messages under way
     stop_timeout = 2.0
+    #: the block that says what the node does, called as ``soul(node)`` by :meth:`execute` and
+    #: :meth:`fork`; one that is set while the node runs takes effect with the next run, and
+    #: :meth:`renew` has one that loops go on as the new one
+    soul: Optional[Block]
+    #: the block run for each message received, called as ``delegate(message, channel)``; those of a
+    #: node run one at a time. The report: ``self receiverDelegate: [:message :channel | ...]``. One
+    #: that is set while the node runs takes effect with the next message.
+    delegate: Optional[Block]
 
     #: the run of the present start, or the last one; None before the first start
     latest_run: 'Run' = None  # type: ignore[assignment]
@@ -68,10 +89,11 @@ class NodeAttributes:
                     f'{cls.__name__}.{name} would never run: each node has a {name} of its own,'
                     f' given to create() or set. Name it otherwise, and set self.{name} in start()'
                 )
-        for name in (cls._methods | _NUMBERS).intersection(vars(cls)):
+        for name in (cls._methods | _CHECKS.keys()).intersection(vars(cls)):
             value = getattr(cls, name)
-            if not isinstance(value, property) and cls._checked(name, value) is not value:
-                setattr(cls, name, cls._checked(name, value))
+            checked = value if isinstance(value, property) else cls._checked(name, value)
+            if checked is not value:
+                setattr(cls, name, checked)
         for name in ('start', 'stop'):
             check_runs(getattr(cls, name), f'{cls.__name__}.{name}')
 
@@ -83,17 +105,14 @@ class NodeAttributes:
     @classmethod
     def _checked(cls, name: str, value: Any) -> Any:
         """The value that an attribute gets, in a class of nodes or in one of them."""
-        if name in _SECONDS:
-            return check_seconds(name, value)
-        is_number = isinstance(value, numbers.Real)
-        if name == 'queue_bytes' and not (is_number and value > 0):
-            raise ValueError(f'queue_bytes is a number of bytes above 0, not {value!r}')
+        if name in _CHECKS:
+            return _CHECKS[name](name, value)
         if name in cls._methods and not callable(value):
             raise _not_to_be_set(name)
         return value
 
     def _configure(
-        self, master: 'Master', settings: Settings, soul: Block, delegate: Block
+        self, master: 'Master', settings: Settings, soul: Optional[Block], delegate: Optional[Block]
     ) -> None:
         self.master = master
         self._settings = settings
@@ -150,34 +169,6 @@ class NodeAttributes:
         return self._settings.xmlrpc_port
 
     @property
-    def soul(self) -> Block:
-        """The block that says what the node does, called as ``soul(node)`` by :meth:`execute` and
-        :meth:`fork`.
-
-        May be replaced while the node runs, and takes effect with the next run; :meth:`renew` has
-        one that loops go on as the new one.
-        """
-        return self._soul
-
-    @soul.setter
-    def soul(self, block: Block) -> None:
-        self._soul = check_soul(block)
-
-    @property
-    def delegate(self) -> Block:
-        """The block run for each message received, called as ``delegate(message, channel)``.
-
-        The report: ``self receiverDelegate: [:message :channel | ...]``. Delegates of a node run
-        one at a time. It may be replaced while the node runs, and takes effect with the next
-        message.
-        """
-        return self._delegate
-
-    @delegate.setter
-    def delegate(self, block: Block) -> None:
-        self._delegate = check_delegate(block)
-
-    @property
     def errors(self) -> Failures:
         """The exceptions that blocks raised, the newest last: of identical ones the newest alone.
 
@@ -218,8 +209,8 @@ def make(
     node_class: Callable[..., NodeType],
     master: 'Master',
     named: str,
-    soul: Block,
-    delegate: Block,
+    soul: Optional[Block],
+    delegate: Optional[Block],
     args: Any,
     kwargs: Any,
     **settings: Any,

@@ -5,6 +5,9 @@ from typing import Any, Callable, Optional, Sequence
 
 from pharos.signals import code_of, is_from_signal
 
+#: what a user gives to be run
+Block = Callable[..., Any]
+
 _ASYNC = inspect.CO_COROUTINE | inspect.CO_ITERABLE_COROUTINE | inspect.CO_ASYNC_GENERATOR
 
 

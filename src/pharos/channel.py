@@ -5,15 +5,13 @@ from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Tuple, Ty
 
 import genpy
 
-from pharos.blocks import check_delegate
+from pharos.blocks import Block, check_delegate
 from pharos.errors import PharosError
 from pharos.intraprocess.inbox import Inbox, SocketInbox
 
 if TYPE_CHECKING:
     from pharos.node import Node
     from pharos.run import Run
-
-Block = Callable[..., Any]
 
 
 class Channel:

@@ -4,9 +4,8 @@ from typing import TYPE_CHECKING, Any, Callable, List, Optional, Type, Union
 import genpy
 
 from pharos import node_registry
-from pharos.attributes import Block
 from pharos.becoming import become
-from pharos.blocks import check_block
+from pharos.blocks import Block, check_block
 from pharos.channel import InputChannel
 from pharos.external_node import describe
 from pharos.health import Health, health_of
@@ -156,7 +155,7 @@ class Node(NodeWithSouls, is_base=True):
         self,
         topic: str,
         typed_as: TypedAs = None,
-        delegate: Block = None,
+        delegate: Optional[Block] = None,
         queue_size: int = QUEUE_SIZE,
         inline: bool = False,
         shared: bool = False,
@@ -214,7 +213,7 @@ class Node(NodeWithSouls, is_base=True):
     def send_to(
         self,
         topic: str,
-        block: Block = None,
+        block: Optional[Block] = None,
         *,
         typed_as: TypedAs = None,
         to: 'Peer' = None,

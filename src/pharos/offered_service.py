@@ -1,11 +1,11 @@
 """Services that a node offers."""
 import contextlib
-from typing import TYPE_CHECKING, Any, Callable, Union
+from typing import TYPE_CHECKING, Any, Union
 
 import genpy
 
 from pharos import messages
-from pharos.blocks import check_block, text_of
+from pharos.blocks import Block, check_block, text_of
 from pharos.errors import MessageTypeError, PharosError
 from pharos.intraprocess.copier import copier_for
 from pharos.private_rospy import local_services
@@ -16,8 +16,6 @@ from pharos.private_rospy.xmlrpc_server import is_call_from_nearby
 
 if TYPE_CHECKING:
     from pharos.node import Node
-
-Block = Callable[[Any], Any]
 
 
 class OfferedService:

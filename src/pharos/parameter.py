@@ -1,16 +1,14 @@
 """Parameters of the parameter server, bound to a node both ways."""
 import functools
-from typing import TYPE_CHECKING, Any, Callable, List
+from typing import TYPE_CHECKING, Any, List
 
 import rosgraph
 
-from pharos.blocks import BlockOf, check_block
+from pharos.blocks import Block, BlockOf, check_block
 from pharos.private_rospy.parameters import as_stored
 
 if TYPE_CHECKING:
     from pharos.node import Node
-
-Block = Callable[[Any], Any]
 
 
 class Parameter:

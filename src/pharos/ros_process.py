@@ -12,7 +12,6 @@ import xmlrpc.client
 from typing import (
     TYPE_CHECKING,
     Any,
-    Callable,
     Deque,
     Dict,
     Iterator,
@@ -30,7 +29,7 @@ import rospkg
 from catkin.find_in_workspaces import find_in_workspaces
 
 from pharos import node_registry
-from pharos.blocks import check_block, name_of
+from pharos.blocks import Block, check_block, name_of
 from pharos.errors import PharosError, UnknownNodeError
 from pharos.failures import Failures
 from pharos.private_rospy.deadlines import time_limit
@@ -48,8 +47,6 @@ LINE_BY_LINE = {'PYTHONUNBUFFERED': '1', 'ROSCONSOLE_STDOUT_LINE_BUFFERED': '1'}
 
 KILL_TIMEOUT = 1.0  # seconds that processes may take to end when they are killed
 ANSWER_TIMEOUT = 1.0  # seconds that the master or a node may take to answer
-
-Block = Callable[[str], Any]
 
 
 class RosProcess:

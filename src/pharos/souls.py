@@ -4,8 +4,8 @@ import threading
 from typing import TYPE_CHECKING, Any, Callable, Iterator, List, Optional
 
 from pharos import node_registry, signals
-from pharos.attributes import Block, NodeAttributes
-from pharos.blocks import BlockOf, check_soul
+from pharos.attributes import NodeAttributes
+from pharos.blocks import Block, BlockOf, check_soul
 from pharos.errors import NodeStoppedError, PharosError
 from pharos.lifecycle import Lifecycle
 from pharos.private_rospy.process_rospy import rospy
@@ -25,7 +25,7 @@ class Soul:
         self.is_asked = False  # whether it is to begin anew
         self.begins_anew = False  # whether it has ended for that
 
-    def block_of(self, node: NodeAttributes) -> Block:
+    def block_of(self, node: NodeAttributes) -> Optional[Block]:
         """What it runs when it begins now; None: nothing."""
         return node.soul if self.block is None else self.block.now
 
@@ -82,7 +82,7 @@ class Souls:
         """Run a soul, as it is now, in this thread."""
         return self._execute(soul, self._checked(soul))
 
-    def fork(self, block: Block, name: str) -> threading.Thread:
+    def fork(self, block: Optional[Block], name: str) -> threading.Thread:
         """Run the node's soul, or ``block``, in a thread of its own, and return the thread."""
         node = self._run.node
         maker = START if node_registry.is_in_start(node) else getattr(self._here, 'soul', None)
@@ -91,7 +91,7 @@ class Souls:
         self.forked.append(soul)
         return self._run.fork(lambda: self._run_forked(soul, first), name)
 
-    def _run_forked(self, soul: Soul, block: Block) -> None:
+    def _run_forked(self, soul: Soul, block: Optional[Block]) -> None:
         self._here.soul = soul
         while block is not None:
             self._execute(soul, block)
@@ -157,7 +157,7 @@ class NodeWithSouls(NodeAttributes, is_base=True):
         """
         return self.current_run.souls.execute()
 
-    def fork(self, block: Block = None, name: Optional[str] = None) -> threading.Thread:
+    def fork(self, block: Optional[Block] = None, name: Optional[str] = None) -> threading.Thread:
         """Run the soul, or ``block(node)``, in a thread of its own, and return the thread.
 
         The report (listing 3.8): ``[node execute] fork``. :meth:`stop` ends it at its next
