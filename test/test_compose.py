@@ -164,7 +164,7 @@ def test_the_nodes_apart_end_where_roslaunch_is_killed(master, compose):
     os.kill(composed.process.pid, signal.SIGKILL)
     until(lambda: not relay.is_alive())
     assert dict(composed.outcomes())['/relay'] == (
-        'in a process of its own, asked to end, as roslaunch was killed'
+        'ran apart: asked to end, as roslaunch was killed'
     )
 
 
@@ -174,6 +174,7 @@ def test_a_stop_ends_all_nodes(master, compose):
     composed.stop()
     assert not composed.nodes[0].is_running
     assert composed.process.poll() is not None
+    assert dict(composed.outcomes())['/relay'] == 'ran apart, by roslaunch, which ended with 0'
     assert {node.name for node in master.nodes()} <= {'/rosout'}
 
 

@@ -75,7 +75,7 @@ def test_required_and_respawn_are_read():
 
 
 def test_roslaunch_gets_the_rest_without_what_is_done_here():
-    rest = read().rest()
+    rest = read().config_apart()
     assert [node.name for node in rest.nodes] == ['relay', 'prefixed', 'shell', 'own_nodes']
     assert (rest.params, rest.nodes_core) == ({}, [])
     assert rest.master.uri == MASTER

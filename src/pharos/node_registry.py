@@ -285,6 +285,12 @@ def wait_until(predicate: Callable[[], bool], timeout: Optional[float] = None) -
     return True
 
 
+def notify() -> None:
+    """Have those who wait look again."""
+    with changed:
+        changed.notify_all()
+
+
 def _has_nodes_to_wait_for() -> bool:
     now = time.monotonic()
     late = [node for node, (_, deadline) in _stops.items() if now >= deadline]

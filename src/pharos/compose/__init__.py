@@ -5,7 +5,7 @@
 - launch_file: a launch file, as roslaunch reads it, and which of its nodes run here
 - composition: Composition, the nodes of a launch file; kept_node: one of them, started again where
   that is asked for
-- rest, rest_program: what runs apart, by roslaunch in a process of its own
+- apart, apart_program: what runs apart, by roslaunch in a process of its own
 - container: the services of a nodelet manager, which load and unload programs
 - progress: what is said of all that on the screen
 

@@ -3,13 +3,13 @@ import dataclasses
 import os
 import threading
 import time
-from typing import TYPE_CHECKING, Any, Collection, Dict, Iterator, List, Optional, Tuple
+from typing import TYPE_CHECKING, Collection, Dict, Iterator, List, Optional, Tuple
 
 import roslaunch.core
 import rospkg
 
 from pharos import node_registry, signals
-from pharos.compose import rest, rest_program
+from pharos.compose.apart import ApartNodes
 from pharos.compose.kept_node import KeptNode
 from pharos.compose.launch_file import LaunchedNode, LaunchFile, Problem
 from pharos.compose.output import SCREEN
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from pharos.master import Master
 
 PATIENCE = 2.0  # seconds that a node may take to start before the next one does
-POLL = 0.1  # seconds between two looks whether something has ended, for want of an event
 
 
 class Composition:
@@ -36,10 +35,6 @@ class Composition:
     def __init__(self, master: 'Master', progress: Optional[Progress] = None) -> None:
         self.master = master
         self.progress = progress or Progress()
-        #: the process in which roslaunch runs the rest; None: there is none
-        self.process: Optional[RosProcess] = None
-        #: the names of the nodes in it
-        self.apart: List[str] = []
         #: why it has ended by itself, before all of its nodes had
         self.reason: Optional[str] = None
         #: whether it ends, or has ended
@@ -47,7 +42,7 @@ class Composition:
         #: why nodes of it were not even tried to start
         self.problems: List[Problem] = []
         self._kept: List[KeptNode] = []
-        self._changed = threading.Condition()  # guards what is above
+        self._apart: Optional[ApartNodes] = None
         self._stopping = threading.RLock()
         node_registry.before_stop_all(self._begin_end)
 
@@ -61,6 +56,11 @@ class Composition:
         """What was started in this process, whether it has come to be a node or not."""
         return list(self._kept)
 
+    @property
+    def process(self) -> Optional[RosProcess]:
+        """The process in which roslaunch runs the nodes apart; None: there are none."""
+        return None if self._apart is None else self._apart.process
+
     # -- start
 
     def launch(self, file: LaunchFile) -> None:
@@ -69,11 +69,8 @@ class Composition:
         :raises MasterUnreachableError: if the master does not answer
         :raises PharosError: if it refuses a parameter
         """
-        run_id = rest.run_id_of(self.master)
-        try:
-            rest.ParameterSetter(run_id, file.config).set_all()
-        except roslaunch.core.RLException as error:
-            raise PharosError(f'{file.path}: {error}') from error
+        run_id = self._run_id()
+        file.set_parameters(run_id)
         for text in file.config.config_errors:
             self.progress.tell(str(text))
         for problem in file.problems:
@@ -82,7 +79,7 @@ class Composition:
             if problem.ends_all:
                 return self.end_because(f'{problem.name}, which is required, cannot be started')
         if file.apart:
-            self._launch_rest(file.rest())
+            self._apart = ApartNodes(self, file.config_apart())
         logs = os.path.join(rospkg.get_log_dir(env=os.environ), run_id)
         for folder in logs, rospkg.get_ros_home():  # roslaunch makes them, too
             os.makedirs(folder, exist_ok=True)
@@ -98,7 +95,7 @@ class Composition:
     def start(self, nodes: List[LaunchedNode]) -> List[KeptNode]:
         """Start nodes, one after the other; one that takes long does not keep the next from it."""
         started = [KeptNode(self, launched) for launched in nodes]
-        with self._changed:
+        with node_registry.changed:
             self._kept += started
         for number, kept in enumerate(started, 1):
             if self.is_ending:
@@ -112,48 +109,27 @@ class Composition:
         self.progress.all_begun([kept.name for kept in started if not kept.settled.is_set()])
         return started
 
-    def _launch_rest(self, config: Any) -> None:
-        self.process = process = rest.start_rest(self.master, config)
-        self.apart = rest.names_of(config)
-        names = ', '.join(self.apart)
-
-        def wait() -> None:
-            status = process.wait()
-            if status == rest_program.REQUIRED_ENDED:
-                self.end_because(f'a required one of {names}, which run apart, has ended')
-            elif status and not self.is_ending:
-                left = '' if status > 0 else ' and its nodes are asked to end'
-                self.progress.tell(
-                    f'roslaunch, which runs {names} apart, has ended with {status}:'
-                    f' the others go on{left}'
-                )
-                if status < 0:  # killed, it has not ended them
-                    rest.shut_down(self.master, self.apart)
-            self.changed()
-
-        threading.Thread(target=wait, name=f'{names} apart', daemon=True).start()
+    def _run_id(self) -> str:
+        """The identifier that all launches at a master have in common, and their folder of logs."""
+        parameters = self.master.parameters
+        if '/run_id' not in parameters:
+            parameters['/run_id'] = roslaunch.core.generate_run_id()
+        return str(parameters['/run_id'])
 
     # -- end
-
-    def changed(self) -> None:
-        """Something of it has ended."""
-        with self._changed:
-            self._changed.notify_all()
 
     @property
     def is_over(self) -> bool:
         """Whether all that it has started has ended."""
-        is_rest_over = self.process is None or self.process.poll() is not None
-        return is_rest_over and all(kept.is_over for kept in self._kept)
+        is_over_apart = self._apart is None or self._apart.is_over
+        return is_over_apart and all(kept.is_over for kept in self._kept)
 
     def outcomes(self) -> Iterator[Tuple[str, str]]:
         """What has become of each node, in a few words: ``(name, outcome)``."""
         for kept in self._kept:
             yield kept.name, kept.outcome
-        is_killed = self.process is not None and (self.process.poll() or 0) < 0
-        by = 'asked to end, as roslaunch was killed' if is_killed else 'ended by roslaunch'
-        for name in self.apart:
-            yield name, f'in a process of its own, {by}'
+        if self._apart is not None:
+            yield from self._apart.outcomes()
         for problem in self.problems:
             yield problem.name, 'did not start'
 
@@ -164,21 +140,19 @@ class Composition:
         :param timeout: seconds, None: without limit
         :raises TimeoutError: if they have not in that time
         """
-        deadline = float('inf') if timeout is None else time.monotonic() + timeout
-        with signals.interruptible_wait(), self._changed:
-            while not (self.is_over or self.is_ending):
-                if time.monotonic() >= deadline:
-                    left = ', '.join(kept.name for kept in self._kept if not kept.is_over)
-                    raise TimeoutError(f'{left} have not ended within {timeout:g} s: stop() them')
-                self._changed.wait(POLL)
+        with signals.interruptible_wait():
+            if not node_registry.wait_until(lambda: self.is_over or self.is_ending, timeout):
+                left = ', '.join(kept.name for kept in self._kept if not kept.is_over)
+                raise TimeoutError(f'{left} have not ended within {timeout:g} s: stop() them')
         self.stop()
-        failed = [*self.problems, *(kept for kept in self._kept if kept.problem is not None)]
-        has_any = len(failed) < len(self._kept) + len(self.apart) + len(self.problems)
-        return 0 if self.reason is None and (has_any or not failed) else 1
+        has_failed = [kept.problem is not None for kept in self._kept]
+        is_nothing_started = all(has_failed) and self._apart is None
+        is_failure = is_nothing_started and bool(has_failed or self.problems)
+        return 1 if is_failure or self.reason is not None else 0
 
     def end_because(self, reason: str) -> None:
         """End all of it, in a thread of its own, for a reason that is told."""
-        with self._changed:
+        with node_registry.changed:
             if self.is_ending:
                 return
             self.reason = reason
@@ -188,20 +162,19 @@ class Composition:
 
     def _begin_end(self) -> None:
         """Start nothing any more."""
-        with self._changed:
+        with node_registry.changed:
             self.is_ending = True
             for kept in self._kept:
                 kept.begin_end()
-            self._changed.notify_all()
+        node_registry.notify()
 
     def stop(self) -> None:
         """End all nodes, those apart too, side by side. Harmless when done twice."""
         self._begin_end()
         with signals.held(), self._stopping:
             ends = [kept.stop for kept in reversed(self._kept)]
-            if self.process is not None:
-                process = self.process
-                ends.append(lambda: rest.stop_rest(process))
+            if self._apart is not None:
+                ends.append(self._apart.stop)
             threads = [threading.Thread(target=end, daemon=True) for end in ends]
             for thread in threads:
                 thread.start()

@@ -67,7 +67,7 @@ class KeptNode:
         finally:
             self.settled.set()
             self.is_over = True
-            self._composition.changed()
+            node_registry.notify()
 
     def _run_once(self) -> None:
         """Start it, and wait for its end."""

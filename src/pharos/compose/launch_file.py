@@ -22,7 +22,9 @@ from typing import (
 import rosgraph.names
 import roslaunch.config
 import roslaunch.core
+import roslaunch.launch
 import roslaunch.node_args
+import roslaunch.pmon
 import roslaunch.xmlloader
 import rospkg
 from roslaunch.substitution_args import SubstitutionException
@@ -110,6 +112,18 @@ class _Loader(roslaunch.xmlloader.XmlLoader):
             raise roslaunch.xmlloader.XmlParseException(
                 f'{context.filename}: {args} raised {type(error).__name__}: {error}'
             ) from error
+
+
+class _ParameterSetter(roslaunch.launch.ROSLaunchRunner):
+    """roslaunch's runner, which sets the parameters and starts nothing."""
+
+    def __init__(self, run_id: str, config: Any) -> None:
+        # a monitor of its own, that never runs: roslaunch's takes the signals of the program
+        super().__init__(run_id, config, pmon=roslaunch.pmon.ProcessMonitor())
+
+    def set_all(self) -> None:
+        self._launch_setup_executables()
+        self._load_parameters()
 
 
 class LaunchFile:
@@ -244,7 +258,17 @@ class LaunchFile:
             )
         )
 
-    def rest(self) -> Any:
+    def set_parameters(self, run_id: str) -> None:
+        """Run what is to run before (rosparam's delete and dump), clear and set the parameters.
+
+        :raises PharosError: if a command fails, or the master refuses
+        """
+        try:
+            _ParameterSetter(run_id, self.config).set_all()
+        except roslaunch.core.RLException as error:
+            raise PharosError(f'{self.path}: {error}') from error
+
+    def config_apart(self) -> Any:
         """The configuration that is left for roslaunch: the nodes apart, without the parameters."""
         rest = copy.copy(self.config)
         rest.nodes = self.apart

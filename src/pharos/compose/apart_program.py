@@ -1,4 +1,4 @@
-"""The program that runs what of a launch file is not for this process: ``rest_program.py FILE
+"""The program that runs what of a launch file is not for this process: ``apart_program.py FILE
 PARENT``.
 
 roslaunch runs it, with the configuration that is pickled in FILE, of which its own loader has read
