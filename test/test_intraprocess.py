@@ -15,6 +15,7 @@ import pharos
 from pharos import Master
 from pharos.intraprocess import dispatcher, inbox as inboxes
 from pharos.run import Lifecycle
+from programs import PROGRAMS
 
 TWIST, IMAGE, STRING = 'geometry_msgs/Twist', 'sensor_msgs/Image', 'std_msgs/String'
 
@@ -448,31 +449,14 @@ def test_a_ring_of_ten_nodes_loses_nothing(master, inline, laps):
 
 # -- mixed topics
 
-SUBSCRIBER = """
-import sys, rospy, std_msgs.msg
-rospy.init_node('external')
-def show(message):
-    print(message.data, flush=True)
-rospy.Subscriber('/t', std_msgs.msg.String, show)
-rospy.spin()
-"""
-PUBLISHER = """
-import sys, rospy, std_msgs.msg
-rospy.init_node('external')
-publisher = rospy.Publisher('/t', std_msgs.msg.String, queue_size=100)
-while publisher.get_num_connections() < 1:
-    rospy.sleep(0.01)
-for number in range(100):
-    publisher.publish('external %d' % number)
-rospy.spin()
-"""
+SUBSCRIBER, PUBLISHER = (
+    [sys.executable, PROGRAMS / f'external_{name}.py'] for name in ('subscriber', 'publisher')
+)
 
 
 def test_receivers_here_and_elsewhere_get_everything_once(master):
     sent, _, mailbox = pair(master, '/t', STRING)
-    with subprocess.Popen(
-        [sys.executable, '-c', SUBSCRIBER], stdout=subprocess.PIPE, text=True
-    ) as external:
+    with subprocess.Popen(SUBSCRIBER, stdout=subprocess.PIPE, text=True) as external:
         assert connected(sent, 2) == [('/external', 'TCPROS'), ('/receiver', 'INTRAPROCESS')]
         for number in range(100):
             sent.send(data=str(number))
@@ -485,7 +469,7 @@ def test_receivers_here_and_elsewhere_get_everything_once(master):
 
 def test_a_receiver_gets_everything_once_from_publishers_here_and_elsewhere(master):
     sent, received, mailbox = pair(master, '/t', STRING)
-    with subprocess.Popen([sys.executable, '-c', PUBLISHER]) as external:
+    with subprocess.Popen(PUBLISHER) as external:
         for number in range(100):
             sent.send(data='here %d' % number)
         texts = [message.data for message in mailbox.take(200)]
@@ -509,7 +493,7 @@ def test_a_node_that_moves_is_found_again_by_the_right_transport(master, mailbox
         assert mailbox.next().data == 'here'
         assert channel.connections == [('/external', 'INTRAPROCESS')]
         here.stop()
-        with subprocess.Popen([sys.executable, '-c', PUBLISHER]) as elsewhere:
+        with subprocess.Popen(PUBLISHER) as elsewhere:
             assert mailbox.take(100)[-1].data == 'external 99'
             assert channel.connections == [('/external', 'TCPROS')]
             elsewhere.terminate()
@@ -528,7 +512,7 @@ def test_one_nodes_messages_only(master):
     receiver = create(master, '/receiver', delegate=everything)
     receiver.interested_in('/t', STRING)
     receiver.interested_in('/t', STRING, delegate=from_one, from_=one)
-    with subprocess.Popen([sys.executable, '-c', PUBLISHER]) as external:
+    with subprocess.Popen(PUBLISHER) as external:
         everything.take(100)
         from_external = Mailbox()
         create(master, '/picky', delegate=from_external).interested_in(

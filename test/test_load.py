@@ -17,7 +17,7 @@ from helpers import create
 from pharos.testing import Mailbox, TIMEOUT
 from load import CAMERA, IMAGE_SIZE, TOPICS, Busy, Viewer, camera, image, subscribe
 from pharos.intraprocess import inbox
-from programs import ROOT, Program, environment
+from programs import ROOT, PROGRAMS, Program, environment
 
 COUNT = 40  # images, 37 MB: several times what fits into the buffers of a connection
 MARGIN = 10  # images that may be under way, beyond those in queues
@@ -37,20 +37,6 @@ def few_images_held(count):
 
 
 # -- a receiver that is too slow
-
-ROSPY_CAMERA = '''
-import rospy
-from load import Image, Int32, image
-rospy.init_node('camera')
-images = rospy.Publisher('/load/images', Image, queue_size=%d)
-def publish(message):
-    while not images.get_num_connections():    # a subscriber knows of a connection before its publisher does
-        rospy.sleep(0.01)
-    for number in range(message.data):
-        images.publish(image(number))
-rospy.Subscriber('/load/more', Int32, publish)
-rospy.spin()
-'''
 
 
 @pytest.fixture(params=['here', 'pharos', 'rospy'])
@@ -74,8 +60,12 @@ def receiving(request, master):
         if request.param == 'here':
             camera(master, COUNT)
         else:
-            code = {'pharos': CAMERA, 'rospy': ROSPY_CAMERA}[request.param] % COUNT
-            peers.enter_context(Program(master.url, sys.executable, '-c', code, PYTHONPATH=PATHS))
+            commands = {
+                'pharos': ['-c', CAMERA % COUNT],
+                'rospy': [PROGRAMS / 'rospy_camera.py', str(COUNT)],
+            }
+            command = sys.executable, *commands[request.param]
+            peers.enter_context(Program(master.url, *command, PYTHONPATH=PATHS))
         yield receive
 
 

@@ -1,4 +1,5 @@
 """rospy's ServiceProxy: to a provider of this process without a socket, to its users as over TCPROS."""
+import contextlib
 import threading
 
 import genpy
@@ -207,7 +208,9 @@ def test_a_service_that_is_looked_up_once_is_another_nodes_when_that_takes_it(ma
     until(lambda: service.call(data=True).message == 'second')
 
 
-def test_a_call_ends_when_the_provider_stops(pair, persistent):
+@contextlib.contextmanager
+def stuck_call(pair, persistent, **expected):
+    """Within this, a call goes on; gives the Mailbox for what it says when it ends all the same."""
     asking, serving = pair
     entered, release, said = threading.Event(), threading.Event(), Mailbox()
 
@@ -218,34 +221,28 @@ def test_a_call_ends_when_the_provider_stops(pair, persistent):
 
     served(serving, '/plain/stuck', SET, stuck)
     proxy = asking.ros.ServiceProxy('/plain/stuck', SET, persistent)
-    thread = in_thread(lambda: said(refused(proxy, True), None))
+    thread = in_thread(lambda: said(refused(proxy, True, **expected), None))
     assert entered.wait(TIMEOUT)
-    serving.stop_timeout = 0.1
-    stopping = in_thread(serving.stop)
-    assert said.next().startswith('transport error completing service call: unable to receive data')
+    yield said
     release.set()
     assert ended(thread)
+
+
+def test_a_call_ends_when_the_provider_stops(pair, persistent):
+    serving = pair[1]
+    serving.stop_timeout = 0.1
+    with stuck_call(pair, persistent) as said:
+        stopping = in_thread(serving.stop)
+        assert said.next().startswith(
+            'transport error completing service call: unable to receive data'
+        )
     assert ended(stopping)
 
 
 def test_a_call_ends_when_the_caller_stops(pair, persistent):
-    asking, serving = pair
-    entered, release, said = threading.Event(), threading.Event(), Mailbox()
-
-    def stuck(request):
-        entered.set()
-        release.wait(TIMEOUT)
-        return True, ''
-
-    served(serving, '/plain/stuck', SET, stuck)
-    proxy = asking.ros.ServiceProxy('/plain/stuck', SET, persistent)
-    call = lambda: said(refused(proxy, True, error=rospy.ROSInterruptException), None)  # noqa: E731
-    thread = in_thread(call)
-    assert entered.wait(TIMEOUT)
-    asking.stop()
-    assert said.next() == 'node shutdown interrupted service call'
-    release.set()
-    assert ended(thread)
+    with stuck_call(pair, persistent, error=rospy.ROSInterruptException) as said:
+        pair[0].stop()
+        assert said.next() == 'node shutdown interrupted service call'
 
 
 def test_calls_that_call_back_do_not_wait_for_each_other(pair):
