@@ -21,6 +21,8 @@ KEYS = {
     'tkinter': 'python3-tk',
     'yaml': 'python3-yaml',
 }
+#: the package of each program that is run
+PROGRAMS = {'dot': 'graphviz', 'sfdp': 'graphviz'}
 #: what is part of this package: its modules, those of its tests, and types that it defines itself
 OWN = {
     'pharos',
@@ -87,6 +89,14 @@ def libraries(source):
             yield node.args[0].value.partition('.')[0]
 
 
+def programs(source):
+    """The packages of the programs that it names first in a list, as subprocess takes them."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.List) and node.elts and isinstance(node.elts[0], ast.Constant):
+            if node.elts[0].value in PROGRAMS:
+                yield PROGRAMS[node.elts[0].value]
+
+
 def is_standard(module):
     if module in KEYS:  # tkinter is a package of its own in Debian
         return False
@@ -110,7 +120,10 @@ def test_what_is_used_at_run_time_is_declared_and_nothing_else():
     paths = [path for path in sources('src', 'scripts') if path.name != 'testing.py']
     texts = [path.read_text() for path in paths]
     used = keys(
-        name for text in texts for found in (imports, types, libraries) for name in found(text)
+        name
+        for text in texts
+        for found in (imports, types, libraries, programs)
+        for name in found(text)
     )
     assert used == declared('depend', 'exec_depend')
 

@@ -61,7 +61,7 @@ ROSPYS_INSIDE = re.compile(
 
 EXPORTS = """
     Master Node BlockNode ScriptNode Lifecycle ExternalNode Topic InputChannel OutputChannel Service
-    Parameter Transcript RosProcess Composition Failure message_class
+    Parameter Transcript RosProcess Composition Graph Failure message_class
     service_class define_message define_service spin __version__
     PharosError MasterUnreachableError NodeNameInUseError PortInUseError UnknownNodeError UnknownTopicError
     UnknownTypeError MessageTypeError UnknownServiceError ServiceTypeError ServiceCallError NodeStoppedError

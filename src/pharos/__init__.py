@@ -39,6 +39,7 @@ from pharos.transcript import Transcript
 if TYPE_CHECKING:
     from pharos.compose.composition import Composition
     from pharos.compose.script import ScriptNode
+    from pharos.live.graph import Graph
 
 __version__ = '0.1.0'
 __all__ = [
@@ -56,6 +57,7 @@ __all__ = [
     'Transcript',
     'RosProcess',
     'Composition',
+    'Graph',
     'Failure',
     'message_class',
     'service_class',

@@ -1,9 +1,22 @@
 """Calls to a ROS master."""
 import contextlib
+import importlib
 import threading
 import time
 import urllib.parse
-from typing import Any, Callable, Dict, Iterator, List, Optional, Tuple, TypeVar
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Callable,
+    Collection,
+    Dict,
+    Iterator,
+    List,
+    Optional,
+    Tuple,
+    TypeVar,
+    Union,
+)
 
 import rosgraph
 
@@ -14,6 +27,9 @@ from pharos.private_rospy.deadlines import MARGIN, time_limit
 from pharos.private_rospy.proxies import ServerProxy, interruption, master_api
 from pharos.private_rospy.registration import COMMUNICATION_ERRORS, PING_TIMEOUT, unreachable
 from pharos.seconds import check_limit
+
+if TYPE_CHECKING:
+    from pharos.live.graph import Graph
 
 TIMEOUT = 5.0  # seconds that a question to the master may take
 POLL = 0.05  # seconds between two looks for a master, or for a node
@@ -92,6 +108,49 @@ class MasterCalls:
         except COMMUNICATION_ERRORS as error:
             return or_busy and not isinstance(error, ConnectionRefusedError)
         return True
+
+    def graph(
+        self,
+        rates: float = 0,
+        *,
+        show_all: bool = False,
+        services: bool = False,
+        nodes_only: bool = False,
+        namespace: Union[str, Collection[str]] = '/',
+        hide: Union[str, Collection[str]] = (),
+        group: str = 'process',
+    ) -> 'Graph':
+        """The :class:`~pharos.Graph` of all nodes and topics as they are: a picture in Jupyter, or
+        in a file by its :meth:`save <pharos.Graph.save>`.
+
+        Nodes that do not answer within a second are in it, too, and marked so.
+
+        :param rates: seconds for which it is counted how often messages come, 0: it is not; nodes
+            count that anyway, and none that nobody hears
+        :param show_all: also what every node has: /rosout, /statistics, /clock,
+            parameter_updates, and services for loggers
+        :param services: services, too
+        :param nodes_only: arrows from node to node, instead of topics
+        :param namespace: only the nodes of that namespace, or of those
+        :param hide: any of 'leaf' (topics that one node alone uses), 'unheard' (that nobody hears),
+            'idle' (of which nothing is connected), 'tf', 'images', 'unreachable' (nodes that do not
+            answer)
+        :param group: what the frames are: 'process' (and hosts around them, where there are
+            several), 'namespace' or 'none'
+        :raises MasterUnreachableError: if the master does not answer
+        :raises TypeError, ValueError: if a choice is none of these
+        """
+        graph: 'Graph' = importlib.import_module('pharos.live.graph').look(
+            self,
+            rates,
+            show_all=show_all,
+            services=services,
+            nodes_only=nodes_only,
+            namespace=namespace,
+            hide=hide,
+            group=group,
+        )
+        return graph
 
     @property
     def pid(self) -> int:

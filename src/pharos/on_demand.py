@@ -5,6 +5,7 @@ from typing import Any, List
 
 _MODULES = {
     'Composition': 'pharos.compose.composition',
+    'Graph': 'pharos.live.graph',
     'ScriptNode': 'pharos.compose.script',
 }
 

@@ -1,0 +1,87 @@
+"""A graph as text, for a terminal."""
+from typing import TYPE_CHECKING, Collection, Dict, Iterator, List, Set, Tuple
+
+from pharos.live.answers import ALIVE
+from pharos.live.dot import rate_text
+from pharos.live.edges import SENDS
+
+if TYPE_CHECKING:
+    from pharos.live.graph import Graph
+
+
+def text_of(graph: 'Graph') -> str:
+    """Hosts, processes and nodes, and of each node what it sends, hears and offers."""
+    return '\n'.join(_lines(graph)) + '\n'
+
+
+def _lines(graph: 'Graph') -> Iterator[str]:
+    yield f'{graph.snapshot.master}: {_summary(graph)}'
+    uses = _Uses(graph)
+    for host in graph.hosts:
+        yield f'host {host.name}'
+        for process in host.processes:
+            yield '  ' + ('no process known' if process.pid is None else f'process {process.pid}')
+            for name in process.nodes:
+                node = graph.nodes[name]
+                state = '' if node.state == ALIVE else f'  [{node.state}: {node.problem}]'
+                yield f'    {name}{state}'
+                yield from ('      ' + line for line in uses.of(name))
+
+
+def _summary(graph: 'Graph') -> str:
+    processes = sum(len(host.processes) for host in graph.hosts)
+    counts = [
+        (len(graph.nodes), 'node', 'nodes'),
+        (processes, 'process', 'processes'),
+        (len(graph.hosts), 'host', 'hosts'),
+    ]
+    if not graph.nodes_only:
+        counts.append((len(graph.topics), 'topic', 'topics'))
+    return ', '.join(f'{count} {one if count == 1 else many}' for count, one, many in counts)
+
+
+class _Uses:
+    """What the nodes of a graph do with its topics and services."""
+
+    def __init__(self, graph: 'Graph') -> None:
+        self._graph = graph
+        self._transports: Dict[
+            Tuple[str, str, str], Set[str]
+        ] = {}  # (topic, publisher, subscriber)
+        for each in graph.snapshot.connections:
+            ends = each.topic, each.publisher, each.subscriber
+            self._transports.setdefault(ends, set()).add(each.transport)
+
+    def of(self, node: str) -> Iterator[str]:
+        """A line for each thing that the node sends, hears and offers."""
+        for edge in self._graph.edges:
+            if edge.kind == SENDS and node in (edge.start, edge.end):
+                arrow, peer = ('->', edge.end) if node == edge.start else ('<-', edge.start)
+                yield f'{arrow} {peer} ({_joined(edge.transports)})  {", ".join(edge.topics)}'
+        for name, topic in self._graph.topics.items():
+            if node in topic.publishers:
+                peers = [(name, node, subscriber) for subscriber in topic.subscribers]
+                heard = 'to ' + self._peers(peers, 2) if peers else 'nobody hears it'
+                yield f'-> {name}  {self._about(name)}  {heard}'
+        for name, topic in self._graph.topics.items():
+            if node in topic.subscribers:
+                peers = [(name, publisher, node) for publisher in topic.publishers]
+                sent = 'from ' + self._peers(peers, 1) if peers else 'nobody publishes it'
+                yield f'<- {name}  {sent}'
+        for name, service in self._graph.services.items():
+            if node in service.providers:
+                yield f'offers {name}'
+
+    def _about(self, topic: str) -> str:
+        rate = self._graph.rates.get(topic)
+        said = self._graph.topics[topic].type or 'type unknown'
+        return said if rate is None else f'{said}, {rate_text(rate)}'
+
+    def _peers(self, ends: List[Tuple[str, str, str]], other: int) -> str:
+        return ', '.join(
+            f'{each[other]} ({_joined(self._transports.get(each, ()))})' for each in ends
+        )
+
+
+def _joined(transports: Collection[str]) -> str:
+    return ' and '.join(sorted(transports)) or 'not connected'

@@ -1,0 +1,97 @@
+"""Pictures by graphviz, whose program ``dot`` runs as a child."""
+import contextlib
+import os
+import pathlib
+import stat
+import subprocess
+from typing import List, Union
+
+from pharos.errors import PharosError, suggest
+
+FORMATS = 'svg', 'png', 'pdf', 'dot'
+#: programs of graphviz, and the seconds that each may take; the second is quick with what is too
+#: tangled for the first, but knows no frames
+LAYOUTS = (
+    (['dot'], 20.0),
+    (['sfdp', '-Goverlap=prism', '-Gsplines=line'], 60.0),
+)
+
+
+def check_format(path: Union[str, 'os.PathLike[str]']) -> str:
+    """The format that the suffix of a path says.
+
+    :raises ValueError: if it is none of :data:`FORMATS`
+    """
+    suffix = pathlib.PurePath(path).suffix[1:].lower()
+    if suffix not in FORMATS:
+        choices = ', '.join('.' + each for each in FORMATS)
+        raise ValueError(
+            f'{os.fspath(path)} does not say what picture it is to be: let its name end in'
+            f' {choices}{suggest(suffix, FORMATS)}'
+        )
+    return suffix
+
+
+def save(dot: str, path: Union[str, 'os.PathLike[str]']) -> None:
+    """Write a picture to a file: see :meth:`Graph.save <pharos.Graph.save>`."""
+    format_ = check_format(path)
+    write(path, dot.encode() if format_ == 'dot' else render(dot, format_))
+
+
+def render(dot: str, format_: str) -> bytes:
+    """The picture that graphviz makes of a text in its language.
+
+    :raises PharosError: if graphviz is not there, or cannot do it
+    """
+    for program, limit in LAYOUTS:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            return _run([*program, f'-T{format_}'], dot, limit)
+    raise PharosError(
+        f'graphviz did not draw the picture within {limit:g} s: leave more of the graph out'
+    )
+
+
+def _run(program: List[str], dot: str, limit: float) -> bytes:
+    try:
+        ended = subprocess.run(
+            program,
+            input=dot.encode(),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            timeout=limit,
+            start_new_session=True,  # Ctrl-C is for us to answer
+            check=False,
+        )
+    except FileNotFoundError as error:
+        raise PharosError(
+            'graphviz draws the picture, and is not installed: apt-get install graphviz, or save'
+            ' it as .dot'
+        ) from error
+    if ended.returncode:
+        raise PharosError(f'graphviz cannot draw it: {ended.stderr.decode().strip()}')
+    return ended.stdout
+
+
+def write(path: Union[str, 'os.PathLike[str]'], content: bytes) -> None:
+    """Write a file all at once, so that nobody sees half of it; what is no file, such as a pipe, is
+    written to.
+
+    :raises PharosError: if it cannot be written
+    """
+    target = os.path.realpath(path)
+    beside = f'{target}.{os.getpid()}'
+    try:
+        if os.path.lexists(target) and not stat.S_ISREG(os.stat(target).st_mode):
+            with open(target, 'wb') as file:
+                file.write(content)
+            return
+        try:
+            with open(beside, 'xb') as file:
+                file.write(content)
+            os.replace(beside, target)
+        except BaseException:
+            with contextlib.suppress(FileNotFoundError):
+                os.unlink(beside)
+            raise
+    except OSError as error:
+        raise PharosError(f'{os.fspath(path)} cannot be written: {error.strerror}') from error
