@@ -46,7 +46,7 @@ def speak_tcpros_only(node):
     """Have the node connect by sockets alone, as those of other processes do; returns it."""
     handlers = node.latest_run.rospy.lifetime.xmlrpc.handler.protocol_handlers
     handlers[:] = [handler for handler in handlers if not handler.supports(PROTOCOL)]
-    impl = node.latest_run.rospy.rospy.impl
+    impl = node.latest_run.rospy.module.impl
     impl.tcpros_service.TCPROSTransport = impl.tcpros_base.TCPROSTransport
     return node
 

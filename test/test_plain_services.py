@@ -48,7 +48,7 @@ def test_a_call_opens_no_socket_to_a_provider_of_this_process(pair, persistent, 
     asking, serving = pair
     name = served(serving, '/plain/set', SET, lambda request: (request.data, 'done'))
     accepted = []
-    server = serving.latest_run.rospy.rospy.impl.tcpros_base._tcpros_server
+    server = serving.latest_run.rospy.module.impl.tcpros_base._tcpros_server
     handler = server.service_connection_handler
     monkeypatch.setattr(
         server,

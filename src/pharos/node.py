@@ -302,7 +302,7 @@ class Node(NodeWithSouls, is_base=True):
     def ros(self) -> Any:
         """The node's own rospy, whole: ``node.ros.Timer``, ``node.ros.Time.now()``. It is for this
         run of the node."""
-        return self.current_run.rospy.rospy
+        return self.current_run.rospy.module
 
     def ros_import(self, name: str) -> Any:
         """A library written on rospy ('actionlib', 'message_filters', 'tf2_ros'), bound to this run

@@ -23,7 +23,7 @@ from pharos import signals
 from pharos.blocks import name_of
 from pharos.errors import NodeNameInUseError, NodeStoppedError, PharosError
 from pharos.private_rospy import process_rospy
-from pharos.private_rospy.lifetime import SIGNAL_LATENCY, Interruption, join
+from pharos.private_rospy.lifetime import SIGNAL_LATENCY, Interruption, join, wait_for
 
 if TYPE_CHECKING:
     from pharos.node import Node
@@ -275,14 +275,7 @@ def wait_until(predicate: Callable[[], bool], timeout: Optional[float] = None) -
     :returns: False where the time was up before
     """
     mine = Interruption()
-    deadline = float('inf') if timeout is None else time.monotonic() + timeout
-    with changed:
-        while not (predicate() or mine.came):
-            left = deadline - time.monotonic()
-            if left <= 0:
-                return False
-            changed.wait(min(left, SIGNAL_LATENCY))
-    return True
+    return wait_for(changed, lambda: predicate() or mine.came, timeout)
 
 
 def notify() -> None:

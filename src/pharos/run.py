@@ -297,7 +297,7 @@ class Run:
         name = check_name(name, what, private=True)
         # where rospy takes what follows for a global name (ros_comm #3044)
         name = '~' + name[2:] if name.startswith('~/') else name
-        return check_name(self.rospy.rospy.resolve_name(name), what)
+        return check_name(self.rospy.module.resolve_name(name), what)
 
     def resolve_peer(self, peer: Any) -> Resolved:
         """The full name of a node that messages come from or go to.

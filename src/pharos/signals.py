@@ -16,7 +16,8 @@ import rosgraph
 
 from pharos.private_rospy.process_rospy import rospy
 
-_main_thread = threading.main_thread  # Python's, also where a script is told that it is in its own
+#: Python's, also where a script is told that it is in its own
+main_thread = threading.main_thread
 
 _DEFAULTS = {
     signal.SIGINT: signal.default_int_handler,
@@ -73,13 +74,13 @@ class _Signal:
     def remind(self) -> None:
         """Have the main thread's handler look again and again, until it has raised an exception."""
         global _is_reminded
-        main_thread = _main_thread().ident
+        identifier = main_thread().ident
         while signal.getsignal(self.number) is _on_signal:
             time.sleep(REMINDER)  # first: mostly it is cut off at once, and needs none
             if _coming is not self:
                 return
             _is_reminded = True
-            signal.pthread_kill(main_thread, self.number)  # type: ignore[arg-type]
+            signal.pthread_kill(identifier, self.number)  # type: ignore[arg-type]
 
     def may_cut_off(self, frame: Optional[FrameType]) -> bool:
         """Whether the main thread, which is at that frame, can be cut off there."""
@@ -129,7 +130,7 @@ def is_from_signal(error: BaseException) -> bool:
     # not by hasattr: the exception may have a __getattr__ of its own
     if _MARK in object.__getattribute__(error, '__dict__'):
         return True
-    if threading.current_thread() is not _main_thread():
+    if threading.current_thread() is not main_thread():
         return False
     handlers = [signal.getsignal(number) for number in signal.valid_signals()]
     if isinstance(error, KeyboardInterrupt) and signal.default_int_handler in handlers:
@@ -161,7 +162,7 @@ def serve(is_needed: Callable[[], bool], stop_all: Callable[[], None]) -> None:
 def _take_on(*numbers: signal.Signals) -> None:
     """Handle the signals for which the program has no handlers, where this is the main thread,
     which alone can."""
-    if threading.current_thread() is _main_thread():
+    if threading.current_thread() is main_thread():
         for number in numbers:
             if signal.getsignal(number) is _DEFAULTS[number]:
                 signal.signal(number, _on_signal)
@@ -173,7 +174,7 @@ def interruptible_wait() -> Iterator[None]:
     """Within this, a signal raises nothing in the main thread: the wait ends because the nodes
     stop."""
     global _waits
-    if threading.current_thread() is not _main_thread():
+    if threading.current_thread() is not main_thread():
         yield
         return
     _waits += 1
@@ -195,7 +196,7 @@ def held(is_end: bool = False) -> Iterator[None]:
         afterwards
     """
     global _coming, _holds
-    if threading.current_thread() is not _main_thread():
+    if threading.current_thread() is not main_thread():
         yield
         return
     _take_on(*_DEFAULTS)

@@ -194,7 +194,7 @@ class NodeWithSouls(NodeAttributes, is_base=True):
         run = self.current_run
         run.souls.end()
         with signals.interruptible_wait(), contextlib.suppress(rospy.ROSInterruptException):
-            run.rospy.rospy.sleep(seconds)
+            run.rospy.module.sleep(seconds)
         run.souls.end()
 
     def every(self, seconds: float) -> Iterator[None]:
@@ -205,4 +205,4 @@ class NodeWithSouls(NodeAttributes, is_base=True):
         """
         seconds = check_seconds('a period', seconds, above=0)
         run = self.current_run
-        return run.souls.turns(run.rospy.rospy.Rate(1.0 / seconds, reset=True))
+        return run.souls.turns(run.rospy.module.Rate(1.0 / seconds, reset=True))

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 RETRY = 1.0  # seconds at least from a start that failed to the next one
 POLL = 0.1  # seconds between two looks whether one that is to stop has just started
+_OF_SCRIPT = 'path', 'args', 'env', 'takes_own_name', 'private_name', 'cwd', 'output'
 
 
 class KeptNode:
@@ -107,15 +108,7 @@ class KeptNode:
                 None,
                 None,
                 (),
-                {
-                    'path': launched.path,
-                    'args': list(launched.args),
-                    'env': dict(launched.env),
-                    'takes_own_name': launched.takes_own_name,
-                    'private_name': launched.private_name,
-                    'cwd': launched.cwd,
-                    'output': launched.output,
-                },
+                {name: getattr(launched, name) for name in _OF_SCRIPT},
             )
         start_made(self.node)
 

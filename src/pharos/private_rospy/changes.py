@@ -1,9 +1,8 @@
 """Waiting for connections of the publishers of this process."""
 import os
 import threading
-import time
 
-from pharos.private_rospy.lifetime import SIGNAL_LATENCY, Interruption
+from pharos.private_rospy.lifetime import Interruption, wait_for
 
 # notified whenever a publisher of this process gains or loses a connection
 _changed = threading.Condition()
@@ -21,11 +20,8 @@ def wait_until(lifetime, predicate, timeout):
     :param timeout: seconds, None: no limit
     :param lifetime: of the node with whose stop the wait ends
     """
-    with Interruption(notify, lifetime) as stop, _changed:
-        until = float('inf') if timeout is None else time.monotonic() + timeout
-        while not (stop.came or predicate()) and time.monotonic() < until:
-            # not longer: this may be the main thread, which handles signals
-            _changed.wait(max(0.0, min(until - time.monotonic(), SIGNAL_LATENCY)))
+    with Interruption(notify, lifetime) as stop:
+        wait_for(_changed, lambda: stop.came or predicate(), timeout)
 
 
 def _forget():

@@ -68,7 +68,7 @@ class Connections:
         try:
             # rospy's queue_size would drop without counting; the inbox has one that counts
             endpoint = registered(
-                lambda: self._node.rospy.Subscriber(
+                lambda: self._node.module.Subscriber(
                     Resolved(topic),
                     receiver.message_class,
                     callback,
@@ -127,7 +127,7 @@ class Connections:
         :raises MasterUnreachableError: if it cannot be registered
         """
         endpoint = registered(
-            lambda: self._node.rospy.Publisher(
+            lambda: self._node.module.Publisher(
                 Resolved(topic),
                 message_class,
                 latch=latch is not None,

@@ -79,12 +79,12 @@ class PrivateRospy:
         #: its sys, as its program and libraries import it
         self.system = imports.system
         self._run_main = imports.run_main
-        self.rospy = imports.load('rospy')
+        self.module = imports.load('rospy')
         patches.check_applied(imports.modules)
         self._process.exit_handlers.clear()  # rospy's: the stop does what is in it
         #: rospy's _base_logger; it reports the caller of its caller, who must call it himself
-        self.log = self.rospy.core._base_logger
-        registries = self.rospy.impl.registration
+        self.log = self.module.core._base_logger
+        registries = self.module.impl.registration
         self.topics, self.service_manager = (
             registries.get_topic_manager(),
             registries.get_service_manager(),
@@ -132,7 +132,7 @@ class PrivateRospy:
 
     def leave_signals_to_rospy(self):
         """The program has rospy handle signals from now on."""
-        self._process.signals.leave_to_rospy(self.rospy.core._ros_signal)
+        self._process.signals.leave_to_rospy(self.module.core._ros_signal)
 
     # -- life
 
@@ -152,16 +152,18 @@ class PrivateRospy:
         """
         settings = self.settings
         register = register or functools.partial(
-            self.rospy.init_node, settings.base_name, argv=settings.argv, disable_signals=True
+            self.module.init_node, settings.base_name, argv=settings.argv, disable_signals=True
         )
         self._deadline = time.monotonic() + timeout
         with time_limit(timeout), self._reached():
             registration.claim_name(settings.master_url, self.name, timeout)
         # the first, so that the threads that rospy waits for end at once
-        self.rospy.core._shutdown_hooks.insert(0, lambda reason: self._end_waits())
+        self.module.core._shutdown_hooks.insert(0, lambda reason: self._end_waits())
         try:
             with _ports_checked('tcp_port', settings.tcp_port):
-                self.tcp_port = tcpros_server.listen(self.rospy.impl.tcpros_base, settings.tcp_port)
+                self.tcp_port = tcpros_server.listen(
+                    self.module.impl.tcpros_base, settings.tcp_port
+                )
             with _ports_checked('xmlrpc_port', settings.xmlrpc_port):
                 # half of it until rospy is registered
                 with time_limit(2 * timeout), self._reached():
@@ -174,7 +176,7 @@ class PrivateRospy:
         self.domain = self.import_library('rosgraph.network').get_host_name()
         if not self.lifetime.has_program:  # which goes on after that, to its end
             # rospy.signal_shutdown called by the node's own code
-            self.rospy.core.add_preshutdown_hook(self.request_stop)
+            self.module.core.add_preshutdown_hook(self.request_stop)
         if not rosgraph.network.is_local_address(self.domain):
             self.warn(
                 f'{self.domain}, which {self.name} tells others to come to, is no address of this'
@@ -213,7 +215,7 @@ class PrivateRospy:
     def is_in_shutdown_hook(self):
         """Whether this thread has called the node's ``rospy.signal_shutdown``, and is in a hook;
         afterwards, that asks for the stop."""
-        core = self.rospy.core
+        core = self.module.core
         return core._in_shutdown and not core._shutdown_flag and core._shutdown_lock._is_owned()
 
     def begin_stop(self):
@@ -231,7 +233,7 @@ class PrivateRospy:
 
     def _end_waits(self):
         self.lifetime.begin_shutdown()
-        waiting = [self.rospy.rostime.get_rostime_cond()]  # simulated time may stand still
+        waiting = [self.module.rostime.get_rostime_cond()]  # simulated time may stand still
         handler = self.handler
         if handler:
             waiting.append(handler.reg_man.cond)
@@ -250,7 +252,7 @@ class PrivateRospy:
             return []
         self._run_hooks()
         self.connections.withdraw()
-        core = self.rospy.core
+        core = self.module.core
         self._flush(flush_timeout)
         self.lifetime.ending_thread = threading.get_ident()
         core.signal_shutdown('stop')
@@ -269,7 +271,7 @@ class PrivateRospy:
 
         Where the node's own code has called that, this waits until it is through.
         """
-        core = self.rospy.core
+        core = self.module.core
         with core._shutdown_lock:
             core._in_shutdown, self.lifetime.hooks_thread = True, threading.get_ident()
             try:
@@ -301,32 +303,32 @@ class PrivateRospy:
             return
         try:
             if registration.repair(self, state, was_away):
-                self.rospy.logwarn(
+                self.module.logwarn(
                     'the master %s had forgotten %s: registered again',
                     self.settings.master_url,
                     self.name,
                 )
                 self.parameters.restore_after_master_restart()
         except (rosgraph.MasterException, *registration.COMMUNICATION_ERRORS) as error:
-            self.rospy.logdebug(
+            self.module.logdebug(
                 'cannot register with the master %s: %s', self.settings.master_url, error
             )
 
     @property
     def is_registered(self):
         """Whether the start is through, and neither a stop nor rospy's own shutdown has begun."""
-        is_ending = self.ended.is_set() or self.rospy.core._in_shutdown
+        is_ending = self.ended.is_set() or self.module.core._in_shutdown
         return self.domain is not None and not is_ending
 
     # -- what others need of rospy's inside
 
     def warn(self, text):
         """A warning in the node's log."""
-        self.rospy.logwarn('%s', text)
+        self.module.logwarn('%s', text)
 
     def debug(self, text):
         """A line in the node's log for those who look for errors."""
-        self.rospy.logdebug('%s', text)
+        self.module.logdebug('%s', text)
 
     def published_class(self, topic):
         """The message class with which the node publishes on the topic; None where it does not."""
@@ -341,7 +343,7 @@ class PrivateRospy:
     def connection_header(self, publisher):
         """What a subscriber of rospy's _PublisherImpl gets as its messages'
         ``_connection_header``."""
-        protocol = self.rospy.impl.tcpros_pubsub.TCPROSPub(
+        protocol = self.module.impl.tcpros_pubsub.TCPROSPub(
             publisher.resolved_name, publisher.data_class, publisher.is_latch, publisher.headers
         )
         return protocol.get_header_fields()

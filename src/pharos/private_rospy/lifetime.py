@@ -12,6 +12,7 @@ from typing import Any, Callable, Iterable, List, Optional
 
 from pharos import working_directory
 from pharos.private_rospy.module_proxy import ModuleProxy
+from pharos.signals import main_thread
 
 # A signal that the kernel gives to another thread, or that comes just before the main thread waits,
 # does not end that wait, after which Python would handle it.
@@ -23,8 +24,6 @@ CUT_OFF_TIMEOUT = 0.5  # seconds likewise, when what sleeps in it is cut off
 KEEPALIVE_IDLE = 10  # seconds of silence after which the peer's host is asked whether it is there
 KEEPALIVE_INTERVAL = 5  # seconds between two such questions
 KEEPALIVE_COUNT = 4  # of them without an answer, and the connection is broken
-
-_main_thread = threading.main_thread  # Python's, also within a program: see own_signals
 
 # .lifetime: of the node on whose behalf the thread runs; .interruption: the innermost it is within;
 # .was_cut_off: whether a ProgramCutOff was raised in it
@@ -240,7 +239,7 @@ class Lifetime:
 
     @staticmethod
     def _sleep_until(event, seconds):
-        is_main = threading.current_thread() is _main_thread()
+        is_main = threading.current_thread() is main_thread()
         longest = SIGNAL_LATENCY if is_main else seconds
         until = time.monotonic() + seconds
         while seconds > 0 and not event.wait(min(seconds, longest)):
@@ -271,6 +270,26 @@ class Lifetime:
 def _is_rospys(frame: Any) -> bool:
     """Whether it is rospy's code that runs there."""
     return str(frame.f_globals.get('__name__')).startswith('rospy.')
+
+
+def wait_for(
+    changed: threading.Condition, predicate: Callable[[], bool], timeout: Optional[float]
+) -> bool:
+    """Wait until ``predicate()`` holds, which is looked at when ``changed`` is notified; returns
+    False where the time was up before.
+
+    In short waits, as :func:`join`.
+
+    :param timeout: seconds, None: without limit
+    """
+    deadline = float('inf') if timeout is None else time.monotonic() + timeout
+    with changed:
+        while not predicate():
+            left = deadline - time.monotonic()
+            if left <= 0:
+                return False
+            changed.wait(min(left, SIGNAL_LATENCY))
+    return True
 
 
 def join(threads: Iterable[threading.Thread], timeout: float) -> List[threading.Thread]:

@@ -145,7 +145,7 @@ class _End(rospy.impl.transport.Transport):
     def __init__(self, link, direction, topic, peer, node):
         super().__init__(direction, topic)
         # getBusStats tells the connections of a node apart by this, which its own rospy counts
-        self.id = node.rospy.impl.transport.Transport(direction).id
+        self.id = node.module.impl.transport.Transport(direction).id
         self.link, self.endpoint_id, self.header = link, peer, link.header
         self._first = link.publisher.fanout.seq
 

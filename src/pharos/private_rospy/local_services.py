@@ -52,7 +52,7 @@ def offer(node, name, service_class, answer, timeout):
     :raises MasterUnreachableError: if it cannot be registered
     """
     return registered(
-        lambda: node.rospy.Service(Resolved(name), service_class, answer),
+        lambda: node.module.Service(Resolved(name), service_class, answer),
         lambda service: service.shutdown('it is not registered'),
         timeout,
     )
@@ -87,7 +87,7 @@ class RospyService(LocalService):
         """What rospy's ServiceImpl._handle_request does, but for the writing."""
         service = self._service
         try:
-            response = self._node.rospy.impl.tcpros_service.convert_return_to_response(
+            response = self._node.module.impl.tcpros_service.convert_return_to_response(
                 service.handler(request), service.response_class
             )
             service.seq += 1

@@ -12,9 +12,10 @@ from typing import Any, Dict
 from pharos.errors import PharosError
 from pharos.private_rospy.lifetime import JOIN_TIMEOUT
 from pharos.private_rospy.module_proxy import ModuleProxy
+from pharos.signals import main_thread
 
 # Python's, also within a program
-_getsignal, _set_signal, _main_thread = signal.getsignal, signal.signal, threading.main_thread
+_getsignal, _set_signal = signal.getsignal, signal.signal
 _programs: Dict[int, Any] = {}  # identifier of a program's main thread -> its OwnSignals
 
 
@@ -186,7 +187,7 @@ class OwnSignals:
         SIGUSR2 from elsewhere, which end a process, are for the programs that have handlers for
         them, where this is Python's main thread, which alone can see to that."""
         self._handlers[signal.SIGINT] = signal.default_int_handler
-        if threading.current_thread() is _main_thread():
+        if threading.current_thread() is main_thread():
             for number in signal.SIGUSR1, signal.SIGUSR2:
                 if _getsignal(number) is signal.SIG_DFL:
                     _set_signal(number, _on_signal)

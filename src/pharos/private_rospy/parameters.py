@@ -91,7 +91,7 @@ class WatchedParameters:
     def restore_after_master_restart(self):
         """A restarted master has no parameters: set the node's private ones and first values, and
         watch again."""
-        rospy = self._node.rospy
+        rospy = self._node.module
         private = rospy.client.load_command_line_node_params(self._node.settings.argv)
         for name, value in private.items():
             rospy.set_param('~' + name, value)

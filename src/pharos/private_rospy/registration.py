@@ -228,7 +228,7 @@ def repair(node, state, was_away):
     )
     # every node offers this from its start on; a channel may have been opened with a restarted
     # master already
-    is_forgotten = node.name not in services.get(node.rospy.resolve_name('~get_loggers'), ())
+    is_forgotten = node.name not in services.get(node.module.resolve_name('~get_loggers'), ())
     if any(kind.lost(node) for kind in kinds) and not keeps_name(node):
         return False
     for kind in kinds:

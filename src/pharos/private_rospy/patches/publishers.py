@@ -170,7 +170,7 @@ def _tell_listeners(publisher, node, method, *arguments):
         except BaseException as error:
             if is_from_signal(error):
                 raise
-            node.rospy.logerr('bad listener: %s\n%s', listener, traceback.format_exc())
+            node.module.logerr('bad listener: %s\n%s', listener, traceback.format_exc())
 
 
 def _refresh(publisher, link=None, connections=None):

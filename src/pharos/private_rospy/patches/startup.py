@@ -73,7 +73,7 @@ def is_shutdown(*, node, original):
 @patch('rospy.topics', 'is_shutdown', 'keeps a soul that ends from sending its last messages')
 def is_shutdown_of_topics(*, node):
     """Hold only at the end of the stop."""
-    return node.rospy.core._shutdown_flag
+    return node.module.core._shutdown_flag
 
 
 @substitute('rospy.core', 'traceback', 'stops half way where what a hook raised cannot be printed')

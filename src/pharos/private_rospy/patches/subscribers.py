@@ -56,7 +56,7 @@ def _invoke_callback(self, msg, cb, cb_args, *, node, original):
     except BaseException as error:
         if is_from_signal(error):
             raise
-        node.rospy.logerr('bad callback: %s\n%s', cb, traceback.format_exc())
+        node.module.logerr('bad callback: %s\n%s', cb, traceback.format_exc())
 
 
 @patch(
