@@ -662,6 +662,11 @@ def test_what_an_argument_cannot_ask_for_is_said(argument, text, master):
     assert master.local_nodes() == []
 
 
+def test_what_a_script_gives_to_init_node_and_is_no_yaml_is_said(master):
+    with pytest.raises(pharos.PharosError, match=r"'_rate:=\[1' sets no private parameter"):
+        master.load(WORKER, None, 'bad argv')
+
+
 def test_the_master_that_it_has_anyway_may_be_among_the_arguments(master):
     with master.load(WORKER, None, 'spin', f'__master:={master.url}') as node:
         assert node.name == '/worker'

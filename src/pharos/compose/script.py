@@ -63,9 +63,13 @@ class ScriptNode(Node):
         found = find_program(path)
         self.path, self.args = source_of(found), [str(argument) for argument in args]
         self._settings.for_program(
-            found, self.args, {} if params is None else params, env or {}, takes_own_name
+            found,
+            self.args,
+            {} if params is None else params,
+            env or {},
+            takes_own_name,
+            private_name,
         )
-        self._settings.private_name = private_name
         if cwd is not None and not os.path.isdir(cwd):
             raise ValueError(f'{found} cannot run in {cwd!r}: there is no such folder')
         self.cwd = cwd

@@ -79,9 +79,9 @@ class Settings:
         for left in '__master', '__ns', '__name':  # the settings say this
             mappings.pop(left, None)
         self.argv = [self.base_name, *map(rosgraph.names.REMAP.join, mappings.items())]
-        _check_private_parameters(self.argv)
+        check_private_parameters(self.argv)
 
-    def for_program(self, path, args, params, env, takes_own_name):
+    def for_program(self, path, args, params, env, takes_own_name, private_name):
         """Have them be those of a program that calls ``init_node`` itself.
 
         :param path: what it finds as ``sys.argv[0]``
@@ -89,11 +89,12 @@ class Settings:
         :param env: ``{name: value}`` of further environment variables
         :param takes_own_name: whether it has the name that it gives to ``init_node``; until then it
             has one that is nobody else's
+        :param private_name: the node in whose namespace its private names are; None: itself
         :raises TypeError, ValueError: if one of them cannot be
         """
         if not isinstance(params, Mapping):
             raise TypeError(f'params is a dict by name, not {params!r}')
-        _check_private_parameters(args)
+        check_private_parameters(args)
         mappings = rosgraph.names.load_mappings(args)
         if not is_same_master(mappings.get('__master', self.master_url), self.master_url):
             raise ValueError(
@@ -106,6 +107,7 @@ class Settings:
         elif '__name' not in mappings:  # which roslaunch gives
             self.argv.append(f'__name{rosgraph.names.REMAP}{self.base_name}')
         self.environ.update(env)
+        self.private_name = private_name
         self.params = {}
         for name, value in params.items():
             key = name[1:] if isinstance(name, str) and name.startswith('~') else name
@@ -140,7 +142,7 @@ def _namespace(name, given):
     return rosgraph.names.make_global_ns(rosgraph.names.ns_join(given, inner))
 
 
-def _check_private_parameters(arguments):
+def check_private_parameters(arguments):
     """Raise ValueError for the value of a private parameter that the server cannot hold, or that is
     no YAML.
 

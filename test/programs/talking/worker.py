@@ -175,6 +175,8 @@ if __name__ == '__main__':
     how, *more = rospy.myargv()[1:]
     if how == 'own argv':
         rospy.init_node('worker', argv=['__name:=called_by_itself', 'image:=/camera'])
+    elif how == 'bad argv':
+        rospy.init_node('worker', argv=['_rate:=[1'])
     elif 'nameless' not in how:
         rospy.init_node('worker', disable_signals='interrupted' in how)
     rospy.sleep(0)

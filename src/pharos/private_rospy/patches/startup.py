@@ -10,6 +10,7 @@ from pharos.private_rospy.names import unique_name
 from pharos.private_rospy.module_proxy import ModuleProxy
 from pharos.private_rospy.patches.table import patch, substitute
 from pharos.private_rospy.process_rospy import rospy
+from pharos.private_rospy.settings import check_private_parameters
 
 
 @substitute('rospy.impl.init', 'time', 'waits in steps of 0.1 s, as long as the master takes')
@@ -42,6 +43,7 @@ def init_node(
         original(name, argv, anonymous, *options, disable_signals, xmlrpc_port, tcpros_port)
         return
     if argv is not None:
+        check_private_parameters(argv)
         module.rospy.names.reload_mappings(argv)
     given = module.rospy.names.get_mappings().get('__name')
     if anonymous and not given:
