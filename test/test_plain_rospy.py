@@ -123,6 +123,19 @@ def connected(publisher, count=1):
     return {connection.transport_type for connection in publisher.impl.connections}
 
 
+class Slow:
+    """A callback that holds each message up until it is released, and keeps what it got."""
+
+    def __init__(self, kept=lambda message: message):
+        self.entered, self.release, self.got = threading.Event(), threading.Event(), Mailbox()
+        self._kept = kept
+
+    def __call__(self, message):
+        self.entered.set()
+        self.release.wait(TIMEOUT)
+        self.got(self._kept(message), None)
+
+
 def test_a_publisher_and_a_subscriber_of_plain_rospy(pair):
     publishing, subscribing = pair
     publisher = publishing.ros.Publisher('/plain/text', STRING, queue_size=100)
@@ -304,24 +317,18 @@ def test_a_callback_that_fails_ends_nothing(pair):
 def test_a_subscriber_with_a_queue_of_one_gets_the_newest(pair):
     publishing, subscribing = pair
     publisher = publishing.ros.Publisher('/plain/newest', INT, queue_size=100)
-    entered, release, mailbox = threading.Event(), threading.Event(), Mailbox()
-
-    def slow(message):
-        entered.set()
-        release.wait(TIMEOUT)
-        mailbox(message, None)
-
+    slow = Slow()
     subscribing.ros.Subscriber('/plain/newest', INT, slow, queue_size=1, buff_size=1 << 20)
     connected(publisher)
     publisher.publish(0)
-    assert entered.wait(TIMEOUT)
+    assert slow.entered.wait(TIMEOUT)
     for number in range(1, 50):
         publisher.publish(number)
-    release.set()
-    assert mailbox.next().data == 0
-    following = [mailbox.next().data]
+    slow.release.set()
+    assert slow.got.next().data == 0
+    following = [slow.got.next().data]
     while following[-1] != 49:
-        following.append(mailbox.next().data)
+        following.append(slow.got.next().data)
     assert following == sorted(following)
     # else some may not have come yet when the callback ended
     if subscribing.transport == 'INTRAPROCESS':
@@ -333,33 +340,21 @@ def test_messages_that_come_faster_than_they_are_taken_are_kept_as_sockets_do(pa
     processes."""
     publishing, subscribing = pair
     publisher = publishing.ros.Publisher('/plain/burst', INT, queue_size=1)
-    entered, release, mailbox = threading.Event(), threading.Event(), Mailbox()
-
-    def slow(message):
-        entered.set()
-        release.wait(TIMEOUT)
-        mailbox(message, None)
-
+    slow = Slow()
     subscribing.ros.Subscriber('/plain/burst', INT, slow)
     connected(publisher)
     for number in range(100):
         publisher.publish(number)
-    assert entered.wait(TIMEOUT)
-    release.set()
-    assert [message.data for message in mailbox.take(100)] == list(range(100))
+    assert slow.entered.wait(TIMEOUT)
+    slow.release.set()
+    assert [message.data for message in slow.got.take(100)] == list(range(100))
 
 
 @pytest.mark.filterwarnings('ignore:The publisher should be created')
 def test_a_publisher_without_a_queue_waits_for_a_slow_callback_and_loses_nothing(pair):
     publishing, subscribing = pair
     publisher = publishing.ros.Publisher('/plain/waits', ARRAY)
-    entered, release, sizes = threading.Event(), threading.Event(), Mailbox()
-
-    def slow(message):
-        entered.set()
-        release.wait(TIMEOUT)
-        sizes(len(message.data), None)
-
+    slow = Slow(lambda message: len(message.data))
     subscribing.ros.Subscriber('/plain/waits', ARRAY, slow)
     connected(publisher)
     published = []
@@ -370,13 +365,13 @@ def test_a_publisher_without_a_queue_waits_for_a_slow_callback_and_loses_nothing
             published.append(number)
 
     thread = in_thread(publish)
-    assert entered.wait(TIMEOUT)
+    assert slow.entered.wait(TIMEOUT)
     thread.join(0.5)
     assert thread.is_alive()  # memory is bounded
     assert len(published) < 30
-    release.set()
+    slow.release.set()
     assert ended(thread)
-    assert sizes.take(40) == [(1 << 20) + number for number in range(40)]
+    assert slow.got.take(40) == [(1 << 20) + number for number in range(40)]
 
 
 @pytest.mark.filterwarnings('ignore:The publisher should be created')
@@ -554,21 +549,15 @@ def test_a_link_that_is_closed_opens_no_thread_for_callbacks(master):
 def test_what_was_published_before_the_publisher_left_still_arrives(pair):
     publishing, subscribing = pair
     publisher = publishing.ros.Publisher('/plain/leaving', INT, queue_size=1000)
-    entered, release, mailbox = threading.Event(), threading.Event(), Mailbox()
-
-    def slow(message):
-        entered.set()
-        release.wait(TIMEOUT)
-        mailbox(message, None)
-
+    slow = Slow()
     subscribing.ros.Subscriber('/plain/leaving', INT, slow)
     connected(publisher)
     for number in range(100):
         publisher.publish(number)
-    assert entered.wait(TIMEOUT)
+    assert slow.entered.wait(TIMEOUT)
     publisher.unregister()
-    release.set()
-    assert [message.data for message in mailbox.take(100)] == list(range(100))
+    slow.release.set()
+    assert [message.data for message in slow.got.take(100)] == list(range(100))
     until(lambda: not link_threads(subscribing))
 
 
@@ -603,18 +592,12 @@ def test_what_is_put_while_another_thread_takes_is_counted():
 def test_large_messages_are_dropped_from_a_full_queue_the_oldest_first(master):
     publishing, subscribing = create(master, '/publisher'), create(master, '/subscriber')
     publisher = publishing.ros.Publisher('/plain/full', ARRAY, queue_size=2)
-    entered, release, sizes = threading.Event(), threading.Event(), Mailbox()
-
-    def slow(message):
-        entered.set()
-        release.wait(TIMEOUT)
-        sizes(len(message.data), None)
-
+    slow = Slow(lambda message: len(message.data))
     subscribing.ros.Subscriber('/plain/full', ARRAY, slow)
     connected(publisher)
     publisher.publish(data=b'')
-    assert entered.wait(TIMEOUT)
+    assert slow.entered.wait(TIMEOUT)
     for number in range(10):
         publisher.publish(data=bytes(plain_receivers.UNDER_WAY + number))
-    release.set()
-    assert sizes.take(3) == [0, plain_receivers.UNDER_WAY + 8, plain_receivers.UNDER_WAY + 9]
+    slow.release.set()
+    assert slow.got.take(3) == [0, plain_receivers.UNDER_WAY + 8, plain_receivers.UNDER_WAY + 9]
