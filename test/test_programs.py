@@ -179,10 +179,9 @@ def test_rospy_is_the_nodes_in_whatever_way_it_is_imported(node):
     assert main.examples == (0, 1)
 
 
-def test_a_programs_time_limit_of_sockets_holds_and_rospys_own_does_not(node):
+def test_a_programs_time_limit_of_sockets_holds(node):
     try:
         main = run(node, 'own/limits_sockets.py')
-        exec('socket.setdefaulttimeout(60)', vars(node.ros_import('rospy.impl.masterslave')))
         assert socket.getdefaulttimeout() == main.found == 1.5
     finally:
         socket.setdefaulttimeout(None)

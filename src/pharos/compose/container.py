@@ -3,6 +3,7 @@ from typing import TYPE_CHECKING, Any, Dict, List
 
 import rosgraph.names
 
+from pharos import node_registry
 from pharos.compose.kept_node import KeptNode
 from pharos.compose.launch_file import LaunchedNode
 from pharos.compose.output import SCREEN
@@ -95,9 +96,9 @@ class Container(Node):
 
     def _drop_at_its_end(self, name: str) -> None:
         kept = self._loaded[name]
-        while not kept.is_over:
-            self.sleep(0.1)
-        self._drop(name)
+        node_registry.wait_until(lambda: kept.is_over)
+        if kept.is_over:  # else this node stops
+            self._drop(name)
 
     def _drop(self, name: str) -> None:
         kept, bond = self._loaded.pop(name, None), self._bonds.pop(name, None)

@@ -2,10 +2,8 @@
 node: environment, arguments, exit handlers, signals, threads and child processes."""
 import atexit
 import functools
-import inspect
 import os
 import posixpath
-import socket
 import time
 import xmlrpc
 import xmlrpc.client
@@ -15,12 +13,6 @@ import _thread
 from pharos.private_rospy.module_proxy import ModuleProxy
 from pharos.private_rospy.own_signals import OwnSignals
 from pharos.private_rospy.proxies import ServerProxy
-
-
-def _set_default_timeout(timeout):
-    """``socket.setdefaulttimeout``, but for rospy, which means its own sockets."""
-    if not inspect.currentframe().f_back.f_globals['__name__'].startswith('rospy.'):
-        socket.setdefaulttimeout(timeout)
 
 
 class OwnProcess:
@@ -58,7 +50,6 @@ class OwnProcess:
                 'threading': lifetime.threading,
                 '_thread': ModuleProxy(_thread, start_new_thread=lifetime.start_thread),
                 'time': ModuleProxy(time, sleep=lifetime.sleep),
-                'socket': ModuleProxy(socket, setdefaulttimeout=_set_default_timeout),
                 'xmlrpc': ModuleProxy(xmlrpc, client=proxies),
                 'xmlrpc.client': proxies,
                 '_posixsubprocess': ModuleProxy(_posixsubprocess, fork_exec=self._fork_exec),
