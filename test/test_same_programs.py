@@ -38,7 +38,8 @@ class Receiver:
     def wait(self):
         """Wait until all has come."""
         with self._arrived:
-            assert self._arrived.wait_for(lambda: len(self.got) >= self.expected, TIMEOUT)
+            is_all = self._arrived.wait_for(lambda: len(self.got) >= self.expected, TIMEOUT)
+            assert is_all, f'{len(self.got)} of {self.expected}: {[got[1] for got in self.got]}'
 
     def by_sender(self):
         """What came, from each node; which of two comes first is nobody's promise."""
