@@ -4,19 +4,25 @@ import dataclasses
 import gc
 import io
 import os
-import pdb
+import re
+import signal
+import subprocess
 import sys
 import threading
 import time
 import traceback
+from unittest import mock
 
 import pytest
 
-from helpers import create
+from helpers import create, ended, in_thread
 from pharos.testing import Mailbox, TIMEOUT, until
 import pharos
 from pharos import BlockNode, Transcript, failures, node_registry
-from programs import Program, run
+from pharos.live import debugger, failure_table
+from programs import PROGRAMS, Program, environment, run
+from sensor_msgs.msg import Image
+from std_msgs.msg import String
 
 
 class OfMyOwn(BaseException):
@@ -860,7 +866,7 @@ def test_a_parameter_block_is_run_again_on_the_same_value(master, transcript):
 
 def test_the_newest_failures_alone_are_run_again_and_looked_at(master, transcript, monkeypatch):
     looked_at = []
-    monkeypatch.setattr(pdb, 'post_mortem', looked_at.append)
+    monkeypatch.setattr(debugger, 'look_at', looked_at.append)
     node = create(master)
     failing(node, lambda number: ValueError(f'bad {number}'), 10)
     assert [failure.is_whole for failure in node.failures] == [False] * 5 + [True] * 5
@@ -885,3 +891,207 @@ def test_a_delegate_of_a_stopped_node_is_not_run_again(master, transcript):
     with pytest.raises(pharos.NodeStoppedError):
         failure.retry()
     assert failure.message.data == 0
+
+
+def test_a_retry_that_waits_for_its_turn_ends_when_the_node_stops(master, transcript):
+    node = create(master)
+    node.stop_timeout = 0.1
+    failing(node, lambda number: ValueError('bad'), 1)
+    (failure,) = node.failures
+    busy, go_on, raised = threading.Event(), threading.Event(), []
+
+    def slow(message, channel):
+        busy.set()
+        go_on.wait(TIMEOUT)
+
+    def retry():
+        try:
+            failure.retry()
+        except pharos.NodeStoppedError as error:
+            raised.append(str(error))
+
+    node.interested_in('/slow', 'std_msgs/Empty', delegate=slow)
+    node.send_to('/slow')
+    assert busy.wait(TIMEOUT)
+    retrying = in_thread(retry)
+    node.stop()
+    assert ended(retrying)
+    go_on.set()
+    assert raised == ['/node has stopped meanwhile: start() it first']
+    assert failure.count == 1
+
+
+def test_no_block_of_a_stopped_node_is_run_again(master, transcript):
+    node, failing_once = create(master), Raising(*[ValueError('bad')] * 3)
+    node.serve('/fails_again', 'std_srvs/Empty', failing_once)
+    with pytest.raises(pharos.ServiceCallError):
+        master.lookup_service('/fails_again').call()
+    node.parameter('~again').on_change(failing_once)
+    master.parameters['/node/again'] = 1
+    node.fork(failing_once)
+    until(lambda: len(node.failures) == 3)
+    node.stop()
+    for failure in node.failures:
+        with pytest.raises(pharos.NodeStoppedError, match='/node is stopped: start'):
+            failure.retry()
+    node.start()
+    assert [failure.retry() for failure in node.failures] == [True] * 3
+
+
+class Fails(pharos.Node):
+    """Blocks that fail, of every kind."""
+
+    def __init__(self):
+        super().__init__()
+        self.done = []
+
+    def hear(self, message, channel):
+        raise ValueError(message.data)
+
+    def answer(self, request):
+        raise ValueError('answer')
+
+    def change(self, value):
+        raise ValueError(value)
+
+    def live(self):
+        raise ValueError('live')
+
+
+class Mended(Fails):
+    """The same, mended."""
+
+    def hear(self, message, channel):
+        self.done.append(message.data)
+
+    def answer(self, request):
+        self.done.append('answer')
+        return {}
+
+    def change(self, value):
+        self.done.append(value)
+
+    def live(self):
+        self.done.append('live')
+
+
+def test_blocks_that_are_mended_by_another_class_are_run_again(master, transcript):
+    node = create(master, node_class=Fails)
+    channel = node.interested_in('/fails', 'std_msgs/String', node.hear)
+    node.serve('/fails_again', 'std_srvs/Empty', node.answer)
+    node.parameter('~again').on_change(node.change)
+    node.send_to('/fails', data='hear')
+    until(lambda: channel.received)
+    with pytest.raises(pharos.ServiceCallError):
+        master.lookup_service('/fails_again').call()
+    master.parameters['/node/again'] = 5
+    ended(node.fork(Fails.live))
+    until(lambda: len(node.failures) == 4)
+    node.become(Mended)
+    assert [failure.retry() for failure in node.failures] == [True] * 4
+    assert {*node.done} == {'hear', 'answer', 5, 'live'}
+    assert len(node.done) == 4
+
+
+def test_a_debugger_opens_in_the_frame_while_the_node_goes_on(master):
+    debugged = subprocess.run(
+        [PROGRAMS / 'debugs.py'],
+        input='p local\np counted()\nw\nc\n',
+        env=environment(master.url),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=2 * TIMEOUT,
+        check=False,
+    )
+    told = debugged.stdout.split('(Pdb) ')
+    assert "raise ValueError(f'{local} is bad')" in told[0]
+    assert told[1:3] == ['1\n', 'True\n'], debugged.stdout
+    assert 'debugs.py' in told[3]
+    assert told[-1] == "retried True [1, 2, 'again 1']\n"
+    assert debugged.returncode == 0
+
+
+def test_ipython_shows_failures_and_debugs_them_with_its_own_debugger(master, tmp_path):
+    session = subprocess.run(
+        [sys.executable, '-m', 'IPython', '--simple-prompt', '--no-banner', '--colors=NoColor'],
+        input=(PROGRAMS / 'debugs.ipy').read_text(),
+        env=environment(master.url, IPYTHONDIR=str(tmp_path), COLUMNS='120'),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=2 * TIMEOUT,
+        check=False,
+    )
+    told = [line.split('told ')[1] for line in session.stdout.splitlines() if 'told ' in line]
+    assert told == ['1', '1 True', "True ['again']"], session.stdout
+    assert re.search(
+        r'\n0  1 .*  delegate on_number on /debugged  ZeroDiv.*  data: 1\n', session.stdout
+    )
+    assert 'ipdb> ' in session.stdout
+    assert session.returncode == 0
+
+
+def test_a_ctrl_c_after_the_debugger_is_no_wish_to_debug(master):
+    before = signal.getsignal(signal.SIGINT)
+    with mock.patch('builtins.input', return_value='continue'):
+        try:
+            1 / 0
+        except ZeroDivisionError as error:
+            debugger.look_at(error.__traceback__)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_what_nobody_raised_cannot_be_looked_at():
+    kept = failures.Failures(lambda line, details: None)
+    kept.report(ValueError('refused'), None, 'connection of /node')
+    with pytest.raises(pharos.PharosError, match='connection of /node failed.*has no frames'):
+        kept.all()[0].debug()
+
+
+# -- as a table
+
+
+def test_failures_are_shown_as_a_table_that_fits_the_terminal(master, transcript, monkeypatch):
+    node = create(master)
+    assert repr(node.failures) == 'no failures'
+    failing(node, lambda number: ValueError('the turtle\nis too fast'), 3)
+    node.parameter('~watched').on_change(lambda value: 1 / 0)
+    master.parameters['/node/watched'] = {'a': [1.0] * 1000}
+    until(lambda: len(node.failures) == 2)
+    for width in 80, 200:
+        monkeypatch.setenv('COLUMNS', str(width))
+        lines = repr(node.failures).split('\n')
+        assert lines[0].split() == ['#', 'count', 'when', 'block', 'cause', 'message']
+        assert max(map(len, lines)) <= width
+        assert re.match(r'0  3      \d\d:\d\d:\d\d  delegate .*  ValueError: ', lines[1])
+        (second,) = [line for line in lines if line.startswith('1 ')]
+        assert re.match(r'1  1      \d\d:\d\d:\d\d  parameter .*  Zero', second)
+    assert re.search('  ValueError: the turtle is too fast +data: 2$', lines[1])
+    assert '  delegate failing.<locals>.delegate on /counted  ' in lines[1]
+    assert isinstance(node.failures, list)
+
+
+def test_failures_are_a_table_in_a_notebook(master, transcript):
+    node = create(master)
+    failing(node, lambda number: ValueError('<b>'), 1)
+    table = node.failures._repr_html_()
+    assert '<td>ValueError: &lt;b&gt;</td><td>data: 0</td>' in table
+
+
+def test_the_table_names_a_large_message_by_its_first_values():
+    failure = failures.Failure(
+        ValueError('bad'), None, 'delegate', message=Image(data=b'1' * 10**7)
+    )
+    begin = time.monotonic()
+    text = failure_table.as_html([failure])
+    assert time.monotonic() - begin < 1.0
+    assert 'data: [49, 49, 49, ... 10000000 in all]' in text
+
+
+def test_a_message_that_cannot_be_shown_is_named_in_the_table():
+    message = String(data=Unspeakable())
+    table = failure_table.as_text(
+        [failures.Failure(ValueError('bad'), None, 'delegate', message=message)]
+    )
+    assert '<std_msgs/String>' in table

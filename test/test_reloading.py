@@ -73,6 +73,6 @@ def test_autoreload_changes_a_node_that_runs_by_itself(master, tmp_path):
         '202 first second',
         '302 third True True',
         'second first',
-        'second [] 0',
+        'second 0 0',
     ], session.stdout
     assert session.returncode == 0

@@ -2,12 +2,12 @@
 set of it, in its class or on it."""
 import inspect
 import numbers
-from typing import TYPE_CHECKING, Any, Callable, Dict, FrozenSet, List, Optional, TypeVar
+from typing import TYPE_CHECKING, Any, Callable, Dict, FrozenSet, Optional, TypeVar
 
 from pharos.blocks import Block, attempt, check_delegate, check_runs, check_soul, text_of
 from pharos import node_registry
 from pharos.errors import NodeStoppedError
-from pharos.failures import Failure, Failures
+from pharos.failures import FailureList, Failures
 from pharos.lifecycle import Lifecycle
 from pharos.private_rospy.settings import Settings
 from pharos.seconds import check_seconds
@@ -178,9 +178,9 @@ class NodeAttributes:
         return self._errors
 
     @property
-    def failures(self) -> List[Failure]:
-        """For each of :attr:`errors` its :class:`~pharos.Failure`: what failed, on what, how
-        often."""
+    def failures(self) -> FailureList:
+        """For each of :attr:`errors` its :class:`~pharos.Failure`: what failed, on what, how often;
+        a list, which is shown as a table of cause, block, message, count and time."""
         return self._errors.all()
 
     def _tell_failure(self, line: str, details: str) -> None:

@@ -23,10 +23,8 @@ class Place(NamedTuple):
 def become(node: 'Node', node_class: type) -> None:
     """What :meth:`Node.become` does, when no delegate of the node runs."""
     run = node.latest_run
-    if run is None:
-        _change(node, node_class)
-    else:
-        run.dispatcher.run_in_turn(lambda: _change(node, node_class))
+    if run is None or not run.dispatcher.run_in_turn(lambda: _change(node, node_class)):
+        _change(node, node_class)  # it has no turns
 
 
 def _change(node: 'Node', node_class: type) -> None:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Tuple, Ty
 import genpy
 
 from pharos.blocks import Block, check_delegate
-from pharos.errors import PharosError
+from pharos.errors import NodeStoppedError, PharosError
 from pharos.intraprocess.inbox import Inbox, SocketInbox
 
 if TYPE_CHECKING:
@@ -184,6 +184,7 @@ class InputChannel(Channel):
         """Run the delegate, as it is now, on a message, when no other of the node runs.
 
         :raises PharosError: if there is none any more
+        :raises NodeStoppedError: if the node is not running, or stops before
         """
 
         def run() -> None:
@@ -198,7 +199,8 @@ class InputChannel(Channel):
             except BaseException as error:
                 self._run.report(error, block, 'delegate', self, message)
 
-        self.node.current_run.dispatcher.run_in_turn(run)
+        if not self.node.current_run.dispatcher.run_in_turn(run):
+            raise NodeStoppedError(f'{self.node.name} has stopped meanwhile: start() it first')
 
     @property
     def _present_delegate(self) -> Any:

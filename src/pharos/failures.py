@@ -1,7 +1,7 @@
 """What blocks raised: kept, counted, told once, and run again."""
 import collections
+import importlib
 import numbers
-import pdb
 import sys
 import threading
 import time
@@ -105,7 +105,10 @@ class Failure:
         blocks run at once, all of them in this thread. What it raises is a failure like any other,
         and told in any case.
 
+        A soul that loops does so here, too: :meth:`Node.fork` it again where it is not to.
+
         :raises PharosError: if the message has been let go, or the block cannot be run again
+        :raises NodeStoppedError: if the node is not running, or stops while this waits for its turn
         """
         if self._again is None:
             raise PharosError(
@@ -122,21 +125,38 @@ class Failure:
             retrying.failed = before
 
     def debug(self) -> None:
-        """Look at the frames in which it was raised: ``pdb.post_mortem``.
+        """Look into the frame in which it was raised, by IPython's debugger in its shells, else by
+        pdb, until that is left by ``q``. Nodes go on meanwhile, this one too.
 
-        :raises PharosError: if they have been let go
+        :raises PharosError: if nobody raised it, or the frames have been let go
         """
+        if self.is_whole and self._frames is None:
+            raise PharosError(f'{self.where} failed, and nobody raised that: it has no frames')
         if self._frames is None:
             raise PharosError(
                 f'the frames of this failure of {self.where} are gone: they are kept of the'
                 f' newest {WHOLE} failures of a node only; debug() one of those, or read its'
                 ' .traceback'
             )
-        pdb.post_mortem(self._frames)
+        importlib.import_module('pharos.live.debugger').look_at(self._frames)
 
     def __repr__(self) -> str:
         times = f', {self.count} times' if self.count > 1 else ''
         return f'<Failure of {self.where}: {type(self.error).__name__}: {self.text}{times}>'
+
+
+class FailureList(List[Failure]):
+    """Failures, which a prompt and a notebook show as a table."""
+
+    def __repr__(self) -> str:
+        return str(_tables().as_text(self))
+
+    def _repr_html_(self) -> str:
+        return str(_tables().as_html(self))
+
+
+def _tables() -> Any:
+    return importlib.import_module('pharos.live.failure_table')
 
 
 class Failures(Sequence[BaseException]):
@@ -171,10 +191,10 @@ class Failures(Sequence[BaseException]):
     def __repr__(self) -> str:
         return repr(self[:])
 
-    def all(self) -> List[Failure]:
+    def all(self) -> 'FailureList':
         """The failures that are kept, the newest last."""
         with self._lock:
-            return list(self._kept.values())
+            return FailureList(self._kept.values())
 
     def pop(self, index: int = -1) -> BaseException:
         """Take an exception out, the newest by default, and return it: it was seen to."""

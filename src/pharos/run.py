@@ -1,5 +1,6 @@
 """One run of a node: all that a start makes, and its stop ends."""
 import contextlib
+import functools
 import threading
 import weakref
 from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Tuple
@@ -348,6 +349,8 @@ class Run:
         if channel is not None:
             where += f' on {channel.topic}'
             again = channel.run_again
+        elif again is not None:
+            again = functools.partial(_again_where_running, self.node, again)
         self.node.errors.report(error, block, where, channel, message, again)
 
     def _hook_failed(self, error: BaseException, what: str = 'a hook of on_shutdown') -> None:
@@ -364,3 +367,8 @@ class Run:
         )
         where = f'connection of {name} to {refusal.publisher} for {refusal.topic}'
         self.node.errors.report(error, None, where)
+
+
+def _again_where_running(node: 'Node', again: Callable[[Any], Any], message: Any) -> None:
+    node.current_run  # raises where it is stopped
+    again(message)

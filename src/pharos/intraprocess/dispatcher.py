@@ -18,6 +18,8 @@ from typing import Any, Callable, Deque, Optional, Protocol
 BURST_INTERVAL = 100e-6
 # seconds for which a publisher at the most yields, until the dispatcher thread has woken up
 YIELD_LIMIT = 1e-3
+# seconds between two looks of who waits for a delegate at whether the node has stopped
+CLOSED_INTERVAL = 0.1
 # seconds for which a thread that brings a message also runs what others bring meanwhile
 COURTESY = 1e-3
 
@@ -111,19 +113,28 @@ class Dispatcher:
             if self.inline:  # scheduled meanwhile by a thread that found the node busy
                 self._leave_to_thread()
 
-    def run_in_turn(self, job: Callable[[], Any]) -> None:
-        """Run ``job()`` in this thread when no delegate runs; at once in one that it runs."""
+    def run_in_turn(self, job: Callable[[], Any]) -> bool:
+        """Run ``job()`` in this thread when no delegate runs; at once in one that it runs.
+
+        :returns: False where it was closed before
+        """
         if self.is_run_here():
             job()
-            return
-        with self._running:
+            return True
+        while not self._running.acquire(True, CLOSED_INTERVAL):
+            if self._closed:
+                return False
+        is_open = not self._closed
+        try:
             self._runner = get_ident()
-            try:
+            if is_open:
                 job()
-            finally:
-                self._runner = None
+        finally:
+            self._runner = None
+            self._running.release()
         if self.inline:  # as in wait_for_delegate
             self._leave_to_thread()
+        return is_open
 
     def need_thread(self) -> None:
         """Have the dispatcher thread, from the first channel on that is not inline."""
