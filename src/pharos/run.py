@@ -37,6 +37,9 @@ class Run:
     has open, in the order of their opening.
     """
 
+    #: what to say of souls that are left behind
+    left_behind = 'A soul ends by itself if it waits with node.sleep() or loops over node.every()'
+
     def __init__(self, node: 'Node', settings: Settings) -> None:
         self.node = node
         self.lifecycle = Lifecycle.STARTING
@@ -152,9 +155,6 @@ class Run:
             (self._end_rospy, timeout),
             (self._close_opened,),
         ]
-
-    #: what to say of souls that are left behind
-    left_behind = 'A soul ends by itself if it waits with node.sleep() or loops over node.every()'
 
     def _end_souls(self, timeout: float) -> None:
         """Wait for the souls, but this thread's."""

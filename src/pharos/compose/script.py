@@ -127,6 +127,8 @@ class ScriptRun(Run):
         self._process = os.getpid()
         self.is_registered = False
         self.has_ended = False  # whether the program has
+        self._is_stopped_early = False  # whether that is by another's stop, before it was a node
+        self._is_awaited = True  # whether start() waits still, whose caller gets what is raised
         self._error: Optional[BaseException] = None  # with which it ended before it was a node
         self.rospy.on_init_node = self._init_node
         folder = (node.cwd or os.getcwd()) if working_directory.is_possible() else None
@@ -158,9 +160,6 @@ class ScriptRun(Run):
                 f' {type(error).__name__}: {error}'
             ) from error
 
-    _is_stopped_early = False  # whether that is by another's stop, before it was a node
-    _is_awaited = True  # whether start() waits still, whose caller gets what the program raises
-
     def _run(self) -> None:
         """What the thread of the program does, and Python at the end of one."""
         error: Optional[BaseException] = None
@@ -183,9 +182,8 @@ class ScriptRun(Run):
         self.rospy.exit_main()
         for stream in self.rospy.system.stdout, self.rospy.system.stderr:
             attempt(stream.flush)
-        with node_registry.changed:
-            self.exit_code, self.has_ended = exit_code, True
-            node_registry.changed.notify_all()
+        self.exit_code, self.has_ended = exit_code, True
+        node_registry.notify()
         if not self.is_ending:
             stop = threading.Thread(
                 target=node_registry.stop, args=(self.node,), name=f'{self.node.name} stop'
@@ -238,9 +236,8 @@ class ScriptRun(Run):
             node.master.parameters[full_name] = value
             self.rospy.parameters.initialize(full_name, value)
         self.rospy.start(node.connect_timeout, register)
-        with node_registry.changed:
-            self.is_registered = True
-            node_registry.changed.notify_all()
+        self.is_registered = True
+        node_registry.notify()
         watcher_of(node.master).check()
 
 
