@@ -41,7 +41,9 @@ class Composition:
         self.is_ending = False
         #: why nodes of it were not even tried to start
         self.problems: List[Problem] = []
-        self._kept: List[KeptNode] = []
+        #: what was started in this process, whether it has come to be a node or not; replaced when
+        #: it changes
+        self.kept: List[KeptNode] = []
         self._apart: Optional[ApartNodes] = None
         self._stopping = threading.RLock()
         node_registry.before_stop_all(self._begin_end)
@@ -49,12 +51,7 @@ class Composition:
     @property
     def nodes(self) -> List[ScriptNode]:
         """The nodes of this process, in the order of the launch file."""
-        return [kept.node for kept in self._kept if kept.node is not None]
-
-    @property
-    def kept(self) -> List[KeptNode]:
-        """What was started in this process, whether it has come to be a node or not."""
-        return list(self._kept)
+        return [kept.node for kept in self.kept if kept.node is not None]
 
     @property
     def process(self) -> Optional[RosProcess]:
@@ -96,7 +93,7 @@ class Composition:
         """Start nodes, one after the other; one that takes long does not keep the next from it."""
         started = [KeptNode(self, launched) for launched in nodes]
         with node_registry.changed:
-            self._kept += started
+            self.kept = [*self.kept, *started]
         for number, kept in enumerate(started, 1):
             if self.is_ending:
                 kept.is_over = True
@@ -122,11 +119,11 @@ class Composition:
     def is_over(self) -> bool:
         """Whether all that it has started has ended."""
         is_over_apart = self._apart is None or self._apart.is_over
-        return is_over_apart and all(kept.is_over for kept in self._kept)
+        return is_over_apart and all(kept.is_over for kept in self.kept)
 
     def outcomes(self) -> Iterator[Tuple[str, str]]:
         """What has become of each node, in a few words: ``(name, outcome)``."""
-        for kept in self._kept:
+        for kept in self.kept:
             yield kept.name, kept.outcome
         if self._apart is not None:
             yield from self._apart.outcomes()
@@ -142,10 +139,10 @@ class Composition:
         """
         with signals.interruptible_wait():
             if not node_registry.wait_until(lambda: self.is_over or self.is_ending, timeout):
-                left = ', '.join(kept.name for kept in self._kept if not kept.is_over)
+                left = ', '.join(kept.name for kept in self.kept if not kept.is_over)
                 raise TimeoutError(f'{left} have not ended within {timeout:g} s: stop() them')
         self.stop()
-        has_failed = [kept.problem is not None for kept in self._kept]
+        has_failed = [kept.problem is not None for kept in self.kept]
         is_nothing_started = all(has_failed) and self._apart is None
         is_failure = is_nothing_started and bool(has_failed or self.problems)
         return 1 if is_failure or self.reason is not None else 0
@@ -164,7 +161,7 @@ class Composition:
         """Start nothing any more."""
         with node_registry.changed:
             self.is_ending = True
-            for kept in self._kept:
+            for kept in self.kept:
                 kept.begin_end()
         node_registry.notify()
 
@@ -172,7 +169,7 @@ class Composition:
         """End all nodes, those apart too, side by side. Harmless when done twice."""
         self._begin_end()
         with signals.held(), self._stopping:
-            ends = [kept.stop for kept in reversed(self._kept)]
+            ends = [kept.stop for kept in reversed(self.kept)]
             if self._apart is not None:
                 ends.append(self._apart.stop)
             threads = [threading.Thread(target=end, daemon=True) for end in ends]
@@ -191,7 +188,7 @@ class Composition:
 
     def __repr__(self) -> str:
         apart = '' if self.process is None else f', {self.process!r} apart'
-        return f'<Composition of {len(self._kept)} nodes at {self.master.url}{apart}>'
+        return f'<Composition of {len(self.kept)} nodes at {self.master.url}{apart}>'
 
 
 def _with_log(launched: LaunchedNode, folder: str, number: int) -> LaunchedNode:

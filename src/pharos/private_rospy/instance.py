@@ -71,7 +71,11 @@ class PrivateRospy:
 
         imports = PrivateImports(patch=lambda module: patches.apply(module, self))
         self._process = OwnProcess(
-            imports, self.settings, self.lifetime, self._fail, self.request_stop
+            imports,
+            self.settings,
+            self.lifetime,
+            lambda *failure: self.on_failure(*failure),
+            self.request_stop,
         )
         self._logging = logs.private_logging(imports)
         #: import_library(name): a library written on rospy, such as 'actionlib', for this node
@@ -92,9 +96,6 @@ class PrivateRospy:
         #: publisher(topic), subscriber(topic): rospy's _PublisherImpl or _SubscriberImpl, or None
         self.publisher = self.topics.get_publisher_impl
         self.subscriber = self.topics.get_subscriber_impl
-
-    def _fail(self, *failure):
-        self.on_failure(*failure)
 
     def wait_for_registration(self, seconds):
         """What rospy waits with until it is registered, in steps of 0.1 s and for ever."""

@@ -21,13 +21,8 @@ def reduce_duration(self):
 
 @addition('rospy.rostime', 'Time.__copy__', _COPIED)
 @addition('rospy.rostime', 'Duration.__copy__', _COPIED)
-def copy_time(self):
-    """Copy it."""
-    return type(self)(self.secs, self.nsecs)
-
-
 @addition('rospy.rostime', 'Time.__deepcopy__', _COPIED)
 @addition('rospy.rostime', 'Duration.__deepcopy__', _COPIED)
-def deepcopy_time(self, memo):
+def copy_time(self, memo=None):
     """Copy it."""
     return type(self)(self.secs, self.nsecs)
