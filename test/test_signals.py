@@ -98,6 +98,7 @@ def test_plain_code_is_ended_as_without_nodes(program, with_signal, busy):
         'ready()\n    wait_for(threading.Event())',
         'ready_in_wait()\n    me.sleep(3600)',
         'ready_in_wait()\n    me.execute()',
+        'ready_in_wait()\n    pharos.spin()',
     ],
 )
 def test_ctrl_c_at_the_prompt_ends_the_line_and_no_node(program, line):
@@ -117,7 +118,7 @@ except KeyboardInterrupt:
     assert running.process.wait(TIMEOUT) == 0
 
 
-def test_ctrl_c_at_the_prompt_ends_spin_and_the_nodes(program):
+def test_sigterm_at_the_prompt_ends_spin_and_the_nodes(program):
     running = program(
         """
 sys.ps1 = '>>> '
@@ -127,7 +128,7 @@ pharos.spin()
 print('went on', me.lifecycle.value)
 """
     )
-    assert running.end(signal.SIGINT) == 0
+    assert running.end(signal.SIGTERM) == 0
     assert 'went on stopped' in running.read_to_the_end()
 
 

@@ -257,13 +257,16 @@ def spin() -> None:
     """Block until every node of the process has stopped, or Ctrl-C, SIGTERM or SIGHUP, which stop
     them.
 
-    A node whose ``stop()`` does not end within 30 s is not waited for. In a soul or delegate, it
-    ends with the node.
+    At the prompt, Ctrl-C ends the line alone, with a KeyboardInterrupt, and the nodes go on. A node
+    whose ``stop()`` does not end within 30 s is not waited for. In a soul or delegate, it ends with
+    the node.
     """
     with signals.interruptible_wait():
         try:
             wait_until(lambda: not _has_nodes_to_wait_for())
         except KeyboardInterrupt:  # the host program has a handler of its own
+            if signals.is_at_prompt():
+                raise
             stop_all()
 
 

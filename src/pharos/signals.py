@@ -62,7 +62,7 @@ class _Signal:
     def __init__(self, number: int) -> None:
         self.number = number
         # at the prompt, it ends the line that runs or is typed, and not what goes on beside it
-        self.is_at_prompt = number == signal.SIGINT and hasattr(sys, 'ps1')
+        self.is_at_prompt = number == signal.SIGINT and is_at_prompt()
         self._came = time.monotonic()
         self._stopped = self._came if self.is_at_prompt else None  # when the nodes had
 
@@ -145,6 +145,12 @@ def code_of(function: Any) -> Any:
     if hasattr(function, '__code__'):
         return function.__code__
     return getattr(getattr(type(function), '__call__', None), '__code__', None)
+
+
+def is_at_prompt() -> bool:
+    """Whether lines are typed at a prompt: Python's, IPython's, or the one that ``python -i`` gives
+    after the program."""
+    return hasattr(sys, 'ps1') or bool(sys.flags.inspect)
 
 
 def serve(is_needed: Callable[[], bool], stop_all: Callable[[], None]) -> None:
