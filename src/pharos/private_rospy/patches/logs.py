@@ -1,5 +1,6 @@
 """What a node logs on the screen."""
 import contextlib
+import sys
 
 from pharos.private_rospy.module_proxy import ModuleProxy
 from pharos.private_rospy.patches.table import patch, substitute
@@ -17,6 +18,32 @@ def default_formatter(*, original):
     )
 
 
+class _Screen:
+    """The process's sys.stdout, or sys.stderr, as it is at the time of each line."""
+
+    def __init__(self, name):
+        self._name = name
+
+    @property
+    def present(self):
+        """The stream; None where the program was started without it."""
+        return getattr(sys, self._name)
+
+
+@patch(
+    'rosgraph.roslogging',
+    'RosStreamHandler.__init__',
+    'keeps the streams of its making, also where a prompt, say, replaces them to write above it',
+)
+def init(self, colorize=True, stdout=None, stderr=None, *, original):
+    """Write where the process does then; what a program has replaced for itself stays."""
+    original(self, colorize, stdout, stderr)
+    if self._stdout is sys.stdout:
+        self._stdout = _Screen('stdout')
+    if self._stderr is sys.stderr:
+        self._stderr = _Screen('stderr')
+
+
 @patch('rosgraph.roslogging', 'RosStreamHandler.emit', 'makes a closed screen an error of who logs')
 def emit(self, record, *, original):
     """Write what can be written."""
@@ -27,5 +54,7 @@ def emit(self, record, *, original):
 @patch('rosgraph.roslogging', 'RosStreamHandler._write', 'needs a screen')
 def write(self, fd, msg, color, *, original):
     """Show the message as it is."""
+    if isinstance(fd, _Screen):
+        fd = fd.present
     if fd is not None:  # the program was started without that one
         original(self, fd, msg.replace(_ESCAPED, '${'), color)
