@@ -11,6 +11,7 @@ STANDARD_LIBRARY = sysconfig.get_path('stdlib')
 
 #: the module of each package that is called otherwise
 KEYS = {
+    'IPython': 'ipython3',
     'PIL': 'python3-pil',
     'hypothesis': 'python3-hypothesis',
     'numpy': 'python3-numpy',

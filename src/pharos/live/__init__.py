@@ -5,6 +5,7 @@
 - watching: Topic.hz, bw, last and watch
 - description: Node.describe
 - message_text: messages as text, long arrays cut
+- workspace: a session in a terminal, with a master, a node and all of pharos at hand
 
 It stands on the facade.
 """

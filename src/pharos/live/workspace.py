@@ -1,0 +1,207 @@
+"""The workspace: a session in which robots are programmed while they run.
+
+``rosrun pharos workspace`` is :func:`run`. What it is made of can be had from any program, too:
+:class:`Workspace`, and :func:`namespace`.
+"""
+import itertools
+import os
+import signal
+import sys
+from typing import Any, Dict, List, Optional, Sequence
+
+from rosgraph.rosenv import ROS_MASTER_URI
+
+import pharos
+from pharos import node_registry, signals
+from pharos.errors import PharosError
+from pharos.master import Master
+from pharos.node import BlockNode
+from pharos.signals import is_from_signal
+
+NAME = 'workspace'  # of the node that a session has, where it is free
+
+
+class Workspace:
+    """What a session has: a master, a node of its own, and the names that can be typed.
+
+    :attr:`master` is the ROS master's proxy, :attr:`me` the node, :attr:`namespace` the names.
+    Where no master is named and none answers, there is one of the session's own
+    (:attr:`is_embedded`), which ROS_MASTER_URI names until :meth:`close`.
+
+    :param url: URL of the ROS master; None: ROS_MASTER_URI's, or a master of its own
+    :param argv: ROS remappings and private parameters of :attr:`me`
+    :raises ValueError: if ROS_MASTER_URI or ``url`` is no URL
+    :raises MasterUnreachableError: if no master answers at ``url``
+    """
+
+    def __init__(self, url: Optional[str] = None, argv: Optional[List[str]] = None) -> None:
+        self.master = Master(url)
+        self.is_embedded = url is None and not self.master.is_reachable()
+        self.sought = self.master.url  #: where a master was looked for
+        self._former_uri = os.environ.get(ROS_MASTER_URI)
+        if self.is_embedded:
+            self.master = Master.embedded()
+            os.environ[ROS_MASTER_URI] = self.master.url
+        try:
+            self.me = self.master.create(BlockNode, named=free_name(self.master, NAME), argv=argv)
+        except BaseException:
+            self._give_back_master()
+            raise
+        self.namespace = namespace(self.master, self.me)
+
+    def close(self) -> None:
+        """Stop its node, and its master where that is its own, with the nodes of this process at
+        it. Harmless when done twice."""
+        self.me.stop()
+        self._give_back_master()
+
+    def _give_back_master(self) -> None:
+        if not self.is_embedded:
+            return
+        self.master.stop()
+        if os.environ.get(ROS_MASTER_URI) == self.master.url:
+            os.environ.pop(ROS_MASTER_URI)
+            if self._former_uri is not None:
+                os.environ[ROS_MASTER_URI] = self._former_uri
+
+    @property
+    def banner(self) -> str:
+        """What is said when the session begins."""
+        if self.is_embedded:
+            where = (
+                f'no ROS master answers at {self.sought}, so this session has one of its own,'
+                f' until it ends.\nOther shells join it by: export'
+                f' {ROS_MASTER_URI}={self.master.url}'
+            )
+        else:
+            count = len(self.master.nodes())
+            where = f'{count} nodes are at the ROS master {self.master.url}'
+        return (
+            f'PhaROS {pharos.__version__}: {where}\n'
+            f'master is that master, me the node {self.me.name} of this session; all of pharos is'
+            ' imported.\nTab completes, x? explains x, Ctrl-C ends a line, Ctrl-D the session and'
+            ' its nodes.\n'
+        )
+
+    def __enter__(self) -> 'Workspace':
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f'<Workspace of {self.me.name} at {self.master.url}>'
+
+
+def namespace(master: Master, me: Optional[BlockNode] = None) -> Dict[str, Any]:
+    """The names of a session: all exports of pharos, ``pharos`` itself, ``master``, and ``me``."""
+    names = {name: getattr(pharos, name) for name in pharos.__all__ if name[0] != '_'}
+    names.update(pharos=pharos, master=master)
+    if me is not None:
+        names['me'] = me
+    return names
+
+
+def free_name(master: Master, name: str) -> str:
+    """``name``, or the first of ``name_2``, ``name_3`` ... that no live node of the master has."""
+    names = itertools.chain([name], (f'{name}_{number}' for number in itertools.count(2)))
+    return next(each for each in names if master.live_node(each) is None)
+
+
+def run(
+    script: Optional[str] = None, args: Sequence[str] = (), argv: Optional[List[str]] = None
+) -> int:
+    """A session in this terminal, until it is left; returns the exit status of the program.
+
+    The nodes made in it stop with the program. Where standard input is no terminal, its lines are
+    run as if they were typed.
+
+    :param script: path of a Python program to be run first, among the names of the session
+    :param args: its further arguments
+    :param argv: as for :class:`Workspace`
+    :raises FileNotFoundError: if there is no such script
+    :raises PharosError: if IPython is not installed
+    :raises ValueError, MasterUnreachableError: as :class:`Workspace`
+    """
+    application = terminal_ipython()
+    if script is not None and not os.path.isfile(script):
+        raise FileNotFoundError(f'there is no script {script}: give the path of a Python program')
+    with Workspace(argv=argv) as workspace:
+        session = _Session(workspace, application)
+        if script is not None:
+            session.run_script(script, args)
+        return session.interact()
+
+
+def terminal_ipython() -> Any:
+    """The class of IPython's program for terminals.
+
+    :raises PharosError: if IPython is not installed
+    """
+    try:
+        from IPython.terminal.ipapp import TerminalIPythonApp
+    except ModuleNotFoundError as error:
+        raise PharosError(
+            f'a workspace needs IPython ({error}): apt install python3-ipython'
+        ) from error
+    return TerminalIPythonApp
+
+
+class _Session:
+    """A workspace in IPython's terminal."""
+
+    def __init__(self, workspace: Workspace, application: Any) -> None:
+        self._app = application.instance()
+        self._app.display_banner = False
+        self._app.initialize([])
+        self._shell = self._app.shell
+        self._is_over = False  # whether a signal has ended the session
+        print(workspace.banner)
+        if not sys.stdin.isatty():
+            print('Standard input is no terminal: its lines are run, to its end.\n')
+            self._shell.confirm_exit = False
+        self._shell.push(workspace.namespace, interactive=False)
+        node_registry.before_stop_all(self._end)  # which a signal asks for
+
+    def run_script(self, path: str, args: Sequence[str]) -> None:
+        """Run a program; what it raises leaves the session open."""
+        argv_before, sys.argv = sys.argv, [path, *args]
+        try:
+            self._shell.safe_execfile(
+                path, self._shell.user_ns, shell_futures=True, raise_exceptions=True
+            )
+        except BaseException as error:
+            if isinstance(error, SystemExit) and is_from_signal(error):
+                raise
+            self._shell.showtraceback()
+        finally:
+            sys.argv = argv_before
+
+    def interact(self) -> int:
+        """Run what is typed, until the session is left; returns the exit status.
+
+        :raises SystemExit: if a signal has ended it
+        """
+        if not self._is_over:
+            self._app.start()
+        node_registry.not_before_stop_all(self._end)
+        if not self._is_over:
+            return 0
+        with signals.held():  # which raises afterwards what the signal is to raise
+            pass
+        return 128 + signal.SIGTERM  # it has ended a wait, and there is nothing to raise
+
+    def _end(self) -> None:
+        """A signal ends the program: leave the prompt as Ctrl-D does, so that the terminal is as it
+        was before, and begin no other line."""
+        self._is_over = True
+        self._shell.confirm_exit = False
+        self._shell.ask_exit()
+        prompt = self._shell.pt_app  # None where there is no terminal
+        if prompt is not None and prompt.app.loop is not None:
+            prompt.app.loop.call_soon_threadsafe(_leave, prompt.app)
+
+
+def _leave(prompt: Any) -> None:
+    if prompt.is_running:
+        prompt.exit(exception=EOFError)
