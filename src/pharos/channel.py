@@ -1,5 +1,6 @@
 """Channels: one node's end of a topic, and the end at which it hears."""
 import collections
+import importlib
 import threading
 from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Tuple, Type
 
@@ -10,6 +11,7 @@ from pharos.errors import NodeStoppedError, PharosError
 from pharos.intraprocess.inbox import Inbox, SocketInbox
 
 if TYPE_CHECKING:
+    from pharos.live.plot import Plot
     from pharos.node import Node
     from pharos.run import Run
 
@@ -205,6 +207,23 @@ class InputChannel(Channel):
     @property
     def _present_delegate(self) -> Any:
         return self.node.delegate if self._delegate is None else self._delegate
+
+    def plot(self, *fields: str, seconds: Optional[float] = None) -> 'Plot':
+        """Plot numeric fields of the topic's messages over time: ``channel.plot('linear.x',
+        seconds=10).save('speed.png')``.
+
+        They are collected from now on by a node of its own; the channel's delegate, queue and
+        counts are not touched.
+
+        :param fields: 'linear.x', 'ranges[0]', 'header.stamp'
+        :param seconds: returns the finished :class:`~pharos.live.plot.Plot` after that long; None:
+            returns at once one that collects until its ``close()``
+        :raises MessageTypeError: if there is no such field, or it is no number
+        :raises TimeoutError: if no message came in these seconds
+        :raises PharosError: if matplotlib is not installed
+        """
+        made: 'Plot' = importlib.import_module('pharos.live.plot').plot(self, fields, seconds)
+        return made
 
     # -- as a pharos.intraprocess.inbox.Receiver
 

@@ -6,6 +6,10 @@
 - description: Node.describe
 - message_text: messages as text, long arrays cut
 - workspace: a session in a terminal, with a master, a node and all of pharos at hand
+- graph: Graph, the picture of a snapshot; edges: its arrows; dot: as a text for graphviz; graphviz: which
+  draws it; graph_text: for a terminal
+- pictures: messages of which a picture says more; images, top_view: how they are drawn
+- plot: InputChannel.plot
 
 It stands on the facade.
 """
