@@ -579,6 +579,39 @@ def test_a_node_waits_for_its_delegate_to_become_another(master):
     assert classes == [First]
 
 
+def test_a_node_becomes_another_though_its_stop_left_a_delegate_behind(master):
+    node, go_on, begun = create(master, node_class=First), threading.Event(), threading.Event()
+    node.stop_timeout = 0.1
+    node.interested_in(
+        '/changed', 'std_msgs/Int32', lambda *args: begun.set() or go_on.wait(TIMEOUT)
+    )
+    publisher(master).send(data=1)
+    assert begun.wait(TIMEOUT)
+    waiting = threading.Thread(target=node.become, args=[Second], daemon=True)
+    waiting.start()
+    node.stop()
+    assert ended(waiting)
+    assert type(node) is Second
+    node.become(First)
+    assert type(node) is First
+    go_on.set()
+
+
+def test_a_soul_that_another_class_has_too_does_not_begin_anew(master):
+    class Further(First):
+        def hear(self, message, channel):
+            pass
+
+    node, begun = create(master, node_class=First), []
+    node.delegate = node.hear
+    node.fork(First.turn)
+    node.fork(lambda me: begun.append(1) or [None for _ in me.every(0.001)])
+    until(lambda: begun)
+    node.become(Further)
+    assert node.delegate.__func__ is Further.hear
+    assert not any(soul.is_asked for soul in node.latest_run.souls.forked)
+
+
 def test_a_delegate_has_its_node_become_another(master):
     class Turns(First):
         def hear(self, message, channel):

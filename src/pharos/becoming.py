@@ -1,4 +1,5 @@
 """How a node becomes one of another class while it runs."""
+import functools
 from typing import TYPE_CHECKING, Any, Callable, Iterator, List, NamedTuple, Sequence, Tuple
 
 from pharos.blocks import BlockOf, check_block
@@ -15,7 +16,7 @@ class Place(NamedTuple):
 
     kind: str  # such as 'delegate'
     of: str  # what that is of
-    given: BlockOf
+    block: BlockOf
     parameters: Sequence[str]  # that it is called with
     take: Callable[[Any], Any]  # takes what it becomes
 
@@ -41,7 +42,7 @@ def _change(node: 'Node', node_class: type) -> None:
     for take, block in changes:
         take(block)
     for soul, block in before:
-        if soul.block_of(node) is not block:
+        if soul.block_of(node) != block:
             soul.is_asked = True
 
 
@@ -49,10 +50,10 @@ def _changes(node: 'Node', node_class: type) -> List[Tuple[Callable[[Any], Any],
     """Who is to take which block, all of them looked up, and checked."""
     changes, gone = [], []
     for place in places(node):
-        block = place.given.as_of(node_class)
+        block = place.block.as_of(node_class)
         if block is None:
-            gone.append(f'{place.given.method}, the {place.kind} of {place.of}')
-        elif place.given.method is not None:
+            gone.append(f'{place.block.method}, the {place.kind} of {place.of}')
+        elif place.block.method is not None:
             changes.append((place.take, check_block(block, place.kind, place.parameters)))
     if gone:
         raise PharosError(
@@ -69,8 +70,8 @@ def places(node: 'Node') -> Iterator[Place]:
         attribute = kind.split()[-1]
         block = getattr(holder, attribute)
         if block is not None:
-            given = BlockOf(node, block)
-            yield Place(kind, of, given, parameters, lambda new: setattr(holder, attribute, new))
+            take = functools.partial(setattr, holder, attribute)
+            yield Place(kind, of, BlockOf(node, block), parameters, take)
 
     yield from held(node, 'delegate', node.name, 'message', 'channel')
     yield from held(node, 'soul', node.name, 'node')

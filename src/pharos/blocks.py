@@ -99,7 +99,7 @@ class BlockOf:
     name of the class that the node has by now."""
 
     def __init__(self, node: Any, block: Any) -> None:
-        self._node, self._block = node, block
+        self._node, self.given = node, block
         #: the name of the method; None: it is none of the class
         self.method = _method_name(node, block)
 
@@ -107,14 +107,14 @@ class BlockOf:
     def now(self) -> Any:
         """The block; the one that was given where the class has no such method any more."""
         block = self.as_of(type(self._node))
-        return self._block if block is None else block
+        return self.given if block is None else block
 
     def as_of(self, node_class: type) -> Any:
         """What it is when the node has that class; None where that has no such method."""
         if self.method is None:
-            return self._block
+            return self.given
         value = inspect.getattr_static(node_class, self.method, None)
-        is_bound = inspect.ismethod(self._block) and self._block.__self__ is self._node
+        is_bound = inspect.ismethod(self.given) and self.given.__self__ is self._node
         bind = getattr(type(value), '__get__', None)
         return bind(value, self._node if is_bound else None, node_class) if bind else value
 

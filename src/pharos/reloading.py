@@ -26,6 +26,7 @@ def follow() -> None:
 def _look_up_methods(*cell: Any) -> None:
     for node in node_registry.nodes():
         for place in places(node):
-            if place.given.method is not None:
+            block = place.block.now
+            if place.block.method is not None and block != place.block.given:
                 # what cannot be called as it was is told when it is called
-                attempt(functools.partial(place.take, place.given.now))
+                attempt(functools.partial(place.take, block))
