@@ -1,6 +1,4 @@
 """A plain rospy node that publishes strings: publishes.py TOPIC RATE [SIZE]; it prints when it does."""
-import sys
-
 import rospy
 from std_msgs.msg import String
 

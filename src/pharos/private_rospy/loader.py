@@ -31,9 +31,10 @@ _TWINS: Dict[str, Dict[str, Any]] = {
     'pkgutil': {},
     'typing': {},
 }
-# Packages that do with the process's copies of Python's modules: their own would slow the start of
-# each node down.
-_WITHOUT_OWN = 'rospy', 'rosgraph', 'logging'
+# Modules of Python's of which a node's program has its own, and rospy does with the process's: those
+# would slow the start of each node down.
+_OWN_OF_PROGRAMS = 'pickle', 'traceback'
+_ROSPYS = 'rospy', 'rosgraph', 'logging'
 # file -> (its time of modification, code), the same for all sets
 _codes: Dict[str, Tuple[Any, Any]] = {}
 
@@ -210,7 +211,7 @@ class PrivateImports:
             absolute = importlib.util.resolve_name('.' * level + name, globals['__package__'])
         top = absolute.partition('.')[0]
         user = (globals or {}).get('__name__', '').partition('.')[0]
-        if top in ownership.OWN_OF_PYTHONS and user in _WITHOUT_OWN:
+        if top in _OWN_OF_PROGRAMS and user in _ROSPYS:
             return builtins.__import__(name, globals, locals, fromlist, level)
         module = self.load(absolute)
         if not fromlist:
