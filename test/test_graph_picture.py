@@ -123,8 +123,8 @@ def small(master):
         yield cpp
 
 
-def test_nodes_of_a_process_are_in_one_frame_and_a_topic_where_all_its_users_are(master, small):
-    create(master, '/picture_three').output_channel('/picture_own', STRING)
+def test_nodes_of_a_process_are_in_one_frame_and_a_topic_where_its_publishers_are(master, small):
+    create(master, '/picture_three').interested_in('/picture_own', STRING)
     graph = master.graph()
     assert isinstance(graph, Graph)
     own, other = f'process {os.getpid()}', f'process {small.pid}'
@@ -134,7 +134,7 @@ def test_nodes_of_a_process_are_in_one_frame_and_a_topic_where_all_its_users_are
         'node /picture_three': [own],
         'node /picture_cpp': [other],
         'topic /picture_own': [own],
-        'topic /picture_a': [],
+        'topic /picture_a': [own],
     }
 
 
@@ -201,17 +201,19 @@ def test_a_dead_node_is_shown_as_such_and_can_be_hidden(master):
 def test_hosts_are_frames_where_there_are_several():
     graph = Graph(
         seen(
-            node_of('/a', ['/t'], host='robot', pid=1),
-            node_of('/b', ['/u'], ['/t'], host='robot', pid=2),
-            node_of('/c', [], ['/u'], host='laptop', pid=1),
+            node_of('/a', ['/t', '/v'], host='robot', pid=1),
+            node_of('/b', ['/u', '/v', '/w'], ['/t'], host='robot', pid=2),
+            node_of('/c', ['/w'], ['/u'], host='laptop', pid=1),
         )
     )
     assert frames(graph) == {
         'node /a': ['host robot', 'process 1'],
         'node /b': ['host robot', 'process 2'],
         'node /c': ['host laptop', 'process 1'],
-        'topic /t': ['host robot'],
-        'topic /u': [],
+        'topic /t': ['host robot', 'process 1'],
+        'topic /u': ['host robot', 'process 2'],
+        'topic /v': ['host robot'],
+        'topic /w': [],
     }
 
 
@@ -371,6 +373,8 @@ def test_without_graphviz_it_says_what_to_install_and_dot_works(tmp_path, monkey
         graph.save(tmp_path / 'graph.svg')
     graph.save(tmp_path / 'graph.dot')
     assert not (tmp_path / 'graph.svg').exists()
+    said = xml.etree.ElementTree.fromstring(graph._repr_svg_())  # in Jupyter
+    assert 'apt-get install graphviz' in ''.join(said.itertext())
 
 
 def test_a_graph_that_graphviz_cannot_read_is_an_error_of_ours():

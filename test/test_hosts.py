@@ -525,3 +525,34 @@ def test_a_publisher_that_refuses_is_asked_once(master, impatient, stranger):
     assert asked.acquire(blocking=False)
     assert not threads('reconnect')
     assert not asked.acquire(blocking=False)
+
+
+# -- a look at all of them
+
+LOOKING = '''
+import sys, time
+from pharos import Master
+from pharos.live import snapshot
+
+master = Master().wait(20)
+for name in sys.argv[1:]:
+    master.wait_for_node(name, 20)
+seen = snapshot.take(master)
+print('hosts', [(host.name, host.is_here, [process.nodes for process in host.processes]) for host in seen.hosts])
+print('states', {name: node.state for name, node in seen.nodes.items()})
+print('seconds', round(time.time() - seen.time))
+'''
+
+
+def test_a_look_at_the_graph_tells_hosts_apart_and_waits_for_none_that_is_gone(one, two, programs):
+    programs(one.python(one, PHAROS)).wait_for('ready')
+    programs(two.start(one, relay(), '/looked_at', '__name:=roscpp'))
+    looking = programs(one.python(one, LOOKING, '/pharos', '/roscpp'))
+    hosts = [(socket.gethostname(), True, [['/pharos']]), (two.address, False, [['/roscpp']])]
+    assert looking.wait_for('hosts') == f'hosts {hosts}\n'
+    assert looking.wait_for('states') == "states {'/pharos': 'alive', '/roscpp': 'alive'}\n"
+    with cut(two):
+        looking = programs(one.python(one, LOOKING))
+        assert looking.wait_for('hosts') == f'hosts {hosts}\n'
+        assert looking.wait_for('states') == "states {'/pharos': 'alive', '/roscpp': 'silent'}\n"
+        assert looking.wait_for('seconds') in ('seconds 1\n', 'seconds 2\n')

@@ -1,5 +1,6 @@
 """A graph in graphviz's language."""
 import collections
+import os.path
 import re
 import time
 from typing import TYPE_CHECKING, Dict, Iterable, Iterator, List, Optional, Set, Tuple
@@ -151,13 +152,28 @@ def _said_of(edge: Edge, transport: str) -> str:
     return f'{edge.start} {edge.kind} {edge.end}{means}'
 
 
+def sorry(text: str) -> str:
+    """A picture, as SVG, that says why there is no other."""
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{8 * len(text) + 20}" height="30">'
+        f'<text x="10" y="20" font-family="{FONT}" font-size="14">{escape(text)}</text></svg>'
+    )
+
+
 # -- frames
+
+
+def _namespaces(name: str) -> Tuple[str, ...]:
+    """The namespaces that a name is in, from the outermost: ('/robot', '/robot/arm')."""
+    parts = name.split('/')[1:-1]
+    return tuple('/' + '/'.join(parts[: depth + 1]) for depth in range(len(parts)))
 
 
 class _Frames:
     """The frames of a graph, each with what is in it alone.
 
-    A topic is in a frame if all who use it are.
+    A topic is in that of its publishers, if they have one in common: what leaves a process crosses
+    its frame. One that nobody publishes is in that of its subscribers.
     """
 
     def __init__(self, graph: 'Graph') -> None:
@@ -173,11 +189,10 @@ class _Frames:
         for name, node in graph.nodes.items():
             self._lines[self._paths.get(name, ())].append(_node_line(node))
         for topic in graph.topics.values():
-            users = {*topic.publishers, *topic.subscribers} & {*graph.nodes}
-            line = _topic_line(topic, graph.rates.get(topic.name))
-            self._lines[self._common(users)].append(line)
+            path = self._place(topic.name, topic.publishers, topic.subscribers)
+            self._lines[path].append(_topic_line(topic, graph.rates.get(topic.name)))
         for service in graph.services.values():
-            path = self._common({*service.providers} & {*graph.nodes})
+            path = self._place(service.name, service.providers)
             self._lines[path].append(_service_line(service.name))
 
     def _frame_processes(self) -> None:
@@ -196,23 +211,23 @@ class _Frames:
 
     def _frame_namespaces(self) -> None:
         for name in self._graph.nodes:
-            parts = name.split('/')[1:-1]
-            self._paths[name] = tuple(
-                '/' + '/'.join(parts[: depth + 1]) for depth in range(len(parts))
-            )
-            for depth in range(len(parts)):
-                path = self._paths[name][: depth + 1]
-                self._labels[path] = path[-1]
+            self._paths[name] = _namespaces(name)
+            for depth, namespace in enumerate(self._paths[name], 1):
+                self._labels[self._paths[name][:depth]] = namespace
 
-    def _common(self, nodes: Set[str]) -> Tuple[str, ...]:
-        """The innermost frame in which all of the nodes are."""
-        paths = [self._paths.get(name, ()) for name in nodes]
-        common = []
-        for frames in zip(*paths):
-            if len({*frames}) > 1:
-                break
-            common.append(frames[0])
-        return tuple(common)
+    def _place(self, name: str, *users: List[str]) -> Tuple[str, ...]:
+        """The innermost frame in which all of its first users are that the graph has; where frames
+        are namespaces, the name says it."""
+        if self._graph.group == 'namespace':
+            path = _namespaces(name)
+            return next(path[:end] for end in range(len(path), -1, -1) if path[:end] in self._known)
+        first = next(filter(None, ({*nodes} & {*self._graph.nodes} for nodes in users)))
+        paths = [self._paths.get(node, ()) for node in first]
+        return tuple(os.path.commonprefix(paths))
+
+    @property
+    def _known(self) -> Set[Tuple[str, ...]]:
+        return {(), *self._labels}
 
     def lines(self, path: Tuple[str, ...] = ()) -> Iterator[str]:
         """The text of a frame's inside."""

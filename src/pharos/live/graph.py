@@ -7,10 +7,10 @@ from typing import Any, Collection, Dict, Iterable, Iterator, List, Set, Tuple, 
 
 import rosgraph.names
 
-from pharos.errors import suggest
+from pharos.errors import PharosError, suggest
 from pharos.live import graphviz, snapshot
 from pharos.live.answers import ALIVE
-from pharos.live.dot import dot_of
+from pharos.live.dot import dot_of, sorry
 from pharos.live.edges import HEARS, OFFERS, PUBLISHES, SENDS, Edge
 from pharos.live.graph_text import text_of
 from pharos.live.snapshot import Host, Process, SeenNode, SeenService, SeenTopic, Snapshot
@@ -178,8 +178,11 @@ class Graph:
         graphviz.save(self.dot(), path)
 
     def _repr_svg_(self) -> str:
-        """The picture in Jupyter."""
-        return graphviz.render(self.dot(), 'svg').decode()
+        """The picture in Jupyter, or why there is none."""
+        try:
+            return graphviz.render(self.dot(), 'svg').decode()
+        except PharosError as error:
+            return sorry(str(error))
 
     def is_like(self, other: 'Graph') -> bool:
         """Whether its picture says the same as another's, rates and what is counted aside."""
