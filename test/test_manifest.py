@@ -19,6 +19,7 @@ KEYS = {
     'pexpect': 'python3-pexpect',
     'psutil': 'python3-psutil',
     'pytest': 'python3-pytest',
+    'rich': 'python3-rich',
     'rospkg': 'python3-rospkg',
     'tkinter': 'python3-tk',
     'yaml': 'python3-yaml',

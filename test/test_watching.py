@@ -3,6 +3,7 @@ import contextlib
 import re
 import signal
 import sys
+import threading
 
 import pexpect
 import pytest
@@ -281,3 +282,24 @@ def test_long_arrays_are_cut():
     assert '  - ... 100 in all' in cloud
     assert text_of(Point(1, 2, 3)) == 'x: 1\ny: 2\nz: 3'
     assert text_of(Polygon()) == 'points: []'
+
+
+def test_a_soul_that_watches_ends_though_its_node_stopped_between_two_messages(master):
+    came, go_on = threading.Event(), threading.Event()
+
+    def block(message):
+        came.set()
+        go_on.wait(TIMEOUT)
+
+    def soul(me):
+        me.master.topic('/watched').watch(None, block)
+
+    with publishing_apart(master, '/watched'):
+        node = create(master, soul=soul)
+        thread = node.fork()
+        assert came.wait(TIMEOUT)
+        stop = in_thread(node.stop)
+        until(lambda: not node.is_running)
+        go_on.set()
+        assert ended(stop) and ended(thread)
+    assert not master.local_nodes()

@@ -1,7 +1,7 @@
 """How a node is doing: see :meth:`Node.health`."""
 import collections
 import time
-from typing import TYPE_CHECKING, Dict, Iterator, NamedTuple, Optional
+from typing import TYPE_CHECKING, Any, Counter, Dict, Iterator, NamedTuple, Optional
 
 import rosgraph
 
@@ -10,6 +10,8 @@ from pharos.watcher import watcher_of
 
 if TYPE_CHECKING:
     from pharos.node import Node
+
+LARGEST = 2**31 - 1  # number that XML-RPC has
 
 
 class Health(NamedTuple):
@@ -70,3 +72,22 @@ def _is_registered(node: 'Node') -> Optional[bool]:
         return False
     except MasterUnreachableError:
         return None
+
+
+def told(node: 'Node') -> Dict[str, Any]:
+    """What a node tells other processes: its ``class``, how many ``threads``, ``souls`` and
+    ``failures`` it has, and how many messages its channels have ``dropped``, by topic.
+
+    It is counted in any case, and put together when somebody asks.
+    """
+    dropped: Counter[str] = collections.Counter()
+    for channel in node.channels:
+        dropped[channel.topic] += getattr(channel, 'dropped', 0)
+    run = node.latest_run
+    return {
+        'class': type(node).__name__,
+        'threads': run.rospy.thread_count,
+        'souls': len(run.souls.forked),
+        'failures': min(node.errors.total, LARGEST),
+        'dropped': {topic: min(count, LARGEST) for topic, count in dropped.items() if count},
+    }

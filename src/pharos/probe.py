@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Any, Callable, Deque, Dict, Optional
 
 import genpy
 
-from pharos import signals
+from pharos import node_registry, signals
 from pharos.channel import InputChannel
 from pharos.errors import NodeStoppedError
 from pharos.intraprocess.inbox import Inbox
 from pharos.private_rospy import changes
+from pharos.private_rospy.lifetime import Interruption
 
 if TYPE_CHECKING:
     from pharos.node import Node
@@ -20,23 +21,43 @@ KEPT = 1000  # messages that wait for a thread that is slower than they come
 QUEUE_SIZE = 100  # messages of nodes of this process that wait to be weighed
 
 
-def wait(node: 'Node', predicate: Callable[[], Any], timeout: float) -> bool:
-    """Wait until ``predicate()`` holds, which is looked at when a :class:`Listener` hears a
-    message; returns whether it does.
+class Look:
+    """One look, of one thread: its waits end when the node stops on whose behalf the thread runs,
+    also where that begins between two of them."""
 
-    :param node: the one that looks
-    :param timeout: seconds
-    :raises NodeStoppedError: if that node stops meanwhile, as Ctrl-C has it where this is no
-        prompt, or the one on whose behalf this thread runs
-    """
-    deadline = time.monotonic() + timeout
-    with signals.interruptible_wait():
-        node.latest_run.rospy.wait_until(predicate, timeout)
-    if predicate():
-        return True
-    if time.monotonic() < deadline:
-        raise NodeStoppedError(f'the nodes of {node.name} stop: nothing is watched any more')
-    return False
+    def __init__(self) -> None:
+        self._stop = Interruption()
+
+    def pause(self, seconds: float) -> None:
+        """Wait; at a prompt, Ctrl-C ends the wait.
+
+        :raises NodeStoppedError: if the thread's node stops
+        """
+        deadline = time.monotonic() + seconds
+        with signals.interruptible_wait():
+            node_registry.wait_until(lambda: self._stop.came, seconds)
+        self._check_time_is_up(deadline)
+
+    def wait(self, node: 'Node', predicate: Callable[[], Any], timeout: float) -> bool:
+        """Wait until ``predicate()`` holds, which is looked at when a :class:`Listener` hears a
+        message; returns whether it does.
+
+        :param node: the one that looks
+        :param timeout: seconds
+        :raises NodeStoppedError: if that node stops meanwhile, as Ctrl-C has it where this is no
+            prompt, or the thread's
+        """
+        deadline = time.monotonic() + timeout
+        with signals.interruptible_wait():
+            node.latest_run.rospy.wait_until(lambda: self._stop.came or predicate(), timeout)
+        if predicate():
+            return True
+        self._check_time_is_up(deadline)
+        return False
+
+    def _check_time_is_up(self, deadline: float) -> None:
+        if self._stop.came or time.monotonic() < deadline:
+            raise NodeStoppedError('the nodes of this thread stop: nothing is watched any more')
 
 
 class Listener:

@@ -10,6 +10,7 @@ from pharos.blocks import attempt, name_of
 from pharos.channel import InputChannel
 from pharos.errors import MessageTypeError, NodeStoppedError
 from pharos.external_node import ExternalNode
+from pharos.health import told
 from pharos.intraprocess.dispatcher import Dispatcher
 from pharos.intraprocess.fanout import Latch
 from pharos.lifecycle import Lifecycle
@@ -65,6 +66,7 @@ class Run:
         self.rospy.on_received = self.dispatcher.run
         self.rospy.on_failure = self._hook_failed
         self.rospy.refusals.on_refused = self._report_refusal
+        self.rospy.tell_health = lambda: told(node)
 
     # -- start and stop
 

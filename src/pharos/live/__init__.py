@@ -10,6 +10,7 @@
   draws it; graph_text: for a terminal
 - pictures: messages of which a picture says more; images, top_view: how they are drawn
 - plot: InputChannel.plot
+- top, top_table, top_screen: rosrun pharos top; terminal: its keys and signals; probing: --measure
 
 It stands on the facade.
 """

@@ -4,15 +4,15 @@ import os
 import time
 from typing import Any, Dict, Iterator, List, Optional, Tuple, Union
 
-from pharos import node_registry, signals
 from pharos.blocks import text_of
 from pharos.channel import InputChannel
-from pharos.errors import NodeStoppedError, PharosError
+from pharos.errors import PharosError
 from pharos.external_node import ExternalNode
 from pharos.live.answers import ALIVE, Answer, ask_all
 from pharos.live.watching import number_text
 from pharos.node import Node
 from pharos.output_channel import OutputChannel
+from pharos.probe import Look
 
 TIMEOUT = 2.0  # seconds that a node has to answer
 WIDTH = 70  # characters of a parameter's value that are shown
@@ -29,7 +29,7 @@ class Description(str):
 
 
 @dataclasses.dataclass
-class _Look:
+class _Account:
     """What a node says at a time."""
 
     answer: Answer
@@ -43,40 +43,31 @@ class _Look:
 def describe(node: AnyNode, seconds: float) -> Description:
     """The description of a node; where there are connections, rates are counted for so many
     seconds."""
-    before = _look(node)
+    look = Look()
+    before = _account_of(node)
     if seconds and before.answer.ends:
-        _wait(node, seconds)
-        return Description('\n'.join(_lines(node, before, _look(node))))
+        look.pause(seconds)
+        return Description('\n'.join(_lines(node, before, _account_of(node))))
     return Description('\n'.join(_lines(node, None, before)))
 
 
-def _wait(node: AnyNode, seconds: float) -> None:
-    deadline = time.monotonic() + seconds
-    with signals.interruptible_wait():
-        node_registry.wait_until(
-            lambda: isinstance(node, Node) and not node.is_running, timeout=seconds
-        )
-    if time.monotonic() < deadline:
-        raise NodeStoppedError(f'nodes stopped while {node.name} was to be described')
-
-
-def _look(node: AnyNode) -> _Look:
+def _account_of(node: AnyNode) -> _Account:
     own = {node.name: node} if isinstance(node, Node) else {}
     answer = ask_all({node.name: node.uri}, own, TIMEOUT, counts=True)[node.name]
-    look = _Look(answer, time.monotonic(), {}, {})
-    for end in sorted(answer.ends or ()):
+    now = _Account(answer, time.monotonic(), {}, {})
+    for end in sorted(answer.ends or (), key=lambda end: end[:4]):
         key = end.is_inbound, end.topic
         peer = f"{'from' if end.is_inbound else 'to'} {_name_of(end.other, node)}"
-        look.peers.setdefault(key, []).append(f'{peer} by {end.transport}')
+        now.peers.setdefault(key, []).append(f'{peer} by {end.transport}')
         count = end.counts.get('received' if end.is_inbound else 'sent')
         if count is not None:
-            former = look.counts.get(key, 0)
+            former = now.counts.get(key, 0)
             # each subscriber gets a copy of what is sent, and each publisher sends something else
-            look.counts[key] = former + count if end.is_inbound else max(former, count)
+            now.counts[key] = former + count if end.is_inbound else max(former, count)
     for channel in _channels(node):
         if isinstance(channel, OutputChannel):
-            look.counts[False, channel.topic] = channel.sent
-    return look
+            now.counts[False, channel.topic] = channel.sent
+    return now
 
 
 def _name_of(other: str, node: AnyNode) -> str:
@@ -96,15 +87,15 @@ def _name_of(other: str, node: AnyNode) -> str:
     return other
 
 
-def _lines(node: AnyNode, before: Optional[_Look], look: _Look) -> Iterator[str]:
+def _lines(node: AnyNode, before: Optional[_Account], now: _Account) -> Iterator[str]:
     own = node if isinstance(node, Node) else None
-    yield from _own_head(own) if own else _head(node, look.answer)
+    yield from _own_head(own) if own else _head(node, now.answer)
     for title, is_heard, types in _topics(node):
         yield from _section(
             title,
-            [_topic_line(own, is_heard, topic, types[topic], before, look) for topic in types],
+            [_topic_line(own, is_heard, topic, types[topic], before, now) for topic in types],
         )
-    yield from _section('offers', _services(node, look.answer.state == ALIVE))
+    yield from _section('offers', _services(node, now.answer.state == ALIVE))
     yield from _section('parameters', list(_parameters(node)))
     if own:
         yield from _section('failures', [repr(failure) for failure in own.failures])
@@ -154,19 +145,19 @@ def _topic_line(
     is_heard: bool,
     topic: str,
     type_: Optional[str],
-    before: Optional[_Look],
-    look: _Look,
+    before: Optional[_Account],
+    now: _Account,
 ) -> str:
     """What there is to say of a topic of a node."""
     key = is_heard, topic
     parts = [_typed(topic, type_)]
-    if before is not None and key in look.counts:
-        count = look.counts[key] - before.counts.get(key, 0)
-        parts.append(f'{number_text(max(0, count) / (look.time - before.time))} Hz')
+    if before is not None and key in now.counts:
+        count = now.counts[key] - before.counts.get(key, 0)
+        parts.append(f'{number_text(max(0, count) / (now.time - before.time))} Hz')
     for channel in _channels(own) if own else ():
         if channel.topic == topic and isinstance(channel, InputChannel) == is_heard:
             parts.append(_channel_text(channel))
-    parts.append(', '.join(look.peers.get(key, ['not connected'])))
+    parts.append(', '.join(now.peers.get(key, ['not connected'])))
     return ', '.join(parts)
 
 

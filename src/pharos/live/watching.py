@@ -17,7 +17,7 @@ from pharos.errors import NodeStoppedError, UnknownTopicError, suggest
 from pharos.live.message_text import text_of
 from pharos.master import Master
 from pharos.node import BlockNode
-from pharos.probe import Listener, Probe, wait
+from pharos.probe import Listener, Look, Probe
 from pharos.seconds import LONGEST, check_seconds
 from pharos.topic import Topic
 from pharos.transcript import Transcript
@@ -153,11 +153,11 @@ def messages_of(
     if count is not None and (type(count) is not int or count < 1):
         raise ValueError(f'count is a number of messages, 1 or more, or None, not {count!r}')
     _check_published(topic)
-    listener = Listener()
+    look, listener = Look(), Listener()
     with create_looker(topic.master) as looker:
         looker.interested_in(topic.name, delegate=listener)
         for _ in itertools.count() if count is None else range(count):
-            if not wait(looker, lambda: listener.messages, timeout):
+            if not look.wait(looker, lambda: listener.messages, timeout):
                 return
             yield listener.messages.popleft()
 
@@ -170,13 +170,13 @@ def create_looker(master: Master) -> BlockNode:
 
 def _measure(topic: Topic, seconds: float, weighs: bool) -> Probe:
     """What a probe has found in so many seconds, from when the publishers were connected."""
-    seconds = check_seconds('seconds', seconds, above=0)
+    seconds, look = check_seconds('seconds', seconds, above=0), Look()
     _check_published(topic)
     with create_looker(topic.master) as looker:
         probe = Probe(looker, topic.name, weighs)
         probe.wait_for_publishers(looker.connect_timeout)
         probe.restart()
-        wait(looker, lambda: False, seconds)
+        look.wait(looker, lambda: False, seconds)
         probe.close()
     return probe
 

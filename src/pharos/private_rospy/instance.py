@@ -37,6 +37,9 @@ class PrivateRospy:
     :param allows_remote_shutdown: ``allows_remote_shutdown()``: whether any host may ask for that
     """
 
+    #: called where another process asks for the node's health; returns what XML-RPC has
+    tell_health = dict
+
     def __init__(self, settings, on_stop_request, allows_remote_shutdown):
         self.settings = settings
         self.name, self.uri, self.domain = settings.name, None, None

@@ -3,7 +3,7 @@ import contextlib
 
 from pharos.private_rospy import registration
 from pharos.private_rospy.local_link import IntraprocessHandler
-from pharos.private_rospy.patches.table import patch
+from pharos.private_rospy.patches.table import addition, patch
 from pharos.private_rospy.xmlrpc_server import caller, is_call_from_nearby
 
 STOP_TIMEOUT = 5.0  # seconds that who asks the node to stop waits for that
@@ -83,3 +83,35 @@ def shutdown(self, caller_id, msg='', *, node):
     node.request_stop(f'{caller_id} asked for it: {msg}')
     node.lifetime.silent.wait(STOP_TIMEOUT)  # whoever asked finds it gone, as with rospy
     return 1, 'shutdown', 0
+
+
+@patch(
+    'rospy.impl.masterslave',
+    'ROSHandler.getBusStats',
+    'answers with an error once more than 2 GiB have gone through a connection',
+)
+def getBusStats(self, caller_id, *, original):
+    """Count from -2 GiB on then, as roscpp does: XML-RPC has no larger numbers."""
+    code, text, stats = original(self, caller_id)
+    return code, text, _in_32_bits(stats)
+
+
+def _in_32_bits(stats):
+    if isinstance(stats, (list, tuple)):
+        return [_in_32_bits(each) for each in stats]
+    is_count = type(stats) is int
+    return (stats + 2**31) % 2**32 - 2**31 if is_count else stats
+
+
+@addition(
+    'rospy.impl.masterslave',
+    'ROSHandler.pharosHealth',
+    'has no words for what blocks failed at, and channels dropped',
+)
+def pharosHealth(self, caller_id, *, node):
+    """What other processes may know of the node's health; see :func:`pharos.health.told`.
+
+    A method more of ROS's slave API, and no service, which each node would register at its start
+    for the few that are ever watched, and which `rosservice list` would show.
+    """
+    return 1, '', node.tell_health()
