@@ -265,6 +265,13 @@ def test_what_has_been_ended_is_not_started_again(compose, how):
     assert not composed.nodes[0].is_running
 
 
+def test_one_that_is_ended_while_it_starts_again_has_not_failed(master, compose):
+    composed = compose('once.launch')
+    until(lambda: '/again' in master.parameters)
+    composed.stop()
+    assert composed.wait(TIMEOUT) == 0
+
+
 def test_a_node_that_takes_long_to_start_does_not_keep_the_others(master, compose, monkeypatch):
     monkeypatch.setattr(composition, 'PATIENCE', 0.1)
     composed = compose('hangs.launch')

@@ -78,15 +78,16 @@ class KeptNode:
             self._start()
             self.problem, self._was_started = None, True
         except Exception as error:
+            if self._ending.is_set():
+                return  # it was stopped while it started
             self.problem = error
         finally:
             self.settled.set()
         progress = self._composition.progress
         if self.problem is not None:
-            if not self._ending.is_set():
-                progress.failed(self, self.problem)
-                if self.launched.is_required:
-                    self._composition.end_because(f'{self.name}, which is required, did not start')
+            progress.failed(self, self.problem)
+            if self.launched.is_required:
+                self._composition.end_because(f'{self.name}, which is required, did not start')
         else:
             assert self.node
             if not self._ending.is_set():
