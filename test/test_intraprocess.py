@@ -388,8 +388,8 @@ def test_a_delegate_may_stop_another_node_and_its_own(master):
         first.stop()
         stopped.set()
 
-    first.interested_in('/stop', 'std_msgs/Empty', delegate=stop_both)
-    second.send_to('/stop')
+    first.interested_in('/stop_both', 'std_msgs/Empty', delegate=stop_both)
+    second.send_to('/stop_both')
     assert stopped.wait(TIMEOUT)
     assert (first.lifecycle, second.lifecycle) == (Lifecycle.STOPPED, Lifecycle.STOPPED)
 

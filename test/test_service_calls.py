@@ -436,7 +436,7 @@ def test_a_block_elsewhere_that_does_not_return_is_given_up_and_its_late_answer_
     with nothing_left(service):
         for number in range(3):
             with pytest.raises(pharos.ServiceCallError, match='/there/wait did not answer in time'):
-                service.call(load_namespace='early', timeout=0.1)
+                service.call(load_namespace='early', timeout=1.0)
             there.wait_for('called by early')
     gate.call(data=True)
     assert service.call(load_namespace='late', timeout=TIMEOUT).message == 'late'

@@ -2,6 +2,7 @@
 import os
 import signal  # noqa: F401
 import sys
+import time  # noqa: F401
 import threading  # noqa: F401
 
 from pharos import BlockNode, Master

@@ -2,11 +2,27 @@
 round left."""
 import json
 import queue
+import random
+import socket
 import sys
 import threading
 
 from counted import LIMIT, count, cpu_share, master, resident, timed
 from pharos import BlockNode
+
+
+def free_port():
+    """One that the system gives to nobody else while the node is stopped."""
+    with open('/proc/sys/net/ipv4/ip_local_port_range', encoding='ascii') as file:
+        below = int(file.read().split()[0])
+    while True:
+        port = random.randrange(10000, below)
+        try:
+            socket.create_server(('127.0.0.1', port)).close()
+            return port
+        except OSError:
+            pass  # it is taken
+
 
 rounds = int(sys.argv[1])
 received, turned = queue.SimpleQueue(), threading.Event()
@@ -14,6 +30,8 @@ node = master.create(
     BlockNode,
     named='/round',
     domain='127.0.0.1',
+    tcp_port=free_port(),
+    xmlrpc_port=free_port(),
     delegate=lambda message, channel: received.put(message.data),
 )
 ports = node.tcp_port, node.xmlrpc_port
