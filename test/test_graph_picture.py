@@ -146,6 +146,19 @@ def test_intraprocess_and_tcpros_differ_in_more_than_colour(master, small):
     assert sorted(drawn['node /picture_one', 'topic /picture_a']) == sorted([within, between])
 
 
+def test_every_transport_and_the_lack_of_one_is_drawn_in_its_own_way_and_in_the_legend():
+    transports = 'INTRAPROCESS', 'TCPROS', 'UDPROS'
+    hearers = [node_of('/' + each.lower(), [], ['/t']) for each in (*transports, 'nobody')]
+    connections = [('/t', '/a', '/' + each.lower(), each) for each in transports]
+    graph = Graph(seen(node_of('/a', ['/t']), *hearers, connections=connections))
+    drawn = [arrows(graph)['topic /t', 'node ' + node.name] for node in hearers]
+    assert len({color for ((_, color, _),) in drawn}) == 4
+    assert len({(style, width) for ((style, _, width),) in drawn}) == 4
+    legend = graph.dot().partition('label=<')[2].partition('</table>')[0]
+    assert all(each in legend for each in (*transports, 'nothing connected'))
+    assert 'UDPROS' not in Graph(seen(node_of('/a', ['/t']))).dot()
+
+
 def test_edges_say_who_sends_what_and_how(master, small):
     edges = {(edge.kind, edge.start, edge.end): edge.transports for edge in master.graph().edges}
     assert edges == {

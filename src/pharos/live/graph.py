@@ -1,5 +1,6 @@
 """The graph of a ROS master: who sends what to whom, from which process, and how; as a picture."""
 import dataclasses
+import itertools
 import os
 import re
 import time
@@ -69,6 +70,7 @@ class Graph:
         self.group = _check_choice('group', group, GROUPS)
         self.namespaces = _check_namespaces(namespace)
         hidden = {hide} if isinstance(hide, str) else set(hide)
+        connected = {each.topic for each in snapshot.connections}
         for each in hidden:
             _check_choice('hide', each, HIDEABLE)
         self.nodes: Dict[str, SeenNode] = {
@@ -83,7 +85,7 @@ class Graph:
             for name, topic in snapshot.topics.items()
             if (show_all or not _DEBUG_TOPICS.fullmatch(name))
             and {*topic.publishers, *topic.subscribers} & {*self.nodes}
-            and not _is_hidden(topic, snapshot, hidden)
+            and not _is_hidden(topic, topic.name in connected, hidden)
         }
         self.services: Dict[str, SeenService] = {
             name: service
@@ -125,11 +127,12 @@ class Graph:
         """Who sends to whom, whatever the topic."""
         sent: Dict[Tuple[str, str], Tuple[Set[str], Set[str]]] = {}
         for name, topic in self.topics.items():
-            for publisher in topic.publishers:
-                for subscriber in topic.subscribers:
-                    if publisher != subscriber and {publisher, subscriber} <= {*self.nodes}:
-                        _, topics = sent.setdefault((publisher, subscriber), (set(), set()))
-                        topics.add(name)
+            publishers = [node for node in topic.publishers if node in self.nodes]
+            subscribers = [node for node in topic.subscribers if node in self.nodes]
+            for publisher, subscriber in itertools.product(publishers, subscribers):
+                if publisher != subscriber:
+                    _, topics = sent.setdefault((publisher, subscriber), (set(), set()))
+                    topics.add(name)
         for each in self.snapshot.connections:
             if each.topic in self.topics and (each.publisher, each.subscriber) in sent:
                 sent[each.publisher, each.subscriber][0].add(each.transport)
@@ -244,13 +247,13 @@ def _is_in(name: str, namespaces: Iterable[str]) -> bool:
     return any((name + '/').startswith(namespace) for namespace in namespaces)
 
 
-def _is_hidden(topic: SeenTopic, seen: Snapshot, hidden: Collection[str]) -> bool:
+def _is_hidden(topic: SeenTopic, is_connected: bool, hidden: Collection[str]) -> bool:
     """Whether a topic is of those that are not wanted."""
     kind = (topic.type or '').rpartition('/')[2]
     return (
         ('leaf' in hidden and len({*topic.publishers, *topic.subscribers}) < 2)
         or ('unheard' in hidden and not topic.subscribers)
-        or ('idle' in hidden and topic.name not in {each.topic for each in seen.connections})
+        or ('idle' in hidden and not is_connected)
         or ('tf' in hidden and _TF.fullmatch(topic.name) is not None)
         or ('images' in hidden and kind in _IMAGES)
     )

@@ -3,7 +3,7 @@ from typing import TYPE_CHECKING, Collection, Dict, Iterator, List, Set, Tuple
 
 from pharos.live.answers import ALIVE
 from pharos.live.dot import rate_text
-from pharos.live.edges import SENDS
+from pharos.live.edges import SENDS, Edge
 
 if TYPE_CHECKING:
     from pharos.live.graph import Graph
@@ -51,13 +51,17 @@ class _Uses:
         for each in graph.snapshot.connections:
             ends = each.topic, each.publisher, each.subscriber
             self._transports.setdefault(ends, set()).add(each.transport)
+        self._sends: Dict[str, List[Edge]] = {}  # from and to each node
+        for edge in graph.edges:
+            if edge.kind == SENDS:
+                for node in edge.start, edge.end:
+                    self._sends.setdefault(node, []).append(edge)
 
     def of(self, node: str) -> Iterator[str]:
         """A line for each thing that the node sends, hears and offers."""
-        for edge in self._graph.edges:
-            if edge.kind == SENDS and node in (edge.start, edge.end):
-                arrow, peer = ('->', edge.end) if node == edge.start else ('<-', edge.start)
-                yield f'{arrow} {peer} ({_joined(edge.transports)})  {", ".join(edge.topics)}'
+        for edge in self._sends.get(node, ()):
+            arrow, peer = ('->', edge.end) if node == edge.start else ('<-', edge.start)
+            yield f'{arrow} {peer} ({_joined(edge.transports)})  {", ".join(edge.topics)}'
         for name, topic in self._graph.topics.items():
             if node in topic.publishers:
                 peers = [(name, node, subscriber) for subscriber in topic.subscribers]
