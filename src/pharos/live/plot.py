@@ -11,7 +11,7 @@ from pharos.channel import InputChannel
 from pharos.errors import PharosError
 from pharos.numeric_field import numeric_field
 from pharos.live.watching import create_looker
-from pharos.probe import wait
+from pharos.probe import Look
 from pharos.seconds import check_seconds
 
 KEPT = 100000  # messages that a plot is made of, the newest
@@ -75,7 +75,8 @@ class Plot:
 
         :raises NodeStoppedError: if the nodes stop meanwhile
         """
-        wait(self._looker, lambda: False, check_seconds('seconds', seconds, above=0))
+        seconds = check_seconds('seconds', seconds, above=0)
+        Look().wait(self._looker, lambda: False, seconds)
         return self
 
     def close(self) -> None:

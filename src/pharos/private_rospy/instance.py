@@ -4,6 +4,7 @@ import errno
 import functools
 import threading
 import time
+from typing import Any
 
 import rosgraph.network
 
@@ -38,7 +39,7 @@ class PrivateRospy:
     """
 
     #: called where another process asks for the node's health; returns what XML-RPC has
-    tell_health = dict
+    tell_health: Any = dict
 
     def __init__(self, settings, on_stop_request, allows_remote_shutdown):
         self.settings = settings
