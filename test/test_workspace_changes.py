@@ -12,9 +12,9 @@ from terminal import Terminal
 
 
 @pytest.fixture
-def poses(master):
+def poses(master, tmp_path):
     """The poses of a turtle that a simulator moves."""
-    with Program(master.url, script('turtle_simulator')):
+    with Program(master.url, script('turtle_simulator'), cwd=tmp_path):
         hearer = create(master, '/hearer')
         yield Mailbox(hearer, '/turtle1/pose', 'turtlesim/Pose')
         hearer.stop()
