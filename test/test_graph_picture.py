@@ -6,14 +6,15 @@ import re
 import stat
 import subprocess
 import sys
+import threading
 import time
 import xml.etree.ElementTree
 
 import pytest
 
 import pharos
-from helpers import create
-from pharos import Graph, Master, MasterUnreachableError, PharosError
+from helpers import create, ended
+from pharos import Graph, Master, MasterUnreachableError, NodeStoppedError, PharosError
 from pharos.live import graphviz
 from pharos.live.snapshot import (
     ALIVE,
@@ -193,6 +194,24 @@ def test_rates_are_counted_where_they_are_asked_for(master, small):
     assert 30 < graph.rates['/picture_a'] < 120
     assert ' Hz' in graph.dot() and ' Hz' in graph.text()
     assert master.graph().rates == {}
+
+
+def test_counting_ends_with_the_node_whose_soul_counts(master):
+    node = create(master, '/picture_one')
+    ends, began = [], threading.Event()
+
+    def count(me):
+        began.set()
+        try:
+            me.master.graph(rates=1000)
+        except NodeStoppedError as error:
+            ends.append(error)
+            raise
+
+    thread = node.fork(count)
+    assert began.wait(TIMEOUT)
+    node.stop()
+    assert ended(thread) and ends
 
 
 def test_a_dead_node_is_shown_as_such_and_can_be_hidden(master):

@@ -138,6 +138,7 @@ class MasterCalls:
         :param group: what the frames are: 'process' (and hosts around them, where there are
             several), 'namespace' or 'none'
         :raises MasterUnreachableError: if the master does not answer
+        :raises NodeStoppedError: if the node on whose behalf this thread counts stops meanwhile
         :raises TypeError, ValueError: if a choice is none of these
         """
         graph: 'Graph' = importlib.import_module('pharos.live.graph').look(

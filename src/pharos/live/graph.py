@@ -3,7 +3,6 @@ import dataclasses
 import itertools
 import os
 import re
-import time
 from typing import Any, Collection, Dict, Iterable, Iterator, List, Set, Tuple, Union
 
 import rosgraph.names
@@ -16,6 +15,7 @@ from pharos.live.edges import HEARS, OFFERS, PUBLISHES, SENDS, Edge
 from pharos.live.graph_text import text_of
 from pharos.live.snapshot import Host, Process, SeenNode, SeenService, SeenTopic, Snapshot
 from pharos.master import Master
+from pharos.probe import Look
 from pharos.seconds import check_seconds
 
 GROUPS = 'process', 'namespace', 'none'
@@ -222,7 +222,7 @@ def look(master: Master, rates: float = 0, **options: Any) -> Graph:
         return Graph(snapshot.take(master), **options)
     before = snapshot.take(master, counts=True)
     Graph(before, **options)  # complains of an option before all the time is spent
-    time.sleep(rates)
+    Look().pause(rates)
     after = snapshot.take(master, counts=True)
     return Graph(after, snapshot.rates(before, after), **options)
 

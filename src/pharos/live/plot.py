@@ -9,8 +9,8 @@ import genpy
 
 from pharos.channel import InputChannel
 from pharos.errors import PharosError
-from pharos.numeric_field import numeric_field
 from pharos.live.watching import create_looker
+from pharos.numeric_field import numeric_field
 from pharos.probe import Look
 from pharos.seconds import check_seconds
 
@@ -73,7 +73,7 @@ class Plot:
     def wait(self, seconds: float) -> 'Plot':
         """Collect for so many seconds more; returns this plot.
 
-        :raises NodeStoppedError: if the nodes stop meanwhile
+        :raises NodeStoppedError: if the nodes stop meanwhile, or the one whose thread this is
         """
         seconds = check_seconds('seconds', seconds, above=0)
         Look().wait(self._looker, lambda: False, seconds)
