@@ -178,6 +178,65 @@ def test_what_a_script_node_prints_comes_above_the_line(master, open_session, tm
     terminal.wait_for(r'^script says hello\n(.*\n)*In \[2\]: half\Z')
 
 
+# -- completion and ?
+
+
+def complete(terminal, typed, completed):
+    """Type, press Tab, and wait for the line that comes of it; then give that up."""
+    terminal.type(typed)
+    terminal.press('Tab')
+    terminal.wait_for(rf'^In \[\d+\]: {re.escape(completed)}')
+    terminal.press('C-c', 'C-c')  # the first may only end the choice between several words
+
+
+def test_tab_completes_names_of_the_graph_fields_and_types(master, open_session):
+    turtle = create(master, '/turtle_of_tab')
+    turtle.interested_in('/turtle1/cmd_vel', 'geometry_msgs/Twist')
+    turtle.serve('/clear_of_tab', 'std_srvs/Empty', lambda request: None)
+    terminal = open_session()
+    complete(terminal, "master.node('/tur", "master.node('/turtle_of_tab")
+    complete(terminal, "me.send_to('/turtle1/", "me.send_to('/turtle1/cmd_vel")
+    complete(
+        terminal, "me.send_to('/turtle1/cmd_vel', lin", "me.send_to('/turtle1/cmd_vel', linear="
+    )
+    complete(terminal, "master.lookup_service('/cl", "master.lookup_service('/clear_of_tab")
+    complete(
+        terminal, "message_class('geometry_msgs/Quat", "message_class('geometry_msgs/Quaternion"
+    )
+    complete(terminal, 'master.wait_for_n', 'master.wait_for_node')
+
+
+def test_tab_completes_fields_in_a_later_line_of_a_call(master, open_session):
+    create(master, '/turtle_of_tab').interested_in('/turtle1/cmd_vel', 'geometry_msgs/Twist')
+    terminal = open_session()
+    terminal.enter("me.send_to('/turtle1/cmd_vel',")
+    terminal.wait_for(r'^ +\.\.\.: $|^ +\.\.\.:')
+    terminal.type('ang')
+    terminal.press('Tab')
+    terminal.wait_for(r'^ +\.\.\.: +angular=')
+
+
+def test_tab_at_a_master_that_has_gone_completes_nothing_and_says_nothing(
+    mortal_master, open_session
+):
+    terminal = open_session(url=mortal_master.url)
+    mortal_master.end()
+    terminal.type("master.node('/work")
+    terminal.press('Tab')
+    terminal.type('space')
+    terminal.wait_for(r"^In \[1\]: master.node\('/workspace\Z")
+
+
+def test_a_question_mark_tells_of_a_topic_and_two_what_it_is_beside(master, open_session):
+    create(master, '/turtle').interested_in('/turtle1/cmd_vel', 'geometry_msgs/Twist')
+    terminal = open_session()
+    terminal.enter('topic = master.topic("/turtle1/cmd_vel")', 'topic?')
+    terminal.wait_for(r'^/turtle1/cmd_vel \[geometry_msgs/Twist\]\n  fields\n    linear: ')
+    assert 'heard by /turtle' in terminal.text
+    terminal.enter('topic??')
+    terminal.wait_for('class Topic:')
+
+
 # -- Ctrl-C, the ends
 
 LINES = [

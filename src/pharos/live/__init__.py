@@ -11,6 +11,7 @@
 - pictures: messages of which a picture says more; images, top_view: how they are drawn
 - plot: InputChannel.plot
 - top, top_table, top_screen: rosrun pharos top; terminal: its keys and signals; probing: --measure
+- completion, explanation, notebook: what completes, explains and shows things there
 
 It stands on the facade.
 """

@@ -20,25 +20,25 @@ class _Text:
 def text_of(message: genpy.Message) -> str:
     """A message as ``rostopic echo`` prints it, but for long arrays: the first values, and how many
     there are."""
-    return str(genpy.message.strify_message(_cut(message)))
+    return str(genpy.message.strify_message(cut(message)))
 
 
-def _cut(value: Any) -> Any:
-    """The value, with long arrays cut."""
+def cut(value: Any) -> Any:
+    """A message, or a value of a field, with long arrays cut."""
     if isinstance(value, genpy.Message):
         copy = object.__new__(type(value))
         for name in value.__slots__:
-            setattr(copy, name, _cut(getattr(value, name)))
+            setattr(copy, name, cut(getattr(value, name)))
         return copy
     if not isinstance(value, (list, tuple, bytes)):
         return value
     if len(value) > LONGEST:
         return _shortened(value)
-    return value if isinstance(value, bytes) else [_cut(each) for each in value]
+    return value if isinstance(value, bytes) else [cut(each) for each in value]
 
 
 def _shortened(values: Any) -> Any:
-    first = [_cut(each) for each in values[:FIRST]]
+    first = [cut(each) for each in values[:FIRST]]
     rest = f'... {len(values)} in all'
     if isinstance(values[0], (genpy.Message, genpy.TVal)):
         return [*first, _Text(rest)]

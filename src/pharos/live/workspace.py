@@ -1,19 +1,22 @@
 """The workspace: a session in which robots are programmed while they run.
 
-``rosrun pharos workspace`` is :func:`run`. What it is made of can be had from any program, too:
-:class:`Workspace`, and :func:`namespace`.
+``rosrun pharos workspace`` is :func:`run`; a notebook has one by :func:`start`, or by
+``%load_ext pharos.live.workspace``. What it is made of can be had from any program, too:
+:class:`Workspace`, :func:`namespace`, and what completes and explains (:mod:`pharos.live.completion`,
+:mod:`pharos.live.explanation`, :mod:`pharos.live.notebook`).
 """
 import itertools
 import os
 import signal
 import sys
-from typing import Any, Dict, List, Optional, Sequence
+from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple
 
 from rosgraph.rosenv import ROS_MASTER_URI
 
 import pharos
 from pharos import node_registry, signals
 from pharos.errors import PharosError
+from pharos.live import completion, explanation, notebook
 from pharos.master import Master
 from pharos.node import BlockNode
 from pharos.signals import is_from_signal
@@ -108,6 +111,57 @@ def free_name(master: Master, name: str) -> str:
     return next(each for each in names if master.live_node(each) is None)
 
 
+def equip(shell: Any, workspace: Workspace) -> Callable[[], None]:
+    """Give a session of IPython's the names of a workspace, and have it complete, explain and show
+    the things of a graph; returns a function that ends that."""
+    shell.push(workspace.namespace, interactive=False)
+    ends = [room.equip(shell) for room in (completion, explanation, notebook)]
+
+    def end() -> None:
+        for each in ends:
+            each()
+
+    return end
+
+
+def start(url: Optional[str] = None) -> Workspace:
+    """Make the IPython session that calls this a workspace, in a notebook for example; returns it.
+
+    In a session that is one already, that ends first. Nothing waits, and no signal is needed:
+    :meth:`Workspace.close` or the end of the session's program stops its node.
+
+    :param url: as for :class:`Workspace`
+    :raises PharosError: if there is no session, or IPython is not installed
+    :raises ValueError, MasterUnreachableError: as :class:`Workspace`
+    """
+    shell = ipython().get_ipython()
+    if shell is None:
+        raise PharosError(
+            'there is no session of IPython that could become a workspace: rosrun pharos workspace'
+            ' opens one'
+        )
+    unload_ipython_extension(shell)
+    workspace = Workspace(url)
+    _started[shell] = equip(shell, workspace), workspace.close
+    print(workspace.banner)
+    return workspace
+
+
+#: session -> what ends its workspace
+_started: Dict[Any, Tuple[Callable[[], None], Callable[[], None]]] = {}
+
+
+def load_ipython_extension(shell: Any) -> None:
+    """What ``%load_ext pharos.live.workspace`` does: :func:`start`."""
+    start()
+
+
+def unload_ipython_extension(shell: Any) -> None:
+    """What ``%unload_ext pharos.live.workspace`` does: the session is no workspace any more."""
+    for end in _started.pop(shell, ()):
+        end()
+
+
 def run(
     script: Optional[str] = None, args: Sequence[str] = (), argv: Optional[List[str]] = None
 ) -> int:
@@ -123,7 +177,7 @@ def run(
     :raises PharosError: if IPython is not installed
     :raises ValueError, MasterUnreachableError: as :class:`Workspace`
     """
-    application = terminal_ipython()
+    application = ipython().terminal.ipapp.TerminalIPythonApp
     if script is not None and not os.path.isfile(script):
         raise FileNotFoundError(f'there is no script {script}: give the path of a Python program')
     with Workspace(argv=argv) as workspace:
@@ -133,18 +187,18 @@ def run(
         return session.interact()
 
 
-def terminal_ipython() -> Any:
-    """The class of IPython's program for terminals.
+def ipython() -> Any:
+    """The module ``IPython``.
 
-    :raises PharosError: if IPython is not installed
+    :raises PharosError: if it is not installed
     """
     try:
-        from IPython.terminal.ipapp import TerminalIPythonApp
+        import IPython
     except ModuleNotFoundError as error:
         raise PharosError(
             f'a workspace needs IPython ({error}): apt install python3-ipython'
         ) from error
-    return TerminalIPythonApp
+    return IPython
 
 
 class _Session:
@@ -160,7 +214,7 @@ class _Session:
         if not sys.stdin.isatty():
             print('Standard input is no terminal: its lines are run, to its end.\n')
             self._shell.confirm_exit = False
-        self._shell.push(workspace.namespace, interactive=False)
+        equip(self._shell, workspace)
         node_registry.before_stop_all(self._end)  # which a signal asks for
 
     def run_script(self, path: str, args: Sequence[str]) -> None:

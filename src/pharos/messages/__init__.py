@@ -31,6 +31,7 @@ from pharos.messages.from_publishers import (
     class_of_header,
     explain_refusal,
 )
+from pharos.messages.lookup import known_types
 
 __all__ = [
     'build',
@@ -48,6 +49,7 @@ __all__ = [
     'fill',
     'is_provisional',
     'known_service_classes',
+    'known_types',
     'message_class',
     'nested_class',
     'service_class',

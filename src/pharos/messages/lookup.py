@@ -106,8 +106,12 @@ def file_text(kind: str, type_: str) -> Optional[str]:
     return None
 
 
-def _near_types(kind: str, type_: str) -> str:
-    """A hint at types with the same last name or one that differs by a slip."""
+def known_types(kind: str) -> Set[str]:
+    """The names of all types that are known here, without importing any; looks into the folders of
+    all packages.
+
+    :param kind: 'msg' or 'srv'
+    """
     files = [
         file for folder in sys.path for file in pathlib.Path(folder).glob(f'*/{kind}/_[A-Za-z]*.py')
     ]
@@ -117,5 +121,11 @@ def _near_types(kind: str, type_: str) -> str:
             files += pathlib.Path(rospack.get_path(package)).glob(f'{kind}/*.{kind}')
     names = {f"{file.parts[-3]}/{file.stem.lstrip('_')}" for file in files}
     names.update(DEFINITIONS[kind], (type_ for known_kind, type_ in [*found] if known_kind == kind))
+    return names
+
+
+def _near_types(kind: str, type_: str) -> str:
+    """A hint at types with the same last name or one that differs by a slip."""
+    names = known_types(kind)
     last = '/' + type_.rpartition('/')[2]
     return suggest(type_, names, sorted(name for name in names if name.endswith(last))[:3])
