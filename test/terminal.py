@@ -51,6 +51,11 @@ class Terminal:
         """Type it, without a return at its end."""
         self._tmux('send-keys', '-l', text)
 
+    def paste(self, text):
+        """Paste it, as a whole where the program knows of that, and without a return."""
+        self._tmux('set-buffer', '--', text)
+        self._tmux('paste-buffer', '-p')
+
     def press(self, *keys):
         """Press keys by tmux's names: 'Enter', 'Tab', 'C-c'."""
         self._tmux('send-keys', *keys)
