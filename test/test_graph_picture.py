@@ -347,6 +347,16 @@ def test_what_is_too_tangled_for_frames_is_drawn_without(monkeypatch):
     xml.etree.ElementTree.fromstring(graph._repr_svg_())
 
 
+def test_a_tangle_of_a_hundred_nodes_is_no_strip():
+    nodes = [
+        node_of(f'/n{n}', [f'/t{n}'], [f'/t{n * 3 % 100 + more}' for more in range(2)], pid=1)
+        for n in range(100)
+    ]
+    box = xml.etree.ElementTree.fromstring(Graph(seen(*nodes))._repr_svg_()).get('viewBox')
+    width, height = map(float, box.split()[2:])
+    assert width < 3 * height
+
+
 @pytest.mark.parametrize(
     'options, text',
     [

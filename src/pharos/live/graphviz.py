@@ -9,12 +9,15 @@ from typing import List, Union
 from pharos.errors import PharosError, suggest
 
 FORMATS = 'svg', 'png', 'pdf', 'dot'
-#: programs of graphviz, and the seconds that each may take; the second is quick with what is too
-#: tangled for the first, but knows no frames
+#: programs of graphviz, and the seconds that each may take; the others draw what is too tangled for
+#: the first, but know no frames
 LAYOUTS = (
     (['dot'], 20.0),
+    (['sfdp', '-Goverlap=prism'], 20.0),
     (['sfdp', '-Goverlap=prism', '-Gsplines=line'], 60.0),
 )
+#: what is longer, in inches, and that many times as long as wide, is a strip that nobody can read
+LONGEST, SLIMMEST = 50.0, 6.0
 
 
 def check_format(path: Union[str, 'os.PathLike[str]']) -> str:
@@ -43,12 +46,25 @@ def render(dot: str, format_: str) -> bytes:
 
     :raises PharosError: if graphviz is not there, or cannot do it
     """
+    picture = None
     for program, limit in LAYOUTS:
         with contextlib.suppress(subprocess.TimeoutExpired):
-            return _run([*program, f'-T{format_}'], dot, limit)
-    raise PharosError(
-        f'graphviz did not draw the picture within {limit:g} s: leave more of the graph out'
-    )
+            try:
+                # as text, too, whose first line has the size: graph SCALE WIDTH HEIGHT
+                text = _run([*program, '-Tplain', f'-T{format_}'], dot, limit)
+            except PharosError:
+                if picture is not None:
+                    break
+                raise
+            layout, _, picture = text.partition(b'\nstop\n')
+            shorter, longer = sorted(map(float, layout.split()[2:4]))
+            if longer < LONGEST or longer < SLIMMEST * shorter:
+                break
+    if picture is None:
+        raise PharosError(
+            f'graphviz did not draw the picture within {limit:g} s: leave more of the graph out'
+        )
+    return picture
 
 
 def _run(program: List[str], dot: str, limit: float) -> bytes:
