@@ -20,11 +20,12 @@ def script(name):
 
 
 def environment(master_url, **variables):
-    """The environment in which programs find this package and the master, but no display."""
+    """The environment in which programs find this package and the master, but no display, and no
+    size of the terminal in which the tests run."""
     kept = {
         name: value
         for name, value in os.environ.items()
-        if name not in ('DISPLAY', 'ROS_NAMESPACE', 'ROS_IP')
+        if name not in ('DISPLAY', 'ROS_NAMESPACE', 'ROS_IP', 'LINES', 'COLUMNS')
     }
     return {
         **kept,

@@ -33,9 +33,11 @@ class Terminal:
         self._tmux('set-option', '-g', 'remain-on-exit', 'on')
         where = ('-c', str(cwd)) if cwd else ()
         self._status = pathlib.Path(self._folder, 'status')
+        # readline, in the tests' own process, notes the size of their terminal in the environment
         line = shlex.join(
-            ['env', *settings, 'sh', '-c', RUN, str(self._status), *map(str, command)]
+            ['env', '-u', 'LINES', '-u', 'COLUMNS', *settings, 'sh', '-c', RUN, str(self._status)]
         )
+        line = f'{line} {shlex.join(map(str, command))}'
         self._tmux('new-window', '-k', '-t', ':0', *where, line)
 
     def _tmux(self, *arguments):
