@@ -14,7 +14,7 @@ from pharos import MessageTypeError, PharosError, message_class
 from pharos.live import pictures
 from pharos.live.pictures import picture
 from pharos.messages import class_from_definition
-from pharos.numeric_field import numeric_field, numeric_paths
+from pharos.messages.numeric_field import numeric_field, numeric_paths
 from pharos.testing import TIMEOUT, Mailbox, until
 from programs import environment
 

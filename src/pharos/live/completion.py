@@ -13,7 +13,7 @@ from typing import Any, Callable, Dict, List, Mapping, NamedTuple, Optional, Tup
 import rosgraph.names
 import rospkg
 
-from pharos import message_types
+from pharos import messages
 from pharos.blocks import attempt
 from pharos.master import Master
 from pharos.node import Node
@@ -146,7 +146,7 @@ class _Call:
     def _keywords(self) -> List[str]:
         """The fields that the call fills, but for those that it has already."""
         cls = self._message_class()
-        fields = message_types.fields_of(cls) if cls is not None else []
+        fields = messages.fields_of(cls) if cls is not None else []
         return [f'{name}=' for name, _ in fields if name not in self.keywords]
 
     def _message_class(self) -> Any:
@@ -162,7 +162,7 @@ class _Call:
         for channel in self.node.channels:
             if channel.topic == topic and not typed_as:
                 return channel.message_class
-        return message_types.message_class(typed_as or _topic_types(self.master)[topic])
+        return messages.message_class(typed_as or _topic_types(self.master)[topic])
 
 
 def _owner(path: str, method: str, names: Mapping[str, Any]) -> Any:
@@ -257,7 +257,7 @@ def _parameters(master: Master) -> List[str]:
 def _types(kind: str, minute: int) -> List[str]:
     """Those known in that minute: to look through all packages for each press of a key takes too
     long."""
-    return sorted(message_types.known_types(kind))
+    return sorted(messages.known_types(kind))
 
 
 def _message_types(master: Master) -> List[str]:

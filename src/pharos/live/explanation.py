@@ -4,7 +4,7 @@
 """
 from typing import Any, Callable, Dict, Iterable, Iterator, List, Optional
 
-from pharos import message_types
+from pharos import messages
 from pharos.channel import Channel, InputChannel
 from pharos.errors import PharosError
 from pharos.external_node import ExternalNode
@@ -44,7 +44,7 @@ def _node(node: Any, seconds: float) -> Iterator[str]:
 def _topic(topic: Topic, seconds: float) -> Iterator[str]:
     type_ = topic.type
     yield f'{topic.name} [{type_}]'
-    yield from _fields('fields', lambda: message_types.message_class(type_))
+    yield from _fields('fields', lambda: messages.message_class(type_))
     yield from _users(topic, seconds)
 
 
@@ -100,11 +100,11 @@ def _fields(title: str, find_class: Callable[[], Any]) -> Iterator[str]:
 
 
 def _fields_of(cls: Any, indent: str) -> Iterator[str]:
-    fields = message_types.fields_of(cls)
+    fields = messages.fields_of(cls)
     for name, type_ in fields:
         yield f'{indent}{name}: {type_}'
         base = type_.partition('[')[0]
-        nested = message_types.nested_class(cls, base) if '/' in base else None
+        nested = messages.nested_class(cls, base) if '/' in base else None
         if nested is not None:
             yield from _fields_of(nested, indent + '  ')
     if not fields:

@@ -8,7 +8,7 @@ from typing import Any, Callable, Iterator, Optional, Tuple
 
 import genpy
 
-from pharos import message_types
+from pharos import messages
 from pharos.blocks import attempt
 from pharos.channel import Channel
 from pharos.external_node import ExternalNode
@@ -47,7 +47,7 @@ def html_of(thing: Any) -> Optional[str]:
 
 def _rows(message: Any, path: str) -> Iterator[Tuple[str, str]]:
     """``(name, value as text)`` of all fields, those of messages in it by their paths."""
-    for name, _ in message_types.fields_of(type(message)):
+    for name, _ in messages.fields_of(type(message)):
         value = getattr(message, name)
         if isinstance(value, genpy.Message):
             yield from _rows(value, f'{path}{name}.')

@@ -10,7 +10,7 @@ import genpy
 from pharos.channel import InputChannel
 from pharos.errors import PharosError
 from pharos.live.watching import create_looker
-from pharos.numeric_field import numeric_field
+from pharos.messages.numeric_field import numeric_field
 from pharos.probe import Look
 from pharos.seconds import check_seconds
 

@@ -4,6 +4,7 @@
 - lookup: where types are sought: installed packages, files, those that turtlesim has
 - definition: a class made from the text of a definition
 - fields: what a message holds: described, filled by name, checked
+- numeric_field: what takes a number out of a message, by its path; loaded only when used
 - from_publishers: the class of a topic's messages as its publishers define it
 - turtlesim: the definitions of turtlesim's types
 """

@@ -1,12 +1,12 @@
-"""Numeric fields of messages, by their paths: 'linear.x', 'ranges[0]', 'header.stamp'; loaded only when used."""
+"""Numbers in messages, by the paths of their fields: 'linear.x', 'ranges[0]', 'header.stamp'."""
 import re
 from typing import Any, Callable, Iterator, List, NoReturn, Optional, Tuple, Type
 
 import genmsg.msgs
 import genpy
 
-from pharos import messages
 from pharos.errors import MessageTypeError, suggest
+from pharos.messages.fields import fields_of, nested_class
 
 MessageClass = Type[genpy.Message]
 LISTED = 12  # fields that an error names
@@ -27,7 +27,7 @@ def numeric_field(cls: MessageClass, path: str) -> Callable[[genpy.Message], Opt
     inner: Optional[MessageClass] = cls
     for part in path.split('.'):
         match = _PART.fullmatch(part)
-        types = dict(messages.fields_of(inner)) if inner else {}
+        types = dict(fields_of(inner)) if inner else {}
         if match is None or match.group(1) not in types:
             _refuse(cls, path, 'there is no such field')
         name, index = match.groups()
@@ -63,12 +63,12 @@ def _inner(cls: Optional[MessageClass], type_: str) -> Optional[MessageClass]:
     """The class of a field's values, None where these are no messages."""
     if cls is None or (genmsg.msgs.is_builtin(type_) and type_ not in ('time', 'duration')):
         return None
-    return messages.nested_class(cls, type_)
+    return nested_class(cls, type_)
 
 
 def numeric_paths(cls: MessageClass, depth: int = DEPTH) -> Iterator[str]:
     """The paths of the numbers in messages of a class; of arrays, those of the first value."""
-    for name, field_type in messages.fields_of(cls):
+    for name, field_type in fields_of(cls):
         type_, is_array, _ = genmsg.msgs.parse_type(field_type)
         path = f'{name}[0]' if is_array else name
         inner = _inner(cls, type_)
