@@ -12,7 +12,6 @@ import xml.etree.ElementTree
 
 import pytest
 
-import pharos
 from helpers import create, ended
 from pharos import Graph, Master, MasterUnreachableError, NodeStoppedError, PharosError
 from pharos.live import graphviz
@@ -531,15 +530,6 @@ def test_who_reads_the_program_s_output_may_stop_early(master, small):
         check=False,
     )
     assert (ended.returncode, ended.stderr, len(ended.stdout.splitlines())) == (0, '', 1)
-
-
-def test_importing_pharos_brings_no_graph():
-    assert 'Graph' in dir(pharos)
-    source = 'import sys, pharos; print(*sys.modules)'
-    modules = subprocess.check_output(
-        [sys.executable, '-c', source], env=environment(''), text=True
-    ).split()
-    assert not [name for name in modules if name.startswith('pharos.live')]
 
 
 def test_the_document_has_pictures_of_each_size():

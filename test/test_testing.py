@@ -54,11 +54,3 @@ def test_it_is_a_plugin(tmp_path):
     (tmp_path / 'test_it.py').write_text(test)
     status, printed = run_tests(tmp_path)
     assert status == pytest.ExitCode.OK, printed
-
-
-def test_it_is_not_loaded_with_pharos():
-    program = "import sys, pharos; print({'pytest', 'pharos.testing'} & set(sys.modules))"
-    printed = subprocess.check_output(
-        [sys.executable, '-c', program], env={**os.environ, 'PYTHONPATH': str(ROOT / 'src')}
-    )
-    assert printed == b'set()\n'

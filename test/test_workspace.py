@@ -121,11 +121,6 @@ def test_the_names_of_a_session_can_be_had_in_a_program(master):
     assert 'me' not in workspace.namespace(master)
 
 
-def test_pharos_itself_imports_nothing_of_it(master):
-    code = 'import sys, pharos; print("pharos.live.workspace" in sys.modules, "IPython" in sys.modules)'
-    assert run(master.url, sys.executable, '-c', code).stdout == 'False False\n'
-
-
 # -- what is printed meanwhile
 
 

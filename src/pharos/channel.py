@@ -1,11 +1,11 @@
 """Channels: one node's end of a topic, and the end at which it hears."""
 import collections
-import importlib
 import threading
 from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Tuple, Type
 
 import genpy
 
+from pharos import on_demand
 from pharos.blocks import Block, check_delegate
 from pharos.errors import NodeStoppedError, PharosError
 from pharos.intraprocess.inbox import Inbox, SocketInbox
@@ -222,7 +222,7 @@ class InputChannel(Channel):
         :raises TimeoutError: if no message came in these seconds
         :raises PharosError: if matplotlib is not installed
         """
-        made: 'Plot' = importlib.import_module('pharos.live.plot').plot(self, fields, seconds)
+        made: 'Plot' = on_demand.module('live.plot').plot(self, fields, seconds)
         return made
 
     # -- as a pharos.intraprocess.inbox.Receiver

@@ -1,9 +1,9 @@
 """Nodes outside this process."""
 import contextlib
-import importlib
 import urllib.parse
 from typing import TYPE_CHECKING, Any, Dict, List, Optional
 
+from pharos import on_demand
 from pharos.errors import UnknownNodeError
 from pharos.private_rospy.proxies import ServerProxy
 from pharos.private_rospy.registration import COMMUNICATION_ERRORS
@@ -19,13 +19,6 @@ def node_api(uri: str, timeout: float = TIMEOUT) -> Any:
     """ROS's slave API of the node at that URI, by XML-RPC: each call of it ends with an error after
     ``timeout`` seconds."""
     return ServerProxy(uri, timeout)
-
-
-def describe(node: Any, seconds: float) -> str:
-    """A node of this process or another one in words; see :meth:`Node.describe`."""
-    seconds = check_seconds('seconds', seconds, least=0)
-    text: str = importlib.import_module('pharos.live.description').describe(node, seconds)
-    return text
 
 
 class ExternalNode:
@@ -99,7 +92,9 @@ class ExternalNode:
 
         :raises UnknownNodeError: if the master knows it no more
         """
-        return describe(self, seconds)
+        seconds = check_seconds('seconds', seconds, least=0)
+        text: str = on_demand.module('live.description').describe(self, seconds)
+        return text
 
     def __eq__(self, other: object) -> bool:
         return (

@@ -1,6 +1,5 @@
 """What blocks raised: kept, counted, told once, and run again."""
 import collections
-import importlib
 import numbers
 import sys
 import threading
@@ -11,6 +10,7 @@ from typing import Any, Callable, Counter, Dict, List, Optional, Sequence, Tuple
 
 import genpy
 
+from pharos import on_demand
 from pharos.blocks import attempt, text_of
 from pharos.errors import PharosError
 from pharos.signals import code_of, is_from_signal
@@ -138,7 +138,7 @@ class Failure:
                 f' newest {WHOLE} failures of a node only; debug() one of those, or read its'
                 ' .traceback'
             )
-        importlib.import_module('pharos.live.debugger').look_at(self._frames)
+        on_demand.module('live.debugger').look_at(self._frames)
 
     def __repr__(self) -> str:
         times = f', {self.count} times' if self.count > 1 else ''
@@ -156,7 +156,7 @@ class FailureList(List[Failure]):
 
 
 def _tables() -> Any:
-    return importlib.import_module('pharos.live.failure_table')
+    return on_demand.module('live.failure_table')
 
 
 class Failures(Sequence[BaseException]):

@@ -1,5 +1,4 @@
 """The proxy of a ROS master."""
-import importlib
 import subprocess
 from typing import (
     TYPE_CHECKING,
@@ -17,7 +16,7 @@ from typing import (
 import rosgraph
 from rosgraph.rosenv import ROS_MASTER_URI
 
-from pharos import attributes, embedded_master, node_registry, ros_process, starts
+from pharos import attributes, embedded_master, node_registry, on_demand, ros_process, starts
 from pharos.blocks import check_block
 from pharos.errors import PharosError, UnknownNodeError, suggest
 from pharos.external_node import ExternalNode
@@ -237,7 +236,7 @@ class Master(MasterCalls):
         :raises NodeNameInUseError: if another node has its name
         :raises PharosError: if it is no Python program, or raised an exception before it was a node
         """
-        node: 'ScriptNode' = importlib.import_module('pharos.compose.script').load(
+        node: 'ScriptNode' = on_demand.module('compose.script').load(
             self,
             package,
             executable,
@@ -276,7 +275,7 @@ class Master(MasterCalls):
         :raises PharosError: if roslaunch cannot read the file
         :raises MasterUnreachableError: if the master does not answer
         """
-        composition: 'Composition' = importlib.import_module('pharos.compose.composition').compose(
+        composition: 'Composition' = on_demand.module('compose.composition').compose(
             self, package, file, only, apart, share_connections, args
         )
         return composition

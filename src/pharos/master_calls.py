@@ -1,6 +1,5 @@
-"""Calls to a ROS master."""
+"""What a ROS master is asked for, each time anew: its state, whether nodes are there, the graph."""
 import contextlib
-import importlib
 import threading
 import time
 import urllib.parse
@@ -20,6 +19,7 @@ from typing import (
 
 import rosgraph
 
+from pharos import on_demand
 from pharos.errors import MasterUnreachableError, NodeStoppedError
 from pharos.private_rospy.addresses import is_same_master
 from pharos.private_rospy.lifetime import Interruption
@@ -141,7 +141,7 @@ class MasterCalls:
         :raises NodeStoppedError: if the node on whose behalf this thread counts stops meanwhile
         :raises TypeError, ValueError: if a choice is none of these
         """
-        graph: 'Graph' = importlib.import_module('pharos.live.graph').look(
+        graph: 'Graph' = on_demand.module('live.graph').look(
             self,
             rates,
             show_all=show_all,

@@ -3,11 +3,10 @@ from typing import TYPE_CHECKING, Any, Callable, List, Optional, Type, Union
 
 import genpy
 
-from pharos import node_registry
+from pharos import node_registry, on_demand
 from pharos.becoming import become
 from pharos.blocks import Block, check_block
 from pharos.channel import InputChannel
-from pharos.external_node import describe
 from pharos.health import Health, health_of
 from pharos.offered_service import OfferedService
 from pharos.output_channel import OutputChannel
@@ -335,7 +334,9 @@ class Node(NodeWithSouls, is_base=True):
 
         :param seconds: for which messages are counted, for the rates; 0: no rates are told
         """
-        return describe(self, seconds)
+        seconds = check_seconds('seconds', seconds, least=0)
+        text: str = on_demand.module('live.description').describe(self, seconds)
+        return text
 
     def __repr__(self) -> str:
         health = f': {health_of(self, ask=False)}' if self.is_running else ''

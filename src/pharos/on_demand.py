@@ -1,20 +1,25 @@
-"""What is built on the facade, and loaded only when it is used."""
+"""What is built on the facade, and loaded only when it is used: its exports, and its modules."""
 import importlib
 import sys
 from typing import Any, List
 
 _MODULES = {
-    'Composition': 'pharos.compose.composition',
-    'Graph': 'pharos.live.graph',
-    'ScriptNode': 'pharos.compose.script',
+    'Composition': 'compose.composition',
+    'Graph': 'live.graph',
+    'ScriptNode': 'compose.script',
 }
+
+
+def module(name: str) -> Any:
+    """A module of this package, such as 'live.plot'."""
+    return importlib.import_module(f'pharos.{name}')
 
 
 def __getattr__(name: str) -> Any:
     """What ``pharos.ScriptNode`` is: the package has this function, too (PEP 562)."""
     if name not in _MODULES:
         raise AttributeError(f"module 'pharos' has no attribute {name!r}")
-    return getattr(importlib.import_module(_MODULES[name]), name)
+    return getattr(module(_MODULES[name]), name)
 
 
 def __dir__() -> List[str]:

@@ -1,12 +1,11 @@
 """Topics: named buses, and the dispatchers that hand a node its channel."""
-import importlib
 import time
 from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, List, Optional, Tuple, Type, Union
 
 import genpy
 import rosgraph
 
-from pharos import messages, node_registry
+from pharos import messages, node_registry, on_demand
 from pharos.channel import Channel, InputChannel
 from pharos.errors import (
     MasterUnreachableError,
@@ -314,4 +313,4 @@ class Topic:
 
 
 def _watching() -> Any:
-    return importlib.import_module('pharos.live.watching')
+    return on_demand.module('live.watching')
