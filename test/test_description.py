@@ -1,8 +1,10 @@
 """Node.describe: a node in words."""
+import contextlib
 import os
 import re
 import signal
 import sys
+import threading
 
 import pytest
 
@@ -101,6 +103,38 @@ def test_a_node_of_another_process_is_described_as_far_as_it_tells(master, mailb
         assert 20 / 3 < float(rate.group(1)) < 20 * 2
         assert '/apart/get_loggers [roscpp/GetLoggers]' in text
         assert re.search(r'\nhears\n  /described .*, from /apart by TCPROS\n', hearer.describe())
+
+
+def test_a_node_of_pharos_in_another_process_tells_how_it_is_doing(master):
+    with Program(master.url, sys.executable, str(PROGRAMS / 'in_trouble.py')) as program:
+        program.wait_for('in trouble')
+        node = master.node('/in_trouble')
+        until(lambda: ', dropped 3, from /peer by' in node.describe(0))
+        text = node.describe(0)
+    assert text.startswith('/in_trouble: Troubled, a node of another process, alive\n')
+    assert re.search(r'\n  3 dropped, 1 failures, 0 souls, \d+ threads\n', text)
+
+
+def test_the_master_is_asked_once_for_the_names_of_all_who_are_heard(master, monkeypatch):
+    hearer = create(master, '/hearer')
+    channel = hearer.interested_in('/described', 'std_msgs/String')
+    command = sys.executable, str(PROGRAMS / 'publishes.py'), '/described', '20'
+    with contextlib.ExitStack() as stack:
+        for name in ('/one', '/other'):
+            stack.enter_context(Program(master.url, *command, f'__name:={name[1:]}'))
+        until(lambda: len(channel.connections) == 2)
+        asked, real, here = [], Master.call, threading.get_ident()
+
+        def call(self, method, *args, **more):
+            if threading.get_ident() == here:
+                asked.append(method)
+            return real(self, method, *args, **more)
+
+        monkeypatch.setattr(Master, 'call', call)
+        text = hearer.describe(0)
+    assert {*re.findall('from (/[a-z]+) by TCPROS', text)} == {'/one', '/other'}
+    # for all names; and whether it is registered itself
+    assert (asked.count('getSystemState'), asked.count('lookupNode')) == (1, 1)
 
 
 def test_a_node_that_is_dead_is_described_as_that(mortal_master):

@@ -13,7 +13,9 @@ from helpers import create, in_thread
 from pharos import Master, MasterUnreachableError
 from pharos.external_node import node_api
 from pharos.live import snapshot
+from pharos.live.answers import Count
 from pharos.live.snapshot import ALIVE, DEAD, SILENT, Connection
+from pharos.live.traffic import Traffic
 from pharos.testing import TIMEOUT, Mailbox, until
 from sockets import refused_url, silent_peer
 
@@ -70,8 +72,10 @@ def test_connections_have_a_direction_and_a_transport(master):
             Connection('/snapshot_a', '/snapshot_one', '/snapshot_cpp', 'TCPROS'),
             Connection('/snapshot_a', '/snapshot_one', '/snapshot_two', 'INTRAPROCESS'),
         ]
-        assert seen.transports('/snapshot_a', '/snapshot_one') == {'INTRAPROCESS', 'TCPROS'}
-        assert seen.transports('/snapshot_a', '/snapshot_two') == {'INTRAPROCESS'}
+        assert seen.transports == {
+            ('/snapshot_a', '/snapshot_one', '/snapshot_cpp'): {'TCPROS'},
+            ('/snapshot_a', '/snapshot_one', '/snapshot_two'): {'INTRAPROCESS'},
+        }
 
 
 def test_topics_and_services_are_those_of_the_master(master):
@@ -223,9 +227,13 @@ def test_each_connection_counts_its_messages_within_the_process_and_to_cpp_and_f
         mailbox.wait_for(lambda message: message.data == 'one')
         until(lambda: two.channels[1].received >= 10)
         after = snapshot.take(master, counts=True)
+
+    def messages(each):
+        return (each.received or each.sent).messages
+
     former = {connection.key: connection for connection in before.connections}
     counted = {
-        (each.topic, each.subscriber): (each.messages_since(former[each.key]), each.transport)
+        (each.topic, each.subscriber): (messages(each) - messages(former[each.key]), each.transport)
         for each in after.connections
     }
     assert counted == {
@@ -234,21 +242,39 @@ def test_each_connection_counts_its_messages_within_the_process_and_to_cpp_and_f
         ('/snapshot_relayed', '/snapshot_two'): (10, 'TCPROS'),
     }
     relayed = next(each for each in after.connections if each.topic == '/snapshot_relayed')
-    assert relayed.sent >= 10 and relayed.received >= 10
-    assert relayed.bytes_sent > 10 * len('one') and relayed.bytes_received > 10 * len('one')
+    for count in relayed.sent, relayed.received:
+        assert count.messages >= 10 and count.bytes > 10 * len('one')
+
+
+def look(seconds, **counts):
+    """Connections of publishers and subscribers of one letter each, which these have counted."""
+    return [
+        Connection(
+            '/t', '/' + ends[0], '/' + ends[1], 'TCPROS', received=Count(of, *sizes, seconds)
+        )
+        for ends, (of, *sizes) in counts.items()
+    ]
 
 
 def test_rates_are_those_of_all_publishers_whoever_hears_them():
-    def look(seconds, **received):
-        connections = [
-            Connection('/t', '/' + ends[0], '/' + ends[1], 'TCPROS', received=count)
-            for ends, count in received.items()
-        ]
-        return snapshot.Snapshot('', seconds, [], {}, {}, {}, connections)
+    before = look(10.0, ax=(1, 100, 0), ay=(1, 200, 0), bx=(2, 300, 0), cx=(3, 400, 0))
+    # c has connected anew, d is new
+    after = look(12.0, ax=(1, 120, 0), ay=(1, 210, 0), bx=(2, 302, 0), cx=(3, 5, 0), dx=(4, 7, 0))
+    traffic = Traffic(before, after)
+    assert traffic.of_topic == {'/t': 10.0 + 1.0}
+    assert traffic.sent == {'/a': 10.0, '/b': 1.0}
+    assert traffic.received == {'/x': 10.0 + 1.0, '/y': 5.0}
 
-    before = look(10.0, ax=100, ay=200, bx=300, cx=400)
-    after = look(12.0, ax=120, ay=210, bx=302, cx=5, dx=7)  # c has connected anew, d is new
-    assert snapshot.rates(before, after) == {'/t': 10.0 + 1.0}
+
+def test_a_connection_made_anew_has_no_rate_though_it_has_carried_more_since():
+    before = look(10.0, ax=(1, 3, 18_000_000))
+    assert Traffic(before, look(11.0, ax=(2, 5, 500))).bandwidth == {}
+    assert Traffic(before, look(11.0, ax=(1, 5, 18_000_500))).bandwidth == {'/t': 500}
+
+
+def test_bytes_that_wrap_are_counted_on():
+    before, after = look(10.0, ax=(1, 3, 2**31 - 100)), look(11.0, ax=(1, 5, 400 - 2**31))
+    assert Traffic(before, after).bandwidth == {'/t': 500}
 
 
 def test_a_node_that_does_not_count_is_alive_all_the_same(master):
@@ -271,3 +297,62 @@ def test_the_connections_of_a_node_have_different_numbers(master):
         until(lambda: len(one.channels[1].connections) == 3)
         numbers = [each[0] for each in node_api(one.uri).getBusInfo('/test')[2]]
         assert len(numbers) == 5 and len(set(numbers)) == 5
+
+
+@contextlib.contextmanager
+def counting(master, name, pause=lambda: None):
+    """A node whose connection carries 1000 messages a second, each of 10 bytes, and which takes its
+    time before it tells."""
+    since = time.monotonic()
+
+    def stats(caller):
+        pause()
+        count = int(1000 * (time.monotonic() - since))
+        return [1, '', [[], [['/snapshot_a', [[1, 10 * count, count, -1, 1]]]], []]]
+
+    methods = {
+        'getPid': lambda caller: [1, '', 42],
+        'getBusInfo': lambda caller: [1, '', [[1, 'http://x/', 'i', 'TCPROS', '/snapshot_a', 1]]],
+        'getBusStats': stats,
+    }
+    with answering(**methods) as uri, registered(master, name, uri):
+        yield
+
+
+def test_rates_are_right_however_long_a_node_takes_to_answer(master):
+    pauses = [0, 0.5]
+    with counting(master, '/snapshot_slow', lambda: time.sleep(pauses.pop(0))):
+        before, after = (snapshot.take(master, 5, counts=True) for _ in range(2))
+    traffic = Traffic(before.connections, after.connections)
+    assert 900 < traffic.of_topic['/snapshot_a'] < 1100
+    assert 9000 < traffic.bandwidth['/snapshot_a'] < 11000
+
+
+def test_the_clock_may_be_set_back_between_two_looks(master, monkeypatch):
+    with counting(master, '/snapshot_slow', lambda: time.sleep(0.2)):
+        before = snapshot.take(master, 5, counts=True)
+        with monkeypatch.context() as patch:
+            patch.setattr(snapshot.time, 'time', lambda: before.time - 5)
+            after = snapshot.take(master, 5, counts=True)
+    assert after.time < before.time
+    assert Traffic(before.connections, after.connections).of_topic['/snapshot_a'] > 500
+
+
+def test_the_uris_of_all_nodes_are_asked_for_in_one_call(master):
+    calls = []
+    names = [create(master, f'/snapshot_{number}').name for number in range(3)]
+    real = master.api
+
+    class Calls:
+        def __init__(self, api):
+            self._api, self.caller_id = api, api.caller_id
+
+        handle = property(lambda self: calls.append(1) or self._api.handle)
+
+    master.api = lambda *args: Calls(real(*args))
+    try:
+        uris = snapshot.uris_of(master, [*names, '/snapshot_gone'])
+    finally:
+        del master.api
+    assert uris == {**{name: master.uri_of(name) for name in names}, '/snapshot_gone': None}
+    assert calls == [1]

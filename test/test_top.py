@@ -6,14 +6,14 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 
 import pytest
-from std_msgs.msg import String
 
 from helpers import create, speak_tcpros_only
-from pharos import BlockNode, ExternalNode, Master, MasterUnreachableError
+from pharos import ExternalNode, Master, MasterUnreachableError
 from pharos.external_node import node_api
-from pharos.live import top
+from pharos.live import answers, top
 from pharos.testing import TIMEOUT, until
 from programs import PROGRAMS, Program, environment
 
@@ -196,20 +196,25 @@ def test_a_node_that_starts_or_ends_meanwhile_disturbs_nothing(master, sender):
 
 def test_others_than_nodes_of_pharos_are_asked_for_their_health_once(master, monkeypatch):
     asked = []
-    real = top.node_api
+    real = answers.node_api
 
-    def api(uri, timeout):
-        asked.append(uri)
-        return real(uri, timeout)
+    class Api:
+        def __init__(self, uri, timeout):
+            self._uri, self._api = uri, real(uri, timeout)
 
-    monkeypatch.setattr(top, 'node_api', api)
+        def __getattr__(self, method):
+            asked.append((method, self._uri))
+            return getattr(self._api, method)
+
+    monkeypatch.setattr(answers, 'node_api', Api)
     with Program(master.url, sys.executable, str(PROGRAMS / 'publishes.py'), '/x', '9') as program:
         program.wait_for('publishing')
         with top.Meter(master) as meter:
             for _ in range(3):
                 meter.measure()
-        (node,) = [node for node in master.nodes() if isinstance(node, ExternalNode)]
-        assert asked.count(node.uri) == 1
+        (uri,) = [node.uri for node in master.nodes() if isinstance(node, ExternalNode)]
+    assert asked.count(('getBusStats', uri)) == 3
+    assert asked.count(('pharosHealth', uri)) == 1
 
 
 def test_more_than_2_gib_through_a_connection_are_counted_on(master, sender):
@@ -228,20 +233,32 @@ def test_more_than_2_gib_through_a_connection_are_counted_on(master, sender):
     assert is_about(rows(found.nodes)['/late'].bytes_received, RATE * SIZE)
 
 
-def test_nobody_is_asked_while_nobody_looks(master, monkeypatch):
-    told = []
-    with create(master, '/node', BlockNode) as node:
-        node.latest_run.rospy.tell_health = lambda: told.append(1) or {}
-        node.interested_in('/x', 'std_msgs/String').deliver(String(), None)
-        assert told == []
-        node_api(node.uri).pharosHealth('/test')
-        assert told == [1]
+def test_nodes_are_asked_for_their_health_by_top_and_no_other_look(master, sender):
+    told, real = [], sender.latest_run.rospy.tell_health
+    sender.latest_run.rospy.tell_health = lambda: told.append(1) or real()
+    master.graph(rates=0.1)
+    sender.describe(0)
+    assert told == []
+    with top.Meter(master) as meter:
+        meter.measure()
+    assert told == [1]
+    node_api(sender.uri).pharosHealth('/test')
+    assert told == [1, 1]
+
+
+def test_the_clock_may_be_set_back_between_two_looks(master, sender, monkeypatch):
+    with top.Meter(master) as meter:
+        first = meter.measure()
+        with monkeypatch.context() as patch:
+            patch.setattr(time, 'time', lambda: first.time - 5)
+            assert 0 < meter.measure().seconds < TIMEOUT
 
 
 def test_looking_from_a_soul_ends_with_its_node(master):
-    raised = []
+    raised, began = [], threading.Event()
 
     def soul(me):
+        began.set()
         try:
             top.measure(me.master, 100)
         except Exception as error:
@@ -249,7 +266,7 @@ def test_looking_from_a_soul_ends_with_its_node(master):
 
     node = create(master, soul=soul)
     thread = node.fork()
-    until(lambda: any(each.name.startswith('top asks') for each in threading.enumerate()))
+    assert began.wait(TIMEOUT)
     node.stop()
     thread.join(TIMEOUT)
     assert raised == ['NodeStoppedError']

@@ -5,7 +5,8 @@ import socket
 import threading
 import time
 import urllib.parse
-from typing import Any, Dict, List, NamedTuple, Optional, Tuple
+import xmlrpc.client
+from typing import Any, Dict, List, NamedTuple, Optional, Set, Tuple
 
 import rosgraph
 import rosgraph.network
@@ -20,6 +21,35 @@ DEAD = 'dead'  # nobody is at its address any more, though the master has it sti
 
 CALLER = '/pharos'
 INBOUND = 'i'  # the direction of a connection, in getBusInfo
+WRAP = 2**32  # bytes after which nodes count from the beginning
+
+
+@dataclasses.dataclass(frozen=True)
+class Count:
+    """What one end of a connection has counted since it was made."""
+
+    #: the URI of the node that counts, and the number by which it knows the connection; of both,
+    #: where two nodes have two
+    of: Tuple[Tuple[str, int], ...]
+    messages: int
+    bytes: int
+    time: float  # when the node had said so, in seconds as of time.monotonic()
+
+    def __add__(self, other: 'Count') -> 'Count':
+        return Count(
+            tuple(sorted(self.of + other.of)),
+            self.messages + other.messages,
+            self.bytes + other.bytes,
+            max(self.time, other.time),
+        )
+
+    def rates_since(self, before: 'Count') -> Optional[Tuple[float, float]]:
+        """Messages and bytes a second since an earlier look; None: it has been connected anew."""
+        seconds = self.time - before.time
+        if self.of != before.of or self.messages < before.messages or seconds <= 0:
+            return None
+        size = (self.bytes - before.bytes) % WRAP
+        return (self.messages - before.messages) / seconds, size / seconds
 
 
 class End(NamedTuple):
@@ -29,7 +59,7 @@ class End(NamedTuple):
     topic: str
     other: str  # the name or the URI of the node at the other end
     transport: str
-    counts: Dict[str, int]  # fields of a Connection
+    counted: Optional[Count]  # None: it does not say, or was not asked
 
 
 @dataclasses.dataclass
@@ -41,6 +71,7 @@ class Answer:
     is_here: bool = False
     pid: Optional[int] = None
     ends: Optional[List[End]] = None
+    health: Optional[Dict[str, Any]] = None  # what a node of pharos tells, if it was asked
     error: Optional[Exception] = None
 
     @property
@@ -60,19 +91,27 @@ class Answer:
 
 
 def ask_all(
-    uris: Dict[str, Optional[str]], own: Dict[str, Node], timeout: float, counts: bool
+    uris: Dict[str, Optional[str]],
+    own: Dict[str, Node],
+    timeout: float,
+    counts: bool,
+    plain: Optional[Set[str]] = None,
 ) -> Dict[str, Answer]:
     """What the nodes at these URIs say until ``timeout`` seconds are over.
 
     Each has a thread, which is left to itself where it takes longer: looking up the name of a host
     has no limit of its own.
+
+    :param counts: whether they are to say what they have counted
+    :param plain: the URIs of nodes known not to be of pharos; all others are asked for their health
+        then, and those found out not to be of pharos are added
     """
     deadline = time.monotonic() + timeout
     answers = {name: Answer(_host_name(uri)) for name, uri in uris.items()}
     threads = [
         threading.Thread(
             target=_ask,
-            args=(answers[name], uri, own.get(name), timeout, counts),
+            args=(answers[name], uri, own.get(name), timeout, counts, plain),
             name=f'snapshot of {name}',
             daemon=True,
         )
@@ -86,7 +125,12 @@ def ask_all(
 
 
 def _ask(
-    answer: Answer, uri: Optional[str], own: Optional[Node], timeout: float, counts: bool
+    answer: Answer,
+    uri: Optional[str],
+    own: Optional[Node],
+    timeout: float,
+    counts: bool,
+    plain: Optional[Set[str]],
 ) -> None:
     """Fill in the answer of a node, for up to ``timeout`` seconds a call."""
     try:
@@ -94,19 +138,31 @@ def _ask(
             raise ConnectionRefusedError('the master does not know it any more')
         if own is not None:
             answer.is_here, answer.pid = True, os.getpid()
-            topics = own.current_run.rospy.topics
-            stats = topics.get_pub_sub_stats() if counts else None
-            answer.ends = _ends(topics.get_pub_sub_info(), stats)
+            rospy = own.current_run.rospy
+            counted = _counts(rospy.topics.get_pub_sub_stats(), uri) if counts else {}
+            answer.ends = _ends(rospy.topics.get_pub_sub_info(), counted)
+            answer.health = None if plain is None else rospy.tell_health()
             return
         answer.is_here, answer.address = _locate(answer.host)
         api = node_api(uri, timeout)
         answer.pid = int(_value(api.getPid(CALLER)))
         bus_info = _value(api.getBusInfo(CALLER))
-        answer.ends = _ends(bus_info, None)
+        answer.ends = _ends(bus_info, {})
         if counts:
-            answer.ends = _ends(bus_info, _bus_stats(api))
+            answer.ends = _ends(bus_info, _counts(_bus_stats(api), uri))
+        if plain is not None and uri not in plain:
+            answer.health = _health(api, uri, plain)
     except Exception as error:  # whatever it answers, it is one node of many
         answer.error = error
+
+
+def _health(api: Any, uri: str, plain: Set[str]) -> Optional[Dict[str, Any]]:
+    """What a node of pharos tells of its health; None, and added to ``plain``: it is none."""
+    try:
+        return dict(_value(api.pharosHealth(CALLER)))
+    except xmlrpc.client.Fault:  # it has no such method
+        plain.add(uri)
+        return None
 
 
 def _bus_stats(api: Any) -> Any:
@@ -123,37 +179,37 @@ def _value(answer: Any) -> Any:
     return value
 
 
-def _ends(bus_info: Any, bus_stats: Any) -> List[End]:
-    """The ends of connections that a node tells by getBusInfo, and by getBusStats, if it was
-    asked."""
-    counts = _counts(bus_stats) if bus_stats else {}
+def _ends(bus_info: Any, counts: Dict[Tuple[bool, str, int], Count]) -> List[End]:
+    """The ends of connections that a node tells by getBusInfo."""
     return [
         End(
             direction == INBOUND,
             topic,
             other,
             transport,
-            counts.get((direction == INBOUND, topic, number), {}),
+            counts.get((direction == INBOUND, topic, number)),
         )
         for number, other, direction, transport, topic, *more in bus_info
         if not more or more[0]  # else it is not connected (yet)
     ]
 
 
-def _counts(bus_stats: Any) -> Dict[Tuple[bool, str, int], Dict[str, int]]:
-    """``{(whether it is inbound, topic, its number): {field of a Connection: count}}``.
+def _counts(bus_stats: Any, uri: str) -> Dict[Tuple[bool, str, int], Count]:
+    """``{(whether it is inbound, topic, its number): Count}``, of a node that has just told them by
+    getBusStats.
 
     Of a topic that it publishes, rospy tells one thing more than roscpp, and roscpp one more of
     each connection.
     """
+    now = time.monotonic()
     published, subscribed, *_ = bus_stats
     found = {}
     for topic, *_, connections in published:
-        for number, count, *messages, _ in connections:
-            found[False, topic, number] = {'sent': messages[-1], 'bytes_sent': count}
+        for number, size, *messages, _ in connections:
+            found[False, topic, number] = Count(((uri, number),), messages[-1], size, now)
     for topic, connections in subscribed:
-        for number, count, messages, *_ in connections:
-            found[True, topic, number] = {'received': messages, 'bytes_received': count}
+        for number, size, messages, *_ in connections:
+            found[True, topic, number] = Count(((uri, number),), messages, size, now)
     return found
 
 

@@ -8,7 +8,9 @@ from pharos.blocks import text_of
 from pharos.channel import InputChannel
 from pharos.errors import PharosError
 from pharos.external_node import ExternalNode
-from pharos.live.answers import ALIVE, Answer, ask_all
+from pharos.live.answers import ALIVE, Answer, End, ask_all
+from pharos.live.snapshot import Connection, connections_of, uris_of
+from pharos.live.traffic import Traffic
 from pharos.live.watching import number_text
 from pharos.node import Node
 from pharos.output_channel import OutputChannel
@@ -18,6 +20,7 @@ TIMEOUT = 2.0  # seconds that a node has to answer
 WIDTH = 70  # characters of a parameter's value that are shown
 
 AnyNode = Union[Node, ExternalNode]
+Rates = Dict[Tuple[bool, str], float]  # (whether it is heard, topic) -> messages a second
 Types = Dict[str, Optional[str]]  # topic or service -> type; None: it is not known
 
 
@@ -33,69 +36,90 @@ class _Account:
     """What a node says at a time."""
 
     answer: Answer
-    time: float
-    #: (whether it is heard, topic) -> messages so far, where they are counted
-    counts: Dict[Tuple[bool, str], int]
-    #: likewise -> 'to <node> by <transport>' of each connection, or 'from'
-    peers: Dict[Tuple[bool, str], List[str]]
+    connections: List[Connection]
+    sent: Dict[str, int]  # topic -> messages so far, through a channel
+    time: float  # when these were counted, in seconds as of time.monotonic()
 
 
 def describe(node: AnyNode, seconds: float) -> Description:
     """The description of a node; where there are connections, rates are counted for so many
     seconds."""
     look = Look()
-    before = _account_of(node)
-    if seconds and before.answer.ends:
+    now, rates = _account_of(node), {}
+    if seconds and now.answer.ends:
         look.pause(seconds)
-        return Description('\n'.join(_lines(node, before, _account_of(node))))
-    return Description('\n'.join(_lines(node, None, before)))
+        before, now = now, _account_of(node)
+        rates = _rates(node.name, before, now)
+    return Description('\n'.join(_lines(node, now.answer, rates)))
 
 
 def _account_of(node: AnyNode) -> _Account:
+    is_own, uris = isinstance(node, Node), {node.name: node.uri}
     own = {node.name: node} if isinstance(node, Node) else {}
-    answer = ask_all({node.name: node.uri}, own, TIMEOUT, counts=True)[node.name]
-    now = _Account(answer, time.monotonic(), {}, {})
-    for end in sorted(answer.ends or (), key=lambda end: end[:4]):
-        key = end.is_inbound, end.topic
-        peer = f"{'from' if end.is_inbound else 'to'} {_name_of(end.other, node)}"
-        now.peers.setdefault(key, []).append(f'{peer} by {end.transport}')
-        count = end.counts.get('received' if end.is_inbound else 'sent')
-        if count is not None:
-            former = now.counts.get(key, 0)
-            # each subscriber gets a copy of what is sent, and each publisher sends something else
-            now.counts[key] = former + count if end.is_inbound else max(former, count)
-    for channel in _channels(node):
-        if isinstance(channel, OutputChannel):
-            now.counts[False, channel.topic] = channel.sent
-    return now
+    answers = ask_all(uris, own, TIMEOUT, counts=True, plain=None if is_own else set())
+    sent = {
+        channel.topic: channel.sent
+        for channel in _channels(node)
+        if isinstance(channel, OutputChannel)
+    }
+    now = time.monotonic()
+    return _Account(answers[node.name], connections_of(uris, answers), sent, now)
 
 
-def _name_of(other: str, node: AnyNode) -> str:
-    """The name of the node at the other end, which publishers have for it, but subscribers not."""
-    if not other.startswith('http'):
-        return other
-    for local in node.master.local_nodes():
-        if local.uri == other:
-            return local.name
-    try:
-        publishers, _, _ = node.master.system_state()
-        for name in sorted({name for names in publishers.values() for name in names}):
-            if node.master.uri_of(name) == other:
-                return name
-    except PharosError:  # the master is away
-        pass
-    return other
+def _rates(name: str, before: _Account, now: _Account) -> Rates:
+    """Messages a second of its topics; a channel counts those, too, that nobody hears."""
+    traffic = Traffic(before.connections, now.connections)
+    rates = {(True, topic): rate for (topic, by), rate in traffic.heard.items() if by == name}
+    for (topic, publisher), (rate, _) in traffic.published.items():
+        if publisher == name:
+            rates[False, topic] = rate
+    for topic, count in now.sent.items():
+        sent = count - before.sent.get(topic, 0)
+        rates[False, topic] = max(0, sent) / (now.time - before.time)
+    return rates
 
 
-def _lines(node: AnyNode, before: Optional[_Account], now: _Account) -> Iterator[str]:
+def _peers(node: AnyNode, ends: List[End]) -> Dict[Tuple[bool, str], List[str]]:
+    """``{(whether it is heard, topic): 'to <node> by <transport>' of each connection, or 'from'}``."""
+    names = _names_of(node, [end for end in ends if end.other.startswith('http')])
+    peers: Dict[Tuple[bool, str], List[str]] = {}
+    for end in sorted(ends, key=lambda end: end[:4]):
+        way = 'from' if end.is_inbound else 'to'
+        peer = f'{way} {names.get(end.other, end.other)} by {end.transport}'
+        peers.setdefault((end.is_inbound, end.topic), []).append(peer)
+    return peers
+
+
+def _names_of(node: AnyNode, ends: List[End]) -> Dict[str, str]:
+    """``{URI: name}`` of the nodes at the other ends: publishers have the names, subscribers not."""
+    names = {local.uri: local.name for local in node.master.local_nodes() if local.uri}
+    topics = {end.topic for end in ends if end.other not in names}
+    if topics:
+        try:
+            publishers, _, _ = node.master.system_state()
+            users = sorted({name for topic in topics for name in publishers.get(topic, ())})
+            uris = uris_of(node.master, users)
+            names.update({uri: name for name, uri in uris.items() if uri})
+        except PharosError:  # the master is away
+            pass
+    return names
+
+
+def _lines(node: AnyNode, answer: Answer, rates: Rates) -> Iterator[str]:
     own = node if isinstance(node, Node) else None
-    yield from _own_head(own) if own else _head(node, now.answer)
+    yield from _own_head(own) if own else _head(node, answer)
+    peers = _peers(node, answer.ends or [])
+    dropped = (answer.health or {}).get('dropped', {})
     for title, is_heard, types in _topics(node):
-        yield from _section(
-            title,
-            [_topic_line(own, is_heard, topic, types[topic], before, now) for topic in types],
-        )
-    yield from _section('offers', _services(node, now.answer.state == ALIVE))
+        lines = []
+        for topic, type_ in types.items():
+            parts = [_typed(topic, type_), *_counted(own, is_heard, topic, rates)]
+            if is_heard and topic in dropped:
+                parts.append(f'dropped {dropped[topic]}')
+            parts.append(', '.join(peers.get((is_heard, topic), ['not connected'])))
+            lines.append(', '.join(parts))
+        yield from _section(title, lines)
+    yield from _section('offers', _services(node, answer.state == ALIVE))
     yield from _section('parameters', list(_parameters(node)))
     if own:
         yield from _section('failures', [repr(failure) for failure in own.failures])
@@ -116,9 +140,15 @@ def _own_head(node: Node) -> Iterator[str]:
 
 
 def _head(node: AnyNode, answer: Answer) -> Iterator[str]:
+    health = answer.health or {}
+    class_name = f"{health['class']}, " if health else ''
     problem = f': {answer.problem}' if answer.problem else ''
-    yield f'{node.name}: a node of another process, {answer.state}{problem}'
+    yield f'{node.name}: {class_name}a node of another process, {answer.state}{problem}'
     yield f'  pid {answer.pid or "unknown"} at {answer.host}; {node.uri}'
+    if health:
+        dropped = sum(health['dropped'].values())
+        counts = (f'{health[what]} {what}' for what in ('failures', 'souls', 'threads'))
+        yield f"  {dropped} dropped, {', '.join(counts)}"
 
 
 def _channels(node: AnyNode) -> List[Any]:
@@ -140,25 +170,14 @@ def _topics(node: AnyNode) -> List[Tuple[str, bool, Types]]:
     ]
 
 
-def _topic_line(
-    own: Optional[Node],
-    is_heard: bool,
-    topic: str,
-    type_: Optional[str],
-    before: Optional[_Account],
-    now: _Account,
-) -> str:
-    """What there is to say of a topic of a node."""
-    key = is_heard, topic
-    parts = [_typed(topic, type_)]
-    if before is not None and key in now.counts:
-        count = now.counts[key] - before.counts.get(key, 0)
-        parts.append(f'{number_text(max(0, count) / (now.time - before.time))} Hz')
+def _counted(own: Optional[Node], is_heard: bool, topic: str, rates: Rates) -> Iterator[str]:
+    """What is known of the messages of a topic of a node."""
+    rate = rates.get((is_heard, topic))
+    if rate is not None:
+        yield f'{number_text(rate)} Hz'
     for channel in _channels(own) if own else ():
         if channel.topic == topic and isinstance(channel, InputChannel) == is_heard:
-            parts.append(_channel_text(channel))
-    parts.append(', '.join(now.peers.get(key, ['not connected'])))
-    return ', '.join(parts)
+            yield _channel_text(channel)
 
 
 def _channel_text(channel: Any) -> str:

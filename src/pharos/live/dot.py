@@ -3,7 +3,7 @@ import collections
 import os.path
 import re
 import time
-from typing import TYPE_CHECKING, Dict, Iterable, Iterator, List, Optional, Set, Tuple
+from typing import TYPE_CHECKING, Dict, Iterable, Iterator, List, Optional, Tuple
 from xml.sax.saxutils import escape
 
 from pharos.live.answers import ALIVE, DEAD
@@ -186,6 +186,7 @@ class _Frames:
             self._frame_processes()
         elif graph.group == 'namespace':
             self._frame_namespaces()
+        self._known = {(), *self._labels}
         for name, node in graph.nodes.items():
             self._lines[self._paths.get(name, ())].append(_node_line(node))
         for topic in graph.topics.values():
@@ -224,10 +225,6 @@ class _Frames:
         first = next(filter(None, ({*nodes} & {*self._graph.nodes} for nodes in users)))
         paths = [self._paths.get(node, ()) for node in first]
         return tuple(os.path.commonprefix(paths))
-
-    @property
-    def _known(self) -> Set[Tuple[str, ...]]:
-        return {(), *self._labels}
 
     def lines(self, path: Tuple[str, ...] = ()) -> Iterator[str]:
         """The text of a frame's inside."""

@@ -14,6 +14,7 @@ from pharos.live.dot import dot_of, sorry
 from pharos.live.edges import HEARS, OFFERS, PUBLISHES, SENDS, Edge
 from pharos.live.graph_text import text_of
 from pharos.live.snapshot import Host, Process, SeenNode, SeenService, SeenTopic, Snapshot
+from pharos.live.traffic import Traffic
 from pharos.master import Master
 from pharos.probe import Look
 from pharos.seconds import check_seconds
@@ -117,10 +118,10 @@ class Graph:
         where there is no other."""
         alone: Dict[Tuple[str, str], Set[str]] = {}
         with_others: Dict[Tuple[str, str], Set[str]] = {}
-        for each in self.snapshot.connections:
-            found = alone if each.publisher == each.subscriber else with_others
-            for node in each.publisher, each.subscriber:
-                found.setdefault((each.topic, node), set()).add(each.transport)
+        for (topic, publisher, subscriber), transports in self.snapshot.transports.items():
+            found = alone if publisher == subscriber else with_others
+            for node in publisher, subscriber:
+                found.setdefault((topic, node), set()).update(transports)
         return {**alone, **with_others}
 
     def _sends(self) -> Iterator[Edge]:
@@ -133,9 +134,9 @@ class Graph:
                 if publisher != subscriber:
                     _, topics = sent.setdefault((publisher, subscriber), (set(), set()))
                     topics.add(name)
-        for each in self.snapshot.connections:
-            if each.topic in self.topics and (each.publisher, each.subscriber) in sent:
-                sent[each.publisher, each.subscriber][0].add(each.transport)
+        for link, used in self.snapshot.transports.items():
+            if link[0] in self.topics and link[1:] in sent:
+                sent[link[1:]][0].update(used)
         for ends, (transports, topics) in sorted(sent.items()):
             yield Edge(SENDS, *ends, tuple(sorted(transports)), tuple(sorted(topics)))
         yield from self._offers()
@@ -224,7 +225,7 @@ def look(master: Master, rates: float = 0, **options: Any) -> Graph:
     Graph(before, **options)  # complains of an option before all the time is spent
     Look().pause(rates)
     after = snapshot.take(master, counts=True)
-    return Graph(after, snapshot.rates(before, after), **options)
+    return Graph(after, Traffic(before.connections, after.connections).of_topic, **options)
 
 
 def _check_choice(what: str, given: str, choices: Iterable[str]) -> str:

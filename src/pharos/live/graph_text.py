@@ -1,5 +1,5 @@
 """A graph as text, for a terminal."""
-from typing import TYPE_CHECKING, Collection, Dict, Iterator, List, Set, Tuple
+from typing import TYPE_CHECKING, Collection, Dict, Iterator, List, Tuple
 
 from pharos.live.answers import ALIVE
 from pharos.live.dot import rate_text
@@ -45,12 +45,6 @@ class _Uses:
 
     def __init__(self, graph: 'Graph') -> None:
         self._graph = graph
-        self._transports: Dict[
-            Tuple[str, str, str], Set[str]
-        ] = {}  # (topic, publisher, subscriber)
-        for each in graph.snapshot.connections:
-            ends = each.topic, each.publisher, each.subscriber
-            self._transports.setdefault(ends, set()).add(each.transport)
         self._sends: Dict[str, List[Edge]] = {}  # from and to each node
         for edge in graph.edges:
             if edge.kind == SENDS:
@@ -83,7 +77,8 @@ class _Uses:
 
     def _peers(self, ends: List[Tuple[str, str, str]], other: int) -> str:
         return ', '.join(
-            f'{each[other]} ({_joined(self._transports.get(each, ()))})' for each in ends
+            f'{each[other]} ({_joined(self._graph.snapshot.transports.get(each, ()))})'
+            for each in ends
         )
 
 

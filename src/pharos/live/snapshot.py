@@ -1,15 +1,17 @@
 """One look at the graph of a ROS master: hosts, processes, nodes, topics, services, connections."""
 import dataclasses
+import functools
 import socket
 import time
+import xmlrpc.client
 from typing import Any, Dict, Iterable, List, Optional, Set, Tuple
 
 import rosgraph
 
-from pharos.live.answers import ALIVE, DEAD, SILENT, Answer, ask_all
+from pharos.live.answers import ALIVE, DEAD, SILENT, Answer, Count, ask_all
 from pharos.master import Master
 
-__all__ = ['ALIVE', 'DEAD', 'SILENT', 'Snapshot', 'take', 'rates']
+__all__ = ['ALIVE', 'DEAD', 'SILENT', 'Snapshot', 'take']
 
 TIMEOUT = 1.0  # seconds that all nodes have to answer, together
 HERE = socket.gethostname()  # the name of the host that this program runs on
@@ -23,29 +25,26 @@ class Connection:
     publisher: str  # the name of a node; its URI where the master knows none there
     subscriber: str
     transport: str  # 'INTRAPROCESS', 'TCPROS' or 'UDPROS'
-    # messages and bytes since it was made, as each end counts them; None: it does not say, or was
-    # not asked
-    sent: Optional[int] = None
-    received: Optional[int] = None
-    bytes_sent: Optional[int] = None
-    bytes_received: Optional[int] = None
+    # what each end has counted; None: it does not say, or was not asked
+    sent: Optional[Count] = None
+    received: Optional[Count] = None
 
     @property
     def key(self) -> Tuple[str, str, str, str]:
         """What it has in common with itself in another snapshot."""
         return self.topic, self.publisher, self.subscriber, self.transport
 
-    def messages_since(self, before: Optional['Connection']) -> Optional[int]:
-        """How many messages have come through since an earlier look; None: it is not known.
+    def rates_since(self, before: Optional['Connection']) -> Optional[Tuple[float, float]]:
+        """Messages and bytes a second since an earlier look; None: they are not known.
 
-        What one end counts is compared with what the same counted before. One that counts less is
-        connected anew.
+        What one end counts is compared with what the same counted before.
         """
         if before is None:
             return None
         for count, former in (self.received, before.received), (self.sent, before.sent):
-            if count is not None and former is not None and count >= former:
-                return count - former
+            found = count.rates_since(former) if count and former else None
+            if found is not None:
+                return found
         return None
 
 
@@ -118,22 +117,34 @@ class Snapshot:
     services: Dict[str, SeenService]
     connections: List[Connection]
 
-    def transports(self, topic: str, node: str) -> Set[str]:
-        """The transports by which a node's messages of a topic come and go."""
-        return {
-            each.transport
-            for each in self.connections
-            if each.topic == topic and node in (each.publisher, each.subscriber)
-        }
+    #: what nodes of pharos tell of their health, by their names, if they were asked
+    health: Dict[str, Dict[str, Any]] = dataclasses.field(default_factory=dict)
+
+    @functools.cached_property
+    def transports(self) -> Dict[Tuple[str, str, str], Set[str]]:
+        """``{(topic, publisher, subscriber): by which messages go}``, where they are connected."""
+        found: Dict[Tuple[str, str, str], Set[str]] = {}
+        for each in self.connections:
+            found.setdefault((each.topic, each.publisher, each.subscriber), set()).add(
+                each.transport
+            )
+        return found
 
 
-def take(master: Master, timeout: float = TIMEOUT, counts: bool = False) -> Snapshot:
+def take(
+    master: Master,
+    timeout: float = TIMEOUT,
+    counts: bool = False,
+    plain: Optional[Set[str]] = None,
+) -> Snapshot:
     """Ask the master, and all nodes at once; returns the :class:`Snapshot`.
 
     Nodes that do not answer are in it, too, and marked so. It may be called in any thread.
 
     :param timeout: seconds that all nodes have to answer, together
     :param counts: ask them, too, what has come through their connections; nodes count that anyway
+    :param plain: ask them for their health, too, but for those that are known not to be of pharos:
+        these are their URIs, to which those found out now are added
     :raises MasterUnreachableError: if the master does not answer
     """
     publishers, subscribers, services = master.system_state()
@@ -141,10 +152,11 @@ def take(master: Master, timeout: float = TIMEOUT, counts: bool = False) -> Snap
     now = time.time()
     kinds = (publishers, subscribers, services)
     names = sorted({name for kind in kinds for users in kind.values() for name in users})
-    uris = _uris_of(master, names)
+    uris = uris_of(master, names)
     own = {node.name: node for node in master.local_nodes() if uris.get(node.name) == node.uri}
-    answers = ask_all(uris, own, timeout, counts)
+    answers = ask_all(uris, own, timeout, counts, plain)
     hosts = _names_of_hosts(answers)
+    uses = [_by_node(kind) for kind in kinds]
     nodes = {
         name: SeenNode(
             name,
@@ -154,7 +166,7 @@ def take(master: Master, timeout: float = TIMEOUT, counts: bool = False) -> Snap
             answers[name].state,
             answers[name].problem,
             name in own,
-            *[sorted(what for what, users in kind.items() if name in users) for kind in kinds],
+            *[use.get(name, []) for use in uses],
         )
         for name in names
     }
@@ -173,21 +185,40 @@ def take(master: Master, timeout: float = TIMEOUT, counts: bool = False) -> Snap
             for name in sorted({*publishers, *subscribers})
         },
         services={name: SeenService(name, sorted(services[name])) for name in sorted(services)},
-        connections=_connections(uris, answers),
+        connections=connections_of(uris, answers),
+        health={name: each.health for name, each in answers.items() if each.health},
     )
 
 
-def _uris_of(master: Master, names: Iterable[str]) -> Dict[str, Optional[str]]:
-    """The URI of each node; None where the master has forgotten it meanwhile."""
+def uris_of(master: Master, names: Iterable[str]) -> Dict[str, Optional[str]]:
+    """The URI of each node, asked for in one call, which roslaunch makes, too; None where the master
+    has forgotten it meanwhile.
+
+    :raises MasterUnreachableError: if the master does not answer
+    """
+    names = list(names)
+    if not names:
+        return {}
     api = master.api()
-    uris: Dict[str, Optional[str]] = {}
     with master.reached():
+        questions = xmlrpc.client.MultiCall(api.handle)
         for name in names:
-            try:
-                uris[name] = str(api.lookupNode(name))
-            except rosgraph.MasterError:
-                uris[name] = None
+            questions.lookupNode(api.caller_id, name)
+        answers: Any = questions()
+        uris: Dict[str, Optional[str]] = {}
+        for index, name in enumerate(names):
+            code, _, uri = answers[index]
+            uris[name] = str(uri) if code == 1 else None
     return uris
+
+
+def _by_node(kind: Dict[str, List[str]]) -> Dict[str, List[str]]:
+    """``{node: what it uses}``, where the master tells who uses what."""
+    found: Dict[str, List[str]] = {}
+    for what in sorted(kind):
+        for name in {*kind[what]}:
+            found.setdefault(name, []).append(what)
+    return found
 
 
 def _names_of_hosts(answers: Dict[str, Answer]) -> Dict[str, str]:
@@ -217,7 +248,7 @@ def _hosts(nodes: Dict[str, SeenNode]) -> List[Host]:
     ]
 
 
-def _connections(uris: Dict[str, Optional[str]], answers: Dict[str, Answer]) -> List[Connection]:
+def connections_of(uris: Dict[str, Optional[str]], answers: Dict[str, Answer]) -> List[Connection]:
     """The connections, of which one end says at least that it has them.
 
     A publisher calls the other end by the name of the node, a subscriber by the URI.
@@ -229,26 +260,8 @@ def _connections(uris: Dict[str, Optional[str]], answers: Dict[str, Answer]) -> 
             other = names.get(end.other.rstrip('/'), end.other)
             ends = (other, name) if end.is_inbound else (name, other)
             counted = found.setdefault((end.topic, ends[0], ends[1], end.transport), {})
-            for what, count in end.counts.items():
-                counted[what] = counted.get(what, 0) + count  # there may be two
+            if end.counted is not None:
+                side = 'received' if end.is_inbound else 'sent'
+                former = counted.get(side)
+                counted[side] = end.counted if former is None else former + end.counted
     return [Connection(*each, **counted) for each, counted in sorted(found.items())]
-
-
-def rates(before: Snapshot, after: Snapshot) -> Dict[str, float]:
-    """``{topic: messages a second}`` between two snapshots taken with ``counts``.
-
-    Of a topic that nobody hears nothing is counted, and so nothing told; of one with several
-    publishers, those of all of them are.
-    """
-    seconds = after.time - before.time
-    former = {each.key: each for each in before.connections}
-    fastest: Dict[Tuple[str, str], float] = {}  # (topic, publisher) -> rate, of its best connection
-    for connection in after.connections:
-        count = connection.messages_since(former.get(connection.key))
-        if count is not None and seconds > 0:
-            ends = connection.topic, connection.publisher
-            fastest[ends] = max(fastest.get(ends, 0.0), count / seconds)
-    found: Dict[str, float] = {}
-    for (topic, _), rate in fastest.items():
-        found[topic] = found.get(topic, 0.0) + rate
-    return found

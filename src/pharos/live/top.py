@@ -4,25 +4,22 @@ Nodes count what comes and goes in any case, so that two looks make rates, and n
 to; where nobody looks, nothing is done. What blocks failed at, and channels dropped, nodes of pharos
 tell when they are asked; of CPU and memory the system tells, for the processes of this host.
 """
-import concurrent.futures
+import collections
 import dataclasses
 import fnmatch
-from typing import Any, Collection, Dict, Iterable, List, Optional, Set, Tuple
-import xmlrpc.client
+import time
+from typing import Any, Collection, DefaultDict, Dict, Iterable, List, Optional, Set, Tuple
 
 import psutil
 
-from pharos.external_node import node_api
 from pharos.live.probing import Probes
-from pharos.live.snapshot import ALIVE, Connection, Snapshot, rates, take
+from pharos.live.snapshot import Snapshot, take
+from pharos.live.traffic import Traffic
 from pharos.master import Master
 from pharos.probe import Look
 from pharos.seconds import check_seconds
 
 TIMEOUT = 1.0  # seconds that all nodes have to answer
-CALLER = '/pharos'
-ASKING = 32  # nodes that are asked side by side for what those of pharos tell
-WRAP = 2**32  # bytes after which nodes count from the beginning
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,8 +129,8 @@ class Meter:
         self.master, self.names = master, tuple(names)
         self._probes = Probes(master) if probes else None
         self._before: Optional[Snapshot] = None
-        self._asker = concurrent.futures.ThreadPoolExecutor(ASKING, 'top asks')
-        self._others: Set[str] = set()  # URIs of nodes that are not of pharos
+        self._measured_at = 0.0  # by time.monotonic()
+        self._plain: Set[str] = set()  # URIs of nodes that are not of pharos
         self._processes: Dict[int, psutil.Process] = {}
 
     def __enter__(self) -> 'Meter':
@@ -144,7 +141,6 @@ class Meter:
 
     def close(self) -> None:
         """End the subscriptions, if there are any."""
-        self._asker.shutdown(wait=False)
         if self._probes is not None:
             self._probes.close()
 
@@ -153,14 +149,16 @@ class Meter:
 
         :raises MasterUnreachableError: if the master does not answer
         """
-        before, after = self._before, take(self.master, TIMEOUT, counts=True)
+        before, measured_before = self._before, self._measured_at
+        after = take(self.master, TIMEOUT, counts=True, plain=self._plain)
+        self._measured_at = time.monotonic()
         if self._probes is not None:
             after = _without(after, self._probes.name)
         self._before = after
-        health = self._health(after)
-        traffic = Traffic(before, after)
+        traffic = Traffic(before.connections if before else (), after.connections)
+        links = _Links(after)
         nodes = [
-            _node_row(after, name, traffic, health.get(name, {}))
+            _node_row(after, name, traffic, links.of_node[name])
             for name in after.nodes
             if is_wanted(name, self.names)
         ]
@@ -169,34 +167,14 @@ class Meter:
         return Measurement(
             master=after.master,
             time=after.time,
-            seconds=after.time - before.time if before else None,
+            seconds=self._measured_at - measured_before if before else None,
             is_measured=self._probes is not None,
             nodes=nodes,
             processes=list(self._process_rows(after, nodes)),
-            topics=[_topic_row(after, name, traffic, health, measured) for name in topics],
+            topics=[
+                _topic_row(after, name, traffic, links.of_topic[name], measured) for name in topics
+            ],
         )
-
-    # -- what nodes of pharos tell
-
-    def _health(self, snapshot: Snapshot) -> Dict[str, Dict[str, Any]]:
-        """``{node: what it tells}``; others than those of pharos are asked once."""
-        asked = {
-            name: self._asker.submit(self._ask, node.uri)
-            for name, node in snapshot.nodes.items()
-            if node.state == ALIVE and node.uri and node.uri not in self._others
-        }
-        answers = {name: future.result() for name, future in asked.items()}
-        return {name: answer for name, answer in answers.items() if answer}
-
-    def _ask(self, uri: str) -> Optional[Dict[str, Any]]:
-        try:
-            code, _, value = node_api(uri, TIMEOUT).pharosHealth(CALLER)
-        except xmlrpc.client.Fault:
-            self._others.add(uri)
-            return None
-        except Exception:  # whatever it answers, it is one node of many, and may just have gone
-            return None
-        return dict(value) if code == 1 else None
 
     # -- what the system tells
 
@@ -268,71 +246,26 @@ def _without(snapshot: Snapshot, name: str) -> Snapshot:
     )
 
 
-class Traffic:
-    """What has gone through connections between two looks, a second."""
-
-    def __init__(self, before: Optional[Snapshot], after: Snapshot) -> None:
-        #: topic -> messages
-        self.of_topic: Dict[str, float] = rates(before, after) if before else {}
-        #: topic -> bytes that one subscriber gets
-        self.bandwidth: Dict[str, float] = {}
-        #: node -> messages, bytes
-        self.received: Dict[str, float] = {}
-        self.sent: Dict[str, float] = {}
-        self.bytes_received: Dict[str, float] = {}
-        self.bytes_sent: Dict[str, float] = {}
-        if before is not None and after.time > before.time:
-            self._compare(before, after, after.time - before.time)
-
-    def _compare(self, before: Snapshot, after: Snapshot, seconds: float) -> None:
-        former = {each.key: each for each in before.connections}
-        # (topic, publisher) -> of its best connection
-        messages: Dict[Tuple[str, str], float] = {}
-        sizes: Dict[Tuple[str, str], float] = {}
-        for each in after.connections:
-            earlier = former.get(each.key)
-            count = each.messages_since(earlier)
-            if earlier is None or count is None:
-                continue
-            size = _bytes_since(earlier, each) / seconds
-            ends = each.topic, each.publisher
-            _raise_to(messages, ends, count / seconds)
-            _raise_to(sizes, ends, size)
-            _add(self.received, each.subscriber, count / seconds)
-            _add(self.bytes_received, each.subscriber, size)
-            _add(self.bytes_sent, each.publisher, size)
-        for (topic, publisher), rate in messages.items():
-            _add(self.sent, publisher, rate)
-            _add(self.bandwidth, topic, sizes[topic, publisher])
-
-
-def _bytes_since(before: Connection, after: Connection) -> int:
-    for count, former in (
-        (after.bytes_received, before.bytes_received),
-        (after.bytes_sent, before.bytes_sent),
-    ):
-        if count is not None and former is not None:
-            return (count - former) % WRAP
-    return 0
-
-
-def _raise_to(values: Dict[Any, float], key: Any, value: float) -> None:
-    values[key] = max(values.get(key, 0.0), value)
-
-
-def _add(values: Dict[str, float], key: str, value: float) -> None:
-    values[key] = values.get(key, 0.0) + value
-
-
 def _sum(values: Iterable[Any]) -> Any:
     """The sum of what is known; None where nothing is."""
     known = [value for value in values if value is not None]
     return sum(known) if known else None
 
 
-def _node_row(snapshot: Snapshot, name: str, traffic: Traffic, health: Dict[str, Any]) -> NodeRow:
-    node = snapshot.nodes[name]
-    ends = [each for each in snapshot.connections if name in (each.publisher, each.subscriber)]
+class _Links:
+    """The transports of the connections of each node and topic."""
+
+    def __init__(self, snapshot: Snapshot) -> None:
+        self.of_node: DefaultDict[str, List[str]] = collections.defaultdict(list)
+        self.of_topic: DefaultDict[str, List[str]] = collections.defaultdict(list)
+        for each in snapshot.connections:
+            self.of_topic[each.topic].append(each.transport)
+            for node in {each.publisher, each.subscriber}:
+                self.of_node[node].append(each.transport)
+
+
+def _node_row(snapshot: Snapshot, name: str, traffic: Traffic, transports: List[str]) -> NodeRow:
+    node, health = snapshot.nodes[name], snapshot.health.get(name, {})
     return NodeRow(
         name=name,
         host=node.host,
@@ -343,7 +276,7 @@ def _node_row(snapshot: Snapshot, name: str, traffic: Traffic, health: Dict[str,
         sent=traffic.sent.get(name),
         bytes_received=traffic.bytes_received.get(name),
         bytes_sent=traffic.bytes_sent.get(name),
-        **_transports(ends),
+        **_counted(transports),
         dropped=sum(health['dropped'].values()) if health else None,
         failures=health.get('failures'),
         threads=health.get('threads'),
@@ -355,11 +288,11 @@ def _topic_row(
     snapshot: Snapshot,
     name: str,
     traffic: Traffic,
-    health: Dict[str, Dict[str, Any]],
+    transports: List[str],
     measured: Dict[str, Tuple[float, float]],
 ) -> TopicRow:
     topic = snapshot.topics[name]
-    hearers = [health[node] for node in topic.subscribers if node in health]
+    hearers = [snapshot.health[node] for node in topic.subscribers if node in snapshot.health]
     rate, bandwidth = measured.get(name, (traffic.of_topic.get(name), traffic.bandwidth.get(name)))
     return TopicRow(
         name=name,
@@ -368,11 +301,11 @@ def _topic_row(
         subscribers=topic.subscribers,
         rate=rate,
         bandwidth=bandwidth,
-        **_transports([each for each in snapshot.connections if each.topic == name]),
+        **_counted(transports),
         dropped=_sum(hearer['dropped'].get(name, 0) for hearer in hearers),
     )
 
 
-def _transports(connections: List[Connection]) -> Dict[str, int]:
-    local = [each for each in connections if each.transport == 'INTRAPROCESS']
-    return {'intraprocess': len(local), 'tcpros': len(connections) - len(local)}
+def _counted(transports: List[str]) -> Dict[str, int]:
+    local = transports.count('INTRAPROCESS')
+    return {'intraprocess': local, 'tcpros': len(transports) - local}
