@@ -305,6 +305,7 @@ def equip(shell: Any) -> Callable[[], None]:
     ends it."""
     completer = shell.Completer
     all_completions = completer.completions
+    has_ended = False
     typed = ''  # all that is typed, of which IPython tells its hooks the last line alone
 
     def note(text: str, offset: int) -> Any:
@@ -315,7 +316,7 @@ def equip(shell: Any) -> Callable[[], None]:
     def complete(line: str, in_strings: bool) -> List[str]:
         code = typed if typed.endswith(line) else line
         place = place_of(code)
-        if place is None or (place.string is not None) is not in_strings:
+        if has_ended or place is None or (place.string is not None) is not in_strings:
             return []
         return completions(code, shell.user_ns)
 
@@ -332,11 +333,9 @@ def equip(shell: Any) -> Callable[[], None]:
     shell.set_hook('complete_command', complete_strings, re_key='(?s).*')
 
     def end() -> None:
-        nonlocal complete
+        nonlocal has_ended
+        has_ended = True  # IPython has no way to take the hook back
         del completer.completions
         completer.custom_matchers.remove(complete_keywords)
-        complete = (
-            lambda line, in_strings: []
-        )  # noqa: E731  # IPython has no way to take the hook back
 
     return end
