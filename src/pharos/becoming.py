@@ -1,6 +1,16 @@
 """How a node becomes one of another class while it runs."""
 import functools
-from typing import TYPE_CHECKING, Any, Callable, Iterator, List, NamedTuple, Sequence, Tuple
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Callable,
+    Iterator,
+    List,
+    NamedTuple,
+    Optional,
+    Sequence,
+    Tuple,
+)
 
 from pharos.blocks import BlockOf, check_block
 from pharos.channel import InputChannel
@@ -18,7 +28,9 @@ class Place(NamedTuple):
     of: str  # what that is of
     block: BlockOf
     parameters: Sequence[str]  # that it is called with
-    take: Callable[[Any], Any]  # takes what it becomes
+    take: Optional[
+        Callable[[Any], Any]
+    ]  # takes what it becomes; None: the place looks that up itself
 
 
 def become(node: 'Node', node_class: type) -> None:
@@ -54,7 +66,9 @@ def _changes(node: 'Node', node_class: type) -> List[Tuple[Callable[[Any], Any],
         if block is None:
             gone.append(f'{place.block.method}, the {place.kind} of {place.of}')
         elif place.block.method is not None:
-            changes.append((place.take, check_block(block, place.kind, place.parameters)))
+            check_block(block, place.kind, place.parameters)
+            if place.take is not None:
+                changes.append((place.take, block))
     if gone:
         raise PharosError(
             f'{node.name} cannot become a {node_class.__name__}, which has no {"; no ".join(gone)}:'
@@ -66,27 +80,25 @@ def _changes(node: 'Node', node_class: type) -> List[Tuple[Callable[[Any], Any],
 def places(node: 'Node') -> Iterator[Place]:
     """The blocks of a node that there are."""
 
-    def held(holder: Any, kind: str, of: str, *parameters: str) -> Iterator[Place]:
-        attribute = kind.split()[-1]
+    def held(holder: Any, attribute: str, kind: str, of: str, *parameters: str) -> Iterator[Place]:
         block = getattr(holder, attribute)
         if block is not None:
             take = functools.partial(setattr, holder, attribute)
             yield Place(kind, of, BlockOf(node, block), parameters, take)
 
-    yield from held(node, 'delegate', node.name, 'message', 'channel')
-    yield from held(node, 'soul', node.name, 'node')
+    yield from held(node, 'delegate', 'delegate', node.name, 'message', 'channel')
+    yield from held(node, 'soul', 'soul', node.name, 'node')
     run = node.latest_run
     if run is None:
         return
     for opened in run.opened:
         if isinstance(opened, InputChannel):
-            yield from held(opened, 'delegate', opened.topic, 'message', 'channel')
+            yield from held(opened, 'delegate', 'delegate', opened.topic, 'message', 'channel')
         elif isinstance(opened, OfferedService):
-            yield from held(opened, 'service block', opened.name, 'request')
-    # those look up by themselves what their blocks have become
+            yield from held(opened, 'block', 'service block', opened.name, 'request')
     for soul in run.souls.forked:
         if soul.block is not None:
-            yield Place('soul', f'the thread {soul.name}', soul.block, ('node',), bool)
+            yield Place('soul', f'the thread {soul.name}', soul.block, ('node',), None)
     for parameter in run.parameters:
         for given in parameter.blocks:
-            yield Place('parameter block', parameter.name, given, ('value',), bool)
+            yield Place('parameter block', parameter.name, given, ('value',), None)

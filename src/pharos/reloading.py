@@ -27,6 +27,6 @@ def _look_up_methods(*cell: Any) -> None:
     for node in node_registry.nodes():
         for place in places(node):
             block = place.block.now
-            if place.block.method is not None and block != place.block.given:
+            if place.take and place.block.method is not None and block != place.block.given:
                 # what cannot be called as it was is told when it is called
                 attempt(functools.partial(place.take, block))
