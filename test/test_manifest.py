@@ -59,7 +59,8 @@ def is_python(path):
 
 def imports(source):
     """The top-level modules that it imports, in its functions and in the programs that it has in
-    strings, and those without which it skips its tests, too, but for what only a type checker imports."""
+    strings, too, but for what only a type checker imports; and those without which it skips its
+    tests."""
     tree = ast.parse(source)
     for node in ast.walk(tree):
         if isinstance(node, ast.If) and ast.dump(node.test) == ast.dump(
