@@ -42,14 +42,14 @@ class Node(NodeWithSouls, is_base=True):
     ``create``.
     """
 
-    #: whether a start opens again what the last run had; a start() of one's own opens it itself
-    _reopens = True
+    #: whether its class has a start() of its own, which opens and forks all that the node has
+    _starts_itself = False
     #: what starts and stops in its own way
     _kind = 'a node'
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        cls._reopens = cls.start is Node.start
+        cls._starts_itself = cls.start is not Node.start
         if 'start' in vars(cls):
             cls.start = of_one_run(cls.start)  # type: ignore[assignment]
         cls.stop = node_registry.one_stop_at_a_time(cls.stop)  # type: ignore[assignment]
@@ -70,7 +70,7 @@ class Node(NodeWithSouls, is_base=True):
         :raises NodeStoppedError: if :meth:`stop` was called meanwhile, and the node is then as it
             was
         """
-        Run(self, self._settings).start(self._reopens)
+        Run(self, self._settings).start(reopens=not self._starts_itself)
 
     @node_registry.one_stop_at_a_time
     def stop(self) -> None:
@@ -103,7 +103,7 @@ class Node(NodeWithSouls, is_base=True):
         :raises NodeStoppedError: if another thread stops the node meanwhile, or all nodes are
         :raises NodeNameInUseError, PortInUseError: and the node is then stopped
         """
-        restart(self, not self._reopens)
+        restart(self, forks_itself=self._starts_itself)
 
     def become(self, node_class: type) -> None:
         """Be a node of another class from now on, such as the one that a reload of its module has

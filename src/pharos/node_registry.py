@@ -40,8 +40,6 @@ _nodes: 'Dict[Tuple[Any, str], Node]' = {}
 _stops: 'Dict[Node, Tuple[int, float]]' = {}
 # (node, identifier of the thread that is in its start()) -> the run that it has begun there
 _starts: 'Dict[Tuple[Node, int], Optional[Run]]' = {}
-# node that is stopped to be started again, and keeps its name -> the thread that does it
-restarts: 'Dict[Node, int]' = {}
 _waiting: 'Dict[int, Node]' = {}  # identifier of a thread -> the node for whose stop it waits
 _finalizer: Any = None  # what multiprocessing runs at the end of its processes
 _others: List[Callable[[], Any]] = []  # they end what else was started: programs, masters
@@ -165,11 +163,6 @@ def start_of(node: 'Node') -> 'Iterator[None]':
     finally:
         if is_outermost:
             _starts.pop(key, None)
-
-
-def is_restarting(node: 'Node') -> bool:
-    """Whether the node is stopped to be started again."""
-    return node in restarts
 
 
 def is_in_start(node: 'Node') -> bool:
@@ -376,7 +369,7 @@ def _forget() -> None:
     changed = threading.Condition()
     _finalizer = None  # its parent's, which multiprocessing has dropped
     former = list(_nodes.values())
-    for known in (_nodes, _stops, _starts, restarts, _waiting, _others, _starters):
+    for known in (_nodes, _stops, _starts, _waiting, _others, _starters):
         known.clear()  # type: ignore[attr-defined]
     for node in former:
         node.latest_run.abandon()

@@ -1,7 +1,8 @@
 """Restarts: a stop and a start, and all that was is there again."""
 import contextlib
+import os
 import threading
-from typing import TYPE_CHECKING, Iterator
+from typing import TYPE_CHECKING, Dict, Iterator
 
 from pharos import node_registry
 from pharos.errors import NodeStoppedError, PharosError
@@ -9,6 +10,10 @@ from pharos.private_rospy.lifetime import SIGNAL_LATENCY, on_nobodys_behalf
 
 if TYPE_CHECKING:
     from pharos.node import Node
+
+# node that is stopped to be started again, and keeps its name -> the identifier of the thread that
+# does it; node_registry.changed guards it
+_restarts: 'Dict[Node, int]' = {}
 
 
 def restart(node: 'Node', forks_itself: bool) -> None:
@@ -41,6 +46,11 @@ def restart(node: 'Node', forks_itself: bool) -> None:
         former.souls.end()
 
 
+def is_restarting(node: 'Node') -> bool:
+    """Whether the node is stopped to be started again."""
+    return node in _restarts
+
+
 @contextlib.contextmanager
 def _turn_of(node: 'Node') -> Iterator[bool]:
     """Within this, the node keeps its name while it is stopped and started, and is waited for by
@@ -51,21 +61,24 @@ def _turn_of(node: 'Node') -> Iterator[bool]:
     """
     me, is_due = threading.get_ident(), True
     with node_registry.changed:
-        if node_registry.restarts.get(node) == me:
+        if _restarts.get(node) == me:
             raise PharosError(f'{node.name} cannot be restarted by its own start() or stop()')
-        while node in node_registry.restarts:
+        while node in _restarts:
             if node.latest_run.is_own_thread():
                 raise NodeStoppedError(f'another thread restarts {node.name}')
             node_registry.changed.wait(SIGNAL_LATENCY)
             is_due = not node.is_running
         if is_due:
-            node_registry.restarts[node] = me
+            _restarts[node] = me
     try:
         yield is_due
     finally:
         with node_registry.changed:
             if is_due:
-                del node_registry.restarts[node]
+                del _restarts[node]
                 if node.latest_run is None or node.latest_run.is_over:
                     node_registry.discard(node)
             node_registry.changed.notify_all()
+
+
+os.register_at_fork(after_in_child=_restarts.clear)

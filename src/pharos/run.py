@@ -20,6 +20,7 @@ from pharos.private_rospy.instance import PrivateRospy
 from pharos.private_rospy.names import Resolved, check_name
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.settings import Settings
+from pharos.restarts import is_restarting
 from pharos.seconds import check_seconds
 from pharos.souls import Souls
 from pharos.topic import Topic
@@ -193,7 +194,7 @@ class Run:
         with node_registry.changed:
             self.lifecycle = lifecycle
             self._starter = None
-            if lifecycle is Lifecycle.STOPPED and not node_registry.is_restarting(self.node):
+            if lifecycle is Lifecycle.STOPPED and not is_restarting(self.node):
                 node_registry.discard(self.node)
             node_registry.changed.notify_all()
 

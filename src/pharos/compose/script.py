@@ -14,6 +14,7 @@ from pharos.compose.programs import check_source, find_program, source_of
 from pharos.errors import NodeStoppedError, PharosError
 from pharos.lifecycle import Lifecycle
 from pharos.node import Node
+from pharos.restarts import is_restarting
 from pharos.ros_process import arguments_of
 from pharos.run import Run
 from pharos.watcher import watcher_of
@@ -104,7 +105,7 @@ class ScriptNode(Node):
             nonlocal run
             while run.successor is not None:
                 run = run.successor
-            return run.is_over and not node_registry.is_restarting(self)
+            return run.is_over and not is_restarting(self)
 
         with signals.interruptible_wait():
             if not node_registry.wait_until(has_ended, timeout):
