@@ -16,6 +16,10 @@ SIGNALS = pytest.mark.parametrize(
     'with_signal', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name
 )
 
+HANDLED_BY_ROSPY = pytest.mark.parametrize(
+    'with_signal', [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name
+)
+
 PREPARED = (PROGRAMS / 'prepared.py').read_text()
 
 
@@ -69,9 +73,35 @@ def test_a_wait_of_ours_ends_and_the_program_goes_on(program, with_signal, wait)
     assert 'went on stopped stopped' in running.read_to_the_end()
 
 
-@pytest.mark.parametrize(
-    'with_signal', [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name
-)
+LOOKS = {
+    'describe': 'other.describe(3600)',
+    'graph': 'me.master.graph(3600)',
+    'top': 'importlib.import_module("pharos.live.top").measure(me.master, 3600)',
+}
+LOOKING = """
+import importlib
+me, other = node(), node("/program_too")
+other.interested_in("/looked_at", "std_msgs/String")
+me.output_channel("/looked_at", "std_msgs/String")
+ready_in_wait()
+"""
+
+
+@SIGNALS
+@pytest.mark.parametrize('look', LOOKS.values(), ids=LOOKS)
+def test_a_look_is_ended_as_plain_code(program, with_signal, look):
+    running = program(LOOKING + look)
+    assert running.end(with_signal) == ended_by(with_signal)
+
+
+@HANDLED_BY_ROSPY
+def test_a_look_ends_where_the_program_is_a_rospy_node_itself(program, with_signal):
+    running = program('import rospy; rospy.init_node("program_itself")' + LOOKING + LOOKS['graph'])
+    # rospy keeps Ctrl-C to itself: the look ends with a NodeStoppedError then
+    assert running.end(with_signal) == (1 if with_signal == signal.SIGINT else 128 + with_signal)
+
+
+@HANDLED_BY_ROSPY
 @pytest.mark.parametrize('first', ['rospy', 'pharos'])
 def test_spin_ends_where_the_program_is_a_rospy_node_itself(program, with_signal, first):
     """rospy's handlers of signals keep Ctrl-C to themselves."""
@@ -99,6 +129,7 @@ def test_plain_code_is_ended_as_without_nodes(program, with_signal, busy):
         'ready_in_wait()\n    me.sleep(3600)',
         'ready_in_wait()\n    me.execute()',
         'ready_in_wait()\n    pharos.spin()',
+        'ready_in_wait()\n    me.master.graph(3600)',
     ],
 )
 def test_ctrl_c_at_the_prompt_ends_the_line_and_no_node(program, line):

@@ -2,6 +2,7 @@
 only when somebody looks."""
 import array
 import collections
+import threading
 import time
 from typing import TYPE_CHECKING, Any, Callable, Deque, Dict, Optional
 
@@ -12,7 +13,7 @@ from pharos.channel import InputChannel
 from pharos.errors import NodeStoppedError
 from pharos.intraprocess.inbox import Inbox
 from pharos.private_rospy import changes
-from pharos.private_rospy.lifetime import Interruption
+from pharos.private_rospy.lifetime import Interruption, wait_for
 
 if TYPE_CHECKING:
     from pharos.node import Node
@@ -29,13 +30,19 @@ class Look:
         self._stop = Interruption()
 
     def pause(self, seconds: float) -> None:
-        """Wait; at a prompt, Ctrl-C ends the wait.
+        """Wait; in the main thread, Ctrl-C raises KeyboardInterrupt, and another signal SystemExit,
+        as in time.sleep().
 
-        :raises NodeStoppedError: if the thread's node stops
+        :raises NodeStoppedError: if the thread's node stops, or all nodes do
         """
-        deadline = time.monotonic() + seconds
-        with signals.interruptible_wait():
-            node_registry.wait_until(lambda: self._stop.came, seconds)
+        deadline, all_stop = time.monotonic() + seconds, threading.Event()
+        node_registry.before_stop_all(all_stop.set)
+        try:
+            with signals.interruptible_wait(is_cut_off=True):
+                own = threading.Condition()  # any other might stay locked where this is cut off
+                wait_for(own, lambda: self._stop.came or all_stop.is_set(), seconds)
+        finally:
+            node_registry.not_before_stop_all(all_stop.set)
         self._check_time_is_up(deadline)
 
     def wait(self, node: 'Node', predicate: Callable[[], Any], timeout: float) -> bool:

@@ -48,6 +48,7 @@ taken_on: Set[int] = set()
 _is_needed: Callable[[], bool] = bool  # see :func:`serve`
 _stop_all: Callable[[], Any] = bool
 _waits = 0  # how deep the main thread is in waits of ours, which end with the nodes
+_is_cut_off = False  # whether the innermost of them is cut off by what the signal raises instead
 _holds = 0  # how many starts and stops, within one another, the main thread runs
 _coming: 'Optional[_Signal]' = None  # has come, and not yet ended what the main thread does
 _is_reminded = False  # whether the next signal is a reminder of that one
@@ -176,18 +177,24 @@ def _take_on(*numbers: signal.Signals) -> None:
 
 
 @contextlib.contextmanager
-def interruptible_wait() -> Iterator[None]:
+def interruptible_wait(is_cut_off: bool = False) -> Iterator[None]:
     """Within this, a signal raises nothing in the main thread: the wait ends because the nodes
-    stop."""
-    global _waits
+    stop.
+
+    :param is_cut_off: whether it raises at once, as in code of the user's: for a wait that holds no
+        lock, and of which there is nothing to return
+    """
+    global _waits, _is_cut_off
     if threading.current_thread() is not main_thread():
         yield
         return
     _waits += 1
+    former, _is_cut_off = _is_cut_off, is_cut_off
     try:
         yield
     finally:
         _waits -= 1
+        _is_cut_off = former
 
 
 @contextlib.contextmanager
@@ -232,7 +239,7 @@ def _on_signal(number: int, frame: Optional[FrameType]) -> None:
         # just now.
         if not coming.is_at_prompt:
             _thread.start_new_thread(coming.stop_nodes, ())
-            if _waits and not _holds:
+            if _waits and not (_holds or _is_cut_off):
                 return  # the wait ends with the nodes
         _coming = coming
         _thread.start_new_thread(coming.remind, ())
@@ -259,9 +266,9 @@ def _do_default(number: int, frame: Any) -> None:
 
 def _forget() -> None:
     """In a process that was forked: it begins anew."""
-    global _waits, _holds, _coming, _is_reminded
+    global _waits, _is_cut_off, _holds, _coming, _is_reminded
     _waits = _holds = 0
-    _coming, _is_reminded = None, False
+    _is_cut_off, _coming, _is_reminded = False, None, False
 
 
 os.register_at_fork(after_in_child=_forget)
