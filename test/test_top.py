@@ -304,7 +304,7 @@ def test_without_a_terminal_all_tables_are_printed_once(master, sender, argument
 
 
 def test_json_is_printed_for_scripts_and_as_help_says(master, sender):
-    ended = run_top(master.url, '--json', '--interval', '0.5', 'sender', 'traffic')
+    ended = run_top(master.url, '--json', '--interval', '0.5', 'sender', 'traffic', '__name:=top')
     assert (ended.returncode, ended.stderr) == (0, '')
     found = json.loads(ended.stdout)
     assert [row['name'] for row in found['nodes']] == ['/sender']

@@ -1,5 +1,8 @@
 """rosrun pharos top in a real terminal, as a user sees it."""
 import contextlib
+import functools
+import os
+import pty
 import re
 import signal
 import sys
@@ -11,6 +14,7 @@ import pytest
 
 from helpers import create
 from pharos import BlockNode, Master
+from pharos.live.terminal import Terminal as Keyboard
 from pharos.live.top_table import printable
 from pharos.testing import TIMEOUT, until
 from programs import PROGRAMS, environment, script
@@ -136,6 +140,8 @@ def test_a_filter_leaves_what_has_the_text_in_its_name(master, sender):
         shown.press('t', 'TOPIC')
         assert column(shown.press('/traf', r'filter: traf_')) == ['/traffic']
         shown.press('x', r'filter: trafx_')
+        shown.press('\x7f', r'filter: traf_')
+        shown.press('\x1b[D\x1b[3~\x1b[1;5Ay', r'filter: trafy_')  # keys that are none of ours
         shown.press('\x7f', r'filter: traf_')
         # q is a letter while it is typed, and a key afterwards
         assert column(shown.press('q', r'filter: trafq_')) == []
@@ -307,3 +313,42 @@ def test_a_node_that_hangs_is_told_and_does_not_hold_up_keys(master, sender):
 
 def test_names_that_would_do_something_to_a_terminal_do_not():
     assert printable('/a\x1b[2Jb\r\nc') == '/a?[2Jb??c'
+
+
+@pytest.fixture
+def typing(monkeypatch):
+    """What writes to a terminal as a keyboard does, and what reads the keys."""
+    keyboard, end = pty.openpty()
+    with os.fdopen(end) as stdin:
+        monkeypatch.setattr(sys, 'stdin', stdin)
+        reader = Keyboard()
+        with reader:
+            yield functools.partial(os.write, keyboard), reader.keys
+        reader.close()
+    os.close(keyboard)
+
+
+@pytest.mark.parametrize(
+    'typed, expected',
+    [
+        (b'\x1b', ['escape']),
+        (b'\x1b[A\x1bOB', ['up', 'down']),
+        (b'\x1b[1~\x1b[7~\x1bOH', ['home'] * 3),
+        (b'\x1b[4~\x1b[8~\x1bOF', ['end'] * 3),
+        (b'\x1b[Dq', ['q']),
+        (b'\x1b[3~\x1b[15~\x1bOP\x1b[[A', []),  # Delete, F5, F1, and F1 of the console
+        (b'\x1b[1;5A', []),  # Ctrl and up
+    ],
+)
+def test_keys_that_are_unknown_are_none(typing, typed, expected):
+    write, keys = typing
+    write(typed)
+    assert keys() == expected
+
+
+def test_a_key_may_come_in_pieces(typing):
+    write, keys = typing
+    write(b'\xc3')
+    assert keys() == []
+    write(b'\xa9')
+    assert keys() == ['\xe9']

@@ -1,6 +1,8 @@
 """A terminal of which a program has the whole screen: its keys, its signals, and its return."""
+import codecs
 import contextlib
 import os
+import re
 import select
 import signal
 import sys
@@ -18,8 +20,17 @@ _SEQUENCES = {
     '[5~': 'page up',
     '[6~': 'page down',
     '[H': 'home',
+    'OH': 'home',
+    '[1~': 'home',
+    '[7~': 'home',
     '[F': 'end',
+    'OF': 'end',
+    '[4~': 'end',
+    '[8~': 'end',
 }
+#: a sequence, of which the last character may not have come yet; the second '[' is the console's
+_SEQUENCE = re.compile(r'\x1b(?P<rest>\[\[?[0-?]*[ -/]*[@-~]?|O[0-9;]*[@-~]?)')
+_BEGUN = re.compile(r'\x1b(\[\[?[0-?]*[ -/]*|O[0-9;]*)?\Z')
 _REST = 0.05  # seconds in which the rest of a sequence comes, also over ssh
 _ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP)
 
@@ -40,6 +51,7 @@ class Terminal:
         #: the signal that asks for the end; SIGTSTP, which Ctrl-Z is, for a pause
         self.ended_by: Optional[signal.Signals] = None
         self._keys = sys.stdin.fileno()
+        self._decode = codecs.getincrementaldecoder('utf-8')('replace').decode
         self._woken, self._wake = os.pipe()
         os.set_blocking(self._wake, False)
         self._before: List[Any] = []
@@ -83,39 +95,32 @@ class Terminal:
         if self._keys not in ready:
             return []
         typed = self._read()
-        if not typed:
-            self.ended_by = signal.SIGHUP
-        while typed.endswith((ESCAPE, ESCAPE + '[', ESCAPE + 'O')):
+        while self.ended_by is None and _BEGUN.search(typed):
             if not select.select([self._keys], [], [], _REST)[0]:
                 break
             typed += self._read()
         return list(_parse(typed))
 
     def _read(self) -> str:
+        """What is there, but for half a character; where nothing is left to come, that is a signal
+        to end."""
         try:
-            return os.read(self._keys, 1024).decode(errors='replace')
+            typed = os.read(self._keys, 1024)
         except OSError:  # the terminal is gone
-            return ''
+            typed = b''
+        if not typed:
+            self.ended_by = signal.SIGHUP
+        return self._decode(typed)
 
 
 def _parse(typed: str) -> Iterator[str]:
+    """The keys; those of which nobody here has heard are none."""
     while typed:
-        if typed[0] == ESCAPE:
-            for sequence, key in _SEQUENCES.items():
-                if typed.startswith(sequence, 1):
-                    yield key
-                    typed = typed[1 + len(sequence) :]
-                    break
-            else:
-                yield 'escape'
-                typed = _after_unknown_sequence(typed)
+        sequence = _SEQUENCE.match(typed)
+        if sequence:
+            key = _SEQUENCES.get(sequence['rest'])
+            if key is not None:
+                yield key
         else:
-            yield {'\r': '\n', '\x08': '\x7f'}.get(typed[0], typed[0])
-            typed = typed[1:]
-
-
-def _after_unknown_sequence(typed: str) -> str:
-    if typed[1:2] not in ('[', 'O'):
-        return typed[1:]
-    rest = typed[2:].lstrip('0123456789;')
-    return rest[1:]
+            yield {ESCAPE: 'escape', '\r': '\n', '\x08': '\x7f'}.get(typed[0], typed[0])
+        typed = typed[sequence.end() if sequence else 1 :]
