@@ -369,9 +369,11 @@ def test_a_wrong_option_is_refused_with_those_that_there_are(master, options, te
         master.graph(**options)
 
 
-def test_a_namespace_is_a_name(master):
-    with pytest.raises(TypeError, match='given by its name'):
-        master.graph(namespace=[3])
+@pytest.mark.parametrize('option', ['namespace', 'hide'])
+@pytest.mark.parametrize('value', [3, [3], None, [['leaf']]])
+def test_a_namespace_and_what_is_hidden_are_names(master, option, value):
+    with pytest.raises(TypeError, match=f'given by its name, .* not as {re.escape(repr(value))}'):
+        master.graph(**{option: value})
 
 
 # -- files

@@ -70,7 +70,7 @@ class Graph:
         self.nodes_only = nodes_only
         self.group = _check_choice('group', group, GROUPS)
         self.namespaces = _check_namespaces(namespace)
-        hidden = {hide} if isinstance(hide, str) else set(hide)
+        hidden = set(_names('what is to be hidden', hide, "'leaf'"))
         connected = {each.topic for each in snapshot.connections}
         for each in hidden:
             _check_choice('hide', each, HIDEABLE)
@@ -238,10 +238,16 @@ def _check_choice(what: str, given: str, choices: Iterable[str]) -> str:
 
 
 def _check_namespaces(given: Union[str, Collection[str]]) -> List[str]:
-    names = [given] if isinstance(given, str) else list(given)
-    if not all(isinstance(name, str) for name in names):
-        raise TypeError(f'a namespace is given by its name, such as /robot, not as {given!r}')
+    names = _names('a namespace', given, '/robot')
     return [rosgraph.names.make_global_ns(name) for name in names]
+
+
+def _names(what: str, given: Union[str, Collection[str]], example: str) -> List[str]:
+    """One name, or several, as a list."""
+    names = [given] if not isinstance(given, Iterable) or isinstance(given, str) else list(given)
+    if not all(isinstance(name, str) for name in names):
+        raise TypeError(f'{what} is given by its name, such as {example}, not as {given!r}')
+    return names
 
 
 def _is_in(name: str, namespaces: Iterable[str]) -> bool:
