@@ -14,10 +14,15 @@ from pharos.blocks import attempt
 _EVENTS = 'pre_run_cell', 'post_run_cell'  # before and after the one, perhaps, autoreload acts
 
 
+def ipython_shell() -> Any:
+    """The session of IPython's that this program is; None: it is none."""
+    ipython: Any = sys.modules.get('IPython')
+    return ipython and ipython.get_ipython()
+
+
 def follow() -> None:
     """From now on, nodes have methods of their present classes for blocks, where this is IPython."""
-    ipython: Any = sys.modules.get('IPython')
-    shell = ipython and ipython.get_ipython()
+    shell = ipython_shell()
     for event in _EVENTS if shell else ():
         if _look_up_methods not in shell.events.callbacks[event]:
             shell.events.register(event, _look_up_methods)
