@@ -358,7 +358,7 @@ def test_without_ipython_it_says_what_to_install(master, tmp_path):
     )
     ended = run(master.url, sys.executable, '-c', code)
     assert ended.returncode == 1
-    assert re.fullmatch('workspace: .*: apt install python3-ipython\n', ended.stderr)
+    assert re.fullmatch('workspace: .*: sudo apt-get install python3-ipython\n', ended.stderr)
 
 
 def test_without_a_terminal_the_lines_of_its_input_are_run(master):

@@ -53,6 +53,16 @@ class NodeStoppedError(PharosError):
     """The node is not running."""
 
 
+def missing(what: str, error: object, packages: str) -> str:
+    """The complaint about what is not installed.
+
+    :param what: what it is needed for: 'matplotlib draws plots'
+    :param error: what was said of it
+    :param packages: Debian's names for it
+    """
+    return f'{what} ({error}): sudo apt-get install {packages}'
+
+
 def suggest(name: str, names: Iterable[str], meant: Optional[List[str]] = None) -> str:
     """The hint that ends a complaint about a wrong name: ``" (did you mean 'x' or 'y'?)"``.
 

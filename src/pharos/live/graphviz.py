@@ -6,7 +6,7 @@ import stat
 import subprocess
 from typing import List, Union
 
-from pharos.errors import PharosError, suggest
+from pharos.errors import PharosError, missing, suggest
 
 FORMATS = 'svg', 'png', 'pdf', 'dot'
 #: programs of graphviz, and the seconds that each may take; the others draw what is too tangled for
@@ -80,8 +80,7 @@ def _run(program: List[str], dot: str, limit: float) -> bytes:
         )
     except FileNotFoundError as error:
         raise PharosError(
-            'graphviz draws the picture, and is not installed: apt-get install graphviz, or save'
-            ' it as .dot'
+            missing('graphviz draws the picture', error, 'graphviz') + ', or save it as .dot'
         ) from error
     if ended.returncode:
         raise PharosError(f'graphviz cannot draw it: {ended.stderr.decode().strip()}')

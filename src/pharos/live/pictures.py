@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, Dict, Optional, Tuple
 
 import genpy
 
-from pharos.errors import MessageTypeError, PharosError
+from pharos.errors import MessageTypeError, PharosError, missing
 from pharos.live.message_text import text_of
 
 if TYPE_CHECKING:
@@ -45,8 +45,9 @@ def picture(message: genpy.Message) -> 'Image':
         drawing: 'Image' = getattr(importlib.import_module(f'pharos.live.{module}'), name)(message)
     except ImportError as error:
         raise PharosError(
-            f'Pillow and NumPy draw pictures of messages ({error}): apt-get install python3-pil'
-            ' python3-numpy'
+            missing(
+                'Pillow and NumPy draw pictures of messages', error, 'python3-pil python3-numpy'
+            )
         ) from error
     except AttributeError as error:  # another definition goes by this name
         raise MessageTypeError(

@@ -15,7 +15,7 @@ from rosgraph.rosenv import ROS_MASTER_URI
 
 import pharos
 from pharos import node_registry, signals
-from pharos.errors import PharosError
+from pharos.errors import PharosError, missing
 from pharos.live import completion, explanation, notebook
 from pharos.master import Master
 from pharos.node import BlockNode
@@ -195,9 +195,7 @@ def ipython() -> Any:
     try:
         import IPython
     except ModuleNotFoundError as error:
-        raise PharosError(
-            f'a workspace needs IPython ({error}): apt install python3-ipython'
-        ) from error
+        raise PharosError(missing('a workspace needs IPython', error, 'python3-ipython')) from error
     return IPython
 
 
