@@ -7,35 +7,25 @@ from typing import TYPE_CHECKING, Dict, Iterable, Iterator, List, Optional, Tupl
 from xml.sax.saxutils import escape
 
 from pharos.live.answers import ALIVE, DEAD
+from pharos.live.colors import BLUE, GREEN, VERMILION
 from pharos.live.edges import HEARS, OFFERS, SENDS, Edge
 from pharos.live.snapshot import SeenNode, SeenTopic
 
 if TYPE_CHECKING:
     from pharos.live.graph import Graph
 
-# Okabe and Ito's colours, which those can tell apart, too, who see no red or green
-BLUE, ORANGE, GREEN, GREY = '#0072B2', '#D55E00', '#009E73', '#8A8A8A'
+GREY = '#8A8A8A'
 FONT = 'Helvetica,Arial,sans-serif'
 LINE = 26  # characters after which a name is broken
 LISTED = 3  # topics that an arrow between nodes names
 
-#: transport -> how an arrow is drawn, what the legend shows for it, and says of it
+#: transport -> an arrow's colour, how else it is drawn, what the legend shows for it, and says of it
 STYLES = {
-    'INTRAPROCESS': (f'color="{BLUE}", penwidth=2.6', BLUE, '━━━▶', 'INTRAPROCESS: no socket'),
-    'TCPROS': (f'color="{ORANGE}", penwidth=1.2, style=dashed', ORANGE, '╌╌╌▶', 'TCPROS'),
-    'UDPROS': (
-        f'color="{GREEN}", penwidth=1.2, style=dotted, arrowhead=vee',
-        GREEN,
-        '┈┈┈▷',
-        'UDPROS',
-    ),
-    '': (
-        f'color="{GREY}", penwidth=1, style=dotted, arrowhead=empty',
-        GREY,
-        '┈┈┈▷',
-        'nothing connected',
-    ),
-    'service': (f'color="{GREEN}", penwidth=1, arrowhead=none', GREEN, '───', 'offers a service'),
+    'INTRAPROCESS': (BLUE, 'penwidth=2.6', '━━━▶', 'INTRAPROCESS: no socket'),
+    'TCPROS': (VERMILION, 'penwidth=1.2, style=dashed', '╌╌╌▶', 'TCPROS'),
+    'UDPROS': (GREEN, 'penwidth=1.2, style=dotted, arrowhead=vee', '┈┈┈▷', 'UDPROS'),
+    '': (GREY, 'penwidth=1, style=dotted, arrowhead=empty', '┈┈┈▷', 'nothing connected'),
+    'service': (GREEN, 'penwidth=1, arrowhead=none', '───', 'offers a service'),
 }
 
 
@@ -101,7 +91,10 @@ def _node_line(node: SeenNode) -> str:
     about, style, look = '', 'rounded,filled', 'fillcolor="#D9EAF7"'
     if node.state != ALIVE:
         about = 'dead' if node.state == DEAD else 'does not answer'
-        style, look = 'rounded,filled,dashed', f'fillcolor="#EEEEEE", color="{ORANGE}", penwidth=2'
+        style, look = (
+            'rounded,filled,dashed',
+            f'fillcolor="#EEEEEE", color="{VERMILION}", penwidth=2',
+        )
     said = [node.uri or '', f'process {node.pid}' if node.pid else '', node.problem]
     tip = ', '.join([node.name, *filter(None, said)])
     return (
@@ -142,8 +135,8 @@ def _arrows(edge: Edge) -> Iterator[str]:
         names = [*edge.topics[:LISTED], *([f'and {more} more'] if more > 0 else [])]
         label = f', label={_table(map(escape, names))}'
     for transport in transports:
-        style = STYLES[transport if transport in STYLES else 'TCPROS'][0]
-        yield f'{start} -> {end} [{style}{label}, tooltip={_quote(_said_of(edge, transport))}]'
+        color, style, *_ = STYLES[transport if transport in STYLES else 'TCPROS']
+        yield f'{start} -> {end} [color="{color}", {style}{label}, tooltip={_quote(_said_of(edge, transport))}]'
         label = ''
 
 
@@ -262,7 +255,7 @@ def _legend(graph: 'Graph') -> str:
         cells.append('<td bgcolor="#FFF6D5" border="1">topic</td>')
     cells += [
         f'<td><font color="{color}">{sample}</font> {said}</td>'
-        for transport, (_, color, sample, said) in STYLES.items()
+        for transport, (color, _, sample, said) in STYLES.items()
         if transport in used
     ]
     if graph.group == 'process':

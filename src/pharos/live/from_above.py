@@ -1,23 +1,23 @@
-"""Pictures of a plane from above, in metres: laser scans, paths, clouds of points, maps."""
+"""Pictures from above, in metres: laser scans, paths, clouds of points, maps."""
 import math
 from typing import Any, List, Optional, Tuple
 
 import numpy
-from PIL import Image, ImageDraw
+from PIL import Image, ImageColor, ImageDraw
 
 from pharos.errors import MessageTypeError
+from pharos.live.colors import BLUE, GREEN, VERMILION
 
 SIZE = 640  # pixels of the longer side of a view
 BORDER = 40  # pixels around what is drawn
 LINES = 8  # lines of the grid that a side has at the most
-BLUE, ORANGE, GREEN = '#0072B2', '#D55E00', '#009E73'  # Okabe and Ito's
 #: from the lowest to the highest: light for all who see, dark to bright as matplotlib's viridis
 _HEIGHTS = numpy.array(
     [(68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (230, 210, 30)], 'f8'
 )
 
 
-class TopView:
+class ViewFromAbove:
     """A view of points from above, x to the right and y up, with a grid in metres.
 
     :param points: an array of x and y, of which all that are finite are to be in view
@@ -112,21 +112,21 @@ def scan_picture(message: Any) -> Image.Image:
     angles = message.angle_min + message.angle_increment * numpy.flatnonzero(known)
     distances = ranges[known]
     points = numpy.column_stack([distances * numpy.cos(angles), distances * numpy.sin(angles)])
-    view = TopView(numpy.vstack([points, [(0, 0)]]), message.header.frame_id)
-    view.dots(points, (0xD5, 0x5E, 0x00), size=3)
+    view = ViewFromAbove(numpy.vstack([points, [(0, 0)]]), message.header.frame_id)
+    view.dots(points, ImageColor.getrgb(VERMILION), size=3)
     view.mark((0, 0), BLUE, 0.0)
     return view.image
 
 
 def path_picture(message: Any) -> Image.Image:
-    """A nav_msgs/Path from above, from its green beginning to its orange end."""
+    """A nav_msgs/Path from above, from its green beginning to its vermilion end."""
     poses = [pose.pose for pose in message.poses]
     points = numpy.array([(pose.position.x, pose.position.y) for pose in poses]).reshape(-1, 2)
-    view = TopView(points, message.header.frame_id)
+    view = ViewFromAbove(points, message.header.frame_id)
     if poses:
         view.line(points, BLUE)
         view.mark(points[0], GREEN, _yaw(poses[0].orientation))
-        view.mark(points[-1], ORANGE, _yaw(poses[-1].orientation))
+        view.mark(points[-1], VERMILION, _yaw(poses[-1].orientation))
     return view.image
 
 
@@ -159,7 +159,7 @@ def cloud_picture(message: Any) -> Image.Image:
     """
     points = _cloud_points(message)
     points = points[numpy.isfinite(points).all(axis=1)]
-    view = TopView(points[:, :2], message.header.frame_id)
+    view = ViewFromAbove(points[:, :2], message.header.frame_id)
     if len(points):
         points = points[numpy.argsort(points[:, 2], kind='stable')]  # the highest on top
         low, high = numpy.percentile(points[:, 2], [2, 98])

@@ -17,10 +17,10 @@ SHOWN = 800, 600  # pixels that a picture has at the most in Jupyter
 _PICTURES: Dict[Tuple[str, str], Tuple[str, str]] = {
     ('sensor_msgs', 'Image'): ('images', 'image_picture'),
     ('sensor_msgs', 'CompressedImage'): ('images', 'compressed_picture'),
-    ('sensor_msgs', 'LaserScan'): ('top_view', 'scan_picture'),
-    ('sensor_msgs', 'PointCloud2'): ('top_view', 'cloud_picture'),
-    ('nav_msgs', 'Path'): ('top_view', 'path_picture'),
-    ('nav_msgs', 'OccupancyGrid'): ('top_view', 'map_picture'),
+    ('sensor_msgs', 'LaserScan'): ('from_above', 'scan_picture'),
+    ('sensor_msgs', 'PointCloud2'): ('from_above', 'cloud_picture'),
+    ('nav_msgs', 'Path'): ('from_above', 'path_picture'),
+    ('nav_msgs', 'OccupancyGrid'): ('from_above', 'map_picture'),
 }
 
 

@@ -8,21 +8,22 @@ from typing import Any, Callable, Deque, Dict, List, Optional, Tuple, Union
 import genpy
 
 from pharos.channel import InputChannel
-from pharos.errors import PharosError
+from pharos.errors import PharosError, missing
+from pharos.live.colors import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION
 from pharos.live.watching import create_looker
 from pharos.messages.numeric_field import numeric_field
 from pharos.probe import Look
 from pharos.seconds import check_seconds
 
 KEPT = 100000  # messages that a plot is made of, the newest
-#: Okabe and Ito's colours, and a dash for each: told apart, too, by those who see no red or green
+#: how lines are drawn, the first first: by the dash, too, where colours are not seen
 _LINES = (
-    ('#0072B2', '-'),
-    ('#D55E00', '--'),
-    ('#009E73', '-.'),
-    ('#CC79A7', ':'),
-    ('#56B4E9', '-'),
-    ('#E69F00', '--'),
+    (BLUE, '-'),
+    (VERMILION, '--'),
+    (GREEN, '-.'),
+    (PURPLE, ':'),
+    (SKY, '-'),
+    (ORANGE, '--'),
 )
 
 
@@ -166,7 +167,6 @@ def load_matplotlib() -> Any:
     try:
         import matplotlib.figure
     except ImportError as error:
-        raise PharosError(
-            'matplotlib draws plots, and is not installed: apt-get install python3-matplotlib'
-        ) from error
+        text = missing('matplotlib draws plots', error, 'python3-matplotlib')
+        raise PharosError(text) from error
     return matplotlib.figure
