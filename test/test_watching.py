@@ -14,7 +14,7 @@ from std_msgs.msg import String
 from helpers import create, ended, in_thread, speak_tcpros_only
 from pharos import NodeStoppedError, UnknownTopicError
 from pharos.live import watching
-from pharos.live.message_text import text_of
+from pharos.live.message_text import text_of_message
 from pharos.testing import TIMEOUT, until
 from programs import PROGRAMS, Program, environment
 
@@ -272,16 +272,16 @@ def test_ctrl_c_at_a_prompt_ends_the_watch_and_stops_no_node(master):
 
 
 def test_long_arrays_are_cut():
-    scan = text_of(LaserScan(ranges=[1.5] * 720))
+    scan = text_of_message(LaserScan(ranges=[1.5] * 720))
     assert 'ranges: [1.5, 1.5, 1.5, ... 720 in all]' in scan
     assert 'intensities: []' in scan
-    assert 'data: [7, 7, 7, ... 100 in all]' in text_of(Image(data=b'\x07' * 100))
-    assert text_of(Image(data=b'\x07' * 2)).endswith('data: [7, 7]')
-    cloud = text_of(PointCloud(points=[Point32(1, 2, 3)] * 100))
+    assert 'data: [7, 7, 7, ... 100 in all]' in text_of_message(Image(data=b'\x07' * 100))
+    assert text_of_message(Image(data=b'\x07' * 2)).endswith('data: [7, 7]')
+    cloud = text_of_message(PointCloud(points=[Point32(1, 2, 3)] * 100))
     assert cloud.count('x: 1') == 3
     assert '  - ... 100 in all' in cloud
-    assert text_of(Point(1, 2, 3)) == 'x: 1\ny: 2\nz: 3'
-    assert text_of(Polygon()) == 'points: []'
+    assert text_of_message(Point(1, 2, 3)) == 'x: 1\ny: 2\nz: 3'
+    assert text_of_message(Polygon()) == 'points: []'
 
 
 def test_a_soul_that_watches_ends_though_its_node_stopped_between_two_messages(master):

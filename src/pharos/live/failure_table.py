@@ -68,4 +68,4 @@ def _message(message: Any) -> str:
     if not isinstance(message, genpy.Message):
         return str(blocks.attempt(lambda: reprlib.repr(message), '?'))
     # a block may have put into it what does not fit
-    return str(blocks.attempt(lambda: message_text.text_of(message), f'<{message._type}>'))
+    return str(blocks.attempt(lambda: message_text.text_of_message(message), f'<{message._type}>'))

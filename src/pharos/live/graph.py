@@ -12,7 +12,7 @@ from pharos.live import graphviz, snapshot
 from pharos.live.answers import ALIVE
 from pharos.live.dot import dot_of, sorry
 from pharos.live.edges import HEARS, OFFERS, PUBLISHES, SENDS, Edge
-from pharos.live.graph_text import text_of
+from pharos.live.graph_text import text_of_graph
 from pharos.live.snapshot import Host, Process, SeenNode, SeenService, SeenTopic, Snapshot
 from pharos.live.traffic import Traffic
 from pharos.master import Master
@@ -169,7 +169,7 @@ class Graph:
 
     def text(self) -> str:
         """The graph for a terminal: each node with what it sends, hears and offers."""
-        return text_of(self)
+        return text_of_graph(self)
 
     def save(self, path: Union[str, 'os.PathLike[str]']) -> None:
         """Write the picture to a file, all at once, so that who looks at it sees no half of one.

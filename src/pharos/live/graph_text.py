@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from pharos.live.graph import Graph
 
 
-def text_of(graph: 'Graph') -> str:
+def text_of_graph(graph: 'Graph') -> str:
     """Hosts, processes and nodes, and of each node what it sends, hears and offers."""
     return '\n'.join(_lines(graph)) + '\n'
 

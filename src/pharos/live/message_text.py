@@ -17,7 +17,7 @@ class _Text:
         return self._text
 
 
-def text_of(message: genpy.Message) -> str:
+def text_of_message(message: genpy.Message) -> str:
     """A message as ``rostopic echo`` prints it, but for long arrays: the first values, and how many
     there are."""
     return str(genpy.message.strify_message(cut(message)))

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Dict, Optional, Tuple
 import genpy
 
 from pharos.errors import MessageTypeError, PharosError, missing
-from pharos.live.message_text import text_of
+from pharos.live.message_text import text_of_message
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -98,4 +98,4 @@ def _png(message: genpy.Message) -> Optional[bytes]:
 
 
 def _text(message: genpy.Message, printer: Any, cycle: bool) -> None:
-    printer.text(text_of(message))
+    printer.text(text_of_message(message))

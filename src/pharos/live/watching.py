@@ -14,7 +14,7 @@ import rosgraph
 
 from pharos.blocks import check_block
 from pharos.errors import NodeStoppedError, UnknownTopicError, suggest
-from pharos.live.message_text import text_of
+from pharos.live.message_text import text_of_message
 from pharos.master import Master
 from pharos.node import BlockNode
 from pharos.probe import Listener, Look, Probe
@@ -199,7 +199,7 @@ def _is_time_simulated(master: Master) -> bool:
 
 
 def _show(message: genpy.Message) -> None:
-    Transcript.show(f'{text_of(message)}\n---')
+    Transcript.show(f'{text_of_message(message)}\n---')
 
 
 def _counted(result: Any) -> str:
