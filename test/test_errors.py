@@ -203,9 +203,33 @@ def test_a_value_in_a_blocks_place_is_told_how_a_block_is_called(master):
     channel = node.output_channel('/t', 'std_msgs/String')
     for send in channel.send, lambda block: node.send_to('/t', block):
         with pytest.raises(
-            TypeError, match=r"a block is called as block\(message\); 'hello' cannot be called"
+            TypeError, match=r"called as block\(message\).*; 'hello' cannot be called: .*typed_as"
         ):
             send('hello')
+        with pytest.raises(TypeError, match=r"cannot be called: give fields as keywords: \*\*"):
+            send({'data': 'hello'})
+    with pytest.raises(TypeError, match='cannot be called: .*typed_as='):
+        node.send_to('/another', pharos.message_class('std_msgs/String'))
+
+
+@pytest.mark.parametrize('interested', [False, True])
+def test_a_ready_message_that_does_not_suit_is_told(master, mailbox, interested):
+    node, string = create(master), pharos.message_class('std_msgs/String')
+    velocity = pharos.message_class('turtlesim/Velocity')
+    if interested:
+        create(master, '/other', delegate=mailbox).interested_in('/t', 'turtlesim/Velocity')
+        with pytest.raises(
+            pharos.MessageTypeError, match='/t carries turtlesim/Velocity, not std_'
+        ):
+            node.send_to('/t', string())
+    channel = node.output_channel('/t', 'turtlesim/Velocity')
+    for send in channel.send, lambda *args, **fields: node.send_to('/t', *args, **fields):
+        with pytest.raises(pharos.MessageTypeError, match='/t carries turtlesim/Velocity'):
+            send(string())
+        with pytest.raises(TypeError, match='is sent as it is, without linear, angular'):
+            send(velocity(), linear=1.0, angular=1.0)
+        with pytest.raises(pharos.MessageTypeError, match='Velocity.linear = .fast. does not fit'):
+            send(velocity(linear='fast'))
 
 
 def test_a_block_that_returns_a_message_of_its_own_is_told_that_it_would_not_be_sent(master):

@@ -46,6 +46,19 @@ def test_a_message_goes_from_node_to_node(master, mailbox):
     assert (channel.topic, channel.type, channel.node) == ('/chat', 'std_msgs/String', receiver)
 
 
+def test_a_ready_message_is_sent_as_rospy_publishes_it(master, mailbox):
+    node, cls = create(master), pharos.message_class('std_msgs/String')
+    ready = cls('first')
+    assert node.send_to('/ready', ready) is ready  # whose type the topic then has
+    assert master.topic('/ready').type == 'std_msgs/String'
+    create(master, '/other', delegate=mailbox).interested_in('/ready')
+    for send in node.output_channel('/ready').send, lambda data: node.send_to('/ready', data):
+        assert send(ready) is ready
+        assert mailbox.next().data == 'first'
+    create(master, '/third').send_to('/ready', cls('known'))
+    assert mailbox.next().data == 'known'
+
+
 def test_the_first_message_to_an_external_node_is_not_lost(master):
     """In one call, its type found. rospy has no such call (ros_comm #1377), and loses 3 of 3 (#176,
     #286)."""

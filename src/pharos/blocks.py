@@ -1,6 +1,7 @@
 """Blocks: the callables that a node is made of."""
 import functools
 import inspect
+import reprlib
 from typing import Any, Callable, Optional, Sequence
 
 from pharos.signals import code_of, is_from_signal
@@ -52,6 +53,22 @@ def check_runs(block: Any, what: str) -> None:
             ' run: write a plain function; to do something again and again, a soul loops over'
             ' node.every(seconds)'
         )
+
+
+def check_filler(block: Any) -> None:
+    """Raise TypeError for what cannot fill a message, and say what does."""
+    if isinstance(block, dict):
+        meant = 'give fields as keywords: **fields'
+    elif isinstance(block, (str, type)):
+        meant = 'give a type as typed_as=, and the value of a field by its name, as a keyword'
+    else:
+        meant = 'give the value of a field by its name, as a keyword'
+    if isinstance(block, type) or not (block is None or callable(block)):
+        raise TypeError(
+            'a message is given ready, or filled by keywords or a block, called as block(message);'
+            f' {reprlib.repr(block)} cannot be called: {meant}'
+        )
+    check_block(block, 'block', ('message',))
 
 
 def check_delegate(block: Any) -> Any:

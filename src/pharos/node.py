@@ -5,7 +5,7 @@ import genpy
 
 from pharos import node_registry, on_demand
 from pharos.becoming import become
-from pharos.blocks import Block, check_block
+from pharos.blocks import Block, check_filler
 from pharos.channel import InputChannel
 from pharos.health import Health, health_of
 from pharos.offered_service import OfferedService
@@ -212,7 +212,7 @@ class Node(NodeWithSouls, is_base=True):
     def send_to(
         self,
         topic: str,
-        block: Optional[Block] = None,
+        block: Union[Block, genpy.Message, None] = None,
         *,
         typed_as: TypedAs = None,
         to: 'Peer' = None,
@@ -220,7 +220,8 @@ class Node(NodeWithSouls, is_base=True):
         wait: float = 0,
         **fields: Any,
     ) -> genpy.Message:
-        """Send one message, filled by ``block(message)``, by keywords, or both; returns it.
+        """Send one message, filled by ``block(message)``, by keywords, or both; or ``block``
+        itself, where that is a ready message. Returns it.
 
         The report (listing 3.1)::
 
@@ -229,7 +230,8 @@ class Node(NodeWithSouls, is_base=True):
             self.send_to('/turtle1/command_velocity', angular=1.0, linear=2.0)
 
         The first message on a topic waits for the subscribers that the master knows, for up to
-        ``connect_timeout`` seconds (None: the node's), so that it is not lost.
+        ``connect_timeout`` seconds (None: the node's), so that it is not lost. A topic that has no
+        type yet gets that of a ready message.
 
         :param to: send it to that node alone: a name, resolved as the topic's is, a Node or
             ExternalNode. One that is not interested in the topic gets nothing, and the log says so
@@ -237,7 +239,8 @@ class Node(NodeWithSouls, is_base=True):
         :param wait: as in :meth:`interested_in`
         :raises UnknownNodeError: if there is no node ``to``
         :raises ValueError: if ``topic`` or ``to`` cannot be a name
-        :raises MessageTypeError: if a field does not exist or does not fit
+        :raises MessageTypeError: if a field does not exist or does not fit, or a ready message is
+            of another type than the topic
         :raises UnknownTopicError, UnknownTypeError: if there is no type
         """
         if to is not None:
@@ -251,7 +254,10 @@ class Node(NodeWithSouls, is_base=True):
         run = self.current_run
         channel = run.send_channels.get(topic) if isinstance(topic, str) else None
         if channel is None or not channel.is_open:
-            check_block(block, 'block', ('message',))
+            if not isinstance(block, genpy.Message):
+                check_filler(block)
+            elif typed_as is None:
+                typed_as = self._topic(topic).class_for(block)
             channel = run.sender(self._topic(topic), typed_as, connect_timeout, wait)
             run.send_channels[topic] = channel
         if typed_as not in (None, channel.message_class, channel.type):

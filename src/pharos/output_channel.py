@@ -1,12 +1,12 @@
 """Output channels: the end of a topic at which a node sends."""
 import threading
 import time
-from typing import TYPE_CHECKING, Any, Callable, NoReturn, Optional, Set, Type
+from typing import TYPE_CHECKING, Any, Callable, Dict, NoReturn, Optional, Set, Type, Union
 
 import genpy
 
 from pharos import first_message, messages
-from pharos.blocks import check_block, check_runs
+from pharos.blocks import check_filler, check_runs
 from pharos.channel import Channel
 from pharos.errors import MessageTypeError, NodeStoppedError
 from pharos.intraprocess.copier import copier_for
@@ -131,17 +131,27 @@ class OutputChannel(Channel):
         self._rospy.connections.unadvertise(endpoint, self.latched)
 
     def send(
-        self, block: Optional[Callable[[Any], Any]] = None, *, to: Any = None, **fields: Any
+        self,
+        block: Union[Callable[[Any], Any], genpy.Message, None] = None,
+        *,
+        to: Any = None,
+        **fields: Any,
     ) -> Any:
         """Fill a fresh message with ``block(message)`` and by keywords, publish it, and return
-        it."""
-        if block is not None:
-            check_runs(block, 'a block')
-        try:
-            message = messages.build(self.message_class, block, fields)
-        except TypeError:
-            check_block(block, 'block', ('message',))  # says how it is called
-            raise
+        it; in the block's place may be a ready message, which is sent as it is.
+
+        :raises TypeError: for a ready message and keywords beside it
+        """
+        if isinstance(block, genpy.Message):
+            message = self._ready(block, fields)
+        else:
+            if block is not None:
+                check_runs(block, 'a block')
+            try:
+                message = messages.build(self.message_class, block, fields)
+            except TypeError:
+                check_filler(block)  # says how it is called
+                raise
         if not self._fanout.connections:  # with nobody interested, nobody else looks at it
             try:
                 self._freeze(message)
@@ -149,6 +159,15 @@ class OutputChannel(Channel):
                 messages.check_fits(message)
                 raise
         self.publish(message, to)
+        return message
+
+    def _ready(self, message: genpy.Message, fields: Dict[str, Any]) -> genpy.Message:
+        self._check_type(message)
+        if fields:
+            raise TypeError(
+                f'a ready {message._type} is sent as it is, without {", ".join(fields)}: set that in'
+                ' the message before, or give all fields as keywords instead of it'
+            )
         return message
 
     def wait_for_subscribers(self, count: int = 1, timeout: Optional[float] = None) -> bool:

@@ -198,6 +198,19 @@ class Topic:
         with time_limit(wait + MARGIN if wait else None):
             return self._message_class(node, typed_as, wait, receives)
 
+    def class_for(self, message: genpy.Message) -> Type[genpy.Message]:
+        """The message class by which a ready message is sent: its own.
+
+        :raises MessageTypeError: if the topic is known to the master with another type
+        """
+        try:
+            known = self.type
+        except UnknownTopicError:
+            known = message._type
+        if message._type not in (known, rosgraph.names.ANYTYPE):
+            raise MessageTypeError(f'{self.name} carries {known}, not {message._type}')
+        return type(message)
+
     def _check_node(self, node: Any) -> None:
         if not node_registry.is_node(node):
             raise TypeError(
