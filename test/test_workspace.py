@@ -143,6 +143,25 @@ def test_what_blocks_show_log_and_print_comes_above_the_line_that_is_typed(maste
     terminal.wait_for(r'^Out\[1\]: 42$')
 
 
+def test_what_blocks_show_comes_above_the_line_that_is_typed_to_the_debugger(master, open_session):
+    terminal = open_session(NODES)
+    terminal.enter('telling.interested_in("/wrong", "std_msgs/Empty") and None')
+    create(master, '/erring').send_to('/wrong', typed_as='std_msgs/Empty')
+    terminal.wait_for('AttributeError')
+    terminal.enter('telling.failures[0].debug()')
+    terminal.wait_for(r'^ipdb>')
+    terminal.type('p "half')
+    terminal.wait_for(r'^ipdb> +p "half$')
+    sender = create(master, '/sender').output_channel('/texts', 'std_msgs/String')
+    sender.wait_for_subscribers(timeout=TIMEOUT)
+    sender.send(data='meanwhile')
+    terminal.wait_for(r'^printed meanwhile\n(.*\n)*ipdb> +p "half\Z')
+    terminal.enter(' a line", message')
+    terminal.wait_for(r"^\('half a line', ")
+    terminal.enter('q', '6 * 7')
+    terminal.wait_for('^Out.*: 42$')
+
+
 def test_log_lines_go_where_the_process_prints_then(master, capfd):
     node = create(master, '/teller')
     node.log('first')
