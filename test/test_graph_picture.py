@@ -189,7 +189,7 @@ def test_rates_are_counted_where_they_are_asked_for(master, small):
             me.send_to('/picture_a', data='tick')
 
     one.fork(send)
-    graph = master.graph(rates=0.5)
+    graph = master.graph(seconds=0.5)
     assert 100 / 3 < graph.rates['/picture_a'] < 100 * 2
     assert ' Hz' in graph.dot() and ' Hz' in graph.text()
     assert master.graph().rates == {}
@@ -202,7 +202,7 @@ def test_counting_ends_with_the_node_whose_soul_counts(master):
     def count(me):
         began.set()
         try:
-            me.master.graph(rates=1000)
+            me.master.graph(seconds=1000)
         except NodeStoppedError as error:
             ends.append(error)
             raise
@@ -361,7 +361,7 @@ def test_a_tangle_of_a_hundred_nodes_is_no_strip():
     [
         ({'hide': 'leafs'}, r"'unreachable', not 'leafs' \(did you mean 'leaf'\?\)"),
         ({'group': 'proces'}, r"did you mean 'process'"),
-        ({'rates': -1}, 'rates is a number of seconds'),
+        ({'seconds': -1}, 'seconds is a number of seconds'),
     ],
 )
 def test_a_wrong_option_is_refused_with_those_that_there_are(master, options, text):
@@ -488,7 +488,7 @@ def test_the_program_waits_for_a_master_that_goes_away_while_it_watches(mortal_m
         (['--output', 'graph.jpeg'], 2, 'end in .svg, .png, .pdf, .dot'),
         (['--output', 'graph.svg', '--json'], 2, 'not both'),
         (['--namespace', '/pictures'], 1, "no node is in /pictures (did you mean '/picture'"),
-        (['--rates', '-1'], 1, 'rates is a number of seconds'),
+        (['--rates', '-1'], 2, '--rates is a number of seconds'),
         (['--hide', 'leafs'], 2, "invalid choice: 'leafs'"),
     ],
 )

@@ -111,7 +111,7 @@ class MasterCalls:
 
     def graph(
         self,
-        rates: float = 0,
+        seconds: float = 0,
         *,
         show_all: bool = False,
         services: bool = False,
@@ -125,8 +125,8 @@ class MasterCalls:
 
         Nodes that do not answer within a second are in it, too, and marked so.
 
-        :param rates: seconds for which it is counted how often messages come, 0: it is not; nodes
-            count that anyway, and none that nobody hears
+        :param seconds: for which messages are counted, for the rates; 0: no rates are told. Nodes
+            count them anyway, and none that nobody hears
         :param show_all: also what every node has: /rosout, /statistics, /clock,
             parameter_updates, and services for loggers
         :param services: services, too
@@ -141,9 +141,9 @@ class MasterCalls:
         :raises NodeStoppedError: if the node on whose behalf this thread counts stops meanwhile
         :raises TypeError, ValueError: if a choice is none of these
         """
-        graph: 'Graph' = on_demand.module('live.graph').look(
+        graph: 'Graph' = on_demand.module('live.graph').graph_of(
             self,
-            rates,
+            seconds,
             show_all=show_all,
             services=services,
             nodes_only=nodes_only,

@@ -216,14 +216,14 @@ class Graph:
         )
 
 
-def look(master: Master, rates: float = 0, **options: Any) -> Graph:
+def graph_of(master: Master, seconds: float = 0, **options: Any) -> Graph:
     """The graph of a master as it is; see :meth:`Master.graph <pharos.Master.graph>`."""
-    rates = check_seconds('rates', rates, least=0)
-    if not rates:
+    seconds = check_seconds('seconds', seconds, least=0)
+    if not seconds:
         return Graph(snapshot.take(master), **options)
     before = snapshot.take(master, counts=True)
     Graph(before, **options)  # complains of an option before all the time is spent
-    Look().pause(rates)
+    Look().pause(seconds)
     after = snapshot.take(master, counts=True)
     return Graph(after, Traffic(before.connections, after.connections).of_topic, **options)
 
