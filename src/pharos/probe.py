@@ -1,5 +1,6 @@
-"""What looks at a topic for a while: probes, which count and weigh messages, and listeners; loaded
-only when somebody looks."""
+"""What ``pharos.live`` looks at topics with: probes, which count and weigh messages, listeners, and
+the waits of those who look. It is of the facade, for it is made of a channel's inbox and dispatcher;
+loaded only when somebody looks."""
 import array
 import collections
 import threading
@@ -61,6 +62,10 @@ class Look:
             return True
         self._check_time_is_up(deadline)
         return False
+
+    def wait_out(self, node: 'Node', seconds: float) -> None:
+        """Wait for so many seconds, as :meth:`wait` does for something."""
+        self.wait(node, lambda: False, seconds)
 
     def _check_time_is_up(self, deadline: float) -> None:
         if self._stop.came or time.monotonic() < deadline:

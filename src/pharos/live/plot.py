@@ -77,7 +77,7 @@ class Plot:
         :raises NodeStoppedError: if the nodes stop meanwhile, or the one whose thread this is
         """
         seconds = check_seconds('seconds', seconds, above=0)
-        Look().wait(self._looker, lambda: False, seconds)
+        Look().wait_out(self._looker, seconds)
         return self
 
     def close(self) -> None:

@@ -160,9 +160,6 @@ def printable(text: str) -> str:
     return ''.join(each if each.isprintable() else '?' for each in text)
 
 
-def plain_tables(measurement: Measurement, wanted: Collection[str] = ()) -> List[Table]:
+def plain_tables(measurement: Measurement) -> List[Table]:
     """A table for each view, with all columns."""
-    return [
-        table(rows(measurement, view, wanted), columns(view, WIDEST), expand=False)
-        for view in VIEWS
-    ]
+    return [table(rows(measurement, view), columns(view, WIDEST)) for view in VIEWS]

@@ -176,7 +176,7 @@ def _measure(topic: Topic, seconds: float, weighs: bool) -> Probe:
         probe = Probe(looker, topic.name, weighs)
         probe.wait_for_publishers(looker.connect_timeout)
         probe.restart()
-        look.wait(looker, lambda: False, seconds)
+        look.wait_out(looker, seconds)
         probe.close()
     return probe
 
