@@ -14,6 +14,7 @@ from std_msgs.msg import String
 from helpers import create, ended, in_thread, speak_tcpros_only
 from pharos import NodeStoppedError, UnknownTopicError
 from pharos.live import watching
+from pharos.live.figures import size_text
 from pharos.live.message_text import text_of_message
 from pharos.testing import TIMEOUT, until
 from programs import PROGRAMS, Program, environment
@@ -75,7 +76,7 @@ def test_bw_tells_how_many_bytes_come(master, publishing):
     assert bandwidth.mean == bandwidth.min == bandwidth.max == size
     assert float(bandwidth) == bandwidth.rate == size * bandwidth.window
     assert repr(bandwidth) == (
-        f'{watching.size_text(bandwidth.rate)}/s (104 B each), {bandwidth.window} messages in 1 s'
+        f'{size_text(bandwidth.rate)}/s (104 B each), {bandwidth.window} messages in 1 s'
     )
 
 

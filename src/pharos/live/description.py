@@ -9,9 +9,9 @@ from pharos.channel import InputChannel
 from pharos.errors import PharosError
 from pharos.external_node import ExternalNode
 from pharos.live.answers import ALIVE, Answer, End, ask_all
+from pharos.live.figures import rate_text
 from pharos.live.snapshot import Connection, connections_of, uris_of
 from pharos.live.traffic import Traffic
-from pharos.live.watching import number_text
 from pharos.node import Node
 from pharos.output_channel import OutputChannel
 from pharos.probe import Look
@@ -174,7 +174,7 @@ def _counted(own: Optional[Node], is_heard: bool, topic: str, rates: Rates) -> I
     """What is known of the messages of a topic of a node."""
     rate = rates.get((is_heard, topic))
     if rate is not None:
-        yield f'{number_text(rate)} Hz'
+        yield rate_text(rate)
     for channel in _channels(own) if own else ():
         if channel.topic == topic and isinstance(channel, InputChannel) == is_heard:
             yield _channel_text(channel)

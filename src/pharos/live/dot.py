@@ -9,6 +9,7 @@ from xml.sax.saxutils import escape
 from pharos.live.answers import ALIVE, DEAD
 from pharos.live.colors import BLUE, GREEN, VERMILION
 from pharos.live.edges import HEARS, OFFERS, SENDS, Edge
+from pharos.live.figures import rate_text
 from pharos.live.snapshot import SeenNode, SeenTopic
 
 if TYPE_CHECKING:
@@ -80,11 +81,6 @@ def _table(rows: Iterable[str]) -> str:
     """Lines below each other; of those that <br/> makes the letters touch."""
     cells = ''.join(f'<tr><td>{row}</td></tr>' for row in rows)
     return f'<<table border="0" cellborder="0" cellspacing="0" cellpadding="1">{cells}</table>>'
-
-
-def rate_text(rate: float) -> str:
-    """A rate as it is read: 0.25 Hz, 9.9 Hz, 30 Hz."""
-    return f'{rate:.2g} Hz' if rate < 10 else f'{rate:.0f} Hz'
 
 
 def _node_line(node: SeenNode) -> str:

@@ -2,8 +2,8 @@
 from typing import TYPE_CHECKING, Collection, Dict, Iterator, List, Tuple
 
 from pharos.live.answers import ALIVE
-from pharos.live.dot import rate_text
 from pharos.live.edges import SENDS, Edge
+from pharos.live.figures import rate_text
 
 if TYPE_CHECKING:
     from pharos.live.graph import Graph

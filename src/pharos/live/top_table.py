@@ -4,6 +4,7 @@ from typing import Any, Callable, Collection, List, NamedTuple, Optional
 from rich.table import Table
 from rich.text import Text
 
+from pharos.live.figures import short_number, short_rate
 from pharos.live.top import Measurement, is_wanted
 
 VIEWS = ('nodes', 'processes', 'topics')
@@ -23,71 +24,55 @@ class Column(NamedTuple):
     share: int = 0  # of the width that the numbers leave
 
 
-def _plain(value: Any) -> str:
-    return '-' if value is None else str(value)
-
-
-def _rate(value: Optional[float]) -> str:
-    if value is None:
-        return '-'
-    return f'{value:.1f}' if value < 99.95 else _thousands(value)
-
-
-def _thousands(value: Optional[float]) -> str:
-    """A number in at most five characters: 999, 1.2k, 35M."""
-    if value is None:
-        return '-'
-    for unit in ('', 'k', 'M'):
-        if value < 999.5:
-            return f'{value:.1f}{unit}' if unit and value < 9.95 else f'{value:.0f}{unit}'
-        value /= 1000
-    return f'{value:.1f}G'
-
-
-def _percent(value: Optional[float]) -> str:
-    return '-' if value is None else f'{value:.0f}%'
+def _percent(value: float) -> str:
+    return f'{value:.0f}%'
 
 
 def _node(row: Any) -> str:
     return row.name if row.state == 'alive' else f'{row.name} ({row.state})'
 
 
+def _known(text: Callable[[Any], str]) -> Callable[[Any], str]:
+    """The same for what may not be known."""
+    return lambda value: '-' if value is None else text(value)
+
+
 def _number(title: str, field: str, text: Callable[[Any], str], **more: Any) -> Column:
-    return Column(title, lambda row: getattr(row, field), text, **more)
+    return Column(title, lambda row: getattr(row, field), _known(text), **more)
 
 
 def _word(title: str, value: Callable[[Any], Any], **more: Any) -> Column:
-    return Column(title, value, _plain, is_number=False, **more)
+    return Column(title, value, _known(str), is_number=False, **more)
 
 
 _TRAFFIC = (
-    _number('IN/S', 'received', _rate),
-    _number('OUT/S', 'sent', _rate),
-    _number('IN B/S', 'bytes_received', _thousands),
-    _number('OUT B/S', 'bytes_sent', _thousands),
+    _number('IN/S', 'received', short_rate),
+    _number('OUT/S', 'sent', short_rate),
+    _number('IN B/S', 'bytes_received', short_number),
+    _number('OUT B/S', 'bytes_sent', short_number),
 )
 _TRANSPORT = (
-    _number('LOCAL', 'intraprocess', _thousands),
-    _number('TCP', 'tcpros', _thousands),
+    _number('LOCAL', 'intraprocess', short_number),
+    _number('TCP', 'tcpros', short_number),
 )
-_DROPPED = _number('DROP', 'dropped', _thousands, is_bad=True)
-_TROUBLE = (_DROPPED, _number('FAIL', 'failures', _thousands, is_bad=True))
+_DROPPED = _number('DROP', 'dropped', short_number, is_bad=True)
+_TROUBLE = (_DROPPED, _number('FAIL', 'failures', short_number, is_bad=True))
 COLUMNS = {
     'nodes': (
         _word('NODE', _node, share=1),
         _word('CLASS', lambda row: row.class_name, least_width=110, share=1),
         _word('HOST', lambda row: row.host, least_width=130),
-        _number('PID', 'pid', _plain, least_width=100),
+        _number('PID', 'pid', str, least_width=100),
         *_TRAFFIC,
         *_TRANSPORT,
         *_TROUBLE,
     ),
     'processes': (
-        _number('PID', 'pid', _plain),
+        _number('PID', 'pid', str),
         _word('HOST', lambda row: row.host, least_width=100),
         _number('CPU', 'cpu', _percent),
-        _number('MEM', 'memory', _thousands),
-        _number('THR', 'threads', _plain, least_width=100),
+        _number('MEM', 'memory', short_number),
+        _number('THR', 'threads', str, least_width=100),
         *_TRAFFIC,
         *_TROUBLE,
         _word('NODES', lambda row: ' '.join(row.nodes), share=1),
@@ -95,10 +80,10 @@ COLUMNS = {
     'topics': (
         _word('TOPIC', lambda row: row.name, share=3),
         _word('TYPE', lambda row: row.type, share=2),
-        _number('HZ', 'rate', _rate),
-        _number('B/S', 'bandwidth', _thousands),
-        Column('PUB', lambda row: len(row.publishers), _plain),
-        Column('SUB', lambda row: len(row.subscribers), _plain),
+        _number('HZ', 'rate', short_rate),
+        _number('B/S', 'bandwidth', short_number),
+        Column('PUB', lambda row: len(row.publishers), str),
+        Column('SUB', lambda row: len(row.subscribers), str),
         *_TRANSPORT,
         _DROPPED,
     ),

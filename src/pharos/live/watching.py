@@ -14,6 +14,7 @@ import rosgraph
 
 from pharos.blocks import check_block
 from pharos.errors import NodeStoppedError, UnknownTopicError, suggest
+from pharos.live.figures import number_text, rate_text, size_text
 from pharos.live.message_text import text_of_message
 from pharos.master import Master
 from pharos.node import BlockNode
@@ -46,7 +47,7 @@ class Rate:
         return self.rate
 
     def __repr__(self) -> str:
-        found = f'{number_text(self.rate)} Hz'
+        found = rate_text(self.rate)
         if self.rate:
             found += f' ({number_text(self.min)} to {number_text(self.max)} s apart'
             found += f', std dev {number_text(self.std_dev)} s)'
@@ -214,19 +215,3 @@ def _messages(count: int) -> str:
     if count == 1:
         return '1 message'
     return f"{count or 'no'} messages"
-
-
-def number_text(value: float) -> str:
-    """A number with three digits that matter, and never an exponent."""
-    if abs(value) >= 100:
-        return f'{value:.0f}'
-    return f'{value:.3g}' if abs(value) >= 1e-4 or not value else f'{value:.6f}'
-
-
-def size_text(count: float) -> str:
-    """A number of bytes as people read it: '6.2 MB'; units are thousands, as rostopic has them."""
-    for unit in ('B', 'kB', 'MB'):
-        if abs(count) < 999.5:
-            return f'{number_text(count)} {unit}'
-        count /= 1000
-    return f'{number_text(count)} GB'
