@@ -2,6 +2,8 @@
 import time
 
 import pytest
+from IPython.core.interactiveshell import InteractiveShell
+from traitlets.config import Config
 
 import pharos
 from helpers import create
@@ -145,3 +147,19 @@ def test_a_place_is_a_call_and_its_last_argument():
     assert place.before == "'/a', \"b\","
     assert (place.argument, place.string) == (' x=', '/tu')
     assert place_of('f(1)') is None
+
+
+@pytest.mark.filterwarnings('ignore')  # IPython calls its completer provisional
+@pytest.mark.parametrize('code, word', [('T.', 'last'), ('T.la', 'last'), ('T.last.', None)])
+def test_ipython_evaluates_no_property_to_complete(names, master, monkeypatch, code, word):
+    looks = []
+    monkeypatch.setattr(pharos.Topic, 'last', property(looks.append))
+    shell = InteractiveShell(config=Config({'HistoryManager': {'enabled': False}}))
+    shell.push({**names, 'T': master.topic('/turtle1/pose')}, interactive=False)
+    end = completion.equip(shell)
+    try:
+        found = [each.text for each in shell.Completer.completions(code, len(code))]
+    finally:
+        end()
+    assert looks == []
+    assert word in [*found, None]

@@ -343,14 +343,33 @@ def test_a_script_has_the_names_of_the_session_and_its_arguments(open_session, t
     terminal.wait_for(r"^Out.*\['/workspace', '__main__', \['--fast', '3'\]\]")
 
 
-@pytest.mark.parametrize('error', ['raise ValueError("odd")', 'import sys; sys.exit("odd")'])
-def test_the_error_of_a_script_leaves_the_session_open(open_session, tmp_path, error):
+def test_a_script_knows_its_file_as_its_functions_do_later(open_session, tmp_path):
+    path = tmp_path / 'first.py'
+    path.write_text('where = __file__\ndef later(): return __file__\n')
+    terminal = open_session(path)
+    terminal.enter(f'where == later() == {str(path)!r}')
+    terminal.wait_for('^Out.*True')
+
+
+@pytest.mark.parametrize(
+    'error, told',
+    [
+        ('raise ValueError("odd")', 'ValueError: odd'),
+        ('import sys; sys.exit("odd")', "failing.py has ended: sys.exit\\('odd'\\)"),
+        ('import sys; sys.exit(3)', r'failing.py has ended: sys.exit\(3\)'),
+        ('import sys; sys.exit(0)', ''),
+    ],
+)
+def test_the_error_of_a_script_leaves_the_session_open(open_session, tmp_path, error, told):
     path = tmp_path / 'failing.py'
     path.write_text(f'before = 1\n{error}\n')
     terminal = open_session(path)
-    terminal.wait_for('(ValueError|SystemExit): odd')
+    terminal.wait_for(told)
     terminal.enter('before')
     terminal.wait_for('^Out.*1')
+    assert 'safe_execfile' not in terminal.text
+    assert ('Traceback' in terminal.text) == ('ValueError' in error)
+    assert leave(terminal)[0] == 0
 
 
 # -- where there is no session
@@ -380,10 +399,11 @@ def test_without_ipython_it_says_what_to_install(master, tmp_path):
     assert re.fullmatch('workspace: .*: sudo apt-get install python3-ipython\n', ended.stderr)
 
 
-def test_without_a_terminal_the_lines_of_its_input_are_run(master):
-    ended = subprocess.run(
-        [sys.executable, script('workspace')],
-        input='x = 6\nfor i in range(2):\n    x += 1\n\nprint(me.name, x)\n1 / 0\nprint("after")\n',
+def run_without_terminal(master, lines, *arguments):
+    """Have a session run these lines; returns what it printed and its status."""
+    return subprocess.run(
+        [sys.executable, script('workspace'), *map(str, arguments)],
+        input=lines,
         env=environment(master.url),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -391,9 +411,28 @@ def test_without_a_terminal_the_lines_of_its_input_are_run(master):
         timeout=TIMEOUT,
         check=False,
     )
+
+
+def test_without_a_terminal_the_lines_of_its_input_are_run(master):
+    ended = run_without_terminal(
+        master,
+        'x = 6\nfor i in range(2):\n    x += 1\n\nprint(me.name, x)\n1 / 0\nprint("after")\n',
+    )
     assert 'Standard input is no terminal' in ended.stdout
     assert '/workspace 8' in ended.stdout
     assert 'ZeroDivisionError' in ended.stdout + ended.stderr
     assert 'after' in ended.stdout
-    assert ended.returncode == 0
+    assert ended.returncode == 1
     assert '/workspace' not in names(master)
+    assert '\x1b' not in ended.stdout + ended.stderr
+
+
+@pytest.mark.parametrize(
+    'code, status', [('1 / 0', 1), ('exit(3)', 3), ('exit(0)', 0), ('exit("odd")', 1), ('x = 1', 0)]
+)
+def test_without_a_terminal_its_status_is_that_of_the_script(master, tmp_path, code, status):
+    path = tmp_path / 'script.py'
+    path.write_text(f'from sys import exit\n{code}\n')
+    ended = run_without_terminal(master, 'print(6 * 7)\n', path)
+    assert ended.returncode == status
+    assert '42' in ended.stdout

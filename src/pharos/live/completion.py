@@ -5,6 +5,7 @@
 """
 import ast
 import functools
+import importlib
 import inspect
 import re
 import time
@@ -328,6 +329,7 @@ def equip(shell: Any) -> Callable[[], None]:
         """Fields beside the variables that may stand there, too."""
         return complete(completer.text_until_cursor, False)
 
+    evaluate_properties = _have_jedi_evaluate_no_properties()
     completer.completions = note
     completer.custom_matchers.append(complete_keywords)
     shell.set_hook('complete_command', complete_strings, re_key='(?s).*')
@@ -335,7 +337,26 @@ def equip(shell: Any) -> Callable[[], None]:
     def end() -> None:
         nonlocal has_ended
         has_ended = True  # IPython has no way to take the hook back
+        evaluate_properties()
         del completer.completions
         completer.custom_matchers.remove(complete_keywords)
 
     return end
+
+
+def _have_jedi_evaluate_no_properties() -> Callable[[], None]:
+    """Have IPython complete what stands after a property without asking for its value, which may
+    ask the whole graph, or wait for a message; returns a function that ends it.
+
+    Without jedi IPython evaluates what is before the last dot, whatever it is told.
+    """
+    try:
+        interpreter: Any = importlib.import_module('jedi').Interpreter
+    except ImportError:
+        return lambda: None
+    before = getattr(interpreter, _EVALUATES, False)
+    setattr(interpreter, _EVALUATES, False)
+    return functools.partial(setattr, interpreter, _EVALUATES, before)
+
+
+_EVALUATES = '_allow_descriptor_getattr_default'

@@ -205,29 +205,45 @@ class _Session:
     def __init__(self, workspace: Workspace, application: Any) -> None:
         self._app = application.instance()
         self._app.display_banner = False
+        if not sys.stdout.isatty():
+            self._app.config.TerminalInteractiveShell.update(colors='NoColor', term_title=False)
         self._app.initialize([])
         self._shell = self._app.shell
         self._is_over = False  # whether a signal has ended the session
+        self._status = 0  # of what failed, where nobody is there to see it
         print(workspace.banner)
         if not sys.stdin.isatty():
             print('Standard input is no terminal: its lines are run, to its end.\n')
             self._shell.confirm_exit = False
+            self._shell.events.register('post_run_cell', self._note)
         equip(self._shell, workspace)
         node_registry.before_stop_all(self._end)  # which a signal asks for
 
     def run_script(self, path: str, args: Sequence[str]) -> None:
         """Run a program; what it raises leaves the session open."""
         argv_before, sys.argv = sys.argv, [path, *args]
+        self._shell.user_ns['__file__'] = path
         try:
             self._shell.safe_execfile(
                 path, self._shell.user_ns, shell_futures=True, raise_exceptions=True
             )
-        except BaseException as error:
-            if isinstance(error, SystemExit) and is_from_signal(error):
+        except SystemExit as error:
+            if is_from_signal(error):
                 raise
-            self._shell.showtraceback()
+            self._status = _status_of(error)
+            if error.code not in (None, 0):
+                print(f'{path} has ended: sys.exit({error.code!r})', file=sys.stderr)
+        except BaseException as error:
+            self._status = 1
+            self._shell.showtraceback((type(error), error, _below(error.__traceback__, path)))
         finally:
             sys.argv = argv_before
+
+    def _note(self, result: Any) -> None:
+        """A line has been run."""
+        error = result.error_before_exec or result.error_in_exec
+        if error is not None:
+            self._status = _status_of(error)
 
     def interact(self) -> int:
         """Run what is typed, until the session is left; returns the exit status.
@@ -238,7 +254,7 @@ class _Session:
             self._app.start()
         node_registry.not_before_stop_all(self._end)
         if not self._is_over:
-            return 0
+            return 0 if sys.stdin.isatty() else self._status
         with signals.held():  # which raises afterwards what the signal is to raise
             pass
         return 128 + signal.SIGTERM  # it has ended a wait, and there is nothing to raise
@@ -257,3 +273,17 @@ class _Session:
 def _leave(prompt: Any) -> None:
     if prompt.is_running:
         prompt.exit(exception=EOFError)
+
+
+def _status_of(error: BaseException) -> int:
+    """The exit status of a program that such an exception ends."""
+    code = error.code if isinstance(error, SystemExit) else 1
+    return 0 if code is None else code if isinstance(code, int) else 1
+
+
+def _below(trace: Any, path: str) -> Any:
+    """A traceback from the script's first line on; where it has not come to run, all of it."""
+    own, script = trace, os.path.realpath(path)
+    while own is not None and own.tb_frame.f_code.co_filename != script:
+        own = own.tb_next
+    return own or trace
