@@ -189,6 +189,22 @@ def test_a_compressed_image_that_nobody_can_read_is_an_error(format_):
             picture(CompressedImage(format=format_, data=data))
 
 
+@pytest.mark.parametrize('format_', ['EPS', 'ICNS', 'PCX'])
+def test_a_compressed_image_reaches_no_reader_but_those_of_its_formats(monkeypatch, format_):
+    data = encoded(format_, numpy.zeros((64, 64, 3), 'u1'))
+    monkeypatch.setattr(subprocess, 'Popen', None)  # which would start Ghostscript
+    with pytest.raises(MessageTypeError, match='cannot be read'):
+        picture(CompressedImage(format='jpeg', data=data))
+
+
+def test_a_compressed_image_of_too_many_pixels_is_an_error(monkeypatch):
+    data = encoded('PNG', numpy.zeros((9, 9), 'u1'))
+    for limit in 30, 60:  # Pillow raises at twice its limit, and warns before
+        monkeypatch.setattr(Pillow, 'MAX_IMAGE_PIXELS', limit)
+        with pytest.raises(MessageTypeError, match='cannot be read: .*decompression bomb'):
+            picture(CompressedImage(format='png', data=data))
+
+
 # -- from above
 
 
@@ -281,6 +297,56 @@ def test_a_cloud_may_be_empty_organized_or_made_wrongly():
         picture(flat)
 
 
+def one_field(**changes):
+    """A cloud of two points, but for these fields."""
+    cloud = cloud_of([(1, 2, 3), (4, 5, 6)])
+    for name, value in changes.items():
+        setattr(cloud, name, value)
+    return cloud
+
+
+def far_away():
+    poses = [PoseStamped(), PoseStamped()]
+    poses[0].pose.position.x, poses[1].pose.position.x = -1e308, 1e308
+    return Path(poses=poses)
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize(
+    'message',
+    [
+        one_field(point_step=0),
+        one_field(point_step=2**31, width=0),
+        one_field(fields=[PointField(name, 2**32 - 1, 7, 1) for name in 'xyz']),
+        one_field(fields=[PointField(name, 40, 7, 1) for name in 'xyz']),
+        cloud_of([(-1.7e308, 0, 0), (1.7e308, 0, 0)], '<f8', 8),
+        far_away(),
+        Image(encoding='yuv422', width=1, height=1, data=bytes(9)),
+        Image(encoding='mono8', width=2, height=1, data=[300, 2]),
+        Image(encoding='mono8', width=2, height=1, data='ab'),
+        Image(encoding='mono8', width=2.0, height=1, data=b'ab'),
+        LaserScan(ranges=['a']),
+    ],
+)
+def test_values_that_make_no_picture_are_an_error_of_ours(message):
+    with pytest.raises(MessageTypeError):
+        picture(message)
+
+
+@pytest.mark.filterwarnings('error')
+def test_values_at_the_limits_of_their_type_are_drawn():
+    heights = cloud_of([(0, 0, -1.7e308), (0, 0, 1.7e308)], '<f8', 8)
+    depths = image_of('64FC1', 2, 1, struct.pack('<2d', 1e308, -1e308))
+    for message in heights, depths:
+        assert picture(message).size
+
+
+def test_a_frame_may_have_any_name():
+    scan = LaserScan(ranges=[1, 2], range_max=5)
+    scan.header.frame_id = '猫'
+    assert picture(scan).size
+
+
 def test_other_messages_have_no_picture():
     with pytest.raises(
         MessageTypeError, match='of geometry_msgs/Twist: there are those of sensor_msgs'
@@ -321,6 +387,15 @@ def test_jupyter_shows_a_picture_of_a_message_and_its_text_without_endless_array
     drawn = Pillow.open(io.BytesIO(shown['image/png']))
     assert drawn.width <= 800 and drawn.height <= 600
     assert 'encoding: "rgb8"' in shown['text/plain'] and len(shown['text/plain']) < 1000
+
+
+@pytest.mark.parametrize('mode', ['F', 'I', 'I;16', 'CMYK', 'LAB', 'PA'])
+def test_jupyter_shows_compressed_images_of_any_mode(ipython, mode):
+    file = io.BytesIO()
+    Pillow.new(mode, (1000, 900)).save(file, 'TIFF')
+    message = CompressedImage(format='tiff', data=file.getvalue())
+    shown, _ = ipython.display_formatter.format(message)
+    assert Pillow.open(io.BytesIO(shown['image/png'])).width <= 800
 
 
 def test_jupyter_shows_the_text_alone_of_what_has_no_picture(ipython):

@@ -34,7 +34,7 @@ class ViewFromAbove:
         self.image = Image.new('RGB', (max(width, SIZE // 3), max(height, SIZE // 4)), 'white')
         self.draw = ImageDraw.Draw(self.image)
         self._draw_grid(extent)
-        self.draw.text((4, 2), frame, fill='#505050')
+        self.draw.text((4, 2), _drawable(frame), fill='#505050')
 
     def place(self, points: Any) -> Any:
         """Where points are, in pixels."""
@@ -88,6 +88,11 @@ class ViewFromAbove:
             end = (x + 14 * math.cos(yaw), y - 14 * math.sin(yaw))
             self.draw.line([(x, y), end], fill=color, width=2)
         self.draw.ellipse([x - 4, y - 4, x + 4, y + 4], fill=color)
+
+
+def _drawable(text: str) -> str:
+    """A text without what Pillow's own font has not."""
+    return text.encode('latin-1', 'replace').decode('latin-1')
 
 
 def _round_step(step: float) -> float:

@@ -1,6 +1,7 @@
 """Pictures of what cameras send: sensor_msgs/Image and CompressedImage."""
 import io
 import struct
+import warnings
 from typing import Any, Dict, Tuple
 
 import numpy
@@ -124,6 +125,12 @@ def _from_yuv(pixels: Any, brightness: Tuple[int, int], blue: int, red: int) -> 
     return Image.fromarray(numpy.dstack([y, *colors]), 'YCbCr').convert('RGB')
 
 
+#: what compressed images may be. Who sends them is not known: other formats of Pillow's have it
+#: start programs, or have more ways to go wrong
+FORMATS = 'JPEG', 'JPEG2000', 'PNG', 'TIFF', 'WEBP', 'BMP', 'GIF', 'PPM'
+_BOMBS = Image.DecompressionBombError, Image.DecompressionBombWarning
+
+
 def compressed_picture(message: Any) -> Image.Image:
     """The picture in a sensor_msgs/CompressedImage, also of a depth camera.
 
@@ -133,9 +140,11 @@ def compressed_picture(message: Any) -> Image.Image:
     is_depth = 'compressedDepth' in message.format
     header, data = (data[:12], data[12:]) if is_depth else (b'', data)
     try:
-        picture = Image.open(io.BytesIO(data))
-        picture.load()
-    except (OSError, SyntaxError, ValueError) as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter('error', Image.DecompressionBombWarning)
+            picture = Image.open(io.BytesIO(data), formats=FORMATS)
+            picture.load()
+    except (*_BOMBS, OSError, SyntaxError, ValueError) as error:
         raise MessageTypeError(
             f'a compressed image, {message.format!r}, of {len(data)} bytes cannot be read: {error}'
         ) from error

@@ -24,6 +24,18 @@ _PICTURES: Dict[Tuple[str, str], Tuple[str, str]] = {
 }
 
 
+#: what reading and drawing raise where the values of a message are no picture's
+_UNFIT = (
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    MemoryError,
+    OSError,
+    TypeError,
+    ValueError,
+)
+
+
 def picture(message: genpy.Message) -> 'Image':
     """A picture of a message, as of the Python Imaging Library: ``picture(scan).save('scan.png')``.
 
@@ -42,16 +54,18 @@ def picture(message: genpy.Message) -> 'Image':
         )
     module, name = _PICTURES[key]
     try:
-        drawing: 'Image' = getattr(importlib.import_module(f'pharos.live.{module}'), name)(message)
+        draw = getattr(importlib.import_module(f'pharos.live.{module}'), name)
+        with importlib.import_module('numpy').errstate(all='ignore'):  # numbers may be anything
+            drawing: 'Image' = draw(message)
     except ImportError as error:
         raise PharosError(
             missing(
                 'Pillow and NumPy draw pictures of messages', error, 'python3-pil python3-numpy'
             )
         ) from error
-    except AttributeError as error:  # another definition goes by this name
+    except _UNFIT as error:  # of another definition by this name, or values that make no picture
         raise MessageTypeError(
-            f'no picture can be made of this {message._type}: {error}'
+            f'no picture can be made of this {message._type}: {error or type(error).__name__}'
         ) from error
     return drawing
 
@@ -81,6 +95,16 @@ def register(ipython: Any) -> None:
     formatters['text/plain'].for_type(genpy.Message, _text)
 
 
+def _as_png_takes_it(shown: 'Image') -> 'Image':
+    if shown.mode in ('1', 'L', 'LA', 'P', 'RGB', 'RGBA'):
+        return shown
+    if shown.mode == 'F' or shown.mode.startswith('I'):  # measured values
+        images = importlib.import_module('pharos.live.images')
+        drawn: 'Image' = images.values_picture(importlib.import_module('numpy').asarray(shown))
+        return drawn
+    return shown.convert('RGBA' if shown.mode == 'PA' else 'RGB')
+
+
 def _png(message: genpy.Message) -> Optional[bytes]:
     """A picture of the size that is shown; None where there is none."""
     if not has_picture(message):
@@ -89,6 +113,7 @@ def _png(message: genpy.Message) -> Optional[bytes]:
         shown = picture(message)
     except PharosError:  # its text is shown all the same
         return None
+    shown = _as_png_takes_it(shown)
     if shown.width > SHOWN[0] or shown.height > SHOWN[1]:
         shown = shown.copy()
         shown.thumbnail(SHOWN)
