@@ -1,12 +1,14 @@
 """Names: checked alike wherever they are given, resolved once, and what `from_=` and `to=` make of
 them."""
+import sys
+
 import pytest
 
 from helpers import create
 from pharos.testing import Mailbox, TIMEOUT, until
 import pharos
 from pharos import BlockNode
-from programs import Program
+from programs import PROGRAMS, Program
 
 STRING = 'std_msgs/String'
 SWAP = ['one:=two', 'two:=one']
@@ -361,3 +363,23 @@ def test_to_costs_the_master_nothing_where_the_peer_is_connected(
     monkeypatch.setattr(pharos.Master, 'api', None)
     channel.send(data='at once', to='listener')
     assert mailbox.next().data == 'at once'
+
+
+# -- what others have named otherwise
+
+
+@pytest.mark.filterwarnings('ignore:.*not a legal ROS graph')  # rospy says so
+def test_what_the_graph_has_is_reached_by_a_name_that_ours_could_not_have(master, node):
+    with Program(master.url, sys.executable, str(PROGRAMS / 'dashed.py')):
+        external = until(lambda: master.has('/my-service', 'service') and master.node('/my-node'))
+        topic = master.topic('/my-topic')
+        assert topic.type == STRING and topic.last.data == 'latched'
+        assert master.wait_for_node('/my-node') == external
+        assert node.interested_in('/my-topic', from_='/my-node').topic == '/my-topic'
+        master.lookup_service('/my-service').call()
+        text = external.describe(0)
+        assert '/my-topic [std_msgs/String]' in text and '/my-service [std_srvs/Empty]' in text
+        assert '~top-speed: 5' in text
+    for look in master.node, master.topic, master.lookup_service:
+        with pytest.raises(ValueError, match='/no-such. cannot be'):
+            look('/no-such')

@@ -24,7 +24,6 @@ from pharos.master_calls import MasterCalls
 from pharos.node import Node
 from pharos.parameters import Parameters
 from pharos.private_rospy.addresses import check_port, check_url
-from pharos.private_rospy.names import check_name, global_name
 from pharos.private_rospy.deadlines import MARGIN, time_limit
 from pharos.ros_process import RosProcess
 from pharos.seconds import check_limit
@@ -295,7 +294,7 @@ class Master(MasterCalls):
 
         :raises UnknownNodeError: if the master knows none
         """
-        name = global_name(name, 'node')
+        name = self.name_of(name, 'node')
         known = {node.name: node for node in self.nodes()}
         if name not in known:
             raise self._unknown(name, known)
@@ -323,7 +322,7 @@ class Master(MasterCalls):
         :raises UnknownNodeError: if it does not come in time
         :raises MasterUnreachableError: if the master has not answered in that time either
         """
-        name, timeout = global_name(name, 'node'), check_limit('timeout', timeout)
+        name, timeout = self.name_of(name, 'node'), check_limit('timeout', timeout)
         with time_limit(timeout):
             node: Optional[AnyNode] = self.look_until_found(
                 lambda: self.live_node(name), timeout, name
@@ -374,7 +373,7 @@ class Master(MasterCalls):
 
     def topic(self, name: str) -> Topic:
         """The topic of that name, whether anybody uses it yet or not."""
-        return Topic(self, global_name(name, 'topic'))
+        return Topic(self, self.name_of(name, 'topic'))
 
     def services(self) -> List[str]:
         """Names of all services."""
@@ -391,8 +390,8 @@ class Master(MasterCalls):
             comes back
         :raises UnknownServiceError: if nobody offers it
         """
-        caller_id = global_name(caller_id, 'node')
-        name = rosgraph.names.resolve_name(check_name(name, 'service', private=True), caller_id)
+        caller_id = self.name_of(caller_id, 'node')
+        name = self.name_of(name, 'service', caller_id)
         return Service(self, name, caller_id, persistent)
 
     def __repr__(self) -> str:

@@ -24,6 +24,7 @@ from pharos.errors import MasterUnreachableError, NodeStoppedError
 from pharos.private_rospy.addresses import is_same_master
 from pharos.private_rospy.lifetime import Interruption
 from pharos.private_rospy.deadlines import MARGIN, time_limit
+from pharos.private_rospy.names import check_name
 from pharos.private_rospy.proxies import ServerProxy, interruption, master_api
 from pharos.private_rospy.registration import COMMUNICATION_ERRORS, PING_TIMEOUT, unreachable
 from pharos.seconds import check_limit
@@ -88,6 +89,38 @@ class MasterCalls:
         """``(publishers, subscribers, services)``, each ``{name: [node names]}``."""
         publishers, subscribers, services = self.call('getSystemState')
         return dict(publishers), dict(subscribers), dict(services)
+
+    def name_of(self, name: str, what: str, caller_id: Optional[str] = None) -> str:
+        """The full name of a node, topic or service.
+
+        One that the graph has is its name however it is written: rospy warns of '/my-node', and
+        goes on.
+
+        :param caller_id: the node to which '~name' is private
+        :raises ValueError: if it cannot be one, and is none
+        """
+        try:
+            check_name(name, what, private=caller_id is not None)
+        except ValueError:
+            if not self.has(name, what):
+                raise
+            return name
+        resolved: str = rosgraph.names.resolve_name(name, caller_id or '/')
+        return resolved
+
+    def has(self, name: Any, what: str) -> bool:
+        """Whether the graph has a 'node', 'topic' or 'service' of that full name; not, if the master
+        does not answer."""
+        if not isinstance(name, str) or not name.startswith('/'):
+            return False
+        try:
+            publishers, subscribers, services = self.system_state()
+        except MasterUnreachableError:
+            return False
+        if what == 'node':
+            users = [*publishers.values(), *subscribers.values(), *services.values()]
+            return any(name in nodes for nodes in users)
+        return name in {'topic': {**publishers, **subscribers}, 'service': services}.get(what, ())
 
     def topic_types(self) -> List[Tuple[str, str]]:
         """``[(topic name, type name)]`` of all topics."""

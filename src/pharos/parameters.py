@@ -49,8 +49,9 @@ class Parameters(MutableMapping[str, Any]):
         try:
             return _global(name)
         except ValueError:
-            if name in self._master.call('getParamNames'):  # as rosparam and a YAML file may
-                return str(name)
+            there = self._master.call('getParamNames')
+            if any(f'{each}/'.startswith(f'{name}/') for each in there):
+                return str(name)  # as rosparam and a YAML file may, or within a node's name
             raise
 
     def _call(self, method: str, name: str, *args: Any) -> Any:

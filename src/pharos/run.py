@@ -298,7 +298,12 @@ class Run:
         :param what: what it is the name of, such as 'topic'
         :raises ValueError: if it cannot be a name
         """
-        name = check_name(name, what, private=True)
+        try:
+            check_name(name, what, private=True)
+        except ValueError:
+            if not self.node.master.has(name, what):
+                raise
+            return name  # which other nodes have given to what is there
         # where rospy takes what follows for a global name (ros_comm #3044)
         name = '~' + name[2:] if name.startswith('~/') else name
         return check_name(self.rospy.module.resolve_name(name), what)

@@ -220,6 +220,8 @@ def _parameters(node: AnyNode) -> Iterator[str]:
     except PharosError as error:
         yield str(error)
         return
+    except ValueError:  # rospy's node has another name than one of ours could, and none of these
+        return
     for name, value in sorted(found.items()) if isinstance(found, dict) else ():
         text = text_of(value)
         yield f'~{name}: {text if len(text) <= WIDTH else text[:WIDTH] + "..."}'
