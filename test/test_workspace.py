@@ -233,12 +233,12 @@ def test_tab_completes_fields_in_a_later_line_of_a_call(master, open_session):
 def test_tab_at_a_master_that_has_gone_completes_nothing_and_says_nothing(
     mortal_master, open_session
 ):
-    terminal = open_session(url=mortal_master.url)
+    terminal = open_session('__name:=robot_shell', url=mortal_master.url)  # which is no file's name
     mortal_master.end()
-    terminal.type("master.node('/work")
+    terminal.type("master.node('/robot_")
     terminal.press('Tab')
-    terminal.type('space')
-    terminal.wait_for(r"^In \[1\]: master.node\('/workspace\Z")
+    terminal.type('shell')
+    terminal.wait_for(r"^In \[1\]: master.node\('/robot_shell\Z")
 
 
 def test_a_question_mark_tells_of_a_topic_and_two_what_it_is_beside(master, open_session):
