@@ -1,13 +1,17 @@
 """What is changed of a node while it runs: its blocks, its souls, a restart, its class."""
 import itertools
 import queue
+import signal
+import sys
 import threading
+import xmlrpc.client
 
 import pytest
 
 import pharos
 from pharos import node_registry
-from helpers import create, ended, speak_tcpros_only
+from helpers import create, ended, in_thread, speak_tcpros_only
+from pharos.restarts import is_restarting
 from pharos.testing import Mailbox, TIMEOUT, until
 
 
@@ -403,9 +407,86 @@ def test_a_node_that_is_restarted_when_all_are_stopped_stays_stopped(master):
             super().start()
 
     node = create(master, '/slow', Slow)
-    node.restart()
+    with pytest.raises(pharos.NodeStoppedError):
+        node.restart()
     assert not node.is_running
     assert not node_registry.nodes()
+
+
+class Halting(pharos.Node):
+    """Calls ``meanwhile()`` in its stop or start, before that happens."""
+
+    def __init__(self):
+        super().__init__()
+        self.halts, self.meanwhile = None, lambda: None
+
+    def start(self):
+        if self.latest_run is not None and self.halts == 'start':
+            self.meanwhile()
+        super().start()
+
+    def stop(self):
+        if self.halts == 'stop':
+            self.meanwhile()
+        super().stop()
+
+
+@pytest.mark.parametrize('halts, kills', [('stop', False), ('start', False), ('stop', True)])
+def test_a_node_that_is_stopped_while_it_is_restarted_stays_stopped(master, halts, kills):
+    node = create(master, node_class=Halting)
+    node.fork(turning(queue.SimpleQueue(), 'turn'))
+    stopping = []
+
+    def stop():
+        if kills:
+            xmlrpc.client.ServerProxy(node.uri).shutdown('/killer', 'killed')
+        else:
+            node.stop()
+
+    def meanwhile():
+        stopping.append(in_thread(stop))
+        until(lambda: not is_restarting(node))
+
+    node.halts, node.meanwhile = halts, meanwhile
+    with pytest.raises(pharos.NodeStoppedError, match='/node'):
+        node.restart()
+    assert ended(*stopping)
+    assert not node.is_running
+    assert not node_registry.nodes()
+    create(master).stop()  # its name is free
+    node.halts = None
+    node.restart()
+    assert node.is_running
+    assert not node.errors
+
+
+def test_a_soul_that_stops_its_node_in_the_end_keeps_it_from_no_restart(master):
+    node, begun = create(master), queue.SimpleQueue()
+
+    def soul(me):
+        begun.put('begun')
+        for _ in me.every(0.001):
+            pass
+        me.stop()
+
+    node.fork(soul)
+    for _ in range(3):
+        assert begun.get(timeout=TIMEOUT) == 'begun'
+        node.restart()
+    assert begun.get(timeout=TIMEOUT) == 'begun'
+    assert node.is_running
+
+
+def test_a_ctrl_c_at_the_prompt_tears_no_restart_up(master, monkeypatch):
+    monkeypatch.setattr(sys, 'ps1', '>>> ', raising=False)
+    node, begun = create(master, node_class=Halting), queue.SimpleQueue()
+    node.halts, node.meanwhile = 'start', lambda: signal.raise_signal(signal.SIGINT)
+    node.fork(soul_of(begun, 'soul'))
+    assert begun.get(timeout=TIMEOUT)
+    with pytest.raises(KeyboardInterrupt):
+        node.restart()
+    assert node.is_running
+    assert begun.get(timeout=TIMEOUT) == ('soul', '/node soul')
 
 
 def test_a_restart_within_a_start_is_refused(master):

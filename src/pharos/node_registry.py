@@ -68,6 +68,7 @@ def claim(run: 'Run') -> 'Optional[Run]':
 
     :raises PharosError: if the node is running already
     :raises NodeNameInUseError: if another node of this process has its name at its master
+    :raises NodeStoppedError: if this thread restarts the node, which another one has stopped
     """
     _end_with_multiprocessing()
     node = run.node
@@ -75,6 +76,8 @@ def claim(run: 'Run') -> 'Optional[Run]':
         _wait_for_stop(node)  # for what an overriding stop() does last
     with changed:
         former = node.latest_run
+        if former and former.restart and former.restart.is_cancelled_here():
+            raise NodeStoppedError(f'{node.name} was stopped while it was restarted')
         _claim_name(node, node.name)
         if former is not None and not former.is_over:
             raise PharosError(
@@ -193,6 +196,7 @@ def _begin_stop(node: 'Node') -> 'Optional[Run]':
     if node.latest_run is not None:
         if node.latest_run.rospy.is_in_shutdown_hook():
             return None  # after the hooks, which are to run before all else, it is stopped
+        _cancel_restart(node)
         node.latest_run.cancel_start()
     with changed:
         run = node.latest_run
@@ -204,6 +208,17 @@ def _begin_stop(node: 'Node') -> 'Optional[Run]':
             return None
         _stops[node] = threading.get_ident(), time.monotonic() + STOP_LIMIT
         return node.latest_run
+
+
+def _cancel_restart(node: 'Node') -> None:
+    """Have the node stay stopped, if another thread restarts it."""
+    with changed:
+        run = node.latest_run
+        if run.restart is None or run.is_ending and run.souls.is_run_here():
+            return  # the restart itself ends the soul, whose last line this is
+        run.restart.cancel()
+        if run.is_over and run.restart.is_cancelled:
+            discard(node)
 
 
 def _wait_for_stop(node: 'Node') -> bool:

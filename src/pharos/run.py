@@ -20,7 +20,7 @@ from pharos.private_rospy.instance import PrivateRospy
 from pharos.private_rospy.names import Resolved, check_name
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.settings import Settings
-from pharos.restarts import is_restarting
+from pharos.restarts import Restart, is_restarting
 from pharos.seconds import check_seconds
 from pharos.souls import Souls
 from pharos.topic import Topic
@@ -62,6 +62,8 @@ class Run:
         self.souls = Souls(self)
         #: the one that began when :meth:`Node.restart` had ended this one
         self.successor: Optional[Run] = None
+        #: the restart that ends this one
+        self.restart: Optional[Restart] = None
         self.rospy = PrivateRospy(settings, self._stop_for_ros, lambda: node.allow_remote_shutdown)
         self.dispatcher = Dispatcher(self.rospy.start_thread)
         self.rospy.on_received = self.dispatcher.run

@@ -142,8 +142,12 @@ class Souls:
     def end(self) -> None:
         """End the soul that runs in this thread, if one does and the node stops."""
         is_running = self._run.lifecycle is Lifecycle.RUNNING
-        if not is_running and threading.get_ident() in self._threads:
+        if not is_running and self.is_run_here():
             raise NodeStoppedError(f'{self._run.node.name} stops, and this soul with it')
+
+    def is_run_here(self) -> bool:
+        """Whether this thread runs a soul of the run."""
+        return threading.get_ident() in self._threads
 
 
 class NodeWithSouls(NodeAttributes, is_base=True):

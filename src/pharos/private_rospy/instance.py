@@ -181,7 +181,7 @@ class PrivateRospy:
         self.domain = self.import_library('rosgraph.network').get_host_name()
         if not self.lifetime.has_program:  # which goes on after that, to its end
             # rospy.signal_shutdown called by the node's own code
-            self.module.core.add_preshutdown_hook(self.request_stop)
+            self.module.core.add_preshutdown_hook(self._request_own_stop)
         if not rosgraph.network.is_local_address(self.domain):
             self.warn(
                 f'{self.domain}, which {self.name} tells others to come to, is no address of this'
@@ -216,6 +216,11 @@ class PrivateRospy:
             threading.Thread(
                 target=self._on_stop_request, args=(reason,), name=self.name + ' stop', daemon=True
             ).start()
+
+    def _request_own_stop(self, reason):
+        """The node's own code ends it, perhaps because it has seen that it stops already."""
+        if not self.ended.is_set():
+            self.request_stop(reason)
 
     def is_in_shutdown_hook(self):
         """Whether this thread has called the node's ``rospy.signal_shutdown``, and is in a hook;
