@@ -242,9 +242,9 @@ def test_what_a_soul_forks_is_not_forked_twice(master, again):
 
     def outer(me):
         me.fork(soul_of(begun, 'inner'), name='inner')
-        begun.put('outer')
-        for _ in me.every(0.001):
-            pass
+        for turn, _ in enumerate(me.every(0.001)):
+            if turn == 0:
+                begun.put('outer')
 
     node.fork(outer, name='outer')
     assert {begun.get(timeout=TIMEOUT) for _ in range(2)} == {'outer', ('inner', '/node inner')}
@@ -252,6 +252,85 @@ def test_what_a_soul_forks_is_not_forked_twice(master, again):
     assert {begun.get(timeout=TIMEOUT) for _ in range(2)} == {'outer', ('inner', '/node inner')}
     until(lambda: len(node.latest_run.souls.forked) == 2)
     assert begun.empty()
+
+
+class Sings(pharos.Node):
+    """A soul that tells of its beginnings and its turns."""
+
+    def sing(self):
+        for _ in self.every(0.001):
+            self.sung = 'Sings'
+
+
+class Hums(pharos.Node):
+    """The same, otherwise."""
+
+    def sing(self):
+        for _ in self.every(0.001):
+            self.sung = 'Hums'
+
+
+@pytest.mark.parametrize('how', ['become', 'renew', 'renew sleeper'])
+def test_a_soul_begins_anew_by_itself_where_the_one_that_has_forked_it_does_not(master, how):
+    node, is_there, release = create(master, node_class=Sings), [], threading.Event()
+    node.stop_timeout = 0.1
+
+    def maker(me):
+        me.fork(Sings.sing, name='child')
+        is_there.append('maker')
+        if how == 'renew':
+            release.wait(TIMEOUT)  # it never turns
+        elif how == 'renew sleeper':
+            me.sleep(1000)
+        for _ in me.every(0.001):
+            pass
+
+    node.fork(maker, name='maker')
+    until(lambda: getattr(node, 'sung', None))
+    if how == 'become':
+        node.become(Hums)
+        until(lambda: node.sung == 'Hums')
+    else:
+        (child,) = [soul for soul in node.latest_run.souls.forked if soul.name == 'child']
+        node.renew()
+        until(lambda: not child.is_asked)
+        node.sung = None
+        until(lambda: node.sung)
+    assert [soul.name for soul in node.latest_run.souls.forked] == ['maker', 'child']
+    assert is_there == ['maker']
+    release.set()
+
+
+def test_a_soul_that_begins_anew_waits_for_what_it_has_forked(master):
+    node, alive, most = create(master), [], []
+    begun = queue.SimpleQueue()
+
+    def child(me):
+        alive.append(me)
+        most.append(len(alive))
+        for turn, _ in enumerate(me.every(0.05)):
+            if turn == 0:
+                begun.put('child')
+        alive.remove(me)
+
+    def parent(me):
+        me.fork(child, name='child')
+        for _ in me.every(0.001):
+            pass
+
+    def grandparent(me):
+        me.fork(parent, name='parent')
+        for _ in me.every(0.001):
+            pass
+
+    node.fork(grandparent, name='grandparent')
+    for _ in range(5):
+        assert begun.get(timeout=TIMEOUT) == 'child'
+        node.renew()
+    assert begun.get(timeout=TIMEOUT) == 'child'
+    assert max(most) == 1
+    assert begun.empty()
+    until(lambda: len(node.latest_run.souls.forked) == 3)
 
 
 def test_a_restart_of_a_stopped_node_starts_it_with_the_souls_that_the_stop_ended(master):

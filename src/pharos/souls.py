@@ -23,7 +23,17 @@ class Soul:
         self.name = name
         self.maker = maker  # START, the Soul in whose thread it was forked, or None
         self.is_asked = False  # whether it is to begin anew
-        self.begins_anew = False  # whether it has ended for that
+        self.is_dropped = False  # whether it is to end, for its maker begins anew, and forks again
+        self.begins_anew = False  # whether its loop has ended for one of these
+        self.loops = 0  # how deep it is in loops over every()
+
+    @property
+    def is_due(self) -> bool:
+        """Whether its loop is to end: not yet where its maker is about to begin anew, which ends it
+        then."""
+        maker = self.maker
+        is_makers = isinstance(maker, Soul) and maker.is_asked and maker.loops > 0
+        return self.is_dropped or self.is_asked and not is_makers
 
     def block_of(self, node: NodeAttributes) -> Optional[Block]:
         """What it runs when it begins now; None: nothing."""
@@ -96,12 +106,29 @@ class Souls:
         while block is not None:
             self._execute(soul, block)
             block = None
-            # what another soul has forked, that forks anew
-            if soul.begins_anew and soul.maker not in self.forked:
+            if soul.begins_anew and (soul.is_dropped or soul.block_of(self._run.node)):
+                self._end_forked_by(soul)
                 soul.is_asked = soul.begins_anew = False
-                block = soul.block_of(self._run.node)
+                if self._run.lifecycle is Lifecycle.RUNNING and not soul.is_dropped:
+                    block = soul.block_of(self._run.node)
         if self._run.lifecycle is Lifecycle.RUNNING:
             self.forked.remove(soul)
+            node_registry.notify()  # its maker may wait for that
+
+    def _end_forked_by(self, maker: Soul) -> None:
+        """End what a soul has forked, which will fork that again, and wait for those that loop."""
+        makers, children = {maker}, []
+        for soul in list(self.forked):  # those that another one has forked come after it
+            if soul.maker in makers:
+                soul.is_dropped = True
+                makers.add(soul)
+                children.append(soul)
+        node_registry.wait_until(
+            lambda: self._run.lifecycle is not Lifecycle.RUNNING
+            or not any(
+                soul in self.forked and (soul.loops > 0 or soul.begins_anew) for soul in children
+            )
+        )
 
     def renew(self) -> None:
         """Have those that are forked begin anew.
@@ -128,16 +155,21 @@ class Souls:
 
     def turns(self, rate: Any) -> Iterator[None]:
         """What :meth:`Node.every` returns, by a Rate of rospy's."""
-        soul = getattr(self._here, 'soul', None)
-        while self._run.lifecycle is Lifecycle.RUNNING:
-            if soul is not None and soul.is_asked:
-                soul.begins_anew = True
-                return
-            yield
-            if self._run.lifecycle is not Lifecycle.RUNNING:
-                return
-            with signals.interruptible_wait(), contextlib.suppress(rospy.ROSInterruptException):
-                rate.sleep()
+        soul = getattr(self._here, 'soul', None) or Soul(None, '', None)
+        soul.loops += 1
+        try:
+            while self._run.lifecycle is Lifecycle.RUNNING:
+                if soul.is_due:
+                    soul.begins_anew = True
+                    return
+                yield
+                if self._run.lifecycle is not Lifecycle.RUNNING:
+                    return
+                with signals.interruptible_wait():
+                    with contextlib.suppress(rospy.ROSInterruptException):
+                        rate.sleep()
+        finally:
+            soul.loops -= 1
 
     def end(self) -> None:
         """End the soul that runs in this thread, if one does and the node stops."""
@@ -181,7 +213,8 @@ class NodeWithSouls(NodeAttributes, is_base=True):
             driver.renew()
 
         A soul that was forked as a ``block`` begins with that block again, and one whose node has no
-        soul any more ends. Without :meth:`every` a soul does not begin anew.
+        soul any more ends. Without :meth:`every` a soul does not begin anew. One that another soul
+        has forked ends when that begins anew, which waits for it, and forks it again.
 
         :raises PharosError: if no soul runs in a thread of its own: it has ended, or failed, and is
             to be forked again
