@@ -823,6 +823,79 @@ def test_a_class_that_lacks_a_method_is_refused_before_anything_changes(master):
     until(lambda: node.heard == [(1, 'first')])
 
 
+class Plain(pharos.Node):
+    """Blocks that are methods."""
+
+    def hear(self, message, channel):
+        channel.node.heard.append('plain')
+
+    def change(self, value):
+        self.heard.append('plain')
+
+    def turn(self):
+        self.turned = 'plain'
+        for _ in self.every(0.001):
+            pass
+
+
+class Static(pharos.Node):
+    """Blocks that are static methods."""
+
+    @staticmethod
+    def hear(message, channel):
+        channel.node.heard.append('static')
+
+    @staticmethod
+    def change(value):
+        Static.latest.heard.append('static')
+
+    @staticmethod
+    def turn(node):
+        node.turned = 'static'
+        for _ in node.every(0.001):
+            pass
+
+
+class OfClass(pharos.Node):
+    """Blocks that are class methods."""
+
+    @classmethod
+    def hear(cls, message, channel):
+        channel.node.heard.append('class')
+
+    @classmethod
+    def change(cls, value):
+        Static.latest.heard.append('class')
+
+    @classmethod
+    def turn(cls, node):
+        node.turned = 'class'
+        for _ in node.every(0.001):
+            pass
+
+
+@pytest.mark.parametrize('first', [Plain, Static, OfClass])
+def test_methods_become_static_and_class_methods_and_methods_again(master, first):
+    names = {Plain: 'plain', Static: 'static', OfClass: 'class'}
+    node = Static.latest = create(master, node_class=first)
+    node.heard, node.turned = [], None
+    node.interested_in('/changed', 'std_msgs/Int32', node.hear)
+    node.parameter('~changed').on_change(node.change)
+    node.soul = type(node).turn
+    node.fork(type(node).turn)
+    numbers = publisher(master)
+    for count, kind in enumerate([Static, Plain, OfClass, Static, OfClass, Plain]):
+        node.become(kind)
+        numbers.send(data=count)
+        until(lambda: len(node.heard) == 1)
+        master.parameters['/node/changed'] = count
+        until(lambda: len(node.heard) == 2)
+        assert node.heard == [names[kind]] * 2
+        node.heard.clear()
+        until(lambda: node.turned == names[kind])
+    assert not node.errors
+
+
 def test_what_is_no_class_that_a_node_can_have_is_refused(master):
     node = create(master)
     for wrong in pharos.Master, node, 'Driver', None:

@@ -84,7 +84,7 @@ def places(node: 'Node') -> Iterator[Place]:
         block = getattr(holder, attribute)
         if block is not None:
             take = functools.partial(setattr, holder, attribute)
-            yield Place(kind, of, BlockOf(node, block), parameters, take)
+            yield Place(kind, of, BlockOf(node, block, kind == 'soul'), parameters, take)
 
     yield from held(node, 'delegate', 'delegate', node.name, 'message', 'channel')
     yield from held(node, 'soul', 'soul', node.name, 'node')

@@ -2,7 +2,7 @@
 import functools
 import inspect
 import reprlib
-from typing import Any, Callable, Optional, Sequence
+from typing import Any, Callable, Optional, Sequence, Tuple
 
 from pharos.signals import code_of, is_from_signal
 
@@ -115,10 +115,14 @@ class BlockOf:
     """A block that was given to a node: where it is a method of the node's class, the one of that
     name of the class that the node has by now."""
 
-    def __init__(self, node: Any, block: Any) -> None:
+    def __init__(self, node: Any, block: Any, is_soul: bool = False) -> None:
         self._node, self.given = node, block
         #: the name of the method; None: it is none of the class
-        self.method = _method_name(node, block)
+        self.method, is_wrapped = _method_of(node, block)
+        # What is called without the node is called with it where it has become a plain method. A
+        # soul gets the node in any case.
+        is_bound = inspect.ismethod(block) and block.__self__ is node
+        self._binds = is_bound or is_wrapped and not is_soul
 
     @property
     def now(self) -> Any:
@@ -131,24 +135,25 @@ class BlockOf:
         if self.method is None:
             return self.given
         value = inspect.getattr_static(node_class, self.method, None)
-        is_bound = inspect.ismethod(self.given) and self.given.__self__ is self._node
         bind = getattr(type(value), '__get__', None)
-        return bind(value, self._node if is_bound else None, node_class) if bind else value
+        return bind(value, self._node if self._binds else None, node_class) if bind else value
 
 
-def _method_name(node: Any, block: Any) -> Optional[str]:
+def _method_of(node: Any, block: Any) -> Tuple[Optional[str], bool]:
+    """The name of the method of the node's class that the block is, and whether that is a static
+    or class method; None if it is none."""
     function = block
     if inspect.ismethod(block):
         function = block.__func__
         if block.__self__ is not node and not isinstance(block.__self__, type):
-            return None  # a method of something else
+            return None, False  # a method of something else
     for owner in type(node).__mro__:
         for name, value in vars(owner).items():
             is_wrapped = isinstance(value, (staticmethod, classmethod))
             other = value.__func__ if is_wrapped else value
             if other is function or _is_reloaded(function, other):
-                return name
-    return None
+                return name, is_wrapped
+    return None, False
 
 
 def _is_reloaded(function: Any, other: Any) -> bool:

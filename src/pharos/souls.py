@@ -96,7 +96,7 @@ class Souls:
         """Run the node's soul, or ``block``, in a thread of its own, and return the thread."""
         node = self._run.node
         maker = START if node_registry.is_in_start(node) else getattr(self._here, 'soul', None)
-        soul = Soul(None if block is None else BlockOf(node, block), name, maker)
+        soul = Soul(None if block is None else BlockOf(node, block, is_soul=True), name, maker)
         first = self._checked(soul)
         self.forked.append(soul)
         return self._run.fork(lambda: self._run_forked(soul, first), name)
