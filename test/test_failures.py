@@ -780,6 +780,59 @@ def test_a_delegate_is_run_again_when_no_other_runs(master, transcript, mailbox)
     assert ran == ['slow', 'again']
 
 
+class Opens(pharos.Node):
+    """Opens in its start() what it opens."""
+
+    def start(self):
+        super().start()
+        self.interested_in('/again', 'std_msgs/String', lambda message, channel: None)
+        self.interested_in('/again', 'std_msgs/String', self.hear)
+        self.serve('/fails_again', 'std_srvs/SetBool', self.answer)
+
+    def hear(self, message, channel):
+        raise ValueError('old')
+
+    def answer(self, request):
+        raise ValueError('old')
+
+
+class OpensMended(Opens):
+    """The same, mended."""
+
+    def hear(self, message, channel):
+        self.heard = message, channel
+
+    def answer(self, request):
+        self.answered = request
+        return {'success': True}
+
+
+def test_what_is_run_again_is_what_a_restart_has_opened_anew(master, transcript):
+    node = create(master, node_class=Opens)
+    node.send_to('/again', data='bad')
+    until(lambda: node.failures)
+    with pytest.raises(pharos.ServiceCallError):
+        master.lookup_service('/fails_again').call(data=True)
+    heard, asked = node.failures
+    node.restart()
+    node.become(OpensMended)
+    assert heard.retry() is True
+    assert node.heard == (heard.message, node.channels[1])
+    assert asked.retry() is True
+    assert node.answered is asked.message
+
+
+def test_what_is_run_again_is_what_was_opened_since(master, transcript, mailbox):
+    node = create(master)
+    channel = node.interested_in('/again', 'std_msgs/String', Raising(ValueError('old')))
+    node.send_to('/again', data='bad')
+    until(lambda: node.failures)
+    channel.close()
+    anew = node.interested_in('/again', 'std_msgs/String', mailbox)
+    assert node.failures[0].retry() is True
+    assert mailbox.next_with_channel()[1] is anew
+
+
 @pytest.mark.parametrize('inline', [False, True])
 def test_a_delegate_may_have_another_one_run_again(master, transcript, mailbox, inline):
     node, failing_once = create(master), Raising(ValueError('bad'))

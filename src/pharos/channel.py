@@ -183,26 +183,47 @@ class InputChannel(Channel):
         self._delegate: Optional[Block] = check_delegate(block)
 
     def run_again(self, message: genpy.Message) -> None:
-        """Run the delegate, as it is now, on a message, when no other of the node runs.
+        """Run the delegate, as it is now, on a message, when no other of the node runs: that of the
+        channel in the place of this one, if another is open there.
 
-        :raises PharosError: if there is none any more
+        :raises PharosError: if there is none any more; or if the node runs a delegate that waits
+            for one that this thread runs
         :raises NodeStoppedError: if the node is not running, or stops before
         """
+        self.node.current_run  # raises where it is stopped
+        channel = self._in_its_place()
 
         def run() -> None:
-            block = self._present_delegate
+            block = channel._present_delegate
             if block is None:
                 raise PharosError(
                     f'{self.topic} has no delegate any more: give {self.node.name} or its '
                     'channel one first'
                 )
             try:
-                block(message, self)
+                block(message, channel)
             except BaseException as error:
-                self._run.report(error, block, 'delegate', self, message)
+                self._run.report(error, block, 'delegate', channel, message)
 
         if not self.node.current_run.dispatcher.run_in_turn(run):
             raise NodeStoppedError(f'{self.node.name} has stopped meanwhile: start() it first')
+
+    def _in_its_place(self) -> 'InputChannel':
+        """The channel; or where it is closed, as after a restart with a start() of the class's own,
+        one that the node has opened for the same since, with a delegate of that name if it can
+        be."""
+        matter = self.topic, self.message_class, self.from_
+        same = [
+            other
+            for other in self._run.channels
+            if isinstance(other, InputChannel)
+            and (other.topic, other.message_class, other.from_) == matter
+        ]
+        if self in same:
+            return self
+        name = getattr(self._delegate, '__name__', None)
+        same.sort(key=lambda other: getattr(other._delegate, '__name__', None) != name)
+        return same[0] if same else self
 
     @property
     def _present_delegate(self) -> Any:

@@ -99,8 +99,16 @@ class OfferedService:
             raise rospy.ServiceException(why) from error
 
     def _answer_again(self, request: genpy.Message) -> None:
+        services = [
+            opened
+            for opened in self.node.current_run.opened
+            if isinstance(opened, OfferedService)
+            and (opened.name, opened.service_class) == (self.name, self.service_class)
+        ]
+        # the node may have closed this one, and offered it anew, as after a restart
+        service = services[0] if services else self
         with contextlib.suppress(rospy.ServiceException):  # it is reported
-            self._answer(request)
+            service._answer(request)
 
     def _as_response(self, value: Any) -> genpy.Message:
         """The response that the block meant: itself, its fields by name or in their order, or its
