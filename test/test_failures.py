@@ -4,6 +4,7 @@ import dataclasses
 import gc
 import io
 import os
+import queue
 import re
 import signal
 import subprocess
@@ -848,6 +849,38 @@ def test_a_delegate_may_have_another_one_run_again(master, transcript, mailbox, 
     node.send_to('/retry')
     assert mailbox.next() is True
     assert failing_once.taken.next().data == 'bad'
+
+
+@pytest.mark.parametrize('does', ['retry', 'become'])
+def test_of_delegates_that_wait_for_one_another_one_gives_up(master, transcript, does):
+    nodes = [create(master, name) for name in ('/a', '/b', '/c')]
+    together, ended, heard = threading.Barrier(3), [], queue.SimpleQueue()
+
+    def each_other(message, channel):
+        if message.data == 'fail':
+            raise ValueError('bad')
+        if message.data != 'wait':
+            return heard.put(channel.node)
+        other = nodes[(nodes.index(channel.node) + 1) % 3]
+        together.wait(TIMEOUT)
+        try:
+            if does == 'retry':
+                ended.append(other.failures[0].retry())
+            else:
+                ended.append(other.become(type(other)))
+        except pharos.PharosError as error:
+            ended.append(str(error))
+        return None
+
+    for node in nodes:
+        node.interested_in('/each_other', 'std_msgs/String', each_other)
+    sender = create(master, '/sender')
+    sender.send_to('/each_other', data='fail')
+    until(lambda: all(node.failures for node in nodes))
+    for text in 'wait', 'go on':
+        sender.send_to('/each_other', data=text)
+    assert {heard.get(timeout=TIMEOUT) for _ in nodes} == set(nodes)
+    assert len([text for text in ended if 'wait for one another' in str(text)]) == 1
 
 
 def test_what_came_inline_while_a_delegate_was_run_again_is_not_left_lying(

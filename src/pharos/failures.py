@@ -107,7 +107,8 @@ class Failure:
 
         A soul that loops does so here, too: :meth:`Node.fork` it again where it is not to.
 
-        :raises PharosError: if the message has been let go, or the block cannot be run again
+        :raises PharosError: if the message has been let go, or the block cannot be run again; or if
+            this waits in a delegate of another node, and one of this node's waits for that delegate
         :raises NodeStoppedError: if the node is not running, or stops while this waits for its turn
         """
         if self._again is None:

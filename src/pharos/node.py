@@ -125,8 +125,9 @@ class Node(NodeWithSouls, is_base=True):
         Neither ``__init__`` nor ``start`` of the new class runs: attributes that only it has are to
         be set before, or have their values in the class.
 
-        :raises PharosError: if the new class lacks one of those methods; nothing has changed then,
-            nor after the others
+        :raises PharosError: if the new class lacks one of those methods; or if this waits in a
+            delegate of another node, and one of this node's waits for that delegate; nothing has
+            changed then, nor after the others
         :raises TypeError: if it is no subclass of Node, one of scripts (where this is none, or the
             other way round), has other ``__slots__``, or a method that cannot be called as the
             former

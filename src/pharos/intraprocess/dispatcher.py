@@ -12,7 +12,9 @@ import collections
 import threading
 import time
 from _thread import allocate_lock, get_ident
-from typing import Any, Callable, Deque, Optional, Protocol
+from typing import Any, Callable, Deque, Dict, Optional, Protocol
+
+from pharos.errors import PharosError
 
 # seconds; a publisher that comes again within them does not yield to the receiver
 BURST_INTERVAL = 100e-6
@@ -22,6 +24,11 @@ YIELD_LIMIT = 1e-3
 CLOSED_INTERVAL = 0.1
 # seconds for which a thread that brings a message also runs what others bring meanwhile
 COURTESY = 1e-3
+
+# identifier of a thread -> the dispatcher in which it waits for its turn; guarded by the lock, so
+# that of threads that wait for one another one alone gives up
+_awaited: 'Dict[int, Dispatcher]' = {}
+_looking = threading.Lock()
 
 
 class Runnable(Protocol):
@@ -117,13 +124,22 @@ class Dispatcher:
         """Run ``job()`` in this thread when no delegate runs; at once in one that it runs.
 
         :returns: False where it was closed before
+        :raises PharosError: if a delegate that runs waits, perhaps by way of others, for one that
+            this thread runs
         """
         if self.is_run_here():
             job()
             return True
-        while not self._running.acquire(True, CLOSED_INTERVAL):
-            if self._closed:
-                return False
+        me = get_ident()
+        try:
+            while not self._running.acquire(True, CLOSED_INTERVAL):
+                if self._closed:
+                    return False
+                with _looking:
+                    _awaited[me] = self
+                    self._check_not_for_each_other(me)
+        finally:
+            _awaited.pop(me, None)
         is_open = not self._closed
         try:
             self._runner = get_ident()
@@ -135,6 +151,19 @@ class Dispatcher:
         if self.inline:  # as in wait_for_delegate
             self._leave_to_thread()
         return is_open
+
+    def _check_not_for_each_other(self, me: int) -> None:
+        dispatcher: Optional[Dispatcher] = self
+        for _ in range(len(_awaited)):
+            runner = dispatcher and dispatcher._runner
+            if runner == me:
+                del _awaited[me]
+                raise PharosError(
+                    'delegates of several nodes wait for one another to end, each to have a block'
+                    ' of the other\'s node run again, or that node become another: do so in a'
+                    ' soul, or fork() it'
+                )
+            dispatcher = _awaited.get(runner or 0)
 
     def need_thread(self) -> None:
         """Have the dispatcher thread, from the first channel on that is not inline."""
