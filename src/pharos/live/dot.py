@@ -62,7 +62,7 @@ def _id(kind: str, name: str) -> str:
 def _lines_of(name: str) -> List[str]:
     """A name, broken before slashes where it is long."""
     lines = ['']
-    for part in re.findall('/?[^/]+', name):
+    for part in re.findall('/*[^/]+|/+$', name) or ['(no name)']:
         if lines[-1] and len(lines[-1]) + len(part) > LINE:
             lines.append('')
         lines[-1] += part

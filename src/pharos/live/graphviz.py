@@ -4,6 +4,7 @@ import os
 import pathlib
 import stat
 import subprocess
+import threading
 from typing import List, Union
 
 from pharos.errors import PharosError, missing, suggest
@@ -24,7 +25,11 @@ def check_format(path: Union[str, 'os.PathLike[str]']) -> str:
     """The format that the suffix of a path says.
 
     :raises ValueError: if it is none of :data:`FORMATS`
+    :raises TypeError: if it is no path
     """
+    if not isinstance(path, (str, os.PathLike)) or '\0' in os.fspath(path):
+        kind = ValueError if isinstance(path, str) else TypeError
+        raise kind(f"a picture is written to a path such as 'graph.svg', not to {path!r}")
     suffix = pathlib.PurePath(path).suffix[1:].lower()
     if suffix not in FORMATS:
         choices = ', '.join('.' + each for each in FORMATS)
@@ -78,12 +83,15 @@ def _run(program: List[str], dot: str, limit: float) -> bytes:
             start_new_session=True,  # Ctrl-C is for us to answer
             check=False,
         )
-    except FileNotFoundError as error:
+    except OSError as error:
         raise PharosError(
             missing('graphviz draws the picture', error, 'graphviz') + ', or save it as .dot'
         ) from error
-    if ended.returncode:
-        raise PharosError(f'graphviz cannot draw it: {ended.stderr.decode().strip()}')
+    if ended.returncode or not ended.stdout:
+        said = ended.stderr.decode(errors='replace').strip()
+        raise PharosError(
+            f'graphviz cannot draw it: {said or f"{program[0]} ended with {ended.returncode}"}'
+        )
     return ended.stdout
 
 
@@ -94,7 +102,9 @@ def write(path: Union[str, 'os.PathLike[str]'], content: bytes) -> None:
     :raises PharosError: if it cannot be written
     """
     target = os.path.realpath(path)
-    beside = f'{target}.{os.getpid()}'
+    # a name of its own, for that of the target may be as long as names can be
+    own_name = f'.{os.getpid()}-{threading.get_ident()}'
+    beside = os.path.join(os.path.dirname(target), own_name)
     try:
         if os.path.lexists(target) and not stat.S_ISREG(os.stat(target).st_mode):
             with open(target, 'wb') as file:

@@ -37,7 +37,9 @@ _ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP)
 
 def is_interactive() -> bool:
     """Whether there is a terminal to draw on, and keys to read."""
-    return sys.stdin.isatty() and sys.stdout.isatty() and os.environ.get('TERM') != 'dumb'
+    ends = sys.stdin, sys.stdout  # None where they are closed
+    can_draw = os.environ.get('TERM', '').lower() not in ('dumb', 'unknown')
+    return can_draw and all(end is not None and end.isatty() for end in ends)
 
 
 class Terminal:

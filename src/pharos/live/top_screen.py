@@ -156,6 +156,9 @@ def show(meter: Meter, interval: float) -> int:
     :param interval: seconds between two looks
     :raises MasterUnreachableError: if the master does not answer at the beginning
     """
+    for size in 'COLUMNS', 'LINES':  # which rich takes as they are
+        if os.environ.get(size) == '0':
+            del os.environ[size]
     console, terminal = Console(), Terminal()
     screen = Screen(meter.measure(), interval)
     looking_on = _LookingOn(meter, screen, terminal)
