@@ -200,6 +200,14 @@ def test_watch_runs_a_block_in_the_thread_that_asks(master):
     assert [message.data for message in came] == [TEXT] * 3
 
 
+def test_a_node_of_the_block_that_has_stopped_is_told(master):
+    node = create(master)
+    node.stop()
+    with publishing(master, '/watched'):
+        with pytest.raises(NodeStoppedError, match='/node'):
+            master.topic('/watched').watch(2, lambda message: node.send_to('/more', data='x'))
+
+
 @pytest.mark.parametrize('count', [0, -1, 1.5, 'many'])
 def test_a_count_that_is_none_is_refused(master, count):
     with pytest.raises(ValueError, match='count is a number of messages, 1 or more'):

@@ -335,6 +335,16 @@ def test_a_signal_ends_the_session_and_the_terminal_is_as_before(
 # -- scripts
 
 
+@pytest.mark.parametrize('with_signal', [signal.SIGTERM, signal.SIGHUP], ids=lambda each: each.name)
+def test_a_signal_ends_a_session_in_which_a_failure_is_debugged(master, open_session, with_signal):
+    terminal = open_session()
+    terminal.enter('me.soul = lambda me: 1 / 0', 'me.execute()', 'me.failures[0].debug()')
+    terminal.wait_for('^ipdb>')
+    os.kill(terminal.pid, with_signal)
+    assert terminal.wait() in (128 + with_signal, 128 + signal.SIGTERM)
+    assert '/workspace' not in names(master)
+
+
 def test_a_script_has_the_names_of_the_session_and_its_arguments(open_session, tmp_path):
     path = tmp_path / 'first.py'
     path.write_text('import sys\nanswer = [me.name, __name__, sys.argv[1:]]\n')

@@ -5,6 +5,8 @@ from types import TracebackType
 
 from pharos.reloading import ipython_shell
 
+from pharos import node_registry
+
 
 def look_at(frames: TracebackType) -> None:
     """Have the user look at the innermost of the frames, in this thread, until he or she quits."""
@@ -18,4 +20,24 @@ def look_at(frames: TracebackType) -> None:
         above = importlib.import_module('prompt_toolkit.patch_stdout').patch_stdout
         session.prompt = above(raw=True)(session.prompt)
     looking.reset()
-    looking.interaction(None, frames)
+
+    def end() -> None:
+        leave(getattr(looking, 'pt_app', None))  # the prompt of IPython's, in a thread of its own
+
+    node_registry.before_stop_all(end)  # which a signal asks for
+    try:
+        looking.interaction(None, frames)
+    finally:
+        node_registry.not_before_stop_all(end)
+
+
+def leave(prompt: Any) -> None:
+    """Have a session of prompt_toolkit's end as by Ctrl-D, from whatever thread; None is none."""
+    application = prompt and prompt.app
+    if application and application.loop is not None:
+        application.loop.call_soon_threadsafe(_leave, application)
+
+
+def _leave(application: Any) -> None:
+    if application.is_running:
+        application.exit(exception=EOFError)

@@ -133,11 +133,17 @@ def watch(
     """See :meth:`Topic.watch <pharos.Topic.watch>`."""
     show = _show if block is None else check_block(block, 'block', ('message',))
     try:
-        for message in messages_of(topic, count):
+        for message in _until_stopped(messages_of(topic, count)):
             show(message)
     except KeyboardInterrupt:  # at a prompt, it ends this line alone
         pass
-    except NodeStoppedError:  # in a script, it has stopped all nodes
+
+
+def _until_stopped(messages: Iterator[genpy.Message]) -> Iterator[genpy.Message]:
+    """The messages; in the main thread, they end where a signal has stopped all nodes."""
+    try:
+        yield from messages
+    except NodeStoppedError:
         if threading.current_thread() is not threading.main_thread():
             raise
 

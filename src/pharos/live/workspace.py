@@ -16,7 +16,7 @@ from rosgraph.rosenv import ROS_MASTER_URI
 import pharos
 from pharos import node_registry, signals
 from pharos.errors import PharosError, missing
-from pharos.live import completion, explanation, notebook
+from pharos.live import completion, debugger, explanation, notebook
 from pharos.master import Master
 from pharos.node import BlockNode
 from pharos.signals import is_from_signal
@@ -265,14 +265,7 @@ class _Session:
         self._is_over = True
         self._shell.confirm_exit = False
         self._shell.ask_exit()
-        prompt = self._shell.pt_app  # None where there is no terminal
-        if prompt is not None and prompt.app.loop is not None:
-            prompt.app.loop.call_soon_threadsafe(_leave, prompt.app)
-
-
-def _leave(prompt: Any) -> None:
-    if prompt.is_running:
-        prompt.exit(exception=EOFError)
+        debugger.leave(self._shell.pt_app)  # None where there is no terminal
 
 
 def _status_of(error: BaseException) -> int:
