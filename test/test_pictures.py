@@ -1,4 +1,5 @@
 """Pictures of messages, and numbers of a topic over time."""
+import gc
 import io
 import struct
 import subprocess
@@ -10,8 +11,8 @@ import pytest
 from PIL import Image as Pillow
 
 from helpers import create
-from pharos import MessageTypeError, PharosError, message_class
-from pharos.live import pictures
+from pharos import MessageTypeError, NodeStoppedError, PharosError, message_class, spin
+from pharos.live import pictures, top
 from pharos.live.pictures import picture
 from pharos.messages import class_from_definition
 from pharos.messages.numeric_field import numeric_field, numeric_paths
@@ -463,6 +464,77 @@ def test_a_plot_is_a_file_or_a_picture_in_jupyter_without_a_display(turns, tmp_p
         plot.save(tmp_path / 'plot.nonsense')
     with pytest.raises(PharosError, match='missing/plot.png cannot be written: No such file'):
         plot.save(tmp_path / 'missing' / 'plot.png')
+
+
+@pytest.mark.parametrize('path', ['', '.', '/', 'noext', 'a.xyz', 'a.svg.', 'a\0b.png'])
+def test_a_plot_is_saved_only_where_the_suffix_says_how(turns, path, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with turns.plot('linear.x') as plot:
+        with pytest.raises((ValueError, PharosError), match='let its name end in|a path such as'):
+            plot.save(path)
+        with pytest.raises(TypeError):
+            plot.save(None)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize('value', [1e308, -1e308])
+def test_numbers_that_matplotlib_cannot_draw_are_left_out(turns, value):
+    with turns.plot('linear.x') as plot:
+        turns.send_x(value)
+        turns.send_x(-value)
+        until(lambda: len(plot.times) >= 2)
+        assert plot._repr_png_().startswith(b'\x89PNG')
+        assert plot.values['linear.x'][-1] == -value
+
+
+def test_a_plot_that_nobody_has_any_more_leaves_no_node(turns):
+    plot = turns.plot('linear.x')
+    assert lookers(turns)
+    del plot
+    gc.collect()
+    until(lambda: not lookers(turns))
+
+
+def test_a_plot_ends_with_the_node_of_its_channel_but_not_by_a_restart(turns):
+    plot = turns.plot('linear.x')
+    turns.node.restart()
+    assert 'collecting' in repr(plot)
+    turns.node.stop()
+    assert 'closed' in repr(plot)
+    assert not lookers(turns)
+    turns.node.start()
+    with pytest.raises(NodeStoppedError, match='the plot of /plotted_turns is closed'):
+        plot.wait(TIMEOUT)
+    assert 'closed' in repr(plot)
+
+
+def test_spin_waits_for_no_plot(turns):
+    others = [node for node in turns.node.master.local_nodes() if node is not turns.node]
+    for node in others:
+        node.stop()
+    plot = turns.plot('linear.x')
+    looker = turns.node.master.node(lookers(turns)[0])
+    turns.node.latest_run.forget(plot._collected)  # as if it were a node's that has stopped before
+    turns.node.stop()
+    spin()
+    assert looker.is_running
+    plot.close()
+
+
+def test_what_only_looks_is_left_out_of_graphs_and_of_top(turns):
+    master = turns.node.master
+    with turns.plot('linear.x'):
+        (looker,) = lookers(turns)
+        assert looker not in master.graph().nodes
+        assert looker in master.graph(show_all=True).nodes
+        for names in (), [looker]:
+            rows = [row.name for row in top.measure(master, 0.1, names).nodes]
+            assert (looker in rows) == bool(names)
+
+
+def lookers(channel):
+    names = [node.name for node in channel.node.master.local_nodes()]
+    return [name for name in names if 'pharos_looks' in name]
 
 
 def test_a_plot_hears_what_its_channel_hears(master):

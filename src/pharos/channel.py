@@ -233,14 +233,15 @@ class InputChannel(Channel):
         """Plot numeric fields of the topic's messages over time: ``channel.plot('linear.x',
         seconds=10).save('speed.png')``.
 
-        They are collected from now on by a node of its own; the channel's delegate, queue and
-        counts are not touched.
+        They are collected from now on by a node of its own, until the channel's node stops, and
+        through its restarts; the channel's delegate, queue and counts are not touched.
 
         :param fields: 'linear.x', 'ranges[0]', 'header.stamp'
         :param seconds: returns the finished :class:`~pharos.live.plot.Plot` after that long; None:
-            returns at once one that collects until its ``close()``
+            returns at once one that collects until its ``close()``, or until it is kept no more
         :raises MessageTypeError: if there is no such field, or it is no number
         :raises TimeoutError: if no message came in these seconds
+        :raises NodeStoppedError: if the channel's node is stopped
         :raises PharosError: if matplotlib is not installed
         """
         made: 'Plot' = on_demand.module('live.plot').plot(self, fields, seconds)

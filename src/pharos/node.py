@@ -337,7 +337,7 @@ class Node(NodeWithSouls, is_base=True):
 
     def describe(self, seconds: float = 1.0) -> str:
         """The node in words: where it runs, its souls, topics with type, rate, counts and peers,
-        services, parameters and failures.
+        services, parameters and failures. A master that hangs is waited for, for its time limit.
 
         :param seconds: for which messages are counted, for the rates; 0: no rates are told
         """

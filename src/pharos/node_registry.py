@@ -22,6 +22,7 @@ from typing import (
 from pharos import signals
 from pharos.blocks import name_of
 from pharos.errors import NodeNameInUseError, NodeStoppedError, PharosError
+from pharos.lookers import is_looker
 from pharos.private_rospy import process_rospy
 from pharos.private_rospy.lifetime import SIGNAL_LATENCY, Interruption, join, wait_for
 
@@ -298,7 +299,7 @@ def notify() -> None:
 def _has_nodes_to_wait_for() -> bool:
     now = time.monotonic()
     late = [node for node, (_, deadline) in _stops.items() if now >= deadline]
-    return any(node not in late for node in _not_stopped_here())
+    return any(node not in late and not is_looker(node.name) for node in _not_stopped_here())
 
 
 def _not_stopped_here() -> 'Set[Node]':

@@ -69,7 +69,14 @@ class Look:
 
     def _check_time_is_up(self, deadline: float) -> None:
         if self._stop.came or time.monotonic() < deadline:
-            raise NodeStoppedError('the nodes of this thread stop: nothing is watched any more')
+            raise NodeStoppedError('nodes stop: nothing is watched any more')
+
+
+def wait_for_publishers(node: 'Node', topic: str, timeout: float) -> None:
+    """Wait until each publisher that the master has named to the node is connected, or out of
+    reach, for up to ``timeout`` seconds."""
+    rospy = node.latest_run.rospy
+    rospy.wait_until(lambda: rospy.connections.has_heard_from_publishers(topic), timeout)
 
 
 class Listener:
@@ -105,12 +112,6 @@ class Probe(InputChannel):
             dispatcher.need_thread()
         inbox = _SocketTally(self, dispatcher)
         self._opened(self._rospy.connections.subscribe(self, inbox, self.node.connect_timeout))
-
-    def wait_for_publishers(self, timeout: float) -> None:
-        """Wait until each publisher that the master has named is connected, or out of reach, for up
-        to ``timeout`` seconds."""
-        connections = self._rospy.connections
-        self._rospy.wait_until(lambda: connections.has_heard_from_publishers(self.topic), timeout)
 
     def restart(self) -> None:
         """Forget what came so far, such as latched messages."""

@@ -2,10 +2,10 @@
 import importlib
 import pdb
 from types import TracebackType
-
-from pharos.reloading import ipython_shell
+from typing import Any
 
 from pharos import node_registry
+from pharos.reloading import ipython_shell
 
 
 def look_at(frames: TracebackType) -> None:
@@ -22,7 +22,7 @@ def look_at(frames: TracebackType) -> None:
     looking.reset()
 
     def end() -> None:
-        leave(getattr(looking, 'pt_app', None))  # the prompt of IPython's, in a thread of its own
+        leave(session)  # whose prompt is in a thread of its own
 
     node_registry.before_stop_all(end)  # which a signal asks for
     try:

@@ -15,6 +15,7 @@ from pharos.live.edges import HEARS, OFFERS, PUBLISHES, SENDS, Edge
 from pharos.live.graph_text import text_of_graph
 from pharos.live.snapshot import Host, Process, SeenNode, SeenService, SeenTopic, Snapshot
 from pharos.live.traffic import Traffic
+from pharos.lookers import is_looker
 from pharos.master import Master
 from pharos.probe import Look
 from pharos.seconds import check_seconds
@@ -78,7 +79,7 @@ class Graph:
             name: node
             for name, node in snapshot.nodes.items()
             if _is_in(name, self.namespaces)
-            and (show_all or name not in _DEBUG_NODES)
+            and (show_all or not (name in _DEBUG_NODES or is_looker(name)))
             and (node.state == ALIVE or 'unreachable' not in hidden)
         }
         self.topics: Dict[str, SeenTopic] = {

@@ -5,7 +5,7 @@ import pathlib
 import stat
 import subprocess
 import threading
-from typing import List, Union
+from typing import Collection, List, Union
 
 from pharos.errors import PharosError, missing, suggest
 
@@ -21,21 +21,21 @@ LAYOUTS = (
 LONGEST, SLIMMEST = 50.0, 6.0
 
 
-def check_format(path: Union[str, 'os.PathLike[str]']) -> str:
+def check_format(path: Union[str, 'os.PathLike[str]'], formats: Collection[str] = FORMATS) -> str:
     """The format that the suffix of a path says.
 
-    :raises ValueError: if it is none of :data:`FORMATS`
+    :raises ValueError: if it is none of the ``formats``
     :raises TypeError: if it is no path
     """
     if not isinstance(path, (str, os.PathLike)) or '\0' in os.fspath(path):
         kind = ValueError if isinstance(path, str) else TypeError
         raise kind(f"a picture is written to a path such as 'graph.svg', not to {path!r}")
     suffix = pathlib.PurePath(path).suffix[1:].lower()
-    if suffix not in FORMATS:
-        choices = ', '.join('.' + each for each in FORMATS)
+    if suffix not in formats:
+        choices = ', '.join('.' + each for each in formats)
         raise ValueError(
             f'{os.fspath(path)} does not say what picture it is to be: let its name end in'
-            f' {choices}{suggest(suffix, FORMATS)}'
+            f' {choices}{suggest(suffix, formats)}'
         )
     return suffix
 

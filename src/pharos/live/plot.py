@@ -3,19 +3,27 @@ import collections
 import io
 import os
 import time
+import weakref
+import _thread
 from typing import Any, Callable, Deque, Dict, List, Optional, Tuple, Union
 
 import genpy
 
+from pharos import node_registry
 from pharos.channel import InputChannel
-from pharos.errors import PharosError, missing
+from pharos.errors import NodeStoppedError, PharosError, missing
+from pharos.live import graphviz
 from pharos.live.colors import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION
 from pharos.live.watching import create_looker
 from pharos.messages.numeric_field import numeric_field
-from pharos.probe import Look
+from pharos.node import BlockNode
+from pharos.probe import Look, wait_for_publishers
+from pharos.restarts import is_restarting
+from pharos.run import Run
 from pharos.seconds import check_seconds
 
 KEPT = 100000  # messages that a plot is made of, the newest
+HIGHEST = 1e300  # of numbers that matplotlib can draw; beyond, it runs out of them for its axes
 #: how lines are drawn, the first first: by the dash, too, where colours are not seen
 _LINES = (
     (BLUE, '-'),
@@ -43,47 +51,52 @@ class Plot:
     ) -> None:
         self.topic, self.type = channel.topic, channel.type
         self.fields: List[str] = list(readers)
-        self._readers = list(readers.values())
-        self._rows: Deque[Tuple[float, List[Optional[float]]]] = collections.deque(maxlen=KEPT)
+        run = channel.node.current_run
         self._looker = create_looker(channel.node.master)
-        self._begin = time.monotonic()
+        self._collected = _Collected(list(readers.values()), run, self._looker)
+        # in a thread, for Python may free it in one that holds any lock, as a Thread's start takes
+        end = _thread.start_new_thread, self._collected.end, ()
+        self._freed = weakref.finalize(self, *end)
+        self._freed.atexit = False
         try:
             self._looker.interested_in(
-                channel.topic, channel.message_class, self._collect, from_=channel.from_
+                channel.topic, channel.message_class, self._collected, from_=channel.from_
             )
         except BaseException:
             self.close()
             raise
 
-    def _collect(self, message: genpy.Message, channel: InputChannel) -> None:
-        self._rows.append(
-            (time.monotonic() - self._begin, [read(message) for read in self._readers])
-        )
-
     @property
     def times(self) -> List[float]:
         """When each message came, in seconds since the beginning."""
-        return [when for when, _ in list(self._rows)]
+        return [when for when, _ in list(self._collected.rows)]
 
     @property
     def values(self) -> Dict[str, List[Optional[float]]]:
         """The values of each field."""
-        rows = [values for _, values in list(self._rows)]
+        rows = [values for _, values in list(self._collected.rows)]
         return {field: [row[at] for row in rows] for at, field in enumerate(self.fields)}
 
     def wait(self, seconds: float) -> 'Plot':
-        """Collect for so many seconds more; returns this plot.
+        """Collect for so many seconds more, from when the publishers are connected; returns this
+        plot.
 
-        :raises NodeStoppedError: if the nodes stop meanwhile, or the one whose thread this is
+        :raises NodeStoppedError: if it is closed, also meanwhile, or the node stops whose thread
+            this is
         """
         seconds = check_seconds('seconds', seconds, above=0)
+        if not self._looker.is_running:
+            raise NodeStoppedError(
+                f'the plot of {self.topic} is closed, and collects no more: plot() begins another'
+            )
+        wait_for_publishers(self._looker, self.topic, self._looker.connect_timeout)
         Look().wait_out(self._looker, seconds)
         return self
 
     def close(self) -> None:
         """Collect no more; what was collected stays. Harmless when done twice."""
-        if self._looker.is_running:
-            self._looker.stop()
+        self._freed.detach()
+        self._collected.end()
 
     def __enter__(self) -> 'Plot':
         return self
@@ -100,11 +113,11 @@ class Plot:
         """
         figure = load_matplotlib().Figure(figsize=(8, 4), layout='constrained')
         axes = figure.add_subplot()
-        rows = list(self._rows)
+        rows = list(self._collected.rows)
         times = [when for when, _ in rows]
         for at, field in enumerate(self.fields):
             color, dash = _LINES[at % len(_LINES)]
-            values = [float('nan') if row[at] is None else row[at] for _, row in rows]
+            values = [_drawable(row[at]) for _, row in rows]
             marker = '.' if len(rows) <= 50 else ''
             axes.plot(times, values, color=color, linestyle=dash, marker=marker, label=field)
         axes.set_xlabel('seconds')
@@ -120,21 +133,64 @@ class Plot:
         :raises ValueError: if matplotlib knows no such suffix
         :raises PharosError: if the file cannot be written, or matplotlib is not installed
         """
-        try:
-            self.figure().savefig(path)
-        except OSError as error:
-            raise PharosError(f'{os.fspath(path)} cannot be written: {error.strerror}') from error
+        figure = self.figure()
+        format_ = graphviz.check_format(path, sorted(figure.canvas.get_supported_filetypes()))
+        graphviz.write(path, _drawn(figure, format_))
 
     def _repr_png_(self) -> bytes:
         """The picture in Jupyter."""
-        file = io.BytesIO()
-        self.figure().savefig(file, format='png')
-        return file.getvalue()
+        return _drawn(self.figure(), 'png')
 
     def __repr__(self) -> str:
         state = 'collecting' if self._looker.is_running else 'closed'
         fields = ', '.join(self.fields)
-        return f'<Plot of {fields} of {self.topic}: {len(self._rows)} messages, {state}>'
+        return f'<Plot of {fields} of {self.topic}: {len(self._collected.rows)} messages, {state}>'
+
+
+class _Collected:
+    """What a plot has collected, and its end, without the plot: who asks for no picture any more
+    may drop that."""
+
+    def __init__(
+        self,
+        readers: List[Callable[[genpy.Message], Optional[float]]],
+        run: Run,
+        looker: BlockNode,
+    ) -> None:
+        self.rows: Deque[Tuple[float, List[Optional[float]]]] = collections.deque(maxlen=KEPT)
+        self._readers, self._node, self._looker = readers, run.node, looker
+        self._begin = time.monotonic()
+        run.remember(self)
+
+    def __call__(self, message: genpy.Message, channel: InputChannel) -> None:
+        self.rows.append(
+            (time.monotonic() - self._begin, [read(message) for read in self._readers])
+        )
+
+    def end(self) -> None:
+        """Collect no more."""
+        self._node.latest_run.forget(self)
+        if self._looker in node_registry.nodes():  # not in a process that was forked
+            self._looker.stop()
+
+    def node_stopped(self) -> None:
+        """The channel's node stops, and perhaps to be started again."""
+        if not is_restarting(self._node):
+            self.end()
+
+    def open(self) -> None:
+        """The channel's node starts again."""
+
+
+def _drawable(value: Optional[float]) -> float:
+    """The value; one that is too high for matplotlib is left out, as infinity is."""
+    return float('nan') if value is None or abs(value) > HIGHEST else value
+
+
+def _drawn(figure: Any, format_: str) -> bytes:
+    file = io.BytesIO()
+    figure.savefig(file, format=format_)
+    return file.getvalue()
 
 
 def plot(channel: InputChannel, fields: Tuple[str, ...], seconds: Optional[float]) -> Plot:

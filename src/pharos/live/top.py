@@ -15,6 +15,7 @@ import psutil
 from pharos.live.probing import Probes
 from pharos.live.snapshot import Snapshot, take
 from pharos.live.traffic import Traffic
+from pharos.lookers import is_looker
 from pharos.master import Master
 from pharos.probe import Look
 from pharos.seconds import check_seconds
@@ -160,7 +161,7 @@ class Meter:
         nodes = [
             _node_row(after, name, traffic, links.of_node[name])
             for name in after.nodes
-            if is_wanted(name, self.names)
+            if is_wanted(name, self.names) and (self.names or not is_looker(name))
         ]
         topics = [name for name in after.topics if is_wanted(name, self.names)]
         measured = self._probes.measure(topics) if self._probes else {}

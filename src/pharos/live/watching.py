@@ -16,9 +16,10 @@ from pharos.blocks import check_block
 from pharos.errors import NodeStoppedError, UnknownTopicError, suggest
 from pharos.live.figures import number_text, rate_text, size_text
 from pharos.live.message_text import text_of_message
+from pharos.lookers import LOOKER
 from pharos.master import Master
 from pharos.node import BlockNode
-from pharos.probe import Listener, Look, Probe
+from pharos.probe import Listener, Look, Probe, wait_for_publishers
 from pharos.seconds import LONGEST, check_seconds
 from pharos.topic import Topic
 from pharos.transcript import Transcript
@@ -171,7 +172,7 @@ def messages_of(
 
 def create_looker(master: Master) -> BlockNode:
     """A node for one look, under a name that no other has."""
-    name = rosgraph.names.anonymous_name('pharos_looks')
+    name = rosgraph.names.anonymous_name(LOOKER)
     return master.create(BlockNode, named=f'{name}_{next(_numbers)}')
 
 
@@ -181,7 +182,7 @@ def _measure(topic: Topic, seconds: float, weighs: bool) -> Probe:
     _check_published(topic)
     with create_looker(topic.master) as looker:
         probe = Probe(looker, topic.name, weighs)
-        probe.wait_for_publishers(looker.connect_timeout)
+        wait_for_publishers(looker, topic.name, looker.connect_timeout)
         probe.restart()
         look.wait_out(looker, seconds)
         probe.close()
