@@ -1181,3 +1181,8 @@ def test_a_message_that_cannot_be_shown_is_named_in_the_table():
         [failures.Failure(ValueError('bad'), None, 'delegate', message=message)]
     )
     assert '<std_msgs/String>' in table
+
+
+def test_the_words_of_an_error_do_nothing_to_the_terminal():
+    error = ValueError('\x1b[31mred\x00')
+    assert '?[31mred?' in failure_table.as_text([failures.Failure(error, None, 'delegate')])

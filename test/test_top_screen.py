@@ -14,8 +14,8 @@ import pytest
 
 from helpers import create
 from pharos import BlockNode, Master
+from pharos.live.message_text import printable
 from pharos.live.terminal import Terminal as Keyboard
-from pharos.live.top_table import printable
 from pharos.testing import TIMEOUT, until
 from programs import PROGRAMS, environment, script
 

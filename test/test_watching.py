@@ -1,4 +1,5 @@
 """Looking at a topic: hz, bw, last and watch."""
+import collections
 import contextlib
 import re
 import signal
@@ -8,7 +9,7 @@ import threading
 import pexpect
 import pytest
 from geometry_msgs.msg import Point, Point32, Polygon
-from sensor_msgs.msg import Image, LaserScan, PointCloud
+from sensor_msgs.msg import Image, JointState, LaserScan, PointCloud
 from std_msgs.msg import String
 
 from helpers import create, ended, in_thread, speak_tcpros_only
@@ -16,6 +17,7 @@ from pharos import NodeStoppedError, UnknownTopicError
 from pharos.live import watching
 from pharos.live.figures import size_text
 from pharos.live.message_text import text_of_message
+from pharos.live.notebook import html_of
 from pharos.testing import TIMEOUT, until
 from programs import PROGRAMS, Program, environment
 
@@ -291,6 +293,31 @@ def test_long_arrays_are_cut():
     assert '  - ... 100 in all' in cloud
     assert text_of_message(Point(1, 2, 3)) == 'x: 1\ny: 2\nz: 3'
     assert text_of_message(Polygon()) == 'points: []'
+
+
+@pytest.mark.parametrize('data', [b'\x07', bytearray(b'\x07'), [7], collections.deque([7])])
+def test_arrays_are_cut_whatever_a_block_has_put_there(data):
+    assert 'data: [7, 7, 7, ... 100 in all]' in text_of_message(Image(data=data * 100))
+    assert text_of_message(Image(data=data * 2)).endswith('data: [7, 7]')
+
+
+def test_long_strings_are_cut():
+    text = text_of_message(String(data='x' * 10**6))
+    assert '1000000 characters in all' in text and len(text) < 3000
+    assert len(text_of_message(Image(data='x' * 10**6))) < 20000
+
+
+def test_a_field_that_a_block_has_deleted_is_none():
+    message = String()
+    del message.data
+    assert text_of_message(message) == 'data: None'
+    assert 'None' in html_of(message)
+
+
+def test_messages_do_nothing_to_the_terminal():
+    names = ['\x1b[2J'] * 20
+    assert '[?[2J, ?[2J, ' in text_of_message(JointState(name=names))
+    assert '\x1b' not in text_of_message(JointState(name=names[:2]))
 
 
 def test_a_soul_that_watches_ends_though_its_node_stopped_between_two_messages(master):

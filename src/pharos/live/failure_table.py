@@ -57,7 +57,7 @@ def _rows(failures: Sequence[Failure]) -> List[List[str]]:
         cause = f'{type(failure.error).__name__}: {failure.text}'
         block = re.sub(' of /[^ ]*', '', failure.where, count=1)  # of the node, whose table it is
         cells = number, failure.count, when, block, cause, _message(failure.message)
-        texts = [' '.join(str(cell).split()) for cell in cells]
+        texts = [message_text.printable(' '.join(str(cell).split())) for cell in cells]
         rows.append([text if len(text) <= LONGEST else f'{text[:LONGEST]}...' for text in texts])
     return rows
 

@@ -48,7 +48,7 @@ def html_of(thing: Any) -> Optional[str]:
 def _rows(message: Any, path: str) -> Iterator[Tuple[str, str]]:
     """``(name, value as text)`` of all fields, those of messages in it by their paths."""
     for name, _ in messages.fields_of(type(message)):
-        value = getattr(message, name)
+        value = getattr(message, name, None)  # None: a block has deleted it
         if isinstance(value, genpy.Message):
             yield from _rows(value, f'{path}{name}.')
         else:

@@ -10,6 +10,7 @@ from rich.live import Live
 from rich.text import Text
 
 from pharos.errors import MasterUnreachableError
+from pharos.live.message_text import printable
 from pharos.live.terminal import Terminal
 from pharos.live.top import Measurement, Meter
 from pharos.live.top_table import (
@@ -18,7 +19,6 @@ from pharos.live.top_table import (
     Column,
     columns,
     plain_tables,
-    printable,
     rows,
     sort,
     table,

@@ -5,6 +5,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pharos.live.figures import short_number, short_rate
+from pharos.live.message_text import printable
 from pharos.live.top import Measurement, is_wanted
 
 VIEWS = ('nodes', 'processes', 'topics')
@@ -138,11 +139,6 @@ def _cell(column: Column, row: Any) -> Text:
     value = column.value(row)
     is_bad = column.is_bad and value or getattr(row, 'state', 'alive') != 'alive'
     return Text(printable(column.text(value)), style=BAD if is_bad else '')
-
-
-def printable(text: str) -> str:
-    """The text without what would do something to a terminal: others choose their names."""
-    return ''.join(each if each.isprintable() else '?' for each in text)
 
 
 def plain_tables(measurement: Measurement) -> List[Table]:
