@@ -192,6 +192,50 @@ def test_what_a_script_node_prints_comes_above_the_line(master, open_session, tm
     terminal.wait_for(r'^script says hello\n(.*\n)*In \[2\]: half\Z')
 
 
+# -- mistakes
+
+
+@pytest.fixture
+def told(master):
+    """What a session tells of lines, without the lines that it shows anyway."""
+
+    def told(*lines):
+        session = subprocess.run(
+            [sys.executable, script('workspace')],
+            input='%colors NoColor\n' + '\n'.join(lines) + '\n',
+            env=environment(master.url),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            timeout=TIMEOUT,
+            check=False,
+        )
+        return session.stdout.partition('to its end.\n')[2]
+
+    return told
+
+
+def test_a_mistake_is_told_by_the_line_and_one_sentence(master, told):
+    create(master, '/hearer').interested_in('/tw', 'geometry_msgs/Twist')
+    text = told("me.send_to('/tw', linear=3)")
+    assert '----> 1 me.send_to(' in text
+    assert 'MessageTypeError: geometry_msgs/Twist.linear = 3 does not fit' in text
+    assert text.count('\n') < 12, text
+    assert 'src/pharos' not in text
+    text = told("me.send_to('/tw', linear=3)", '%tb')  # and that shows all
+    assert 'src/pharos' in text
+
+
+def test_the_line_in_a_function_of_the_users_is_shown_and_what_is_no_mistake_as_ever(told):
+    text = told(
+        'def ask():', '    return master.parameters["no"]', '', 'ask()', '{}["no"]', '1 / 0'
+    )
+    assert '----> 2     return master.' in text or '----> 2 return master.' in text
+    assert 'src/pharos' not in text
+    assert text.count('KeyError') > 1
+    assert 'ZeroDivisionError' in text
+
+
 # -- completion and ?
 
 

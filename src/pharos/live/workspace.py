@@ -16,7 +16,7 @@ from rosgraph.rosenv import ROS_MASTER_URI
 import pharos
 from pharos import node_registry, signals
 from pharos.errors import PharosError, missing
-from pharos.live import completion, debugger, explanation, notebook
+from pharos.live import completion, debugger, explanation, mistakes, notebook
 from pharos.master import Master
 from pharos.node import BlockNode
 from pharos.signals import is_from_signal
@@ -113,9 +113,9 @@ def free_name(master: Master, name: str) -> str:
 
 def equip(shell: Any, workspace: Workspace) -> Callable[[], None]:
     """Give a session of IPython's the names of a workspace, and have it complete, explain and show
-    the things of a graph; returns a function that ends that."""
+    the things of a graph, and mistakes in short; returns a function that ends that."""
     shell.push(workspace.namespace, interactive=False)
-    ends = [room.equip(shell) for room in (completion, explanation, notebook)]
+    ends = [room.equip(shell) for room in (completion, explanation, mistakes, notebook)]
 
     def end() -> None:
         for each in ends:

@@ -166,10 +166,15 @@ def _fill(message: genpy.Message, fields: Dict[str, Any], path: str) -> genpy.Me
     for name, value in fields.items():
         if name not in field_types:
             raise _no_field(cls, path, name)
-        field_type, field_path = field_types[name], f'{path}.{name}'
+        field_type = field_types[name]
+        fits = False
         try:
             _WRITERS[field_type](value)
+            fits = True
         except Exception:  # it is no single number or string, or does not fit
+            pass
+        if not fits:
+            field_path = f'{path}.{name}'
             value = _from_dicts(cls, field_type, value, field_path, getattr(message, name))
             _check(cls, field_type, value, field_path)
         setattr(message, name, value)
@@ -209,11 +214,11 @@ def _check(cls: MessageClass, field_type: str, value: Any, path: str) -> None:
                 _check(nested, nested_type, getattr(value, name), f'{path}.{name}')
     except MessageTypeError:
         raise
-    except Exception as error:
+    except Exception:  # of which the names of genpy's own code would say no more
         raise MessageTypeError(
             f'{path} = {reprlib.repr(value)} does not fit {field_type}: '
             f'give {_what_fits(cls, base, is_array, length)}'
-        ) from error
+        ) from None
 
 
 def _check_array(
