@@ -31,6 +31,7 @@ def names(master):
         'turtle': turtle,
         'Velocity': pharos.message_class('turtlesim/Velocity'),
         'spawn': master.lookup_service('/spawn'),
+        'heard': turtle.channels[0],
         'channel': me.output_channel('/turtle1/cmd_vel'),
         'message_class': pharos.message_class,
         'service_class': pharos.service_class,
@@ -65,6 +66,10 @@ TOPICS = ['/turtle1/cmd_vel', '/turtle1/pose']
         ("message_class('geometry_msgs/Quaternion", None),
         ("service_class('std_srvs/Em", ['std_srvs/Empty']),
         ("master.run('rosgraph_m", ['rosgraph_msgs']),
+        ("master.load('rosgraph_m", ['rosgraph_msgs']),
+        ("master.compose('rosgraph_m", ['rosgraph_msgs']),
+        ("heard.plot('linear.", ['linear.x', 'linear.y', 'linear.z']),
+        ("heard.plot('linear.x', 'angular.z", ['angular.z']),
     ],
 )
 def test_names_are_completed_as_the_call_asks_for(names, code, words):

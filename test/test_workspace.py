@@ -264,6 +264,21 @@ def test_tab_completes_names_of_the_graph_fields_and_types(master, open_session)
     complete(terminal, 'master.wait_for_n', 'master.wait_for_node')
 
 
+def test_tab_lists_fields_alone_where_nothing_is_typed_and_first_where_something_is(
+    master, open_session
+):
+    create(master, '/turtle_of_tab').interested_in('/turtle1/cmd_vel', 'geometry_msgs/Twist')
+    terminal = open_session()
+    terminal.type("me.send_to('/turtle1/cmd_vel', ")
+    terminal.press('Tab')
+    terminal.wait_for(r"cmd_vel', *\n +angular= *\n +linear=\Z")
+    terminal.press('C-c', 'C-c')
+    terminal.enter('another = 1')
+    terminal.type("me.send_to('/turtle1/cmd_vel', a")
+    terminal.press('Tab')
+    terminal.wait_for(r'^ +angular= +(.*)another')
+
+
 def test_tab_completes_fields_in_a_later_line_of_a_call(master, open_session):
     create(master, '/turtle_of_tab').interested_in('/turtle1/cmd_vel', 'geometry_msgs/Twist')
     terminal = open_session()

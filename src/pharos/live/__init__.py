@@ -13,7 +13,7 @@
 - colors: those of pictures and plots
 - failure_table: Node.failures as a table; debugger: Failure.debug
 - top, top_table, top_screen: rosrun pharos top; terminal: its keys and signals; probing: --measure
-- completion, explanation, notebook: what completes, explains and shows things there
+- completion, explanation, mistakes, notebook: what completes, explains and shows things there
 
 It stands on the facade.
 """

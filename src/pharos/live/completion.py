@@ -17,6 +17,7 @@ import rospkg
 from pharos import messages
 from pharos.blocks import attempt
 from pharos.master import Master
+from pharos.messages.numeric_field import numeric_paths
 from pharos.node import Node
 from pharos.output_channel import OutputChannel
 from pharos.service import Service
@@ -119,8 +120,15 @@ class _Call:
         if self.place.string is None:
             is_word = re.fullmatch(r'\s*\w*', self.place.argument)
             return self._keywords() if is_word else []
-        kind = _KINDS.get((self.name, self._parameter())) or _KINDS.get(('', self._parameter()))
+        kind = self.kind()
+        if kind is _fields:
+            return list(numeric_paths(self.owner.message_class))
         return self._names(kind) if kind else []
+
+    def kind(self) -> Optional[Callable[[Master], List[str]]]:
+        """What the string that is typed names; None for what is no name."""
+        parameter = self._parameter()
+        return _KINDS.get((self.name, parameter)) or _KINDS.get(('', parameter))
 
     def _parameter(self) -> str:
         """The name of the parameter that the last argument is for; '' where that cannot be told."""
@@ -129,8 +137,11 @@ class _Call:
             return ''  # the string is a part of an expression
         if keyword:
             return keyword[1]
-        parameters = list(inspect.signature(self.function).parameters)
-        return parameters[len(self.positional)] if len(self.positional) < len(parameters) else ''
+        parameters = list(inspect.signature(self.function).parameters.values())
+        for number, parameter in enumerate(parameters):
+            if number == len(self.positional) or parameter.kind is parameter.VAR_POSITIONAL:
+                return parameter.name
+        return ''
 
     def _names(self, kind: Callable[[Master], List[str]]) -> List[str]:
         """The names of a kind, written as the word that is to be completed is."""
@@ -273,6 +284,11 @@ def _packages(master: Master) -> List[str]:
     return sorted(rospkg.RosPack().list())
 
 
+def _fields(master: Master) -> List[str]:
+    """Paths of fields, of which only the call can tell the message."""
+    return []
+
+
 _RELATIVE = {_topics, _services, _nodes, _parameters}  # may be typed in a node's namespace
 
 #: (method or function, its parameter) -> the names that there are for it; '' stands for all others
@@ -293,6 +309,7 @@ _KINDS: Dict[Tuple[str, str], Callable[[Master], List[str]]] = {
     ('wait_for_service', 'name'): _services,
     ('parameter', 'name'): _parameters,
     ('serve', 'typed_as'): _service_types,
+    ('plot', 'fields'): _fields,
     ('message_class', 'type_or_class'): _message_types,
     ('service_class', 'type_or_class'): _service_types,
 }
@@ -312,7 +329,14 @@ def equip(shell: Any) -> Callable[[], None]:
     def note(text: str, offset: int) -> Any:
         nonlocal typed
         typed = text[:offset]
-        return all_completions(text, offset)
+        found = all_completions(text, offset)
+        place = None if has_ended else place_of(typed)
+        if place is None or place.string is not None:
+            return found
+        keywords = completions(typed, shell.user_ns)
+        if keywords and not place.word:
+            return [each for each in found if each.text in keywords]
+        return sorted(found, key=lambda each: each.text not in keywords) if keywords else found
 
     def complete(line: str, in_strings: bool) -> List[str]:
         code = typed if typed.endswith(line) else line
@@ -326,7 +350,7 @@ def equip(shell: Any) -> Callable[[], None]:
         return complete(event.text_until_cursor, True)
 
     def complete_keywords(_: str) -> List[str]:
-        """Fields beside the variables that may stand there, too."""
+        """Fields beside the variables that may stand there, too, once a letter is typed."""
         return complete(completer.text_until_cursor, False)
 
     evaluate_properties = _have_jedi_evaluate_no_properties()
