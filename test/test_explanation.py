@@ -1,4 +1,6 @@
 """What ``thing?`` tells at a prompt, and how things look in a notebook."""
+import re
+
 import pytest
 
 import pharos
@@ -114,3 +116,11 @@ def test_a_node_has_html_in_a_notebook(turtle):
     assert text.startswith('<pre><b>/turtle: BlockNode, running')
     assert '/pose [turtlesim/Pose]' in text
     assert html_of(3) is None
+
+
+def test_a_graph_counts_what_it_has_and_says_how_it_is_shown():
+    with pharos.Master.embedded() as master:
+        create(master, '/only')
+        text = repr(master.graph())
+    assert re.search(r': 1 node, \d topics?, \d edges?; print\(graph.text\(\)\)', text), text
+    assert not re.search(r'\b1 \w+s\b', text), text

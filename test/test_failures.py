@@ -22,6 +22,7 @@ import pharos
 from pharos import BlockNode, Transcript, failures, node_registry
 from pharos.live import debugger, failure_table
 from programs import PROGRAMS, Program, environment, run
+from geometry_msgs.msg import Pose
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
@@ -1112,7 +1113,7 @@ def test_ipython_shows_failures_and_debugs_them_with_its_own_debugger(master, tm
     told = [line.split('told ')[1] for line in session.stdout.splitlines() if 'told ' in line]
     assert told == ['1', '1 True', "True ['again']"], session.stdout
     assert re.search(
-        r'\n0  1 .*  delegate on_number on /debugged  ZeroDiv.*  data: 1\n', session.stdout
+        r'\n0  1 .*  delegate on_number on /debugged  ZeroDiv.*  data=1\n', session.stdout
     )
     assert 'ipdb> ' in session.stdout
     assert session.returncode == 0
@@ -1153,7 +1154,7 @@ def test_failures_are_shown_as_a_table_that_fits_the_terminal(master, transcript
         assert re.match(r'0  3      \d\d:\d\d:\d\d  delegate .*  ValueError: ', lines[1])
         (second,) = [line for line in lines if line.startswith('1 ')]
         assert re.match(r'1  1      \d\d:\d\d:\d\d  parameter .*  Zero', second)
-    assert re.search('  ValueError: the turtle is too fast +data: 2$', lines[1])
+    assert re.search('  ValueError: the turtle is too fast +data=2$', lines[1])
     assert '  delegate failing.<locals>.delegate on /counted  ' in lines[1]
     assert isinstance(node.failures, list)
 
@@ -1162,7 +1163,24 @@ def test_failures_are_a_table_in_a_notebook(master, transcript):
     node = create(master)
     failing(node, lambda number: ValueError('<b>'), 1)
     table = node.failures._repr_html_()
-    assert '<td>ValueError: &lt;b&gt;</td><td>data: 0</td>' in table
+    assert '<td>ValueError: &lt;b&gt;</td><td>data=0</td>' in table
+
+
+def test_the_table_shows_the_newest_failures_and_messages_in_few_digits(monkeypatch):
+    monkeypatch.setenv('COLUMNS', '120')
+    pose = Pose()
+    pose.position.x, pose.orientation.w = 2.6249999, 1.0
+    failed = [
+        failures.Failure(ValueError(f'bad {number}'), None, 'delegate', message=pose)
+        for number in range(100)
+    ]
+    lines = failure_table.as_text(failed).splitlines()
+    assert [line.split()[0] for line in lines if line[0].isdigit()] == [*map(str, range(90, 100))]
+    assert lines[-1] == '... 90 more, which are older'
+    text = failure_table.as_html(failed)
+    message = 'position=(x=2.62, y=0, z=0), orientation=(x=0, y=0, z=0, w=1)'
+    assert message in text and '90 more' in text
+    assert 'more' not in failure_table.as_text(failed[:10])
 
 
 def test_the_table_names_a_large_message_by_its_first_values():
@@ -1172,7 +1190,7 @@ def test_the_table_names_a_large_message_by_its_first_values():
     begin = time.monotonic()
     text = failure_table.as_html([failure])
     assert time.monotonic() - begin < 1.0
-    assert 'data: [49, 49, 49, ... 10000000 in all]' in text
+    assert 'data=[49, 49, 49, ... 10000000 in all]' in text
 
 
 def test_a_message_that_cannot_be_shown_is_named_in_the_table():

@@ -18,6 +18,8 @@ HEADS = '#', 'count', 'when', 'block', 'cause', 'message'
 GAP = '  '
 LEAST = 12  # characters that a column has where the terminal is narrow
 LONGEST = 160  # characters of a cause or message that are shown
+DIGITS = 3  # of a number in a message
+ROWS = 10  # failures that are shown: the newest
 DAY = 24 * 60 * 60  # seconds
 
 
@@ -30,7 +32,8 @@ def as_text(failures: Sequence[Failure]) -> str:
     room = shutil.get_terminal_size().columns - len(GAP) * (len(HEADS) - 1)
     while sum(widths) > room and max(widths) > LEAST:
         widths[widths.index(max(widths))] -= 1
-    return '\n'.join(line for row in rows for line in _lines(row, widths))
+    lines = [line for row in rows for line in _lines(row, widths)]
+    return '\n'.join(lines + _more(failures))
 
 
 def _lines(row: Sequence[str], widths: Sequence[int]) -> Iterator[str]:
@@ -46,12 +49,18 @@ def as_html(failures: Sequence[Failure]) -> str:
         return 'no failures'
     rows = [''.join(f'<td>{html.escape(text)}</td>' for text in row) for row in _rows(failures)]
     head = ''.join(f'<th>{head}</th>' for head in HEADS)
-    return f"<table><tr>{head}</tr>{''.join(f'<tr>{row}</tr>' for row in rows)}</table>"
+    table = f"<table><tr>{head}</tr>{''.join(f'<tr>{row}</tr>' for row in rows)}</table>"
+    return table + ''.join(_more(failures))
+
+
+def _more(failures: Sequence[Failure]) -> List[str]:
+    rest = len(failures) - ROWS
+    return [f'... {rest} more, which are older'] if rest > 0 else []
 
 
 def _rows(failures: Sequence[Failure]) -> List[List[str]]:
     rows = []
-    for number, failure in enumerate(failures):
+    for number, failure in list(enumerate(failures))[-ROWS:]:
         is_recent = time.time() - failure.time < DAY
         when = time.strftime('%H:%M:%S' if is_recent else '%Y-%m-%d', time.localtime(failure.time))
         cause = f'{type(failure.error).__name__}: {failure.text}'
@@ -68,4 +77,21 @@ def _message(message: Any) -> str:
     if not isinstance(message, genpy.Message):
         return str(blocks.attempt(lambda: reprlib.repr(message), '?'))
     # a block may have put into it what does not fit
-    return str(blocks.attempt(lambda: message_text.text_of_message(message), f'<{message._type}>'))
+    return str(blocks.attempt(lambda: _fields(message_text.cut(message)), f'<{message._type}>'))
+
+
+def _fields(message: Any) -> str:
+    """In one line that is broken between fields alone: ``x=2.62, y=3.63``."""
+    return ', '.join(f'{name}={_value(getattr(message, name))}' for name in message.__slots__)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, float):
+        return f'{value:.{DIGITS}g}'
+    if isinstance(value, genpy.TVal):
+        return f'{value.to_sec()}'
+    if isinstance(value, genpy.Message):
+        return f'({_fields(value)})'
+    if isinstance(value, list):
+        return f"[{', '.join(map(_value, value))}]"
+    return repr(value) if isinstance(value, str) else str(value)

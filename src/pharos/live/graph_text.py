@@ -37,7 +37,12 @@ def _summary(graph: 'Graph') -> str:
     ]
     if not graph.nodes_only:
         counts.append((len(graph.topics), 'topic', 'topics'))
-    return ', '.join(f'{count} {one if count == 1 else many}' for count, one, many in counts)
+    return ', '.join(counted(*count) for count in counts)
+
+
+def counted(count: int, one: str, many: str) -> str:
+    """``1 process``, ``2 processes``."""
+    return f'{count} {one if count == 1 else many}'
 
 
 class _Uses:
