@@ -146,6 +146,7 @@ def test_what_blocks_show_log_and_print_comes_above_the_line_that_is_typed(maste
 def test_what_blocks_show_comes_above_the_line_that_is_typed_to_the_debugger(master, open_session):
     terminal = open_session(NODES)
     terminal.enter('telling.interested_in("/wrong", "std_msgs/Empty") and None')
+    terminal.wait_for(r'^In \[2\]:')
     create(master, '/erring').send_to('/wrong', typed_as='std_msgs/Empty')
     terminal.wait_for('AttributeError')
     terminal.enter('telling.failures[0].debug()')
