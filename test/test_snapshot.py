@@ -12,7 +12,7 @@ import pytest
 from helpers import create, in_thread
 from pharos import Master, MasterUnreachableError
 from pharos.external_node import node_api
-from pharos.live import snapshot
+from pharos.live import snapshot, top
 from pharos.live.answers import Count
 from pharos.live.snapshot import ALIVE, DEAD, SILENT, Connection
 from pharos.live.traffic import Traffic
@@ -164,6 +164,42 @@ def test_a_node_that_answers_nonsense_is_marked_with_what_it_said(master):
     with answering(**methods) as uri, registered(master, '/snapshot_odd', uri):
         node = snapshot.take(master).nodes['/snapshot_odd']
         assert (node.pid, node.state, node.problem) == (42, SILENT, 'no')
+
+
+GOOD = {'getPid': 42, 'getBusInfo': [], 'getBusStats': [[], [], []]}
+
+
+@pytest.mark.parametrize(
+    'odd, state',
+    [
+        ({'getBusInfo': [[1, 5, 'o', {'x': 1}, 7]]}, SILENT),
+        ({'getBusInfo': [[1, '/x', 'o', 'TCPROS', ['/t']]]}, SILENT),
+        ({'getPid': -1}, SILENT),
+        ({'getBusStats': [[['/t', 'x', [[1, 'many', 'much', True]]]], [], []]}, ALIVE),
+        ({'getBusStats': [[['/t', 'x', [[1, float('nan'), 5, True]]]], [], []]}, ALIVE),
+        ({'pharosHealth': {'class': 'Odd'}}, ALIVE),
+        ({'pharosHealth': 'text'}, ALIVE),
+        ({'pharosHealth': {'class': 5, 'dropped': {'/t': 'many'}}}, ALIVE),
+    ],
+)
+def test_a_node_with_odd_answers_harms_no_other(master, odd, state):
+    create(master, '/snapshot_good')
+    methods = {
+        name: lambda caller, value=value: [1, '', value] for name, value in {**GOOD, **odd}.items()
+    }
+    with answering(**methods) as uri, registered(master, '/snapshot_odd', uri):
+        seen = snapshot.take(master, counts=True, plain=set())
+        odd_node = seen.nodes['/snapshot_odd']
+        assert (odd_node.state, bool(odd_node.problem)) == (state, state == SILENT)
+        assert seen.nodes['/snapshot_good'].state == ALIVE
+        measured = top.measure(master, 0.1)
+        json.dumps([dataclasses.asdict(measured), master.graph(0.1).as_dict()], allow_nan=False)
+        assert '/snapshot_odd' in master.graph().text()
+
+
+def test_a_node_with_an_address_that_is_none_is_dead(master):
+    with registered(master, '/snapshot_odd', 'http://[broken/'):
+        assert snapshot.take(master).nodes['/snapshot_odd'].state == DEAD
 
 
 def test_nodes_of_another_master_are_not_in_it(master):

@@ -145,7 +145,7 @@ def _ask(
             return
         answer.is_here, answer.address = _locate(answer.host)
         api = node_api(uri, timeout)
-        answer.pid = int(_value(api.getPid(CALLER)))
+        answer.pid = _pid(_value(api.getPid(CALLER)))
         bus_info = _value(api.getBusInfo(CALLER))
         answer.ends = _ends(bus_info, {})
         if counts:
@@ -159,7 +159,11 @@ def _ask(
 def _health(api: Any, uri: str, plain: Set[str]) -> Optional[Dict[str, Any]]:
     """What a node of pharos tells of its health; None, and added to ``plain``: it is none."""
     try:
-        return dict(_value(api.pharosHealth(CALLER)))
+        health = _value(api.pharosHealth(CALLER))
+        counts = [health[name] for name in ('threads', 'souls', 'failures')]
+        _check(str, health['class'], *health['dropped'])
+        _check(int, *counts, *health['dropped'].values())
+        return dict(health)
     except xmlrpc.client.Fault:  # it has no such method
         plain.add(uri)
         return None
@@ -179,8 +183,24 @@ def _value(answer: Any) -> Any:
     return value
 
 
+def _pid(given: Any) -> int:
+    pid = int(given)
+    if not 0 < pid < 2**31:
+        raise ValueError(f'its process cannot have the number {pid}')
+    return pid
+
+
+def _check(kind: Any, *values: Any) -> None:
+    """What a node says goes to all who look at the graph: complain of what is no ``kind``."""
+    for value in values:
+        if not isinstance(value, kind):
+            raise ValueError(f'it has answered {value!r} where {kind.__name__} is due')
+
+
 def _ends(bus_info: Any, counts: Dict[Tuple[bool, str, int], Count]) -> List[End]:
     """The ends of connections that a node tells by getBusInfo."""
+    for _, other, direction, transport, topic, *_ in bus_info:
+        _check(str, other, direction, transport, topic)
     return [
         End(
             direction == INBOUND,
@@ -206,15 +226,20 @@ def _counts(bus_stats: Any, uri: str) -> Dict[Tuple[bool, str, int], Count]:
     found = {}
     for topic, *_, connections in published:
         for number, size, *messages, _ in connections:
+            _check(int, number, size, messages[-1])
             found[False, topic, number] = Count(((uri, number),), messages[-1], size, now)
     for topic, connections in subscribed:
         for number, size, messages, *_ in connections:
+            _check(int, number, size, messages)
             found[True, topic, number] = Count(((uri, number),), messages, size, now)
     return found
 
 
 def _host_name(uri: Optional[str]) -> str:
-    return urllib.parse.urlsplit(uri or '').hostname or 'unknown'
+    try:
+        return urllib.parse.urlsplit(uri or '').hostname or 'unknown'
+    except ValueError:  # it is no URI
+        return 'unknown'
 
 
 def _locate(host: str) -> Tuple[bool, str]:
