@@ -236,7 +236,7 @@ def test_more_than_2_gib_through_a_connection_are_counted_on(master, sender):
 def test_nodes_are_asked_for_their_health_by_top_and_no_other_look(master, sender):
     told, real = [], sender.latest_run.rospy.tell_health
     sender.latest_run.rospy.tell_health = lambda: told.append(1) or real()
-    master.graph(rates=0.1)
+    master.graph(seconds=0.1)
     sender.describe(0)
     assert told == []
     with top.Meter(master) as meter:
