@@ -24,6 +24,7 @@ KEYS = {
     'rich': 'python3-rich',
     'rospkg': 'python3-rospkg',
     'tkinter': 'python3-tk',
+    'traitlets': 'ipython3',  # which is made of it
     'yaml': 'python3-yaml',
 }
 #: what each tool has no use for: the demonstration draws no pictures of messages, and no tables
