@@ -83,11 +83,14 @@ def warnings():
 
 
 @pytest.fixture
-def screen(monkeypatch):
-    """What nodes print that start now."""
-    screen = io.StringIO()
-    monkeypatch.setattr(sys, 'stdout', screen)
-    monkeypatch.setattr(sys, 'stderr', screen)
+def screen(capsys):
+    """``screen()``: all that was printed so far."""
+    printed = []
+
+    def screen():
+        printed.extend(capsys.readouterr())
+        return ''.join(printed)
+
     return screen
 
 
@@ -113,7 +116,7 @@ def node(master, warnings, screen):
     with open(log) as file:
         file.seek(logged_before)
         assert 'Traceback' not in file.read()
-    assert 'Traceback' not in screen.getvalue()
+    assert 'Traceback' not in screen()
 
 
 # -- silent and slow clients, and many of them
@@ -356,7 +359,7 @@ def test_a_caller_id_is_shown_as_it_is(node, warnings, screen):
             is_closed(other)
         line = warnings.next()
         assert f'Client [{name}] wants topic' in line
-        assert line in screen.getvalue()
+        assert line in screen()
 
 
 def test_a_node_whose_screen_is_closed_refuses_as_before(node, warnings):

@@ -53,7 +53,7 @@ def test_without_seconds_no_rate_is_told(master):
 
 
 def test_its_parameters_and_failures_are_told(master, mailbox):
-    node, peer = create(master), create(master, '/peer')
+    node, peer = create(master, '/fails'), create(master, '/peer')
 
     def block(message, channel):
         raise ZeroDivisionError(mailbox(message, channel))
@@ -66,7 +66,7 @@ def test_its_parameters_and_failures_are_told(master, mailbox):
     until(lambda: node.failures)
     text = node.describe(0)
     assert f"\nparameters\n  ~long: {'x' * 70}...\n  ~rate: 3\nfailures\n  <Failure of dele" in text
-    del master.parameters['/node']
+    del master.parameters['/fails']
 
 
 def test_a_node_that_is_stopped_is_described_too(master):
