@@ -65,6 +65,13 @@ USES = {
 }
 
 
+def test_no_name_at_all_is_refused_where_there_are_parameters(master):
+    master.parameters['/some/parameter'] = 1
+    with pytest.raises(ValueError):
+        '' in master.parameters
+    del master.parameters['/some']
+
+
 @pytest.mark.parametrize('use', USES)
 def test_what_is_no_name_is_refused_wherever_one_is_given(node, use):
     refused = []

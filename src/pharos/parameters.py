@@ -50,7 +50,7 @@ class Parameters(MutableMapping[str, Any]):
             return _global(name)
         except ValueError:
             there = self._master.call('getParamNames')
-            if any(f'{each}/'.startswith(f'{name}/') for each in there):
+            if name and any(f'{each}/'.startswith(f'{name}/') for each in there):
                 return str(name)  # as rosparam and a YAML file may, or within a node's name
             raise
 
