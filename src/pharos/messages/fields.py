@@ -214,11 +214,11 @@ def _check(cls: MessageClass, field_type: str, value: Any, path: str) -> None:
                 _check(nested, nested_type, getattr(value, name), f'{path}.{name}')
     except MessageTypeError:
         raise
-    except Exception:  # of which the names of genpy's own code would say no more
+    except Exception as error:
         raise MessageTypeError(
             f'{path} = {reprlib.repr(value)} does not fit {field_type}: '
             f'give {_what_fits(cls, base, is_array, length)}'
-        ) from None
+        ) from error
 
 
 def _check_array(
