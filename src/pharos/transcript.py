@@ -69,12 +69,13 @@ class _Transcript:
         return f"<Transcript to {'standard output' if self._receiver is None else self._receiver}>"
 
 
-def _print(text: str) -> None:
+def _print(line: str) -> None:
+    text = f'{line}\n'  # in one piece: what other threads print does not come into the line
     try:
-        print(text, flush=True)
+        print(text, end='', flush=True)
     except UnicodeEncodeError:  # as on a terminal that knows ASCII only
         encoding = sys.stdout.encoding
-        print(text.encode(encoding, 'backslashreplace').decode(encoding), flush=True)
+        print(text.encode(encoding, 'backslashreplace').decode(encoding), end='', flush=True)
 
 
 Transcript = _Transcript()
