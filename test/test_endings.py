@@ -59,6 +59,17 @@ def test_a_node_that_starts_or_stops_is_never_one_of_another_process(master):
     assert {type(node) for node in seen} == {BlockNode}
 
 
+def test_a_node_that_starts_while_the_master_is_asked_is_one_of_this_process(master, monkeypatch):
+    def ask():
+        create(master, '/sudden')
+        return Master(master.url).system_state()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(master, 'system_state', ask)
+        found = master.nodes()
+    assert [type(node) for node in found if node.name == '/sudden'] == [BlockNode]
+
+
 def test_a_node_that_is_waited_for_runs(master):
     thread, found = in_thread(master.wait_for_node, '/awaited', TIMEOUT)
     node = create(master, '/awaited')

@@ -285,6 +285,7 @@ class Master(MasterCalls):
         """All nodes: a Node where it runs in this process, an ExternalNode elsewhere."""
         local = {node.name: node for node in self.local_nodes()}
         names = {name for kind in self.system_state() for users in kind.values() for name in users}
+        local.update((node.name, node) for node in self.local_nodes())  # one may just have started
         return [
             local[name] if name in local else ExternalNode(self, name) for name in sorted(names)
         ]
