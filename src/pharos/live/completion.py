@@ -375,12 +375,13 @@ def _have_jedi_evaluate_no_properties() -> Callable[[], None]:
     Without jedi IPython evaluates what is before the last dot, whatever it is told.
     """
     try:
-        interpreter: Any = importlib.import_module('jedi').Interpreter
+        jedi: Any = importlib.import_module('jedi')
     except ImportError:
         return lambda: None
-    before = getattr(interpreter, _EVALUATES, False)
-    setattr(interpreter, _EVALUATES, False)
-    return functools.partial(setattr, interpreter, _EVALUATES, before)
-
-
-_EVALUATES = '_allow_descriptor_getattr_default'
+    # since 0.19 there is a setting
+    owner, name = jedi.settings, 'allow_unsafe_interpreter_executions'
+    if not hasattr(owner, name):
+        owner, name = jedi.Interpreter, '_allow_descriptor_getattr_default'
+    before = getattr(owner, name, False)
+    setattr(owner, name, False)
+    return functools.partial(setattr, owner, name, before)
