@@ -1,4 +1,5 @@
 """The debugger in frames of what is over: IPython's in its shells, else pdb."""
+import contextvars
 import importlib
 import pdb
 from types import TracebackType
@@ -18,7 +19,10 @@ def look_at(frames: TracebackType) -> None:
     if session is not None:
         # as IPython has it of its own prompt: what is printed meanwhile comes above the line
         above = importlib.import_module('prompt_toolkit.patch_stdout').patch_stdout
-        session.prompt = above(raw=True)(session.prompt)
+        prompt = above(raw=True)(session.prompt)
+        # What other threads print finds the prompt in the session that all have by default; IPython
+        # gives the debugger's one of its own since 8.13 or so.
+        session.prompt = lambda: contextvars.Context().run(prompt)
     looking.reset()
 
     def end() -> None:
