@@ -73,6 +73,20 @@ def test_a_block_returns_the_only_field(master, call, block):
 
 
 @both_ways
+@pytest.mark.parametrize('value', [['a', 'b'], ('a', 'b'), [['a', 'b']], (('a', 'b'),)], ids=repr)
+def test_an_only_field_that_is_an_array_may_be_in_a_list_as_rospy_has_it(master, call, value):
+    create(master, '/provider').serve('/list', 'roscpp/GetLoggers', lambda request: nested(value))
+    assert [each.name for each in call(master, '/list').loggers] == ['a', 'b']
+
+
+def nested(value):
+    """The value with messages in the place of texts."""
+    if isinstance(value, str):
+        return pharos.message_class('roscpp/Logger')(name=value)
+    return type(value)(map(nested, value))
+
+
+@both_ways
 def test_a_falsy_value_is_the_only_field_too(master, call):
     create(master, '/provider').serve('/spawn', SPAWN, lambda request: '')
     assert call(master, '/spawn', name='bob').name == ''
@@ -106,9 +120,13 @@ def test_the_block_gets_the_request(master, call):
     [
         (None, r'must return .* its fields \(success: bool, message: string\); it returned None'),
         (True, r'must return a response, a dict, tuple or list of its fields .* it returned True'),
-        ((True,), r'must return a response, .* it returned \(True,\)'),
-        ((7, 7), r'SetBoolResponse.message = 7 does not fit string'),
-        ({'ok': True}, r'SetBoolResponse has no field .ok.'),
+        (
+            (True,),
+            r'a std_srvs/SetBool, must return .*it returned \(True,\), of length 1 and not 2',
+        ),
+        ([True, '', ''], r'block of /set, .* of length 3 and not 2'),
+        ((7, 7), r'block of /set returned .*std_srvs/SetBoolResponse.message = 7 does not fit str'),
+        ({'ok': True}, r'block of /set .*SetBoolResponse has no field .ok.*success: bool, mess'),
         ({'message': 7}, r'SetBoolResponse.message = 7 does not fit string'),
         (std_srvs.srv.EmptyResponse(), 'must return a response'),
     ],

@@ -2,7 +2,8 @@
 set of it, in its class or on it."""
 import inspect
 import numbers
-from typing import TYPE_CHECKING, Any, Callable, Dict, FrozenSet, Optional, TypeVar
+import threading
+from typing import TYPE_CHECKING, Any, Callable, Dict, FrozenSet, List, Optional, TypeVar
 
 from pharos.blocks import Block, attempt, check_delegate, check_runs, check_soul, text_of
 from pharos import node_registry
@@ -19,12 +20,19 @@ if TYPE_CHECKING:
 
 NodeType = TypeVar('NodeType', bound='NodeAttributes')
 _SET_ONCE = frozenset(['master', '_settings', '_errors'])
+_made_here = threading.local()  # .node_class: of the node that this thread makes
 
 
 def _check_bytes(name: str, value: Any) -> Any:
     is_number = isinstance(value, numbers.Real)
     if not (is_number and value > 0):
         raise ValueError(f'{name} is a number of bytes above 0, not {value!r}')
+    return value
+
+
+def _check_run(name: str, value: Any) -> Any:
+    if value is not None and not isinstance(getattr(value, 'lifecycle', None), Lifecycle):
+        raise _not_to_be_set(name)
     return value
 
 
@@ -35,6 +43,7 @@ _CHECKS: Dict[str, Callable[[str, Any], Any]] = {
     'queue_bytes': _check_bytes,
     'soul': lambda name, block: check_soul(block),
     'delegate': lambda name, block: check_delegate(block),
+    'latest_run': _check_run,
 }
 # names of levels -> rospy's
 _LEVELS = {level: level for level in ('debug', 'info', 'warning', 'error', 'critical')}
@@ -68,13 +77,20 @@ class NodeAttributes:
     latest_run: 'Run' = None  # type: ignore[assignment]
     #: names of the methods of Node, without which it could not work, nor stop
     _methods: FrozenSet[str] = frozenset()
+    #: names of what can be asked of it, and is not set
+    _properties: FrozenSet[str] = frozenset()
 
-    def __init__(self) -> None:
-        if '_settings' not in vars(self):
-            name = type(self).__name__
-            raise TypeError(
-                f'a node is made by a master: Master().create({name}, named=...), not {name}()'
-            )
+    if not TYPE_CHECKING:  # who reads its arguments takes them for those of the nodes
+
+        def __new__(cls, *args, **kwargs):
+            if getattr(_made_here, 'node_class', None) is not cls:
+                given = [kwargs.get('named'), kwargs.get('name'), *args]
+                name = next((repr(each) for each in given if isinstance(each, str)), '...')
+                raise TypeError(
+                    f'a node is made by a master: Master().create({cls.__name__}, named={name}),'
+                    f' not {cls.__name__}()'
+                )
+            return super().__new__(cls)
 
     def __init_subclass__(cls, is_base: bool = False, **kwargs: Any) -> None:
         """:param is_base: whether it is one of those that make up Node"""
@@ -82,7 +98,11 @@ class NodeAttributes:
         if is_base:
             methods = inspect.getmembers(cls, inspect.isfunction)
             cls._methods = frozenset(name for name, _ in methods)
+            properties = inspect.getmembers(cls, lambda member: isinstance(member, property))
+            cls._properties = frozenset(name for name, _ in properties)
             return
+        for name in (cls._properties | _SET_ONCE).intersection(vars(cls)):
+            raise _not_to_be_set(name)
         for name in ('soul', 'delegate'):
             if name in vars(cls) and not isinstance(vars(cls)[name], property):
                 raise TypeError(
@@ -107,7 +127,8 @@ class NodeAttributes:
         """The value that an attribute gets, in a class of nodes or in one of them."""
         if name in _CHECKS:
             return _CHECKS[name](name, value)
-        if name in cls._methods and not callable(value):
+        is_taken = name in cls._methods and not callable(value)
+        if is_taken or name in cls._properties and name != 'name':  # which says more
             raise _not_to_be_set(name)
         return value
 
@@ -143,6 +164,9 @@ class NodeAttributes:
         hint = ''
         if lifecycle is Lifecycle.NEW:
             hint = '; a start() of its own has to call super().start() before anything else'
+            if not node_registry.is_in_start(self):
+                hint = ', which create() does when __init__ has run; what needs it'
+                hint += ' goes into a start() of its own, after super().start()'
         raise NodeStoppedError(f'{self.name} is {lifecycle.value}: start() it first{hint}')
 
     @property
@@ -218,13 +242,39 @@ def make(
     """A new node of ``node_class``, configured and not yet started."""
     if not (isinstance(node_class, type) and issubclass(node_class, NodeAttributes)):
         raise TypeError(f'a node is made of a subclass of Node, or BlockNode; not {node_class!r}')
-    node: NodeType = node_class.__new__(node_class)
+    if node_class.__hash__ is None:
+        name = node_class.__name__
+        raise TypeError(
+            f'nodes are told apart by their identity, and {name} compares its nodes by their values:'
+            f' write @dataclass(eq=False), or give {name} no __eq__'
+        )
+    taken = {'named': named, 'soul': soul, 'delegate': delegate, **settings}
+    _check_not_taken(node_class, [name for name, value in taken.items() if value])
+    _made_here.node_class = node_class
+    try:
+        node: NodeType = node_class.__new__(node_class)
+    finally:
+        del _made_here.node_class
     node._configure(master, Settings(named, master.url, **settings), soul, delegate)
     node.__init__(*args, **kwargs)
     return node
 
 
+def _check_not_taken(node_class: type, given: List[str]) -> None:
+    """Raise TypeError where a keyword that create() was given, and takes for itself, is one that the
+    class's own __init__ waits for."""
+    parameters = inspect.signature(node_class.__init__).parameters  # type: ignore[misc]
+    for name in given:
+        if name in parameters:
+            raise TypeError(
+                f'create() takes {name}= for itself, so that {node_class.__name__}.__init__ would'
+                f' never get it: give that parameter another name, such as my_{name}'
+            )
+
+
 def _not_to_be_set(name: str) -> AttributeError:
+    hint = ' (a node\'s name is given to create(), as named=)' if name == 'name' else ''
     return AttributeError(
-        f'{name} is what each Node has, and needs: give what else has that name another one'
+        f'{name} is what each Node has, and needs{hint}: give what else has that name another one,'
+        f' such as my_{name}'
     )

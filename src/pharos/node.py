@@ -47,6 +47,22 @@ class Node(NodeWithSouls, is_base=True):
     #: what starts and stops in its own way
     _kind = 'a node'
 
+    if TYPE_CHECKING:
+
+        def __init__(self) -> None:
+            ...
+
+    else:
+
+        def __init__(self, *args, **kwargs):
+            if args or kwargs:
+                given = [*map(repr, args), *(f'{name}={kwargs[name]!r}' for name in kwargs)]
+                raise TypeError(
+                    f'Node.__init__ takes nothing, and got {", ".join(given)}: a name, soul and so'
+                    ' on are given to create(), and what else is, to the __init__ of a class of'
+                    f' your own, which calls super().__init__(); see help(Master.create)'
+                )
+
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         cls._starts_itself = cls.start is not Node.start

@@ -1,6 +1,7 @@
 """Services that a node offers."""
 import contextlib
-from typing import TYPE_CHECKING, Any, Union
+import reprlib
+from typing import TYPE_CHECKING, Any, Dict, Union
 
 import genpy
 
@@ -128,20 +129,35 @@ class OfferedService:
             except Exception:
                 messages.check_fits(value)  # tells what of it does not fit
             return value
-        if isinstance(value, dict):
-            return messages.fill(response(), value)
+        fields = value if isinstance(value, dict) else self._fields_in_order(value)
+        try:
+            return messages.fill(response(), fields)
+        except MessageTypeError as error:
+            raise MessageTypeError(
+                f'the block of {self.name} returned what does not fit: {error}'
+            ) from error
+
+    def _fields_in_order(self, value: Any) -> Dict[str, Any]:
+        """The fields of a response by their names, where the block returned their values, or the
+        value of the only one."""
+        response = self.service_class._response_class
         names = response.__slots__
         if not names:
-            return response()
-        has_values = isinstance(value, (list, tuple)) and len(value) == len(names)
-        if has_values and (len(names) > 1 or not response._slot_types[0].endswith(']')):
-            return messages.fill(response(), dict(zip(names, value)))
+            return {}
+        is_sequence = isinstance(value, (list, tuple))
+        if is_sequence and len(value) == len(names):
+            # [[1, 2]], as rospy has it, or [1]: ROS has no arrays of arrays
+            is_one_array = len(names) == 1 and response._slot_types[0].endswith(']')
+            if not is_one_array or isinstance(value[0], (list, tuple, bytes)):
+                return dict(zip(names, value))
         if len(names) == 1 and value is not None:
-            return messages.fill(response(), {names[0]: value})
+            return {names[0]: value}
         or_field = ' or its only field' if len(names) == 1 else ''
+        length = f', of length {len(value)} and not {len(names)}' if is_sequence else ''
         raise TypeError(
-            f'the block of {self.name} must return a response, a dict, tuple or list of its fields'
-            f' ({messages.describe_fields(response)}){or_field}; it returned {value!r}'
+            f'the block of {self.name}, a {self.type}, must return a response, a dict, tuple or list'
+            f' of its fields ({messages.describe_fields(response)}){or_field}; it returned'
+            f' {reprlib.repr(value)}{length}'
         )
 
     def close(self) -> None:

@@ -1,0 +1,127 @@
+"""What those who know rospy, or read no manual, try first: it works, or the error says what to write."""
+import dataclasses
+
+import pytest
+
+from helpers import create
+import pharos
+from pharos import BlockNode, Node
+
+# -- nodes made, and named, in another way than by create()
+
+
+class Driver(Node):
+    """A node with a keyword of its own."""
+
+    def __init__(self, speed=1.0):
+        self.speed = speed
+
+
+@dataclasses.dataclass
+class Compared(Node):
+    """A node that Python compares by its values."""
+
+    speed: float = 1.0
+
+
+@pytest.mark.parametrize(
+    'make, said',
+    [
+        (lambda: BlockNode(), r'create\(BlockNode, named=\.\.\.\), not BlockNode\(\)'),
+        (lambda: Node('driver'), r"create\(Node, named='driver'\), not Node\(\)"),
+        (lambda: Node(named='driver', soul=print), r"create\(Node, named='driver'\)"),
+        (lambda: Driver(speed=2.0), r'create\(Driver, named=\.\.\.\), not Driver\(\)'),
+        (lambda: Compared(2.0), r'create\(Compared, named=\.\.\.\), not Compared\(\)'),
+    ],
+    ids=['BlockNode()', 'Node(name)', 'Node(named=)', '__init__ without super()', 'dataclass'],
+)
+def test_a_node_made_by_hand_is_told_how_it_is_made(make, said):
+    with pytest.raises(TypeError, match='made by a master: .*' + said):
+        make()
+
+
+def test_an_init_needs_no_super(master):
+    assert create(master, '/driver', Driver, speed=2.0).speed == 2.0
+
+
+@pytest.mark.parametrize('arguments', [('driver',), {'named': 'driver'}], ids=repr)
+def test_a_name_given_to_the_init_of_node_as_in_ros_2_is_told_where_it_goes(master, arguments):
+    class Named(Node):
+        def __init__(self):
+            if isinstance(arguments, dict):
+                super().__init__(**arguments)
+            else:
+                super().__init__(*arguments)
+
+    with pytest.raises(
+        TypeError,
+        match=r"takes nothing, and got .*'driver': a name.* create\(\).*super\(\).__init__\(\)",
+    ):
+        create(master, '/driver', Named)
+    assert master.local_nodes() == []
+
+
+def test_a_keyword_that_nobody_takes_is_named(master):
+    with pytest.raises(
+        TypeError, match=r"takes nothing, and got callback=3: .*help\(Master.create\)"
+    ):
+        create(master, callback=3)
+    with pytest.raises(TypeError, match="Driver.__init__.. got an unexpected keyword .*'sped'"):
+        create(master, '/driver', Driver, sped=2.0)
+
+
+@pytest.mark.parametrize('name', ['domain', 'soul', 'named'])
+def test_a_parameter_of_an_init_that_create_takes_for_itself_is_told(master, name):
+    """It never got there, in silence where it had a default."""
+    classes = {
+        'domain': type('Framed', (Node,), {'__init__': lambda self, domain='odom': None}),
+        'soul': type('Framed', (Node,), {'__init__': lambda self, soul: None}),
+        'named': type('Framed', (Node,), {'__init__': lambda self, named=None: None}),
+    }
+    with pytest.raises(
+        TypeError, match=f'takes {name}= for itself, .*Framed.__init__ would never .* my_{name}'
+    ):
+        create(master, '/node', classes[name], soul=print)
+    assert master.local_nodes() == []
+
+
+def test_a_node_that_is_compared_by_its_values_is_refused(master):
+    with pytest.raises(TypeError, match=r'Compared compares .*@dataclass\(eq=False\)'):
+        create(master, '/node', Compared)
+    same = dataclasses.dataclass(eq=False)(
+        type('Same', (Node,), {'__annotations__': {'speed': float}, 'speed': 1.0})
+    )
+    assert create(master, '/node', same, speed=2.0).speed == 2.0
+
+
+PROPERTIES = sorted(
+    name
+    for owner in Node.__mro__
+    for name, value in vars(owner).items()
+    if isinstance(value, property)
+)
+
+
+@pytest.mark.parametrize('name', [*PROPERTIES, 'master', 'latest_run'])
+def test_what_each_node_has_is_not_hidden_by_a_class_of_its_own(master, name):
+    """It went on half, or failed far from there: ``errors = []`` had no failure in it."""
+    for value in [], 'text', lambda self: 'text', property(lambda self: 'text'):
+        if name != 'latest_run':
+            with pytest.raises(AttributeError, match=f'^{name} is what each Node has.* my_{name}'):
+                type('Arm', (Node,), {name: value})
+    node = create(master)
+    with pytest.raises(AttributeError, match=f'^{name} is what each|^/node is the name'):
+        setattr(node, name, [])
+    node.stop()
+    assert not node.errors
+
+
+def test_a_stop_that_does_not_call_super_stops_the_node(master):
+    class Silent(Node):
+        def stop(self):
+            pass
+
+    node = create(master, '/silent', Silent)
+    node.stop()
+    assert not master.is_node_alive('/silent')
+    assert node.lifecycle is pharos.Lifecycle.STOPPED
