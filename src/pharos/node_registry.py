@@ -169,7 +169,7 @@ def start_of(node: 'Node') -> 'Iterator[None]':
             _starts.pop(key, None)
 
 
-def is_in_start(node: 'Node') -> bool:
+def is_in_start(node: Any) -> bool:
     """Whether this thread is in a :func:`start_of` the node."""
     return (node, threading.get_ident()) in _starts
 
