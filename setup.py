@@ -10,6 +10,7 @@ setup(
             'pharos.intraprocess',
             'pharos.live',
             'pharos.messages',
+            'pharos.new_package',
             'pharos.private_rospy',
             'pharos.private_rospy.patches',
             'pharos_turtle',

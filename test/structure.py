@@ -14,6 +14,7 @@ ROOMS = {
     'pharos.private_rospy': 'private_rospy',
     'pharos.compose': ABOVE,
     'pharos.live': ABOVE,
+    'pharos.new_package': ABOVE,
     'pharos.testing': ABOVE,
     'pharos_turtle': ABOVE,
 }

@@ -13,6 +13,7 @@ STANDARD_LIBRARY = sysconfig.get_path('stdlib')
 KEYS = {
     'IPython': 'ipython3',
     'PIL': 'python3-pil',
+    'catkin_pkg': 'catkin',  # which is made of it
     'matplotlib': 'python3-matplotlib',
     'hypothesis': 'python3-hypothesis',
     'ipykernel': 'jupyter-notebook',  # rosdep has no name for this alone, nor for the next

@@ -91,7 +91,7 @@ class Mailbox:
         """The next ``count`` messages."""
         return [self.next() for _ in range(count)]
 
-    def wait_for(self, predicate: Callable[[Any], bool], timeout: Optional[float] = None) -> Any:
+    def wait_for(self, predicate: Callable[[Any], Any], timeout: Optional[float] = None) -> Any:
         """Take messages until one for which ``predicate(message)`` holds; returns that one.
 
         :param timeout: seconds for all of them, None: :data:`TIMEOUT`
