@@ -276,9 +276,15 @@ def test_the_facade_loads_modules_by_on_demand_alone():
     assert loading == ['pharos.on_demand']
 
 
+def programs():
+    """What rosrun runs."""
+    scripts = [path for path in (ROOT / 'scripts').iterdir() if path.is_file()]
+    return [*scripts, *(ROOT / 'examples').glob('*.py')]
+
+
 def test_rosrun_finds_each_script_once():
     """In a devel space it looks through the whole source, and asks which one is meant."""
-    names = {path.name for path in (ROOT / 'scripts').iterdir()}
+    names = {path.name for path in programs()}
     found = subprocess.run(
         [
             'find',
@@ -298,12 +304,11 @@ def test_rosrun_finds_each_script_once():
         check=True,
     ).stdout.splitlines()
     paths = [path for path in map(pathlib.Path, found) if path.name in names]
-    assert [path for path in paths if path.parent != ROOT / 'scripts'] == []
+    assert sorted(paths) == sorted(programs())
 
 
 def test_scripts_are_run_by_debians_python():
-    scripts = [path for path in (ROOT / 'scripts').iterdir() if path.is_file()]
-    for path in scripts:
+    for path in programs():
         assert path.read_text().startswith('#!/usr/bin/python3\n'), path
         assert path.stat().st_mode & 0o111 == 0o111, path
 

@@ -1,27 +1,35 @@
 """What the programs of the command line have in common: how they end."""
 import os
 import sys
-from typing import Any, Callable
+from typing import Any, Callable, Optional
 
 from pharos.errors import PharosError
 
 
-def run(name: str, main: Callable[[], int]) -> int:
-    """Run a program that prints; returns its exit status.
+def run(name: str, main: Callable[[], Optional[int]], about: Optional[str] = None) -> int:
+    """Run a program that prints; returns its exit status, 0 after Ctrl-C.
 
-    What is wrong is told in one line; who reads its output may stop early, or read no UTF-8.
+    What is wrong is told in one line; who reads its output may stop early, or read no UTF-8::
+
+        if __name__ == '__main__':
+            sys.exit(program.run('camera', main, about=__doc__))
 
     :param name: the program's, for that line
-    :param main: returns the exit status
+    :param main: returns the exit status; None: 0
+    :param about: what is printed instead where the program was called with ``--help``; None: that
+        is left to ``main``
     """
     try:
         if sys.stdout is None:
             raise PharosError('its standard output is closed: give it a file or a terminal')
         output: Any = sys.stdout
         output.reconfigure(errors='replace')
-        status = main()
+        if about is not None and {'-h', '--help'} & {*sys.argv[1:]}:
+            status: Optional[int] = print(about.strip())
+        else:
+            status = main()
         output.flush()
-        return status
+        return status or 0
     except KeyboardInterrupt:
         return 0
     except BrokenPipeError:  # who reads it has enough

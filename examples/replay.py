@@ -1,0 +1,58 @@
+#!/usr/bin/python3
+"""Recording a drive with rosbag, and replaying it again and again, in the time of the recording.
+
+Each replay jumps back in time, which neither the node's loop nor rospy's Timer minds. No roscore is
+needed: all nodes of a master have one time, so this has a master of its own. It goes on until
+Ctrl-C; what to type meanwhile, in another terminal, it says itself.
+"""
+import itertools
+import math
+import pathlib
+import sys
+import tempfile
+
+from pharos import BlockNode, Master, Node, Transcript
+from pharos.live import program
+
+
+def drive(robot):
+    for turn, _ in enumerate(robot.every(0.1)):
+        robot.send_to('/position', typed_as='geometry_msgs/Point', x=math.sin(turn / 10))
+
+
+class Listener(Node):
+    def start(self):
+        super().start()
+        self.x = math.nan
+        self.interested_in('/position', typed_as='geometry_msgs/Point', delegate=self.keep)
+        self.fork(Listener.look)
+        self.ros.Timer(self.ros.Duration(2), lambda event: self.show('Timer'), reset=True)
+
+    def keep(self, position, channel):
+        self.x = position.x
+
+    def look(self):
+        for _ in self.every(1):
+            self.show('every')
+
+    def show(self, who):
+        Transcript.show(f'{self.ros.get_time() % 1000:.1f} {who}: x={self.x:.2f}')
+
+
+def main():
+    with Master.embedded() as master, tempfile.TemporaryDirectory() as folder:
+        Transcript.show(f'ROS_MASTER_URI={master.url} rostopic echo /clock')
+        bag = pathlib.Path(folder, 'drive.bag')
+        with master.create(BlockNode, named='robot', soul=drive) as robot:
+            robot.fork()
+            Transcript.show('recording')
+            master.run('rosbag', 'record', '--duration=3', '-O', bag, '/position').wait()
+        master.parameters['/use_sim_time'] = True
+        master.create(Listener, named='listener')
+        for count in itertools.count(1):
+            Transcript.show(f'replay {count}')
+            master.run('rosbag', 'play', '--clock', bag, name='player').wait()
+
+
+if __name__ == '__main__':
+    sys.exit(program.run('replay', main, about=__doc__))

@@ -1,0 +1,53 @@
+#!/usr/bin/python3
+"""A supervisor that restarts nodes of its process: those that have failed, and those that stopped.
+
+Each worker fails after some steps: that ends its soul, and no other node. The supervisor says why,
+restarts it, and tells on /diagnostics how all are. It goes on until Ctrl-C; meanwhile, in other
+terminals:
+
+  rosnode kill /left        # the supervisor starts it again
+  rostopic echo /diagnostics
+"""
+import random
+import sys
+
+from pharos import BlockNode, Master, spin
+from pharos.live import program
+
+
+def work(worker):
+    for step, _ in enumerate(worker.every(0.1)):
+        worker.send_to('/steps', typed_as='std_msgs/UInt32', data=step)
+        if random.random() < 0.02:
+            raise RuntimeError(f'the wheel is stuck after {step} steps')
+
+
+def supervise(supervisor, workers):
+    failed = {worker: 0 for worker in workers}
+    for _ in supervisor.every(1):
+        statuses = []
+        for worker in workers:
+            health = worker.health()
+            if not worker.is_running or health.errors > failed[worker]:
+                why = worker.errors[-1] if health.errors > failed[worker] else 'it was stopped'
+                failed[worker] = health.errors
+                supervisor.log(f'restarts {worker.name}: {why}', level='warn')
+                worker.restart()
+            statuses.append({'name': worker.name, 'message': str(health)})
+        supervisor.send_to(
+            '/diagnostics', typed_as='diagnostic_msgs/DiagnosticArray', status=statuses
+        )
+
+
+def main():
+    master = Master()
+    workers = [master.create(BlockNode, named=name, soul=work) for name in ('left', 'right')]
+    for worker in workers:
+        worker.fork()
+    supervisor = master.create(BlockNode, named='supervisor')
+    supervisor.fork(lambda me: supervise(me, workers))
+    spin()
+
+
+if __name__ == '__main__':
+    sys.exit(program.run('supervisor', main, about=__doc__))
