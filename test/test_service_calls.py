@@ -466,18 +466,149 @@ def test_a_process_that_hangs_is_given_up_and_called_again_once_it_goes_on(
     service.close()
 
 
-def test_a_provider_that_hangs_is_given_up_when_it_is_looked_up(master, there, monkeypatch):
+@pytest.mark.parametrize('kind', ['rospy', 'roscpp'])
+def test_a_provider_that_hangs_holds_up_no_look_up_but_what_needs_its_type(
+    master, there, mux, kind, monkeypatch
+):
     monkeypatch.setattr('pharos.service.TIMEOUT', 1.0)  # seconds; five else
-    service = master.lookup_service('/there/echo')
+    name, pid = (
+        ('/there/echo', there.process.pid) if kind == 'rospy' else ('/calls/mux/list', mux.pid)
+    )
+    hang(pid)
+    try:
+        begin = time.monotonic()
+        service = master.lookup_service(name)
+        assert time.monotonic() - begin < 0.9
+        assert repr(service) == f'<Service {name} of a type not told yet at {service.uri}>'
+        with nothing_left(service), pytest.raises(
+            pharos.ServiceCallError, match=f'provider of {name} at .*does not answer .*running'
+        ):
+            service.call()
+        with pytest.raises(pharos.ServiceCallError, match=f'{name} at .*does not answer'):
+            service.call(timeout=0.1)
+        assert connections_to(service) == 0
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    service.call(timeout=TIMEOUT)
+    assert service.type == (ECHO if kind == 'rospy' else 'topic_tools/MuxList')
+
+
+# -- waits
+
+
+@pytest.mark.parametrize(
+    'wait',
+    [
+        lambda master, name: master.wait_for_service(name, TIMEOUT),
+        lambda master, name: master.wait_for_service(name),
+        lambda master, name: master.lookup_service(name, wait=TIMEOUT),
+        lambda master, name: master.lookup_service(name, wait=None),
+    ],
+    ids=['wait_for_service', 'without limit', 'lookup_service', 'lookup_service, without limit'],
+)
+def test_a_service_is_waited_for(master, wait):
+    node, looks = create(master, '/awaited'), threading.Event()
+    look = pharos.Master.call
+
+    def noted(self, method, *args, **options):
+        try:
+            return look(self, method, *args, **options)
+        finally:
+            looks.set()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pharos.Master, 'call', noted)
+        awaited = started(lambda: wait(master, '/awaited/late'))
+        assert looks.wait(TIMEOUT)  # it was not there
+    node.serve('/awaited/late', 'std_srvs/Trigger', lambda request: (True, 'here'))
+    assert awaited().call().message == 'here'
+
+
+def test_a_service_that_is_there_is_not_waited_for(master, there):
+    for service in (
+        master.wait_for_service('/there/echo', 0),
+        master.wait_for_service('/there/echo', timeout=TIMEOUT, caller_id='/me'),
+    ):
+        assert service.call(load_namespace='ann').message == 'ann'
+    assert service.caller_id == '/me'
+
+
+def test_a_service_that_does_not_come_in_time_is_said(master, there, monkeypatch):
+    monkeypatch.setattr('pharos.master_services.PATIENCE', 0.1)
+    with pytest.raises(
+        pharos.UnknownServiceError,
+        match=r"no node offered /there/ecko within 0.1 s \(did you mean '/there/echo'.*: is it start",
+    ):
+        master.wait_for_service('/there/ecko', 0.1)
     hang(there.process.pid)
     try:
         with pytest.raises(
-            pharos.ServiceCallError, match='provider of /there/echo at .*does not answer .*running'
+            pharos.ServiceCallError, match='provider of /there/echo at .*does not answer: is it'
         ):
-            master.lookup_service('/there/echo')
-        assert connections_to(service) == 0
+            master.lookup_service('/there/echo', wait=0.2)
     finally:
         os.kill(there.process.pid, signal.SIGCONT)
+    for wait in float('nan'), '1':
+        with pytest.raises(ValueError, match='wait is a number of seconds'):
+            master.lookup_service('/there/echo', wait=wait)
+
+
+def test_a_provider_that_was_killed_is_waited_for_until_it_is_there_again(master):
+    with provider(master.url, '/mortal') as program:
+        kill(program)
+        with pytest.raises(pharos.ServiceCallError, match='/mortal/echo .*does not answer'):
+            master.wait_for_service('/mortal/echo', 0.2)
+        with provider(master.url, '/mortal'):
+            service = master.wait_for_service('/mortal/echo', TIMEOUT)
+            assert service.call(load_namespace='ann').message == 'ann'
+
+
+def test_a_stop_ends_a_wait_for_a_service(master):
+    raised, waits = queue.Queue(), threading.Event()
+
+    def soul(me):
+        try:
+            waits.set()
+            me.master.wait_for_service('/nobody/offers')
+        except BaseException as error:
+            raised.put(error)
+            raise
+
+    node = create(master, '/waits', soul=soul)
+    node.fork()
+    assert waits.wait(TIMEOUT)
+    node.stop()
+    error = raised.get(timeout=TIMEOUT)
+    assert isinstance(error, pharos.NodeStoppedError)
+    assert str(error) == 'the node that waited for /nobody/offers stops'
+    assert not node.errors
+
+
+def test_ctrl_c_ends_a_wait_for_a_service(master):
+    program = 'import pharos\nprint("waits")\npharos.Master().wait_for_service("/nobody/offers")\n'
+    with Program(master.url, sys.executable, '-c', program) as waiting:
+        waiting.wait_for('waits')
+        assert waiting.end(signal.SIGINT) == -signal.SIGINT
+        assert 'KeyboardInterrupt' in waiting.read_to_the_end()
+
+
+def test_a_wait_for_a_service_ends_where_the_master_stays_away_and_goes_on_where_it_comes_back(
+    mortal_master, monkeypatch
+):
+    master = pharos.Master(mortal_master.url)
+    awaited = started(lambda: master.wait_for_service('/awaited/late'))
+    mortal_master.end()
+    mortal_master.come_back()
+    node = create(master, '/awaited')
+    node.serve('/awaited/late', 'std_srvs/Trigger', lambda request: (True, 'here'))
+    assert awaited().call().message == 'here'
+    node.stop()
+    mortal_master.end()
+    monkeypatch.setattr('pharos.master_services.TIMEOUT', 0.2)
+    with pytest.raises(pharos.MasterUnreachableError, match=master.url):
+        master.wait_for_service('/awaited/late')
+    with pytest.raises(pharos.MasterUnreachableError, match=master.url):
+        master.wait_for_service('/awaited/late', 0.1)
 
 
 class Refuser:

@@ -20,14 +20,13 @@ from pharos import attributes, embedded_master, node_registry, on_demand, ros_pr
 from pharos.blocks import check_block
 from pharos.errors import PharosError, UnknownNodeError, suggest
 from pharos.external_node import ExternalNode
-from pharos.master_calls import MasterCalls
+from pharos.master_services import MasterServices
 from pharos.node import Node
 from pharos.parameters import Parameters
 from pharos.private_rospy.addresses import check_port, check_url
 from pharos.private_rospy.deadlines import MARGIN, time_limit
 from pharos.ros_process import RosProcess
 from pharos.seconds import check_limit
-from pharos.service import Service
 from pharos.topic import Topic
 from pharos.watcher import watcher_of
 
@@ -44,7 +43,7 @@ NodeType = TypeVar('NodeType', bound=Node)
 AnyNode = Union[Node, ExternalNode]
 
 
-class Master(MasterCalls):
+class Master(MasterServices):
     """The proxy of a ROS master: creates nodes, and finds others.
 
     The report (listing 3.2)::
@@ -375,25 +374,6 @@ class Master(MasterCalls):
     def topic(self, name: str) -> Topic:
         """The topic of that name, whether anybody uses it yet or not."""
         return Topic(self, self.name_of(name, 'topic'))
-
-    def services(self) -> List[str]:
-        """Names of all services."""
-        return sorted(self.system_state()[2])
-
-    def lookup_service(
-        self, name: str, caller_id: str = '/pharos', persistent: bool = False
-    ) -> Service:
-        """The :class:`Service` of that name, to be called in the name of ``caller_id``.
-
-        The report (listing 3.5): ``master lookupService: '/clear' with: '/myID'``.
-
-        :param persistent: keep connections between calls; they are opened again when the provider
-            comes back
-        :raises UnknownServiceError: if nobody offers it
-        """
-        caller_id = self.name_of(caller_id, 'node')
-        name = self.name_of(name, 'service', caller_id)
-        return Service(self, name, caller_id, persistent)
 
     def __repr__(self) -> str:
         return f'<Master {self.url}>'

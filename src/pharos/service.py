@@ -1,5 +1,6 @@
 """Services of any node, called by name alone."""
 import contextlib
+import math
 import socket
 import time
 from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, List, Optional
@@ -21,7 +22,7 @@ from pharos.intraprocess.services import Failed
 from pharos.intraprocess.sharing import numbered
 from pharos.private_rospy import local_services
 from pharos.private_rospy.process_rospy import rospy
-from pharos.private_rospy.deadlines import time_limit
+from pharos.private_rospy.deadlines import deadline_in, time_limit
 from pharos.private_rospy.lifetime import Interruption
 from pharos.private_rospy.tcpros_connection import TcprosConnection
 from pharos.seconds import check_limit
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from pharos.master import Master
 
 TIMEOUT = 5.0  # seconds in which the master, and a provider asked for its type, must answer
+PATIENCE = 0.25  # seconds that a look-up waits for the provider, which is asked again when need be
 
 
 class Service:
@@ -47,7 +49,12 @@ class Service:
     """
 
     def __init__(
-        self, master: 'Master', name: str, caller_id: str, persistent: bool = False
+        self,
+        master: 'Master',
+        name: str,
+        caller_id: str,
+        persistent: bool = False,
+        patience: float = PATIENCE,
     ) -> None:
         self.master = master
         self.name = name
@@ -60,10 +67,10 @@ class Service:
         self._local: Any = None  # the provider, where it is a node of this process
         self._idle: List[TcprosConnection] = []  # persistent, and nobody uses them just now
         self._md5sum_by_hand: Optional[str] = None
+        self._told: Optional[Dict[str, str]] = None  # the provider's description, once it gave one
         self._look_up(None)
-        header = self._ask()
-        self.type: Any = header.get('type')
-        self._found_md5sum = header.get('md5sum')
+        with contextlib.suppress(_Silent):
+            self._told = self._ask(patience=patience)
 
     def _look_up(self, deadline: Optional[float]) -> str:
         """Find the provider, which may have moved; returns its URI."""
@@ -78,20 +85,33 @@ class Service:
                 ) from None
         return self.uri
 
-    def _ask(self, deadline: Optional[float] = None) -> Dict[str, str]:
+    @property
+    def is_described(self) -> bool:
+        """Whether the provider has answered, so that its type is known."""
+        return self._told is not None
+
+    def _description(self, deadline: Optional[float] = None) -> Dict[str, str]:
+        """What the provider last told of the service; it is asked where it has not yet."""
+        if self._told is None:
+            self._look_up(deadline)
+            self._told = self._ask(deadline)
+        return self._told
+
+    def _ask(self, deadline: Optional[float] = None, patience: float = math.inf) -> Dict[str, str]:
         """The provider's own description of the service: the header that it answers a probe with.
 
         As ``rosservice.get_service_headers`` asks for it, which hides why there is none, and waits
         for ever for a provider that sends a byte every four seconds.
         """
-        limit, waiting = time.monotonic() + TIMEOUT, Interruption()
+        limit, waiting = deadline_in(min(TIMEOUT, patience)), Interruption()
         if deadline is not None:
             limit = min(limit, deadline)
         try:
             connection = self._connect({**self._header('*'), 'probe': '1'}, limit)
         except OSError as error:
             self._check_awaited(waiting, error)
-            raise ServiceCallError(
+            kind = _Silent if isinstance(error, socket.timeout) else ServiceCallError
+            raise kind(
                 f'the provider of {self.name} at {self.uri} does not answer ({error}): is it still'
                 ' running? rosnode cleanup removes it if not'
             ) from error
@@ -104,17 +124,29 @@ class Service:
         return connection.header
 
     @property
+    def type(self) -> Any:
+        """The name of its type, as the provider tells it.
+
+        :raises ServiceCallError: if the provider has not told it yet, and does not answer now
+        """
+        return self._description().get('type')
+
+    @property
     def md5sum(self) -> Optional[str]:
-        """The provider's md5sum, or the one set by hand; setting it to None takes that back."""
-        return self._found_md5sum if self._md5sum_by_hand is None else self._md5sum_by_hand
+        """The provider's md5sum, or the one set by hand; setting it to None takes that back.
+
+        :raises ServiceCallError: as :attr:`type`
+        """
+        by_hand = self._md5sum_by_hand
+        return self._description().get('md5sum') if by_hand is None else by_hand
 
     @md5sum.setter
     def md5sum(self, md5sum: Optional[str]) -> None:
         if not isinstance(md5sum, (str, type(None))):
+            found = self._description().get('md5sum')
             raise ValueError(
-                f'the md5sum of {self.name} is a text such as {self._found_md5sum!r}, not'
-                f' {md5sum!r}: where it comes from YAML, as parameters do, put one of digits alone'
-                ' in quotes (\"\'0\'\")'
+                f'the md5sum of {self.name} is a text such as {found!r}, not {md5sum!r}: where it'
+                ' comes from YAML, as parameters do, put one of digits alone in quotes (\"\'0\'\")'
             )
         self._md5sum_by_hand, self._local = md5sum, None
 
@@ -179,14 +211,15 @@ class Service:
     def _check_definition(self, deadline: Optional[float]) -> None:
         """Refuse a definition that is not the provider's, before anybody wonders which fields a
         request has."""
+        told = self._description(deadline)
         ours = self.service_class._md5sum
-        if self._md5sum_by_hand is not None or self._found_md5sum in (None, '*', ours):
+        if self._md5sum_by_hand is not None or told.get('md5sum') in (None, '*', ours):
             return
         self._look_up(deadline)
         header = self._ask(deadline)  # it may have been built anew since it was looked up
         if header.get('md5sum') != ours:
             raise self._type_error(header)
-        self._found_md5sum = ours
+        self._told = {**told, 'md5sum': ours}
 
     def _check_awaited(self, waiting: Interruption, error: Exception) -> None:
         """Raise NodeStoppedError where a connection broke because the node that waits stops."""
@@ -331,7 +364,12 @@ class Service:
             connection.close()
 
     def __repr__(self) -> str:
-        return f'<Service {self.name} {self.type} at {self.uri}>'
+        type_ = self.type if self._told else 'of a type not told yet'
+        return f'<Service {self.name} {type_} at {self.uri}>'
+
+
+class _Silent(ServiceCallError):
+    """The provider has not answered in time."""
 
 
 class _HandshakeRefused(Exception):
