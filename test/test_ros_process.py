@@ -1,5 +1,6 @@
 """Master.run and Master.launch: ROS programs as processes of this one."""
 import os
+import pathlib
 import queue
 import re
 import shutil
@@ -96,6 +97,51 @@ def test_an_unknown_package_or_program_is_said(master, package):
         master.launch('no_such_robot', 'a.launch')
     with pytest.raises(UnknownNodeError, match="fake_robot has no launch file 'b.launch': is it"):
         master.launch('fake_robot', 'b.launch')
+
+
+@pytest.mark.parametrize(
+    'given',
+    [
+        lambda path: [str(path)],
+        lambda path: [path],
+        lambda path: [None, str(path)],
+        lambda path: [None, path],
+        lambda path: [os.path.relpath(path)],
+        lambda path: ['fake_robot', path.name],
+    ],
+    ids=['text', 'Path', 'file', 'file as a Path', 'relative', 'in a package'],
+)
+def test_a_launch_file_is_given_by_its_path_or_by_its_package(master, package, given):
+    path = package / 'launch' / 'only_sets.launch'
+    write(path, '<launch><arg name="to"/><param name="/launched" value="$(arg to)"/></launch>')
+    master.parameters.pop('/launched', None)
+    process = master.launch(*given(path), to='it')
+    assert process.wait(2 * TIMEOUT) == 0
+    assert 'only_sets.launch' in repr(process)
+    assert master.parameters['/launched'] == 'it'
+
+
+@pytest.mark.parametrize(
+    'given, error, says',
+    [
+        (['/no/such/robot.launch'], UnknownNodeError, "no launch file '/no/such/robot.launch': is"),
+        (['robot.launch'], UnknownNodeError, "by two names: 'robot.launch', and that of the file"),
+        ([pathlib.Path('/usr')], UnknownNodeError, "'/usr' is a folder: give the path of a launch"),
+        ([None], ValueError, 'or by its path alone, not by None'),
+        ([b'/a.launch'], ValueError, "or by its path alone, not by b'/a.launch'"),
+        (['fake_robot', pathlib.Path('a.launch')], ValueError, "by its name, not PosixPath"),
+    ],
+)
+@pytest.mark.parametrize('how', ['launch', 'compose'])
+def test_what_is_no_launch_file_is_said(master, package, how, given, error, says):
+    with pytest.raises(error, match=says):
+        getattr(master, how)(*given)
+
+
+def test_an_argument_of_a_launch_file_that_is_none_is_refused(master, package):
+    write(package / 'launch' / 'empty.launch', '<launch/>')
+    with pytest.raises(TypeError, match="texts or numbers, not None: {'to': None}"):
+        master.launch('fake_robot', 'empty.launch', to=None)
 
 
 def test_a_broken_manifest_of_another_package_is_named(master, tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ import pytest
 
 import pharos
 from helpers import create, ended, in_thread, registrations
-from pharos import node_registry, ros_process
+from pharos import node_registry, program_files
 from pharos.private_rospy import registration
 from pharos.testing import Mailbox, until
 from pharos.watcher import watcher_of
@@ -226,7 +226,7 @@ def test_a_program_and_catkins_wrapper_of_it_are_one(master, tmp_path, monkeypat
     for file in program, wrapper:
         file.chmod(0o755)
     monkeypatch.setenv('ROS_PACKAGE_PATH', str(tmp_path))
-    assert len(ros_process.find('wrapped', program.name)) == 2
+    assert len(program_files.find('wrapped', program.name)) == 2
     with master.load('wrapped', program.name, 'spin') as node:
         assert node.path == str(program)
 

@@ -25,14 +25,13 @@ from pharos.node import Node
 from pharos.parameters import Parameters
 from pharos.private_rospy.addresses import check_port, check_url
 from pharos.private_rospy.deadlines import MARGIN, time_limit
+from pharos.program_files import AnyPath
 from pharos.ros_process import RosProcess
 from pharos.seconds import check_limit
 from pharos.topic import Topic
 from pharos.watcher import watcher_of
 
 if TYPE_CHECKING:
-    import os
-
     from typing_extensions import ParamSpec  # part of typing since Python 3.10
 
     from pharos.compose.composition import Composition
@@ -188,24 +187,29 @@ class Master(MasterServices):
 
     def launch(
         self,
-        package: Optional[str],
-        file: str,
+        package: Optional[AnyPath],
+        file: Optional[AnyPath] = None,
         on_line: Optional[Callable[[str], Any]] = None,
         **args: object,
     ) -> RosProcess:
         """Start a launch file at this master, as ``roslaunch`` does; returns the
         :class:`RosProcess`.
 
+        ``master.launch('my_robot', 'robot.launch')``, or by its path: ``master.launch(path)``.
+
         :param package: a ROS package; None: ``file`` is a path
+        :param file: the name of the launch file in it; None: ``package`` is its path
         :param args: the launch file's arguments
         :param on_line: block called as ``on_line(text)`` for each line of its output, in a thread
             of its own
+        :raises UnknownNodeError: if there is no such package or launch file
+        :raises TypeError, ValueError: if what is given can be none, or an argument is None
         """
         return ros_process.launch(self, package, file, args, on_line)
 
     def load(
         self,
-        package: Union[str, 'os.PathLike[str]'],
+        package: AnyPath,
         executable: Optional[str] = None,
         *args: object,
         name: Optional[str] = None,
@@ -249,8 +253,8 @@ class Master(MasterServices):
 
     def compose(
         self,
-        package: Optional[str],
-        file: str,
+        package: Optional[AnyPath],
+        file: Optional[AnyPath] = None,
         *,
         only: Collection[str] = (),
         apart: Collection[str] = (),
@@ -265,6 +269,7 @@ class Master(MasterServices):
         and the others go on.
 
         :param package: a ROS package; None: ``file`` is a path
+        :param file: the name of the launch file in it; None: ``package`` is its path
         :param only: the names of the nodes that are wanted; all, if there are none
         :param apart: the names of Python nodes that are to have processes of their own
         :param share_connections: is to come

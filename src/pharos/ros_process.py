@@ -1,4 +1,4 @@
-"""ROS programs run as processes of their own, found and ended as rosrun and roslaunch do."""
+"""ROS programs run as processes of their own, and ended as rosrun and roslaunch do."""
 import collections
 import contextlib
 import os
@@ -14,7 +14,6 @@ from typing import (
     Any,
     Deque,
     Dict,
-    Iterator,
     List,
     Mapping,
     Optional,
@@ -24,14 +23,11 @@ from typing import (
 
 import psutil
 import rosgraph.network
-import roslib.packages
-import rospkg
-from catkin.find_in_workspaces import find_in_workspaces
 
 from pharos import node_registry
 from pharos.blocks import Block, check_block, name_of
-from pharos.errors import PharosError, UnknownNodeError
 from pharos.failures import Failures
+from pharos.program_files import AnyPath, find, find_launch_file
 from pharos.private_rospy.deadlines import time_limit
 from pharos.private_rospy.names import check_name
 from pharos.private_rospy.proxies import ServerProxy
@@ -301,37 +297,10 @@ def run(
     return RosProcess([find(package, executable)[0], *args], master, on_line)
 
 
-def find(package: str, executable: str) -> List[str]:
-    """The paths of a program, as rosrun looks it up.
-
-    :raises UnknownNodeError: if there is no such package or program
-    """
-    with _known(package, executable):
-        paths = _find(package, executable)
-    if not paths:
-        raise UnknownNodeError(
-            f'the ROS package {package} has no program {executable!r}: see what it has with rosrun'
-            f' {package} <Tab>'
-        )
-    return paths
-
-
-def _find(package: str, executable: str) -> List[str]:
-    try:
-        return list(roslib.packages.find_node(package, executable))
-    except rospkg.ResourceNotFound:
-        # Debian's topic_tools and others have no package.xml, but catkin knows their folder
-        folders = find_in_workspaces(['libexec'], project=package)
-        if not folders:
-            raise
-        paths = [os.path.join(folder, executable) for folder in folders]
-        return [path for path in paths if os.access(path, os.X_OK)]
-
-
 def launch(
     master: 'Master',
-    package: Optional[str],
-    file: str,
+    package: Optional[AnyPath],
+    file: Optional[AnyPath],
     args: Dict[str, object],
     on_line: Optional[Block] = None,
 ) -> RosProcess:
@@ -344,43 +313,7 @@ def launch(
     """
     path = find_launch_file(package, file)
     roslaunch = [sys.executable, '-c', 'import roslaunch; roslaunch.main()', '--skip-log-check']
+    if None in args.values():
+        raise TypeError(f'the arguments of a launch file are texts or numbers, not None: {args}')
     arguments = [f'{name}:={value}' for name, value in args.items()]
     return RosProcess([*roslaunch, path, *arguments], master, on_line)
-
-
-def find_launch_file(package: Optional[str], file: str) -> str:
-    """The path of a launch file, as roslaunch looks it up.
-
-    :param package: None: ``file`` is a path
-    :raises UnknownNodeError: if there is no such package or launch file
-    """
-    if package is None:
-        if not (isinstance(file, (str, os.PathLike)) and os.path.isfile(file)):
-            raise UnknownNodeError(f'there is no launch file {file!r}: is the path spelt so?')
-        return file
-    with _known(package, file):
-        found = roslib.packages.find_resource(package, file)
-    if not found:
-        raise UnknownNodeError(
-            f'the ROS package {package} has no launch file {file!r}: is it spelt so, and installed?'
-        )
-    return str(found[0])
-
-
-@contextlib.contextmanager
-def _known(package: str, file: str) -> Iterator[None]:
-    """Say what to do where there is no such package."""
-    if not all(isinstance(name, str) and name for name in (package, file)):
-        raise ValueError(
-            f'a ROS package and a program or file in it are given by their names, not {package!r}'
-            f' and {file!r}'
-        )
-    try:
-        yield
-    except rospkg.ResourceNotFound:
-        raise UnknownNodeError(
-            f'no ROS package {package!r} on ROS_PACKAGE_PATH: install it, or source its'
-            ' workspace\'s setup.bash'
-        ) from None
-    except Exception as error:  # catkin reads the package.xml of every package in a workspace
-        raise PharosError(f'{package}/{file} cannot be looked up: {error}; mend that') from error

@@ -16,6 +16,7 @@ from pharos.compose.output import SCREEN
 from pharos.compose.progress import Progress
 from pharos.compose.script import ScriptNode
 from pharos.errors import PharosError
+from pharos.program_files import AnyPath
 from pharos.ros_process import RosProcess
 
 if TYPE_CHECKING:
@@ -203,8 +204,8 @@ def _with_log(launched: LaunchedNode, folder: str, number: int) -> LaunchedNode:
 
 def compose(
     master: 'Master',
-    package: Optional[str],
-    file: str,
+    package: Optional[AnyPath],
+    file: Optional[AnyPath],
     only: Collection[str],
     apart: Collection[str],
     share_connections: bool,

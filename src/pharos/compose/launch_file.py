@@ -33,7 +33,7 @@ from pharos import working_directory
 from pharos.compose.programs import source_of
 from pharos.errors import PharosError, UnknownNodeError, suggest
 from pharos.parameters import as_stored
-from pharos.ros_process import find_launch_file
+from pharos.program_files import AnyPath, find_launch_file
 
 _PYTHON = re.compile(r'python(3(\.\d+)?)?')
 #: a program of ours makes its nodes itself: within another one they would not end with it
@@ -130,7 +130,7 @@ class LaunchFile:
     """A launch file and all that it includes.
 
     :param master_url: the master that its nodes are for
-    :param package: a ROS package; None: ``file`` is a path
+    :param package: a ROS package; without it, or without ``file``, the other one is a path
     :param args: the arguments of the launch file
     :param only: the names of the nodes that are wanted; all, if there are none
     :param apart: the names of those that are to run in processes of their own
@@ -141,8 +141,8 @@ class LaunchFile:
     def __init__(
         self,
         master_url: str,
-        package: Optional[str],
-        file: str,
+        package: Optional[AnyPath],
+        file: Optional[AnyPath],
         args: Dict[str, object],
         only: Collection[str] = (),
         apart: Collection[str] = (),

@@ -5,7 +5,7 @@ import re
 import tokenize
 from typing import Any, Optional
 
-from pharos import ros_process
+from pharos import program_files
 from pharos.errors import PharosError, UnknownNodeError
 
 #: what catkin puts into a devel space for a script: it runs the file that it names
@@ -33,7 +33,7 @@ def find_program(package: Any, executable: Optional[str] = None) -> str:
                 f'there is no file {path}: to load a program of a package, give the names of both'
             )
         return path
-    paths = ros_process.find(package, executable)
+    paths = program_files.find(package, executable)
     # a wrapper in the devel space and what it wraps are one
     if len({os.path.realpath(source_of(path)) for path in paths}) > 1:
         raise UnknownNodeError(
