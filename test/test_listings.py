@@ -5,6 +5,7 @@ by `__name`.
 """
 import importlib.machinery
 import importlib.util
+import posixpath
 import signal
 import socket
 import threading
@@ -29,9 +30,15 @@ def no_parameters_left(master):
 
 @pytest.fixture
 def turtle(master):
-    """A node in the turtle's place, whose delegate keeps the commands that it was sent."""
+    """A node in the place of the report's turtle, whose delegate keeps the commands that it was
+    sent."""
+    return turtle_at(master, COMMANDS)
+
+
+def turtle_at(master, topic):
     node = master.create(BlockNode, named='/turtle', delegate=Mailbox())
-    node.interested_in(COMMANDS, typed_as='turtlesim/Velocity')
+    node.output_channel(f'{posixpath.dirname(topic)}/pose', typed_as='turtlesim/Pose')
+    node.interested_in(topic, typed_as='turtlesim/Velocity')
     return node
 
 
@@ -100,9 +107,10 @@ def test_listing_3_3_a_subscriber_node_is_a_class_with_a_delegate_that_shows_eac
     master, transcript
 ):
     logger = master.create(classes_of('turtle_logger').TurtleLogger, named='/my_turtle_logger')
-    assert [(channel.topic, channel.type) for channel in logger.channels] == [
-        (COMMANDS, 'turtlesim/Velocity')
-    ]
+    assert {(channel.topic, channel.type) for channel in logger.channels} == {
+        ('/turtle1/cmd_vel', 'geometry_msgs/Twist'),
+        (COMMANDS, 'turtlesim/Velocity'),
+    }
     shown = threading.Event()
     Transcript.on_show(lambda text: transcript.append(text) or shown.set())
     master.create(BlockNode, named='/driver').send_to(COMMANDS, linear=2.0, angular=1.0)
@@ -110,7 +118,7 @@ def test_listing_3_3_a_subscriber_node_is_a_class_with_a_delegate_that_shows_eac
     assert transcript == ['linear: 2.0\nangular: 1.0']
 
 
-def test_listing_3_4_a_logger_prints_what_it_hears(master):
+def test_listing_3_4_a_logger_prints_what_it_hears(master, turtle):
     with Program(master.url, script('turtle_logger'), '__name:=listener') as logger, Program(
         master.url, script('turtle_driver'), '_linear:=1.25', '_period:=0.02'
     ):
@@ -200,7 +208,7 @@ def test_listing_3_8_a_soul_in_the_background_sends_every_second(master, turtle)
         assert publisher.end() == 0
 
 
-def test_listing_3_9_a_delegate_given_at_creation_shows_each_message(master):
+def test_listing_3_9_a_delegate_given_at_creation_shows_each_message(master, turtle):
     with Program(master.url, script('block_subscriber'), '__name:=listener') as subscriber, Program(
         master.url, script('block_publisher'), '--background'
     ):
@@ -240,8 +248,7 @@ def test_a_missing_master_is_one_line_on_stderr_and_status_1(name):
 
 @pytest.mark.parametrize('name', PUBLISHERS)
 def test_a_publisher_follows_remappings(master, name):
-    turtle = master.create(BlockNode, named='/turtle', delegate=Mailbox())
-    turtle.interested_in('/turtle2/velocity', typed_as='turtlesim/Velocity')
+    turtle = turtle_at(master, '/turtle2/velocity')
     with Program(master.url, script(name), f'{COMMANDS}:=/turtle2/velocity', '_linear:=0.75'):
         assert next_command(turtle) == (0.75, 1.0)
 

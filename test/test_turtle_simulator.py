@@ -449,8 +449,8 @@ def test_the_reports_nodes_drive_and_log_it(master, simulator):
     with Program(master.url, script('turtle_logger')) as logger, Program(
         master.url, script('turtle_driver')
     ):
-        logger.wait_for('linear: 2.0')
-        logger.wait_for('angular: 1.0')
+        logger.wait_for('x: 2.0')
+        logger.wait_for('z: 1.0')
     assert run(master.url, script('clear_turtle')).returncode == 0
     simulator.wait_for('Clearing turtlesim.')
 
