@@ -11,8 +11,10 @@ from sockets import refused_url
 from terminal import Terminal
 
 TUTORIAL = ROOT / 'doc' / 'tutorial.md'
-#: kind of a block of code -> what is shown where such a line may be typed
-PROMPTS = {'console': '', 'python': r'^In \[(\d+)\]: *\Z', 'debugger': r'^ipdb> *\Z'}
+IPYTHON = r'^In \[(\d+)\]: *\Z'
+#: kind of a block of code -> what is shown where such a line may be typed; what is no Python alone,
+#: such as a question mark behind a name, is of the kind ipython
+PROMPTS = {'console': '', 'python': IPYTHON, 'ipython': IPYTHON, 'debugger': r'^ipdb> *\Z'}
 
 
 class Block(NamedTuple):

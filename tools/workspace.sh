@@ -1,5 +1,5 @@
 # shellcheck shell=bash
-# Sourced by tools/demo and tools/test: Debian's packages, a catkin workspace around this clone, an environment of their
+# Sourced by the tools in bash: Debian's packages, a catkin workspace around this clone, an environment of their
 # own. What they write goes to build/ in the clone, and nothing of the caller's ROS or Python is used.
 
 root=$(cd -P "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)

@@ -17,15 +17,15 @@ LARGEST = 2**31 - 1  # number that XML-RPC has
 class Health(NamedTuple):
     """What can be said of a node at a glance; as a string, in one line."""
 
-    # whether the master has it at its URI; None: the master does not answer
+    #: whether the master has it at its URI; None: the master does not answer
     registered: Optional[bool]
-    # since when the master answers, in seconds as of time.time(); None: it does not
+    #: since when the master answers, in seconds as of time.time(); None: it does not
     reachable_since: Optional[float]
-    connections: Dict[str, int]  # transport -> how many the node's channels have
-    dropped: int  # messages that its input channels have dropped
-    errors: int  # times that its blocks failed; node.errors has identical ones once
-    threads: int  # of the node
-    refused: int = 0  # publishers that its channels cannot hear, for they publish another type
+    connections: Dict[str, int]  #: transport -> how many the node's channels have
+    dropped: int  #: messages that its input channels have dropped
+    errors: int  #: times that its blocks failed; node.errors has identical ones once
+    threads: int  #: of the node
+    refused: int = 0  #: publishers that its channels cannot hear, for they publish another type
 
     def __str__(self) -> str:
         return ', '.join(self._parts())

@@ -222,7 +222,7 @@ class Master(MasterServices):
         :class:`~pharos.ScriptNode`.
 
         It returns when the program's ``rospy.init_node`` has registered the node; see
-        :meth:`ScriptNode.start <pharos.compose.script.ScriptNode.start>`.
+        :meth:`ScriptNode.start`.
 
         :param package: where ``executable`` is, as ``rosrun`` looks it up; without that, the path
             of the program

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class OfferedService:
-    """A service of a node; made by :meth:`Node.serve`."""
+    """A service of a node; made by :meth:`~pharos.Node.serve`."""
 
     def __init__(
         self,

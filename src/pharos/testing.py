@@ -27,7 +27,8 @@ import pytest
 
 from pharos import Failure, InputChannel, Master, Node
 
-TIMEOUT = 30.0  # seconds; a bound on waits for events, which a test that passes never reaches
+#: seconds; a bound on waits for events, which a test that passes never reaches
+TIMEOUT = 30.0
 POLL = 0.01  # seconds between two looks at what tells nobody of its change
 NodeType = TypeVar('NodeType', bound=Node)
 Value = TypeVar('Value')

@@ -10,7 +10,7 @@ Receiver = Optional[Callable[[str], Any]]
 
 
 class _Transcript:
-    """Shows things a line each, from any thread, on standard output or wherever :meth:`on_show`
+    """Shows things a line each, from any thread, on standard output or wherever ``on_show()``
     says.
 
     The report (listing 3.3)::

@@ -27,7 +27,7 @@ class ScriptNode(Node):
     """A rospy program, unmodified, as a node of this process: made by :meth:`Master.load`.
 
     :meth:`start` runs it from its first line, in a thread of its own; its ``rospy.init_node``
-    registers the node. :meth:`stop` ends it, :meth:`restart` also runs it again, and the node stops
+    registers the node. :meth:`stop` ends it, ``restart()`` also runs it again, and the node stops
     when it has ended by itself.
 
     :param path: the file of the program

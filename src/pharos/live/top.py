@@ -30,18 +30,18 @@ class NodeRow:
     name: str
     host: str
     pid: Optional[int]
-    state: str  # 'alive', 'silent' (it does not answer in time) or 'dead' (nobody is there)
-    class_name: Optional[str]  # of a node of pharos
-    received: Optional[float]  # messages a second
-    sent: Optional[float]  # messages a second, however many hear them
-    bytes_received: Optional[float]  # bytes a second through sockets
-    bytes_sent: Optional[float]  # to all who hear them
-    intraprocess: int  # connections
-    tcpros: int  # connections, those by UDPROS among them
-    dropped: Optional[int]  # messages, by its channels
-    failures: Optional[int]  # of its blocks
-    threads: Optional[int]  # of the node
-    souls: Optional[int]  # in threads of their own
+    state: str  #: 'alive', 'silent' (it does not answer in time) or 'dead' (nobody is there)
+    class_name: Optional[str]  #: of a node of pharos
+    received: Optional[float]  #: messages a second
+    sent: Optional[float]  #: messages a second, however many hear them
+    bytes_received: Optional[float]  #: bytes a second through sockets
+    bytes_sent: Optional[float]  #: to all who hear them
+    intraprocess: int  #: connections
+    tcpros: int  #: connections, those by UDPROS among them
+    dropped: Optional[int]  #: messages, by its channels
+    failures: Optional[int]  #: of its blocks
+    threads: Optional[int]  #: of the node
+    souls: Optional[int]  #: in threads of their own
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,10 +51,10 @@ class ProcessRow:
     pid: Optional[int]
     host: str
     nodes: List[str]
-    cpu: Optional[float]  # percent of one processor
-    memory: Optional[int]  # bytes that are in memory
+    cpu: Optional[float]  #: percent of one processor
+    memory: Optional[int]  #: bytes that are in memory
     threads: Optional[int]
-    received: Optional[float]  # these, as its nodes'
+    received: Optional[float]  #: these, as its nodes'
     sent: Optional[float]
     bytes_received: Optional[float]
     bytes_sent: Optional[float]
@@ -67,14 +67,14 @@ class TopicRow:
     """A topic."""
 
     name: str
-    type: Optional[str]  # None: nobody has named it
+    type: Optional[str]  #: None: nobody has named it
     publishers: List[str]
     subscribers: List[str]
-    rate: Optional[float]  # messages a second; None: nobody hears them, or they are not counted
-    bandwidth: Optional[float]  # bytes a second that one subscriber gets through a socket
-    intraprocess: int  # connections
-    tcpros: int  # connections, those by UDPROS among them
-    dropped: Optional[int]  # messages, by channels of nodes of pharos
+    rate: Optional[float]  #: messages a second; None: nobody hears them, or they are not counted
+    bandwidth: Optional[float]  #: bytes a second that one subscriber gets through a socket
+    intraprocess: int  #: connections
+    tcpros: int  #: connections, those by UDPROS among them
+    dropped: Optional[int]  #: messages, by channels of nodes of pharos
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,10 +84,10 @@ class Measurement:
     All in it are plain values: ``dataclasses.asdict(measurement)`` is what ``top --json`` prints.
     """
 
-    master: str  # its URL
-    time: float  # its end, in seconds as of time.time()
-    seconds: Optional[float]  # that it took; None: it is a first look, and there are no rates
-    is_measured: bool  # whether rates of topics are those of subscriptions made for that
+    master: str  #: its URL
+    time: float  #: its end, in seconds as of time.time()
+    seconds: Optional[float]  #: that it took; None: it is a first look, and there are no rates
+    is_measured: bool  #: whether rates of topics are those of subscriptions made for that
     nodes: List[NodeRow]
     processes: List[ProcessRow]
     topics: List[TopicRow]

@@ -36,10 +36,10 @@ class Rate:
     """
 
     topic: str
-    rate: float  # messages a second; 0 where there were not two, which it takes to tell
-    window: int  # messages that came
-    seconds: float  # for which they were counted, of wall time
-    is_time_simulated: bool  # whether the time of the nodes is another one
+    rate: float  #: messages a second; 0 where there were not two, which it takes to tell
+    window: int  #: messages that came
+    seconds: float  #: for which they were counted, of wall time
+    is_time_simulated: bool  #: whether the time of the nodes is another one
     min: float
     max: float
     std_dev: float
@@ -60,11 +60,11 @@ class Bandwidth:
     """How many bytes messages had: what ``rostopic bw`` tells. As a number, bytes a second."""
 
     topic: str
-    rate: float  # bytes a second, as TCPROS has them
-    window: int  # messages that came
-    seconds: float  # for which they were counted, of wall time
-    is_time_simulated: bool  # whether the time of the nodes is another one
-    mean: float  # bytes of a message
+    rate: float  #: bytes a second, as TCPROS has them
+    window: int  #: messages that came
+    seconds: float  #: for which they were counted, of wall time
+    is_time_simulated: bool  #: whether the time of the nodes is another one
+    mean: float  #: bytes of a message
     min: int
     max: int
 

@@ -1,0 +1,116 @@
+"""What Sphinx is to make of the documentation; tools/doc runs it."""
+import os
+import pathlib
+import re
+import sys
+
+from pygments.lexers.special import TextLexer
+
+ROOT = pathlib.Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / 'src'))
+os.environ['PYTHONPATH'] = str(ROOT / 'src')  # for the programs whose --help is shown
+os.environ['COLUMNS'] = '90'  # which those are to fill
+
+import pharos  # noqa: E402
+
+project = 'pharos'
+author = 'PhaROS developers'
+release = version = pharos.__version__
+
+# The source is the whole clone: a page links to README.md as it does where it is read there.
+root_doc = 'doc/index'
+include_patterns = [
+    '*.md',
+    'CHANGELOG.rst',
+    'doc/**.md',
+    'benchmark/README.md',
+    'examples/README.md',
+]
+exclude_patterns = ['build', '**/.*']
+extensions = [
+    'myst_parser',
+    'sphinx.ext.autodoc',
+    'sphinx.ext.graphviz',
+    'sphinxcontrib.programoutput',
+]
+myst_heading_anchors = 3
+graphviz_output_format = 'svg'
+
+autodoc_member_order = 'bysource'
+autodoc_default_options = {'members': True}
+autodoc_typehints_format = 'short'
+python_use_unqualified_type_names = True
+add_module_names = False
+maximum_signature_line_length = 90  # Sphinx 7.1 and later
+
+nitpicky = True
+nitpick_ignore_regex = [
+    # types in signatures that have no page here: those of others, type variables, what is internal
+    ('py:(class|exc)', r'(genpy|rospy|rosgraph|threading|os|subprocess|_pytest)\..*'),
+    ('py:class', r'(Init|Init\.k?w?args|.*\.Self|(.*\.)?(NodeType|Value)|Block|Peer|Image)'),
+    (
+        'py:class',
+        r'(Run|pharos\.run\.Run|pharos\.channel\.Channel|pharos\.failures\.Failure(s|List))',
+    ),
+    ('py:class', r'pharos\.(live\.(snapshot|edges)|compose\.(progress|launch_file|kept_node))\..*'),
+    # attributes that their class's docstring tells
+    ('py:attr', r'.*'),
+]
+
+html_theme = 'furo'
+html_title = f'pharos {release}'
+html_copy_source = False
+html_show_copyright = False
+
+
+def draw_flowcharts(app, name, source):
+    """Have graphviz draw what GitHub draws by mermaid, of which Debian has no Sphinx extension."""
+    source[0] = re.sub(
+        r'^```mermaid\nflowchart TD\n(.*?)^```$', _by_graphviz, source[0], flags=re.M | re.S
+    )
+
+
+def _by_graphviz(flowchart):
+    dot = re.sub(r'^( *\w+)\["(.*)"\]$', r'\1 [label=<\2>]', flowchart[1], flags=re.M)
+    style = 'node [shape=box, fontname="sans-serif", fontsize=10, margin="0.2,0.1"]'
+    return f'```{{graphviz}}\ndigraph {{\n{style}\n{dot.replace("-->", "->")}}}\n```'
+
+
+def tell_programs(app, name, source):
+    """Have the page of the programs show what each says to --help."""
+    if name == 'doc/reference/programs':
+        for script in sorted((ROOT / 'scripts').iterdir()):
+            source[
+                0
+            ] += f'\n## {script.name}\n\n```{{program-output}} {sys.executable} {script} --help\n```\n'
+
+
+def take_fields_apart(app, what, name, thing, options, lines):
+    """Make of ``:raises A, B: why``, and of ``:param a, b: what``, a field for each of them."""
+    fields = re.sub(
+        r'^:(raises|param) (\w+(?:, \w+)+):(.*(?:\n[ \t]+.*)*)',
+        _apart,
+        '\n'.join(lines),
+        flags=re.M,
+    )
+    lines[:] = fields.split('\n')
+
+
+def _apart(field):
+    return '\n'.join(f':{field[1]} {name}:{field[3]}' for name in field[2].split(', '))
+
+
+def let_folders_be(app, environment, node, text):
+    """Leave links to folders to who reads the clone: there is no page of a folder."""
+    folder = (ROOT / node['refdoc']).parent / node['reftarget']
+    return text if node.get('refdomain') != 'py' and folder.is_dir() else None
+
+
+def setup(app):
+    """What Sphinx calls first."""
+    app.connect('source-read', draw_flowcharts)
+    app.connect('source-read', tell_programs)
+    app.connect('autodoc-process-docstring', take_fields_apart)
+    app.connect('missing-reference', let_folders_be)
+    for kind in 'debugger', 'ipython':  # of what is typed in the tutorial
+        app.add_lexer(kind, TextLexer)
