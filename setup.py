@@ -6,6 +6,7 @@ setup(
     **generate_distutils_setup(
         packages=[
             'pharos',
+            'pharos.commands',
             'pharos.compose',
             'pharos.intraprocess',
             'pharos.live',

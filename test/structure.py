@@ -12,6 +12,8 @@ ROOMS = {
     'pharos.messages': 'messages',
     'pharos.intraprocess': 'intraprocess',
     'pharos.private_rospy': 'private_rospy',
+    'pharos.__main__': ABOVE,
+    'pharos.commands': ABOVE,
     'pharos.compose': ABOVE,
     'pharos.live': ABOVE,
     'pharos.new_package': ABOVE,

@@ -10,6 +10,7 @@ import pathlib
 import re
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pharos
 import structure
@@ -329,7 +330,8 @@ def test_the_methods_and_properties_of_exported_classes_have_docstrings():
 def test_setup_py_names_every_package(monkeypatch):
     given = {}
     monkeypatch.setattr('catkin_pkg.python_setup.generate_distutils_setup', lambda **named: named)
-    monkeypatch.setattr('setuptools.setup', given.update)
+    # not setuptools itself, which cannot be imported once distutils have been
+    monkeypatch.setitem(sys.modules, 'setuptools', SimpleNamespace(setup=given.update))
     exec((ROOT / 'setup.py').read_text(), {})
     packages = [module.name for module in MODULES if module.path.name == '__init__.py']
     assert sorted(given['packages']) == packages

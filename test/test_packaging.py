@@ -1,0 +1,137 @@
+"""What others install: the wheel, Debian's package, and the versions and dependencies that these have."""
+import importlib.util
+import pathlib
+import re
+import shutil
+import subprocess
+import sys
+import xml.etree.ElementTree
+import zipfile
+
+import pytest
+
+import pharos
+from pharos.__main__ import COMMANDS, main
+from pharos.testing import TIMEOUT
+from programs import ROOT, environment
+
+MANIFEST = xml.etree.ElementTree.parse(ROOT / 'package.xml').getroot()
+#: what setup.py reads, beside the modules
+READ_BY_SETUP = 'package.xml', 'setup.py', 'setup.cfg', 'pyproject.toml', 'MANIFEST.in', 'LICENSE'
+
+
+@pytest.fixture(scope='module')
+def wheel(tmp_path_factory):
+    """The path of a wheel, built of a copy, in which nothing else is; and without the network."""
+    if not importlib.util.find_spec('pip'):  # not imported: it gets into setuptools' way
+        pytest.skip('no python3-pip here')
+    source, target = tmp_path_factory.mktemp('source'), tmp_path_factory.mktemp('wheel')
+    shutil.copytree(ROOT / 'src', source / 'src', ignore=shutil.ignore_patterns('__pycache__'))
+    for name in READ_BY_SETUP:
+        shutil.copy(ROOT / name, source)
+    options = '--no-index', '--no-build-isolation', '--no-deps', '--wheel-dir'
+    run(sys.executable, '-m', 'pip', 'wheel', *options, target, source)
+    (path,) = target.iterdir()
+    return path
+
+
+@pytest.fixture(scope='module')
+def venv(wheel, tmp_path_factory):
+    """The folder of a virtual environment with the wheel and Debian's packages, such as rospy."""
+    folder = tmp_path_factory.mktemp('venv')
+    run(sys.executable, '-m', 'venv', '--system-site-packages', '--without-pip', folder)
+    python = folder / 'bin' / 'python3'
+    run(sys.executable, '-m', 'pip', '--python', python, 'install', '--no-index', wheel)
+    return folder
+
+
+def run(*command, master_url='http://127.0.0.1:1/'):
+    """Run a program that does not find the clone's modules; returns what it printed, once it has
+    ended well."""
+    ended = subprocess.run(
+        list(map(str, command)),
+        cwd='/',
+        env=environment(master_url, PYTHONPATH='', PYTHONNOUSERSITE='1'),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        timeout=4 * TIMEOUT,
+        check=False,
+    )
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    return ended.stdout
+
+
+# -- the wheel
+
+
+def test_the_wheel_has_all_modules_and_nothing_else(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        names = {name for name in archive.namelist() if '.dist-info/' not in name}
+    sources = [*(ROOT / 'src').rglob('*.py'), ROOT / 'src' / 'pharos' / 'py.typed']
+    assert names == {str(path.relative_to(ROOT / 'src')) for path in sources}
+
+
+def test_the_wheel_has_the_version_of_the_manifest(wheel):
+    assert wheel.name == f'pharos-{MANIFEST.findtext("version")}-py3-none-any.whl'
+
+
+def test_the_wheel_is_imported_from_where_it_was_installed(venv):
+    where = run(venv / 'bin' / 'python3', '-c', 'import pharos; print(pharos.__file__)')
+    assert venv in pathlib.Path(where).parents
+
+
+@pytest.mark.parametrize('program', [['pharos'], ['python3', '-m', 'pharos']])
+def test_the_wheel_s_command_shows_the_live_graph(program, venv, master):
+    with master.create(pharos.BlockNode, named='/seen_by_command'):
+        command = venv / 'bin' / program[0], *program[1:]
+        assert '/seen_by_command' in run(*command, 'graph', master_url=master.url)
+        tables = run(*command, 'top', '--json', '--interval', '0.1', master_url=master.url)
+        assert '"/seen_by_command"' in tables
+
+
+# -- the command
+
+
+@pytest.mark.parametrize('command', COMMANDS)
+def test_each_command_tells_its_own_arguments(command, capsys, monkeypatch):
+    monkeypatch.setattr(sys, 'argv', ['pharos', command, '--help'])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 0
+    module = importlib.import_module(f'pharos.commands.{command}')
+    said = capsys.readouterr().out
+    assert said.startswith(f'usage: pharos {command} ')
+    assert module.__doc__ in said
+
+
+def test_every_command_has_a_script_and_a_line_of_help(capsys, monkeypatch):
+    modules = {path.stem for path in (ROOT / 'src' / 'pharos' / 'commands').glob('[!_]*.py')}
+    assert modules == set(COMMANDS) <= {path.name for path in (ROOT / 'scripts').iterdir()}
+    monkeypatch.setattr(sys, 'argv', ['pharos'])
+    with pytest.raises(SystemExit):
+        main()
+    said = capsys.readouterr().out
+    assert re.findall(r'^  ([a-z]+)  ', said, re.MULTILINE) == list(COMMANDS)
+
+
+def test_a_command_passes_on_how_it_has_ended(capsys, monkeypatch):
+    monkeypatch.setenv('ROS_MASTER_URI', 'http://127.0.0.1:1/')
+    monkeypatch.setattr(sys, 'argv', ['pharos', 'graph'])
+    assert main() == 1
+    assert re.fullmatch('graph: no ROS master answers at .*\n', capsys.readouterr().err)
+
+
+def test_a_command_that_is_none_is_told_with_those_there_are(capsys, monkeypatch):
+    monkeypatch.setattr(sys, 'argv', ['pharos', 'tob'])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    assert "invalid choice: 'tob' (choose from " in capsys.readouterr().err
+
+
+# -- versions
+
+
+def test_the_version_is_the_same_everywhere():
+    assert pharos.__version__ == MANIFEST.findtext('version')
