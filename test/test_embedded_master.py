@@ -2,6 +2,7 @@
 import os
 import signal
 import socket
+import subprocess
 import sys
 
 import pytest
@@ -10,7 +11,7 @@ from pharos.testing import Mailbox, TIMEOUT
 import pharos
 from pharos import BlockNode, Master, PharosError, PortInUseError
 from pharos.errors import MasterUnreachableError
-from programs import PROGRAMS, Program, run
+from programs import PROGRAMS, Program, environment, run
 from sockets import listening, refused_url, wait_for_end
 
 
@@ -214,6 +215,21 @@ except KeyboardInterrupt:
         program.wait_for('PAUSES')
         os.killpg(program.process.pid, signal.SIGINT)  # as a terminal sends it to all of a program
         assert program.wait_for('THERE')
+
+
+def test_it_says_nothing_where_ctrl_c_came_before_it_was_there():
+    read, write = os.pipe()
+    os.close(read)  # as the program's end does
+    with subprocess.Popen(
+        [sys.executable, '-m', 'pharos.master_program', '0', str(os.getpid())],
+        env=environment(refused_url()),
+        stdin=subprocess.DEVNULL,
+        stdout=write,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as child:
+        os.close(write)
+        assert child.communicate(timeout=TIMEOUT)[1] == ''
 
 
 def test_only_an_embedded_one_is_stopped(master):

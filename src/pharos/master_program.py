@@ -3,6 +3,7 @@
 It prints its URL, or 'busy' and why. It ends when its standard input does, or the process PARENT,
 whose forks may hold the other end of that.
 """
+import contextlib
 import logging
 import os
 import select
@@ -41,7 +42,8 @@ def main(port: int, parent: int) -> None:
     )
     # roscore tells it, too
     master.parameters['/rosdistro'] = os.environ.get('ROS_DISTRO', 'Debian')
-    print(master.url, file=answers, flush=True)
+    with contextlib.suppress(BrokenPipeError):  # Ctrl-C has ended the parent meanwhile
+        print(master.url, file=answers, flush=True)
     try:
         while os.getppid() == parent and not select.select([sys.stdin], [], [], POLL)[0]:
             pass
