@@ -334,6 +334,41 @@ def test_every_and_sleep_follow_simulated_time(master):
         master.api().deleteParam('/use_sim_time')
 
 
+def test_loops_sleeps_and_timers_go_on_after_a_jump_back_in_time(master):
+    master.api().setParam('/use_sim_time', True)
+    try:
+        clock = create(master, '/clock_server').output_channel('/clock', 'rosgraph_msgs/Clock')
+        node = create(master, '/simulated')
+        loop, sleeper, timer = Mailbox(), Mailbox(), Mailbox()
+        until(lambda: '/simulated' in dict(clock.connections))
+        clock.send(clock={'secs': 100})
+        until(lambda: node.ros.Time.now().secs == 100)
+
+        def turn(me):
+            for _ in me.every(10):
+                loop(me.ros.Time.now().secs, None)
+
+        def sleep(me):
+            while True:
+                sleeper(me.ros.Time.now().secs, None)
+                me.sleep(10)
+
+        node.fork(turn)
+        node.fork(sleep)
+        node.ros.Timer(
+            node.ros.Duration(10), lambda event: timer(event.current_real.secs, None), reset=True
+        )
+        assert (loop.next(), sleeper.next()) == (100, 100)
+        waiting = node.ros.rostime.get_rostime_cond()._waiters
+        for seconds in (110, 120, 50, 60, 70):  # as rosbag play does it when it begins anew
+            until(lambda: len(waiting) == 3)
+            clock.send(clock={'secs': seconds})
+            assert (loop.next(), sleeper.next(), timer.next()) == (seconds, seconds, seconds)
+        assert not node.errors
+    finally:
+        master.api().deleteParam('/use_sim_time')
+
+
 def test_delegates_of_a_node_run_one_at_a_time(master, mailbox):
     """rospy's callbacks run in as many threads as there are connections (ros_comm #1377)."""
     busy = threading.Lock()

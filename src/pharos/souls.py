@@ -223,7 +223,8 @@ class NodeWithSouls(NodeAttributes, is_base=True):
         self.current_run.souls.renew()
 
     def sleep(self, seconds: float) -> None:
-        """Wait for ``seconds`` of ROS time, or until the node stops; a soul is ended by that.
+        """Wait for ``seconds`` of ROS time, or until the node stops; a soul is ended by that. A
+        jump back in simulated time, as when a bag is played again, ends the wait alone.
 
         The report: ``(Delay forSeconds: 1) wait``.
         """
@@ -238,7 +239,8 @@ class NodeWithSouls(NodeAttributes, is_base=True):
         """An iterator that turns at once and then every ``seconds`` of ROS time, without drift,
         until the node stops, or its soul begins anew (see :meth:`renew`).
 
-        A turn that takes longer than ``seconds`` delays the next, which then comes at once.
+        A turn that takes longer than ``seconds`` delays the next, which then comes at once, as it
+        does after a jump back in simulated time.
         """
         seconds = check_seconds('a period', seconds, above=0)
         run = self.current_run
