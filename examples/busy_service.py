@@ -1,5 +1,5 @@
 #!/usr/bin/python3
-"""A service whose provider is busy: an arm that takes 1 s or 3 s to pick, one thing at a time.
+"""A service whose provider is busy: an arm that takes 3 s or 1 s to pick, one thing at a time.
 
 Each call runs in a thread of its own, so that the arm can tell a second caller at once that it is
 busy, and everybody how far it is. The callers wait for 2 s and then do something else. All this
@@ -20,7 +20,7 @@ class Arm(Node):
     def start(self):
         super().start()
         self.gripper = threading.Lock()
-        self.seconds = itertools.cycle([1, 3])
+        self.seconds = itertools.cycle([3, 1])
         self.serve('~pick', 'std_srvs/Trigger', self.pick)
 
     def pick(self, request):

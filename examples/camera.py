@@ -20,7 +20,7 @@ SIZE = {'height': HEIGHT, 'width': WIDTH, 'step': WIDTH, 'encoding': 'mono8'}
 
 
 def film(camera):
-    for turn, _ in enumerate(camera.every(0.1)):
+    for turn in camera.every(0.1):
         pixels = numpy.zeros((HEIGHT, WIDTH), numpy.uint8)
         column = int(WIDTH / 2 + WIDTH / 3 * math.sin(turn / 10))
         pixels[200:240, column - 20 : column + 20] = 255

@@ -16,7 +16,7 @@ from pharos.live import program
 
 
 def drive(robot):
-    for turn, _ in enumerate(robot.every(0.1)):
+    for turn in robot.every(0.1):
         robot.send_to('/position', typed_as='geometry_msgs/Point', x=math.sin(turn / 10))
 
 
@@ -26,13 +26,13 @@ class Listener(Node):
         self.x = math.nan
         self.interested_in('/position', typed_as='geometry_msgs/Point', delegate=self.keep)
         self.fork(Listener.look)
-        self.ros.Timer(self.ros.Duration(2), lambda event: self.show('Timer'), reset=True)
+        self.ros.Timer(self.ros.Duration(1), lambda event: self.show('Timer'), reset=True)
 
     def keep(self, position, channel):
         self.x = position.x
 
     def look(self):
-        for _ in self.every(1):
+        for _ in self.every(0.5):
             self.show('every')
 
     def show(self, who):
@@ -46,7 +46,7 @@ def main():
         with master.create(BlockNode, named='robot', soul=drive) as robot:
             robot.fork()
             Transcript.show('recording')
-            master.run('rosbag', 'record', '--duration=3', '-O', bag, '/position').wait()
+            master.run('rosbag', 'record', '--duration=2', '-O', bag, '/position').wait()
         master.parameters['/use_sim_time'] = True
         master.create(Listener, named='listener')
         for count in itertools.count(1):

@@ -16,26 +16,22 @@ from pharos.live import program
 
 
 def work(worker):
-    for step, _ in enumerate(worker.every(0.1)):
+    for step in worker.every(0.1):
         worker.send_to('/steps', typed_as='std_msgs/UInt32', data=step)
         if random.random() < 0.02:
             raise RuntimeError(f'the wheel is stuck after {step} steps')
 
 
 def supervise(supervisor, workers):
-    failed = {worker: 0 for worker in workers}
     for _ in supervisor.every(1):
-        statuses = []
         for worker in workers:
-            health = worker.health()
-            if not worker.is_running or health.errors > failed[worker]:
-                why = worker.errors[-1] if health.errors > failed[worker] else 'it was stopped'
-                failed[worker] = health.errors
+            if worker.errors or not worker.is_running:
+                why = worker.errors.pop() if worker.errors else 'it was stopped'
                 supervisor.log(f'restarts {worker.name}: {why}', level='warn')
                 worker.restart()
-            statuses.append({'name': worker.name, 'message': str(health)})
+        health = [{'name': worker.name, 'message': str(worker.health())} for worker in workers]
         supervisor.send_to(
-            '/diagnostics', typed_as='diagnostic_msgs/DiagnosticArray', status=statuses
+            '/diagnostics', typed_as='diagnostic_msgs/DiagnosticArray', status=health
         )
 
 

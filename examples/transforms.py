@@ -29,7 +29,7 @@ def drive(robot):
     mounting = tf2_ros.StaticTransformBroadcaster()
     mounting.sendTransform(transform(now(), 'robot', 'camera', 0.5, 0.0))
     broadcaster = tf2_ros.TransformBroadcaster()
-    for turn, _ in enumerate(robot.every(0.1)):
+    for turn in robot.every(0.1):
         yaw = turn / 20
         x, y = 2 * math.sin(yaw), -2 * math.cos(yaw)
         broadcaster.sendTransform(transform(now(), 'map', 'robot', x, y, yaw))

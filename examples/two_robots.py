@@ -13,7 +13,7 @@ from pharos.live import program
 
 
 def lead(robot):
-    for turn, _ in enumerate(robot.every(0.2)):
+    for turn in robot.every(0.2):
         position = {'x': math.cos(turn / 10), 'y': math.sin(turn / 10)}
         robot.send_to('/leader', typed_as='geometry_msgs/Point', **position)
 

@@ -17,7 +17,7 @@ NAMES = sorted(path.stem for path in EXAMPLES.glob('*.py'))
 #: what an example prints when all of its graph is there, or soon will be
 READY = {
     'action': '...',
-    'busy_service': 'picked',
+    'busy_service': 'busy',
     'camera': 'the ball',
     'replay': 'replay 1',
     'supervisor': 'restarts',

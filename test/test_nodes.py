@@ -321,14 +321,14 @@ def test_every_and_sleep_follow_simulated_time(master):
         until(lambda: node.ros.Time.now().secs == 100)
 
         def soul(me):
-            for _ in me.every(10):
-                turns(me.ros.Time.now().secs, None)
+            for turn in me.every(10):
+                turns((turn, me.ros.Time.now().secs), None)
 
         node.fork(soul)
         # a turn that comes late does not delay those after it
-        for seconds in (100, 110, 125, 130, 140):
+        for turn, seconds in enumerate((100, 110, 125, 130, 140)):
             clock.send(clock={'secs': seconds})
-            assert turns.next() == seconds
+            assert turns.next() == (turn, seconds)
         node.stop()  # time stands still, the soul ends all the same
     finally:
         master.api().deleteParam('/use_sim_time')

@@ -153,16 +153,18 @@ class Souls:
             if not is_back and soul.block_of(self._run.node) is not None:
                 self.fork(None if soul.block is None else soul.block.now, soul.name)
 
-    def turns(self, rate: Any) -> Iterator[None]:
+    def turns(self, rate: Any) -> Iterator[int]:
         """What :meth:`Node.every` returns, by a Rate of rospy's."""
         soul = getattr(self._here, 'soul', None) or Soul(None, '', None)
         soul.loops += 1
+        turn = 0
         try:
             while self._run.lifecycle is Lifecycle.RUNNING:
                 if soul.is_due:
                     soul.begins_anew = True
                     return
-                yield
+                yield turn
+                turn += 1
                 if self._run.lifecycle is not Lifecycle.RUNNING:
                     return
                 with signals.interruptible_wait():
@@ -235,9 +237,10 @@ class NodeWithSouls(NodeAttributes, is_base=True):
             run.rospy.module.sleep(seconds)
         run.souls.end()
 
-    def every(self, seconds: float) -> Iterator[None]:
+    def every(self, seconds: float) -> Iterator[int]:
         """An iterator that turns at once and then every ``seconds`` of ROS time, without drift,
-        until the node stops, or its soul begins anew (see :meth:`renew`).
+        until the node stops, or its soul begins anew (see :meth:`renew`). It counts its turns, from
+        0 on.
 
         A turn that takes longer than ``seconds`` delays the next, which then comes at once, as it
         does after a jump back in simulated time.
