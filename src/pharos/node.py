@@ -1,33 +1,19 @@
 """Nodes: real ROS nodes of this process, written with blocks."""
-from typing import TYPE_CHECKING, Any, Callable, List, Optional, Type, Union
-
-import genpy
+from typing import TYPE_CHECKING, Any, Callable, Optional, Union
 
 from pharos import node_registry, on_demand
 from pharos.becoming import become
-from pharos.blocks import Block, check_filler
-from pharos.channel import InputChannel
 from pharos.health import Health, health_of
+from pharos.node_topics import NodeWithTopics
 from pharos.offered_service import OfferedService
-from pharos.output_channel import OutputChannel
 from pharos.parameter import Parameter
 from pharos.restarts import restart
 from pharos.run import Run
 from pharos.seconds import check_seconds
-from pharos.souls import NodeWithSouls
 from pharos.starts import of_one_run
-from pharos.topic import QUEUE_SIZE, Topic
-
-if TYPE_CHECKING:
-    from pharos.external_node import ExternalNode
-
-    Peer = Union[str, 'Node', ExternalNode, None]
-
-TypedAs = Union[str, Type[genpy.Message], None]
-Channel = Union[InputChannel, OutputChannel]
 
 
-class Node(NodeWithSouls, is_base=True):
+class Node(NodeWithTopics, is_base=True):
     """A ROS node of this process: made by :meth:`Master.create`, subclassed to override
     :meth:`start` and :meth:`stop`.
 
@@ -164,132 +150,6 @@ class Node(NodeWithSouls, is_base=True):
 
     def __exit__(self, *error: Any) -> None:
         self.stop()
-
-    # -- topics
-
-    def interested_in(
-        self,
-        topic: str,
-        typed_as: TypedAs = None,
-        delegate: Optional[Block] = None,
-        queue_size: int = QUEUE_SIZE,
-        inline: bool = False,
-        shared: bool = False,
-        from_: 'Peer' = None,
-        wait: float = 0,
-    ) -> InputChannel:
-        """Receive the messages of a topic from now on; returns the :class:`InputChannel`.
-
-        The report (listing 3.3)::
-
-            self interestedIn: '/turtle1/command_velocity' typedAs: 'turtlesim/Velocity'
-            self.interested_in('/turtle1/command_velocity', typed_as='turtlesim/Velocity')
-
-        :param typed_as: type name or message class; None: the master's type for the topic, whose
-            definition comes from a publisher where no package here has it
-        :param delegate: block for this channel only, instead of the node's
-        :param queue_size: messages kept while the node is busy; the oldest are dropped and counted.
-            Of large messages no more are kept than have :attr:`queue_bytes` bytes, 64 MiB by
-            default.
-        :param inline: run the delegate in the publisher's thread, where that is a node of this
-            process
-        :param shared: get the very message that a node of this process published, and promise not
-            to change it
-        :param from_: only messages of that node: a name, resolved as the topic's is, a Node or
-            ExternalNode; it need not be there yet
-        :param wait: without ``typed_as``, seconds to wait until somebody has given the topic a type
-        :raises UnknownTopicError, UnknownTypeError, MessageTypeError: if there is no type, or
-            another
-        :raises ValueError: if ``topic`` or ``from_`` cannot be a name
-        :raises MasterUnreachableError: if the master does not answer; nothing is left behind then
-        """
-        return self._topic(topic).input_channel(
-            self, typed_as, delegate, queue_size, inline, shared, from_, wait
-        )
-
-    def output_channel(
-        self,
-        topic: str,
-        typed_as: TypedAs = None,
-        latch: bool = False,
-        queue_size: int = QUEUE_SIZE,
-        wait: float = 0,
-    ) -> OutputChannel:
-        """Publish on a topic from now on; returns the :class:`OutputChannel`.
-
-        :param typed_as: type name or message class; None: the master's type for the topic
-        :param latch: send the last message to those who become interested later, also after a
-            restart of this node; one sent ``to=`` a node is for that node alone
-        :param queue_size: messages kept for each slow receiver; the oldest are dropped
-        :param wait: as in :meth:`interested_in`
-        :raises MasterUnreachableError: if the master does not answer; nothing is left behind then
-        """
-        return self._topic(topic).output_channel(self, typed_as, latch, queue_size, wait=wait)
-
-    def send_to(
-        self,
-        topic: str,
-        block: Union[Block, genpy.Message, None] = None,
-        *,
-        typed_as: TypedAs = None,
-        to: 'Peer' = None,
-        connect_timeout: Optional[float] = None,
-        wait: float = 0,
-        **fields: Any,
-    ) -> genpy.Message:
-        """Send one message, filled by ``block(message)``, by keywords, or both; or ``block``
-        itself, where that is a ready message. Returns it.
-
-        The report (listing 3.1)::
-
-            self sendTo: '/turtle1/command_velocity'
-                a: [:message | message angular: 1.0. message linear: 2.0]
-            self.send_to('/turtle1/command_velocity', angular=1.0, linear=2.0)
-
-        The first message on a topic waits for the subscribers that the master knows, for up to
-        ``connect_timeout`` seconds (None: the node's), so that it is not lost. A topic that has no
-        type yet gets that of a ready message.
-
-        :param to: send it to that node alone: a name, resolved as the topic's is, a Node or
-            ExternalNode. One that is not interested in the topic gets nothing, and the log says so
-            once.
-        :param wait: as in :meth:`interested_in`
-        :raises UnknownNodeError: if there is no node ``to``
-        :raises ValueError: if ``topic`` or ``to`` cannot be a name
-        :raises MessageTypeError: if a field does not exist or does not fit, or a ready message is
-            of another type than the topic
-        :raises UnknownTopicError, UnknownTypeError: if there is no type
-        """
-        if to is not None:
-            to = self.current_run.resolve_peer(to)
-        if connect_timeout is None:
-            connect_timeout = self.connect_timeout
-        else:
-            connect_timeout = check_seconds('connect_timeout', connect_timeout)
-        if wait != 0:
-            wait = check_seconds('wait', wait, least=0)
-        run = self.current_run
-        channel = run.send_channels.get(topic) if isinstance(topic, str) else None
-        if channel is None or not channel.is_open:
-            if not isinstance(block, genpy.Message):
-                check_filler(block)
-            elif typed_as is None:
-                typed_as = self._topic(topic).class_for(block)
-            channel = run.sender(self._topic(topic), typed_as, connect_timeout, wait)
-            run.send_channels[topic] = channel
-        if typed_as not in (None, channel.message_class, channel.type):
-            self._topic(topic).message_class(self, typed_as)  # refuses another type
-        # another thread may be opening it just now
-        channel.wait_until_connected(connect_timeout)
-        return channel.send(block, to=to, **fields)
-
-    @property
-    def channels(self) -> List[Channel]:
-        """The channels that the node has open."""
-        return self.latest_run.channels if self.latest_run else []
-
-    def _topic(self, name: str) -> Topic:
-        return Topic(self.master, self.current_run.resolve(name, 'topic'))
 
     # -- services, parameters, log
 

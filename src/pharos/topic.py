@@ -1,6 +1,18 @@
 """Topics: named buses, and the dispatchers that hand a node its channel."""
 import time
-from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, List, Optional, Tuple, Type, Union
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Callable,
+    Dict,
+    Iterator,
+    List,
+    Optional,
+    Tuple,
+    Type,
+    TypeVar,
+    Union,
+)
 
 import genpy
 import rosgraph
@@ -29,6 +41,7 @@ if TYPE_CHECKING:
 POLL = 0.05  # seconds between two looks at the master's types
 #: a type name or message class; None: what the node or the master knows
 TypedAs = Union[None, str, Type[genpy.Message]]
+InputType = TypeVar('InputType', bound=InputChannel)
 QUEUE_SIZE = 1000  # messages kept for a slow receiver, where nothing else is said
 
 
@@ -144,16 +157,37 @@ class Topic:
 
         :raises TypeError, ValueError: if that is no node of this process, or one of another master
         """
+        return self.open_input(
+            InputChannel,
+            node,
+            typed_as,
+            wait,
+            delegate=delegate,
+            queue_size=queue_size,
+            inline=inline,
+            shared=shared,
+            from_=from_,
+        )
+
+    def open_input(
+        self,
+        channel_class: Type[InputType],
+        node: 'Node',
+        typed_as: TypedAs,
+        wait: float,
+        **options: Any,
+    ) -> InputType:
+        """A new input channel of that class, as :meth:`input_channel` gives it to ``node``.
+
+        :param options: of the class
+        """
         self._check_node(node)
         is_first = all(channel.topic != self.name for channel in node.channels)
         message_class = self.message_class(node, typed_as, wait, receives=True)
-        options: Dict[str, Any] = dict(
-            delegate=delegate, queue_size=queue_size, inline=inline, shared=shared, from_=from_
-        )
         if not is_first or message_class is typed_as or not messages.is_provisional(message_class):
-            return InputChannel(node, self.name, message_class, **options)
+            return channel_class(node, self.name, message_class, **options)
         with node.latest_run.rospy.refusals.held(self.name):
-            channel = InputChannel(node, self.name, message_class, **options)
+            channel = channel_class(node, self.name, message_class, **options)
             self._agree_with_publishers(channel)
         return channel
 

@@ -1,4 +1,5 @@
 """How the channels of a node are connected through its rospy, and to the nodes of this process."""
+import contextlib
 import os
 import select
 import threading
@@ -36,6 +37,7 @@ class Connections:
         self.subscribers_at_registration = {}
         # topics of which the log says that subscribers did not connect in time
         self.told_late = set()
+        self._reading = {}  # identifier of a thread -> the topic whose socket it reads
         # (topic, URI) of each publisher just being connected to -> whether somebody asked again
         self._connecting = {}
 
@@ -291,6 +293,19 @@ class Connections:
                 for uri in subscriber.publishers
             )
         )
+
+    @contextlib.contextmanager
+    def reading(self, topic):
+        """Within this, the thread reads the socket of a connection to a publisher of the topic."""
+        self._reading[threading.get_ident()] = topic
+        try:
+            yield
+        finally:
+            del self._reading[threading.get_ident()]
+
+    def is_read_here(self, topic):
+        """Whether this thread reads what comes on the topic, and runs a delegate meanwhile."""
+        return self._reading.get(threading.get_ident()) == topic
 
     @staticmethod
     def local_node_at(uri):

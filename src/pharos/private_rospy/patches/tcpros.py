@@ -62,7 +62,8 @@ def robust_connect_subscriber(
         subscriber = node.subscriber(resolved_topic_name)
         if subscriber is not None:
             subscriber.limit_reading()
-        conn.receive_loop(receive_cb)
+        with node.connections.reading(resolved_topic_name):
+            conn.receive_loop(receive_cb)
 
 
 @patch(
