@@ -203,11 +203,9 @@ def test_a_value_in_a_blocks_place_is_told_how_a_block_is_called(master):
     channel = node.output_channel('/t', 'std_msgs/String')
     for send in channel.send, lambda block: node.send_to('/t', block):
         with pytest.raises(
-            TypeError, match=r"called as block\(message\).*; 'hello' cannot be called: .*typed_as"
+            TypeError, match=r"called as block\(message\); 'hello' cannot .* name.*: data='hello'$"
         ):
             send('hello')
-        with pytest.raises(TypeError, match=r"cannot be called: give fields as keywords: \*\*"):
-            send({'data': 'hello'})
     with pytest.raises(TypeError, match='cannot be called: .*typed_as='):
         node.send_to('/another', pharos.message_class('std_msgs/String'))
 

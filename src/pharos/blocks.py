@@ -55,20 +55,28 @@ def check_runs(block: Any, what: str) -> None:
         )
 
 
-def check_filler(block: Any) -> None:
-    """Raise TypeError for what cannot fill a message, and say what does."""
+def check_filler(
+    block: Any, find_class: Callable[[], Any] = lambda: None, what: str = 'message'
+) -> None:
+    """Raise TypeError for what cannot fill a message, and say what does.
+
+    :param find_class: finds the class of the message, for what is said
+    :param what: 'message' or 'request'
+    """
     if isinstance(block, dict):
-        meant = 'give fields as keywords: **fields'
-    elif isinstance(block, (str, type)):
-        meant = 'give a type as typed_as=, and the value of a field by its name, as a keyword'
-    else:
-        meant = 'give the value of a field by its name, as a keyword'
+        return
     if isinstance(block, type) or not (block is None or callable(block)):
+        names: Sequence[str] = getattr(attempt(find_class), '__slots__', ())
+        meant = 'give the value of a field by its name, as a keyword'
+        if len(names) == 1 and not isinstance(block, type):
+            meant += f': {names[0]}={reprlib.repr(block)}'
+        elif isinstance(block, (str, type)):
+            meant = f'give a type as typed_as=, and {meant[5:]}'
         raise TypeError(
-            'a message is given ready, or filled by keywords or a block, called as block(message);'
-            f' {reprlib.repr(block)} cannot be called: {meant}'
+            f'a {what} is given ready, or filled by keywords, a dict of fields, or a block, called'
+            f' as block({what}); {reprlib.repr(block)} cannot be called: {meant}'
         )
-    check_block(block, 'block', ('message',))
+    check_block(block, 'block', (what,))
 
 
 def check_delegate(block: Any) -> Any:

@@ -1,9 +1,10 @@
 """What nodes send and hear."""
-from typing import TYPE_CHECKING, Any, Callable, List, Optional, Type, Union
+from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Type, Union
 
 import genpy
 
-from pharos.blocks import Block, check_filler
+from pharos import messages
+from pharos.blocks import Block, attempt, check_filler
 from pharos.channel import InputChannel
 from pharos.next_message import next_message
 from pharos.output_channel import OutputChannel
@@ -86,7 +87,7 @@ class NodeWithTopics(NodeWithSouls, is_base=True):
     def send_to(
         self,
         topic: str,
-        block: Union[Block, genpy.Message, None] = None,
+        block: Union[Block, Dict[str, Any], genpy.Message, None] = None,
         *,
         typed_as: TypedAs = None,
         to: 'Peer' = None,
@@ -94,8 +95,8 @@ class NodeWithTopics(NodeWithSouls, is_base=True):
         wait: float = 0,
         **fields: Any,
     ) -> genpy.Message:
-        """Send one message, filled by ``block(message)``, by keywords, or both; or ``block``
-        itself, where that is a ready message. Returns it.
+        """Send one message, filled by keywords, ``block(message)``, or both; or a ready message.
+        Returns it.
 
         The report (listing 3.1)::
 
@@ -103,10 +104,15 @@ class NodeWithTopics(NodeWithSouls, is_base=True):
                 a: [:message | message angular: 1.0. message linear: 2.0]
             self.send_to('/turtle1/command_velocity', angular=1.0, linear=2.0)
 
+        Fields that have the name of one of these keywords are given in a dict, with all others::
+
+            self.send_to('/orders', {'to': 'kitchen', 'wait': 5.0})
+
         The first message on a topic waits for the subscribers that the master knows, for up to
         ``connect_timeout`` seconds (None: the node's), so that it is not lost. A topic that has no
         type yet gets that of a ready message.
 
+        :param block: ``block(message)``, a dict of fields, or a ready message, sent as it is
         :param to: send it to that node alone: a name, resolved as the topic's is, a Node or
             ExternalNode. One that is not interested in the topic gets nothing, and the log says so
             once.
@@ -117,19 +123,23 @@ class NodeWithTopics(NodeWithSouls, is_base=True):
             of another type than the topic
         :raises UnknownTopicError, UnknownTypeError: if there is no type
         """
+        run = self.current_run
+        channel = run.send_channels.get(topic) if isinstance(topic, str) else None
+        if to is not None or connect_timeout is not None or wait != 0:
+            cls = channel.message_class if channel else attempt(self._class_finder(topic, typed_as))
+            own = {'to': to, 'connect_timeout': connect_timeout, 'wait': wait or None}
+            messages.check_not_hidden(cls, block, **own)
         if to is not None:
-            to = self.current_run.resolve_peer(to)
+            to = run.resolve_peer(to)
         if connect_timeout is None:
             connect_timeout = self.connect_timeout
         else:
             connect_timeout = check_seconds('connect_timeout', connect_timeout)
         if wait != 0:
             wait = check_seconds('wait', wait, least=0)
-        run = self.current_run
-        channel = run.send_channels.get(topic) if isinstance(topic, str) else None
         if channel is None or not channel.is_open:
             if not isinstance(block, genpy.Message):
-                check_filler(block)
+                check_filler(block, self._class_finder(topic, typed_as))
             elif typed_as is None:
                 typed_as = self._topic(topic).class_for(block)
             channel = run.sender(self._topic(topic), typed_as, connect_timeout, wait)
@@ -139,6 +149,10 @@ class NodeWithTopics(NodeWithSouls, is_base=True):
         # another thread may be opening it just now
         channel.wait_until_connected(connect_timeout)
         return channel.send(block, to=to, **fields)
+
+    def _class_finder(self, topic: str, typed_as: TypedAs) -> Callable[[], Any]:
+        """Finds the class of what is sent on a topic, before a channel is opened."""
+        return lambda: self._topic(topic).message_class(self._node, typed_as)
 
     def wait_for_message(
         self,

@@ -1,4 +1,5 @@
 """Output channels: the end of a topic at which a node sends."""
+import reprlib
 import threading
 import time
 from typing import TYPE_CHECKING, Any, Callable, Dict, NoReturn, Optional, Set, Type, Union
@@ -108,10 +109,12 @@ class OutputChannel(Channel):
     def _check_type(self, message: Any) -> None:
         allowed = self.message_class._md5sum, '*'
         if not isinstance(message, genpy.Message) or message._md5sum not in allowed:
+            is_value = not isinstance(message, genpy.Message)
             raise MessageTypeError(
                 f'{self.topic} carries {self.type}'
                 f' ({messages.describe_fields(self.message_class)}), not'
-                f' {getattr(message, "_type", None) or repr(message)}'
+                f' {reprlib.repr(message) if is_value else message._type}'
+                + (': send() fills one by the names of its fields' if is_value else '')
             )
 
     def _explain(self, error: Exception, message: genpy.Message) -> NoReturn:
@@ -132,25 +135,32 @@ class OutputChannel(Channel):
 
     def send(
         self,
-        block: Union[Callable[[Any], Any], genpy.Message, None] = None,
+        block: Union[Callable[[Any], Any], Dict[str, Any], genpy.Message, None] = None,
         *,
         to: Any = None,
         **fields: Any,
     ) -> Any:
-        """Fill a fresh message with ``block(message)`` and by keywords, publish it, and return
-        it; in the block's place may be a ready message, which is sent as it is.
+        """Fill a fresh message and publish it, as :meth:`Node.send_to` does; returns it.
 
+        :param block: ``block(message)`` that fills it; a dict of its fields, in which alone a field
+            is set that is called ``block`` or ``to``; or a ready message, which is sent as it is
+        :param to: see :meth:`Node.send_to`
+        :param fields: by their names
         :raises TypeError: for a ready message and keywords beside it
         """
         if isinstance(block, genpy.Message):
-            message = self._ready(block, fields)
+            message = block
+            self._check_type(message)
+            messages.check_alone(message, fields)
         else:
+            if to is not None:
+                messages.check_not_hidden(self.message_class, block, to=to)
             if block is not None:
                 check_runs(block, 'a block')
             try:
                 message = messages.build(self.message_class, block, fields)
             except TypeError:
-                check_filler(block)  # says how it is called
+                check_filler(block, lambda: self.message_class)  # says how it is called
                 raise
         if not self._fanout.connections:  # with nobody interested, nobody else looks at it
             try:
@@ -159,15 +169,6 @@ class OutputChannel(Channel):
                 messages.check_fits(message)
                 raise
         self.publish(message, to)
-        return message
-
-    def _ready(self, message: genpy.Message, fields: Dict[str, Any]) -> genpy.Message:
-        self._check_type(message)
-        if fields:
-            raise TypeError(
-                f'a ready {message._type} is sent as it is, without {", ".join(fields)}: set that in'
-                ' the message before, or give all fields as keywords instead of it'
-            )
         return message
 
     def wait_for_subscribers(self, count: int = 1, timeout: Optional[float] = None) -> bool:

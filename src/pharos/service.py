@@ -3,14 +3,15 @@ import contextlib
 import math
 import socket
 import time
-from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, List, Optional
+from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, List, Optional, Union
 
 import genpy
 import rosgraph
 
 from pharos import messages
-from pharos.blocks import check_block
+from pharos.blocks import check_filler
 from pharos.errors import (
+    MessageTypeError,
     NodeStoppedError,
     ServiceCallError,
     ServiceTypeError,
@@ -162,16 +163,19 @@ class Service:
 
     def call(
         self,
-        block: Optional[Callable[[Any], Any]] = None,
+        block: Union[Callable[[Any], Any], Dict[str, Any], genpy.Message, None] = None,
         *,
         timeout: Optional[float] = None,
         **fields: Any,
     ) -> Any:
-        """Call the service: ``block(request)`` and keywords fill the request. Returns the response.
+        """Call the service, with a request filled by keywords, ``block(request)``, or both; or with
+        a ready request. Returns the response.
 
         A service of a node of this process is called without a socket: without ``timeout`` in this
         thread, so that no wiring deadlocks, and with one in a thread of that node.
 
+        :param block: ``block(request)``; a dict of fields, in which alone one is set that is called
+            ``block`` or ``timeout``; or a ready request
         :param timeout: seconds that the whole call may take; None: no limit
         :raises ServiceTypeError: if the type is defined otherwise here than at the provider, the
             provider changed it, or the md5sum set by hand does not fit
@@ -181,13 +185,14 @@ class Service:
         :raises NodeStoppedError: if the node whose soul or delegate waits for the answer stops
             meanwhile
         """
+        if not isinstance(block, genpy.Message):
+            check_filler(block, lambda: self.service_class._request_class, 'request')
         timeout = check_limit('timeout', timeout)
         deadline = None if timeout is None else time.monotonic() + timeout
         self.response = None
-        if block is not None:
-            check_block(block, 'block', ('request',))
         self._check_definition(deadline)
-        request = messages.build(self.service_class._request_class, block, fields)
+        messages.check_not_hidden(self.service_class._request_class, block, timeout=timeout)
+        request = self._request(block, fields)
         self._calls += 1
         request = numbered(request, self._calls)
         waiting = Interruption()
@@ -207,6 +212,19 @@ class Service:
                 ' still running?'
             ) from error
         return response  # not self.response, which is another thread's by now
+
+    def _request(self, filler: Any, fields: Dict[str, Any]) -> genpy.Message:
+        """A request that is filled, or the ready one itself."""
+        cls = self.service_class._request_class
+        if not isinstance(filler, genpy.Message):
+            return messages.build(cls, filler, fields)
+        if filler._md5sum != cls._md5sum:
+            raise MessageTypeError(
+                f'{self.name} is called with a {cls._type} ({messages.describe_fields(cls)}), not'
+                f' {filler._type}'
+            )
+        messages.check_alone(filler, fields)
+        return filler
 
     def _check_definition(self, deadline: Optional[float]) -> None:
         """Refuse a definition that is not the provider's, before anybody wonders which fields a

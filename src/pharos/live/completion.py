@@ -159,7 +159,9 @@ class _Call:
         """The fields that the call fills, but for those that it has already."""
         cls = self._message_class()
         fields = messages.fields_of(cls) if cls is not None else []
-        return [f'{name}=' for name, _ in fields if name not in self.keywords]
+        # those that the call has keywords for go into a dict
+        taken = {*self.keywords, *inspect.signature(self.function).parameters}
+        return [f'{name}=' for name, _ in fields if name not in taken]
 
     def _message_class(self) -> Any:
         """The class of the message, or request, that the call fills."""

@@ -20,7 +20,9 @@ from pharos.messages.classes import (
 )
 from pharos.messages.fields import (
     build,
+    check_alone,
     check_fits,
+    check_not_hidden,
     describe_fields,
     explain,
     fields_of,
@@ -36,7 +38,9 @@ from pharos.messages.lookup import known_types
 
 __all__ = [
     'build',
+    'check_alone',
     'check_fits',
+    'check_not_hidden',
     'class_from_definition',
     'class_from_publishers',
     'class_of_header',

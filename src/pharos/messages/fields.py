@@ -76,20 +76,47 @@ def nested_classes(cls: MessageClass) -> List[MessageClass]:
     return [cls for cls in nested if cls]  # None for one of a class written by hand
 
 
-def build(
-    cls: MessageClass, block: Optional[Callable[[Any], Any]], fields: Dict[str, Any]
-) -> genpy.Message:
-    """A new message that ``block(message)``, if there is one, and then ``fields`` by name have
-    filled.
+def check_not_hidden(cls: Optional[MessageClass], filler: Any, **own: Any) -> None:
+    """Raise TypeError where a field of a message has the name of a keyword that a call has for
+    itself, and which it was given: it may be meant for the field.
+
+    :param cls: None: it is not known yet
+    :param filler: what fills the message beside keywords; where there is that, these are the call's
+    :param own: the keywords, None: it was not given
+    """
+    for name, value in own.items():
+        is_given = filler is None and value is not None
+        if cls is not None and is_given and name in cls.__slots__:
+            raise TypeError(
+                f'{cls._type} has a field {name!r}, and this call a keyword {name}= of its own: give'
+                f' the fields in a dict, {{{name!r}: {reprlib.repr(value)}}}, and {name}= beside it'
+                ' is the keyword'
+            )
+
+
+def check_alone(message: genpy.Message, fields: Dict[str, Any]) -> None:
+    """Raise TypeError where fields are given beside a message that is ready."""
+    if fields:
+        raise TypeError(
+            f'a ready {message._type} is sent as it is, without {", ".join(fields)}: set that in the'
+            ' message before, or give all fields as keywords instead of it'
+        )
+
+
+def build(cls: MessageClass, filler: Any, fields: Dict[str, Any]) -> genpy.Message:
+    """A new message that is filled by ``filler(message)``, or by the fields in it where it is a
+    dict, and then by ``fields`` by name.
 
     :raises MessageTypeError: for a field that does not exist, for a value in ``fields`` that does
         not fit, and for a block that returns a message of its own, or a value instead of setting
         fields
     """
     message = cls()
-    if block is not None:
+    if isinstance(filler, dict):
+        return fill(message, {**filler, **fields})
+    if filler is not None:
         try:
-            made = block(message)
+            made = filler(message)
         except AttributeError as error:
             explain(error, message)
             raise
