@@ -18,15 +18,15 @@ define_service(CALL_TYPE, 'float64 timeout\nstring block\n---\nstring said')
 @pytest.fixture
 def send(request, master, mailbox):
     """Sends by a node, or by its channel; what arrives is in ``send.mailbox``."""
-    create(master, '/receiver', delegate=mailbox).interested_in('/orders', TYPE)
+    create(master, '/receiver', delegate=mailbox).interested_in('/hidden/orders', TYPE)
     node = create(master, '/sender')
     if request.param == 'send_to':
 
         def send(*args, **fields):
-            return node.send_to('/orders', *args, **fields)
+            return node.send_to('/hidden/orders', *args, **fields)
 
     else:
-        channel = node.output_channel('/orders', TYPE)
+        channel = node.output_channel('/hidden/orders', TYPE)
 
         def send(*args, **fields):
             return channel.send(*args, **fields)
@@ -68,49 +68,53 @@ def test_a_dict_with_a_wrong_field_or_value_is_told_as_keywords_are(send):
 @both
 def test_a_dict_may_hold_others_for_nested_messages(master, mailbox, send):
     node = create(master, '/other', delegate=mailbox)
-    node.interested_in('/moved', 'geometry_msgs/Twist')
-    node.send_to('/moved', {'linear': {'x': 2.0}})
+    node.interested_in('/hidden/moved', 'geometry_msgs/Twist')
+    node.send_to('/hidden/moved', {'linear': {'x': 2.0}})
     assert mailbox.next().linear.x == 2.0
 
 
 def test_a_keyword_that_may_be_meant_for_the_field_is_refused(master, mailbox):
     """It was taken for the call's own, in silence: the message went out without it."""
-    create(master, '/receiver', delegate=mailbox).interested_in('/orders', TYPE)
+    create(master, '/receiver', delegate=mailbox).interested_in('/hidden/orders', TYPE)
     node = create(master, '/sender')
     for again in False, True:
         for name, value in ('wait', 0.5), ('connect_timeout', 1.0), ('to', 'the kitchen'):
             with pytest.raises(
                 TypeError, match=f"Order has a field '{name}', .* dict, {{'{name}': {value!r}}}"
             ):
-                node.send_to('/orders', price=1.0, **{name: value})
+                node.send_to('/hidden/orders', price=1.0, **{name: value})
         if not again:
             assert node.channels == []
-            node.send_to('/orders', price=1.0)
-    channel = node.output_channel('/orders')
+            node.send_to('/hidden/orders', price=1.0)
+    channel = node.output_channel('/hidden/orders')
     with pytest.raises(TypeError, match="has a field 'to', and this call a keyword to="):
         channel.send(to='/receiver', price=1.0)
     with pytest.raises(TypeError, match='multiple values .*topic'):
-        node.send_to('/orders', topic='x')
+        node.send_to('/hidden/orders', topic='x')
     with pytest.raises(TypeError, match="a dict of fields, .* 'x' cannot be called"):
-        node.send_to('/orders', block='x')
+        node.send_to('/hidden/orders', block='x')
     assert mailbox.next().price == 1.0
     assert mailbox.empty()
 
 
 def test_a_block_or_a_ready_message_leaves_no_doubt(master, mailbox):
-    create(master, '/receiver', delegate=mailbox).interested_in('/orders', TYPE)
+    create(master, '/receiver', delegate=mailbox).interested_in('/hidden/orders', TYPE)
     node = create(master, '/sender')
-    node.send_to('/orders', lambda message: setattr(message, 'to', 'bar'), to='/receiver', wait=1)
+    node.send_to(
+        '/hidden/orders', lambda message: setattr(message, 'to', 'bar'), to='/receiver', wait=1
+    )
     assert mailbox.next().to == 'bar'
-    node.send_to('/orders', pharos.message_class(TYPE)(to='bed'), to='/receiver', connect_timeout=1)
+    node.send_to(
+        '/hidden/orders', pharos.message_class(TYPE)(to='bed'), to='/receiver', connect_timeout=1
+    )
     assert mailbox.next().to == 'bed'
 
 
 def test_a_service_is_called_with_a_dict(master):
     create(master, '/provider').serve(
-        '/order', CALL_TYPE, lambda request: f'{request.timeout} {request.block}'
+        '/hidden/order', CALL_TYPE, lambda request: f'{request.timeout} {request.block}'
     )
-    service = master.lookup_service('/order')
+    service = master.lookup_service('/hidden/order')
     fields = {'timeout': 2.5, 'block': 'b'}
     assert service.call(fields).said == service.call(fields, timeout=10).said == '2.5 b'
     with pytest.raises(TypeError, match=r"CallRequest has a field 'timeout', .* {'timeout': 2.5}"):

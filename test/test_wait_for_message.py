@@ -109,7 +109,9 @@ def test_where_chooses_and_what_it_raises_is_raised(master, pair):
         waiting.wait_for_message('/waited', where=lambda: True)
 
 
-@pytest.mark.parametrize('topic', ['/trigger', '/waited'], ids=['another topic', 'its own topic'])
+@pytest.mark.parametrize(
+    'topic', ['/waited/trigger', '/waited'], ids=['another topic', 'its own topic']
+)
 def test_a_delegate_waits_for_a_message_while_it_runs(master, pair, topic):
     """It is the node's dispatcher that would bring it to a channel, and that is busy."""
     waiting, sending, channel = pair
@@ -148,8 +150,8 @@ def test_a_delegate_that_reads_the_socket_itself_is_told_that_nothing_would_come
 
 def test_a_soul_waits_and_ends_with_its_node(master, pair):
     waiting, sending, channel = pair
-    thread = waiting.fork(lambda me: me.wait_for_message('/never', INT))
-    assert sending.output_channel('/never', INT).wait_for_subscribers(timeout=TIMEOUT)
+    thread = waiting.fork(lambda me: me.wait_for_message('/waited/never', INT))
+    assert sending.output_channel('/waited/never', INT).wait_for_subscribers(timeout=TIMEOUT)
     waiting.stop()
     assert ended(thread)
     assert not waiting.errors
@@ -157,19 +159,21 @@ def test_a_soul_waits_and_ends_with_its_node(master, pair):
 
 def test_the_main_thread_is_told_that_the_node_stops(master, pair):
     waiting, sending, channel = pair
-    never = sending.output_channel('/never', INT)
+    never = sending.output_channel('/waited/never', INT)
     thread = in_thread(lambda: never.wait_for_subscribers(timeout=TIMEOUT) and waiting.stop())
-    with pytest.raises(pharos.NodeStoppedError, match='/waiting stops, and the wait .* /never'):
-        waiting.wait_for_message('/never', INT)
+    with pytest.raises(
+        pharos.NodeStoppedError, match='/waiting stops, and the wait .* /waited/never'
+    ):
+        waiting.wait_for_message('/waited/never', INT)
     assert ended(thread)
     with pytest.raises(pharos.NodeStoppedError, match=r'/waiting is stopped: start\(\) it first'):
-        waiting.wait_for_message('/never', INT)
+        waiting.wait_for_message('/waited/never', INT)
 
 
 def test_the_block_of_another_node_stops_to_wait_when_that_stops(master, pair):
     waiting, sending, channel = pair
-    never = sending.output_channel('/never', INT)
-    other = create(master, '/other', soul=lambda me: waiting.wait_for_message('/never', INT))
+    never = sending.output_channel('/waited/never', INT)
+    other = create(master, '/other', soul=lambda me: waiting.wait_for_message('/waited/never', INT))
     thread = other.fork()
     assert never.wait_for_subscribers(timeout=TIMEOUT)
     other.stop()
@@ -179,7 +183,7 @@ def test_the_block_of_another_node_stops_to_wait_when_that_stops(master, pair):
 
 def test_what_does_not_come_in_time_is_a_timeout_error_that_names_the_publishers(master, pair):
     waiting, sending, channel = pair
-    for topic, who in ('/waited', '/sending'), ('/never', 'nobody'):
+    for topic, who in ('/waited', '/sending'), ('/waited/never', 'nobody'):
         with pytest.raises(
             TimeoutError, match=rf'in time \(0.05 s\) on {topic}: .* published by {who}$'
         ):
@@ -200,14 +204,14 @@ def test_another_type_is_told_in_the_timeout_error(master, pair, transcript):
 def test_a_topic_without_a_type_is_unknown_or_waited_for_within_the_time_limit(master):
     node, other = create(master), create(master, '/other')
     for timeout in None, 0.05:
-        with pytest.raises(pharos.UnknownTopicError, match='/untyped_yet.*typed_as='):
-            node.wait_for_message('/untyped_yet', timeout=timeout)
+        with pytest.raises(pharos.UnknownTopicError, match='/waited/untyped.*typed_as='):
+            node.wait_for_message('/waited/untyped', timeout=timeout)
 
     def come():
-        other.output_channel('/untyped_yet', INT, latch=True).send(data=4)
+        other.output_channel('/waited/untyped', INT, latch=True).send(data=4)
 
     thread = in_thread(come)
-    assert node.wait_for_message('/untyped_yet', timeout=TIMEOUT).data == 4
+    assert node.wait_for_message('/waited/untyped', timeout=TIMEOUT).data == 4
     assert ended(thread)
 
 
