@@ -130,8 +130,62 @@ def test_a_command_that_is_none_is_told_with_those_there_are(capsys, monkeypatch
     assert "invalid choice: 'tob' (choose from " in capsys.readouterr().err
 
 
+# -- Debian's package
+
+CONTROL = (ROOT / 'debian' / 'control').read_text()
+#: the package in Debian of each key of package.xml that is not called after it
+IN_DEBIAN = {'graphviz': 'graphviz', 'ipython3': 'python3-ipython'}
+
+
+def in_debian(key):
+    """The package in Debian of a key of package.xml."""
+    by_rule = key if key.startswith('python3-') else 'python3-' + key.replace('_', '-')
+    return IN_DEBIAN.get(key, by_rule)
+
+
+def relation(field):
+    """The packages that debian/control names there, but for what debhelper fills in."""
+    found = re.search(rf'^{field}:\n((?: .*\n)+)', CONTROL, re.MULTILINE)
+    names = [line.strip(' ,').partition(' ')[0] for line in found.group(1).splitlines()]
+    assert names == sorted(names, key=lambda name: (name[0] != '$', name))
+    return {name for name in names if not name.startswith('$')}
+
+
+def test_debians_package_needs_what_the_manifest_says():
+    needed = {in_debian(element.text) for element in MANIFEST.iter('exec_depend')}
+    # rosbash has rosrun, which a catkin package has no need to name
+    assert relation('Depends') | relation('Recommends') == needed | {'rosbash'}
+    assert relation('Depends') & relation('Recommends') == set()
+
+
+def test_debians_package_comes_with_all_that_importing_pharos_loads():
+    source = 'import sys, pharos; print(*{name.partition(".")[0] for name in sys.modules})'
+    loaded = {in_debian(name) for name in run_here(sys.executable, '-c', source).stdout.split()}
+    # numpy is loaded by genpy, where it is there
+    assert relation('Recommends') & loaded <= {'python3-numpy'}
+
+
+def test_the_manual_page_names_every_command():
+    page = (ROOT / 'debian' / 'pharos.1').read_text()
+    found = re.findall(r'^\.TP\n\.B ([a-z]+)\n(.*)', page, re.MULTILINE)
+    assert dict(found) == COMMANDS
+
+
+def run_here(*command):
+    """Run a program with the modules of the clone; returns what it printed and its status."""
+    return subprocess.run(
+        command,
+        env=environment('http://127.0.0.1:1/'),
+        stdout=subprocess.PIPE,
+        text=True,
+        timeout=2 * TIMEOUT,
+        check=True,
+    )
+
+
 # -- versions
 
 
 def test_the_version_is_the_same_everywhere():
-    assert pharos.__version__ == MANIFEST.findtext('version')
+    debians = re.match(r'pharos \((\S+)\) ', (ROOT / 'debian' / 'changelog').read_text())
+    assert pharos.__version__ == MANIFEST.findtext('version') == debians.group(1)
