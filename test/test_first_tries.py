@@ -1,11 +1,12 @@
 """What those who know rospy, or read no manual, try first: it works, or the error says what to write."""
 import dataclasses
+import re
 
 import pytest
 
 from helpers import create
 import pharos
-from pharos import BlockNode, Node
+from pharos import BlockNode, Node, wrong_guesses
 
 # -- nodes made, and named, in another way than by create()
 
@@ -102,7 +103,7 @@ PROPERTIES = sorted(
 )
 
 
-@pytest.mark.parametrize('name', [*PROPERTIES, 'master', 'latest_run'])
+@pytest.mark.parametrize('name', [*PROPERTIES, 'latest_run'])
 def test_what_each_node_has_is_not_hidden_by_a_class_of_its_own(master, name):
     """It went on half, or failed far from there: ``errors = []`` had no failure in it."""
     for value in [], 'text', lambda self: 'text', property(lambda self: 'text'):
@@ -125,3 +126,72 @@ def test_a_stop_that_does_not_call_super_stops_the_node(master):
     node.stop()
     assert not master.is_node_alive('/silent')
     assert node.lifecycle is pharos.Lifecycle.STOPPED
+
+
+# -- names that rospy has, and ROS 2
+
+
+@pytest.mark.parametrize(
+    'name, said',
+    [
+        ('Publisher', r"write node.send_to\('/topic', typed_as='std_msgs/String', data='x'\)"),
+        ('create_subscription', r"write node.interested_in\('/topic', delegate=lambda"),
+        ('Rate', r'write for _ in node.every\(0.1\)'),
+        ('is_shutdown', 'node.is_running'),
+        ('get_param', r"write node.parameter\('~name', initialized=1\).value"),
+        ('loginfo', r'write node.log\(text\)'),
+        ('Timer', r'rospy has by that name is node.ros.Timer$'),
+    ],
+)
+def test_a_name_of_rospys_is_told_by_what_it_is_here(master, name, said):
+    node = create(master)
+    channel = node.output_channel('/guessed', 'std_msgs/String')
+    for thing in node, master, channel, pharos:
+        assert not hasattr(thing, name)
+        with pytest.raises(AttributeError, match=f"has no attribute '{name}': .*{said}"):
+            getattr(thing, name)
+
+
+def test_what_the_table_of_guesses_says_is_there(master):
+    """It may have been renamed."""
+    node = create(master)
+    channel = node.output_channel('/guessed', 'std_msgs/String')
+    names = {'node': node, 'master': master, 'channel': channel, 'pharos': pharos}
+    for guess, text in wrong_guesses._TABLE.items():
+        for owner, name in re.findall(r'\b(node|master|channel|pharos)\.(\w+)', text):
+            assert hasattr(names[owner], name), (guess, name)
+        assert not all(hasattr(thing, guess) for thing in names.values()), guess
+
+
+def test_any_other_name_and_what_a_property_raises_are_as_python_has_it(master):
+    class Arm(Node):
+        @property
+        def speed(self):
+            return self._sped
+
+    node = create(master, '/arm', Arm)
+    for name, missing in ('speed', '_sped'), ('spam', 'spam'), ('topic', 'topic'):
+        with pytest.raises(AttributeError, match=f"'Arm' object has no attribute '{missing}'$"):
+            getattr(node, name)
+
+
+# -- values that are published
+
+
+def test_a_value_in_the_place_of_a_message_is_told_by_the_name_of_its_field(master):
+    node = create(master)
+    channel = node.output_channel('/said', 'std_msgs/String')
+    with pytest.raises(pharos.MessageTypeError, match=r"\(data: string\), not 'hello': send\(\) "):
+        channel.publish('hello')
+    for send in (
+        lambda: channel.send('hello'),
+        lambda: node.send_to('/said', 'hello'),
+        lambda: node.send_to('/never_said', 'hello', typed_as='std_msgs/String'),
+    ):
+        with pytest.raises(TypeError, match="as a keyword: data='hello'$"):
+            send()
+    with pytest.raises(TypeError, match=r"'hello' cannot be called: .* typed_as=, and the value"):
+        node.send_to('/never_said', 'hello')
+    with pytest.raises(pharos.UnknownTypeError, match="did you mean 'std_msgs/String'"):
+        node.output_channel('/never_said', 'String')
+    assert node.channels == [channel]

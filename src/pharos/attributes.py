@@ -13,13 +13,14 @@ from pharos.lifecycle import Lifecycle
 from pharos.private_rospy.settings import Settings
 from pharos.seconds import check_seconds
 from pharos.transcript import Transcript
+from pharos.wrong_guesses import getattr_with_hint
 
 if TYPE_CHECKING:
     from pharos.master import Master
     from pharos.run import Run
 
 NodeType = TypeVar('NodeType', bound='NodeAttributes')
-_SET_ONCE = frozenset(['master', '_settings', '_errors'])
+_SET_ONCE = frozenset(['_master', '_settings', '_errors'])
 _made_here = threading.local()  # .node_class: of the node that this thread makes
 
 
@@ -67,11 +68,11 @@ class NodeAttributes:
     #: the block that says what the node does, called as ``soul(node)`` by :meth:`execute` and
     #: :meth:`fork`; one that is set while the node runs takes effect with the next run, and
     #: :meth:`renew` has one that loops go on as the new one
-    soul: Optional[Block]
+    soul: Optional[Block] = None
     #: the block run for each message received, called as ``delegate(message, channel)``; those of a
     #: node run one at a time. The report: ``self receiverDelegate: [:message :channel | ...]``. One
     #: that is set while the node runs takes effect with the next message.
-    delegate: Optional[Block]
+    delegate: Optional[Block] = None
 
     #: the run of the present start, or the last one; None before the first start
     latest_run: 'Run' = None  # type: ignore[assignment]
@@ -91,6 +92,8 @@ class NodeAttributes:
                     f' not {cls.__name__}()'
                 )
             return super().__new__(cls)
+
+        __getattr__ = getattr_with_hint
 
     def __init_subclass__(cls, is_base: bool = False, **kwargs: Any) -> None:
         """:param is_base: whether it is one of those that make up Node"""
@@ -135,14 +138,19 @@ class NodeAttributes:
     def _configure(
         self, master: 'Master', settings: Settings, soul: Optional[Block], delegate: Optional[Block]
     ) -> None:
-        self.master = master
+        self._master = master
         self._settings = settings
         self._errors = Failures(self._tell_failure)
         self.soul, self.delegate = soul, delegate
 
     @property
+    def master(self) -> 'Master':
+        """The :class:`Master` that created the node."""
+        return self._master
+
+    @property
     def lifecycle(self) -> Lifecycle:
-        """A :class:`Lifecycle`."""
+        """Where the node is in its life: a :class:`Lifecycle`."""
         return Lifecycle.NEW if self.latest_run is None else self.latest_run.lifecycle
 
     @property

@@ -9,6 +9,7 @@ from pharos import on_demand
 from pharos.blocks import Block, check_delegate
 from pharos.errors import NodeStoppedError, PharosError
 from pharos.intraprocess.inbox import Inbox, SocketInbox
+from pharos.wrong_guesses import getattr_with_hint
 
 if TYPE_CHECKING:
     from pharos.live.plot import Plot
@@ -23,6 +24,8 @@ class Channel:
     """
 
     refused: Any = 0  # how many of the other end the channel cannot hear
+    if not TYPE_CHECKING:
+        __getattr__ = getattr_with_hint
 
     def __init__(
         self, node: 'Node', topic: str, message_class: Type[genpy.Message], queue_size: int
@@ -122,8 +125,17 @@ class Channel:
 class InputChannel(Channel):
     """The end at which a node receives: made by :meth:`Node.interested_in`.
 
-    :attr:`received` counts the messages that the node has taken from the channel, :attr:`dropped`
-    those dropped, the oldest first, because the node was slower than they came.
+    :ivar node: the node that has it
+    :ivar topic: the name of the topic
+    :ivar message_class: the class of its messages
+    :ivar received: how many messages the node has taken from it
+    :ivar dropped: how many were dropped, the oldest first, for the node was slower than they came
+    :ivar from_: the name of the only node that it hears; None: all
+    :ivar inline: whether the delegate runs in the publisher's thread
+    :ivar shared: whether it gets the very message that was published
+    :ivar queue_size: messages that may wait for the node
+    :ivar queue_bytes: bytes of large messages that may
+    :ivar closed: whether it was closed for good
     """
 
     def __init__(

@@ -22,7 +22,11 @@ def node_api(uri: str, timeout: float = TIMEOUT) -> Any:
 
 
 class ExternalNode:
-    """An interface to any ROS node outside this process, written in any language."""
+    """An interface to any ROS node outside this process, written in any language.
+
+    :ivar master: the :class:`Master` that it is of
+    :ivar name: its full name
+    """
 
     def __init__(self, master: 'Master', name: str) -> None:
         self.master = master

@@ -26,15 +26,20 @@ LARGE = 10000  # bytes of a thing that an exception without its frames may hold 
 class Failure:
     """A failure of a block, as often as it came: one of :attr:`Node.failures`.
 
-    :attr:`error` is the exception, :attr:`block` what raised it, :attr:`message` what the block was
-    run on (a message, a service's request, a parameter's value; None for a soul), :attr:`channel`
-    where that came from (None where it is no message), :attr:`count` how many times it came, and
-    :attr:`time` when that was last, in seconds as of ``time.time()``; error and message are of that
-    time. Failures are identical, and one, where block, channel, class and text of the exception,
-    and the line that raised it, are the same.
+    Failures are identical, and one, where block, channel, class and text of the exception, and the
+    line that raised it, are the same. Of the newest 5 failures of a node, message and frames are
+    kept; of older ones the text of the :attr:`traceback`.
 
-    Of the newest 5 failures of a node, message and frames are kept; of older ones the text of the
-    :attr:`traceback`.
+    :ivar error: the exception, of the last time
+    :ivar block: what raised it
+    :ivar message: what the block was run on, the last time: a message, a service's request, a
+        parameter's value; None for a soul
+    :ivar channel: the channel that it came from; None where it is no message
+    :ivar count: how many times it came
+    :ivar time: when that was last, in seconds as of ``time.time()``
+    :ivar where: the block and its node, in words
+    :ivar text: the text of the exception, cut where it is long
+    :ivar kept_by: the node's :attr:`~Node.errors`
     """
 
     def __init__(

@@ -53,6 +53,7 @@ class Master(MasterServices):
     Masters whose URLs mean one address ('localhost' and '127.0.0.1') are equal; a host name is
     looked up where two are compared.
 
+    :ivar url: its URL
     :param url: URL of the ROS master; None: ROS_MASTER_URI, else ROS's default. Makes no connection
         yet.
     :raises ValueError: if it is no URL

@@ -28,6 +28,7 @@ from pharos.private_rospy.names import check_name
 from pharos.private_rospy.proxies import ServerProxy, interruption, master_api
 from pharos.private_rospy.registration import COMMUNICATION_ERRORS, PING_TIMEOUT, unreachable
 from pharos.seconds import check_limit
+from pharos.wrong_guesses import getattr_with_hint
 
 if TYPE_CHECKING:
     from pharos.live.graph import Graph
@@ -46,6 +47,8 @@ class MasterCalls:
     """
 
     url: str
+    if not TYPE_CHECKING:
+        __getattr__ = getattr_with_hint
 
     def api(self, caller_id: str = '/pharos', timeout: float = TIMEOUT) -> rosgraph.Master:
         """rosgraph's own API of the master; its calls take ``timeout`` seconds at the most."""

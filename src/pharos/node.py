@@ -26,6 +26,27 @@ class Node(NodeWithTopics, is_base=True):
 
     A node is configured before its ``__init__`` runs, which gets only the further keywords of
     ``create``.
+
+    :ivar name: its name, as the master knows it: '/robot1/driver'
+    :ivar master: the :class:`Master` that created it
+    :ivar is_running: whether it is started, and no stop has begun; :attr:`lifecycle` says more
+    :ivar soul: the block that says what it does, called as ``soul(node)``; may be set
+    :ivar delegate: the block run for each message, called as ``delegate(message, channel)``; may be
+        set
+    :ivar channels: the channels that it has open
+    :ivar errors: the exceptions that its blocks raised, the newest last
+    :ivar failures: a :class:`Failure` for each of these: block, message, count, ``retry()`` ...
+    :ivar ros: its own rospy, whole
+    :ivar uri: the URI of its XML-RPC server
+    :ivar domain: the address that it advertises
+    :ivar tcp_port: its TCPROS port
+    :ivar xmlrpc_port: its XML-RPC port
+    :ivar connect_timeout: seconds that a topic's first message waits for subscribers; may be set
+    :ivar stop_timeout: seconds that a stop waits for souls and messages; may be set
+    :ivar queue_bytes: bytes of messages that wait for a slow receiver; may be set
+    :ivar allow_remote_shutdown: whether any host may stop it, not only this one and the master's;
+        may be set
+    :ivar latest_run: what its present start, or the last one, has made; None before the first
     """
 
     #: whether its class has a start() of its own, which opens and forks all that the node has
@@ -230,7 +251,7 @@ class Node(NodeWithTopics, is_base=True):
 
 
 class BlockNode(Node):
-    """A node made of blocks alone, for tests and prototypes.
+    """A node made of blocks alone, for tests and prototypes; ``help(Node)`` tells what it has.
 
     The report (listing 3.7)::
 

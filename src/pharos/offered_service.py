@@ -20,7 +20,13 @@ if TYPE_CHECKING:
 
 
 class OfferedService:
-    """A service of a node; made by :meth:`~pharos.Node.serve`."""
+    """A service of a node; made by :meth:`~pharos.Node.serve`.
+
+    :ivar node: the node that offers it
+    :ivar name: its full name
+    :ivar service_class: the class of its type
+    :ivar closed: whether it was closed
+    """
 
     def __init__(
         self,

@@ -18,7 +18,8 @@ def module(name: str) -> Any:
 def __getattr__(name: str) -> Any:
     """What ``pharos.ScriptNode`` is: the package has this function, too (PEP 562)."""
     if name not in _MODULES:
-        raise AttributeError(f"module 'pharos' has no attribute {name!r}")
+        hint = module('wrong_guesses').hint(name)
+        raise AttributeError(f"module 'pharos' has no attribute {name!r}{hint}")
     return getattr(module(_MODULES[name]), name)
 
 

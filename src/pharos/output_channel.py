@@ -23,7 +23,16 @@ if TYPE_CHECKING:
 class OutputChannel(Channel):
     """The end at which a node sends, as :meth:`Node.output_channel` or ``send_to`` makes it.
 
-    :attr:`sent` counts the messages published; :attr:`latched` keeps the last, None: nothing does.
+    :ivar node: the node that has it
+    :ivar topic: the name of the topic
+    :ivar message_class: the class of its messages
+    :ivar sent: how many messages were published
+    :ivar latch: whether those get the last one who become interested later
+    :ivar latched: what keeps it for them; None: nothing does
+    :ivar refused: 0, for only an InputChannel refuses
+    :ivar queue_size: messages that may wait for a slow receiver
+    :ivar queue_bytes: bytes of large messages that may
+    :ivar closed: whether it was closed for good
     """
 
     def __init__(

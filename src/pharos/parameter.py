@@ -14,12 +14,16 @@ if TYPE_CHECKING:
 class Parameter:
     """A parameter as a node sees it; made by :meth:`Node.parameter`.
 
-    PhaROS 2018: ``parameter: name initialized: value``. :attr:`name` is its global name.
+    PhaROS 2018: ``parameter: name initialized: value``.
     Initialized with None it may hold anything, otherwise only values of that type (a float also
     takes integers). A namespace is a parameter, too, whose value is a dict of what it holds.
 
     The blocks of :meth:`on_change` outlive a restart of the node as its channels do, and one of the
     master, after which the parameter has its initial value again.
+
+    :ivar node: the node that sees it
+    :ivar name: its full name
+    :ivar blocks: what :meth:`on_change` was given
     """
 
     def __init__(self, node: 'Node', name: str, initialized: Any = None) -> None:

@@ -50,6 +50,8 @@ class RosProcess:
     ``with`` block.
 
     What the program has started ends with it.
+
+    :ivar command: the program and its arguments
     """
 
     def __init__(

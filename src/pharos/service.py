@@ -11,7 +11,6 @@ import rosgraph
 from pharos import messages
 from pharos.blocks import check_filler
 from pharos.errors import (
-    MessageTypeError,
     NodeStoppedError,
     ServiceCallError,
     ServiceTypeError,
@@ -45,8 +44,15 @@ class Service:
 
     :attr:`type` and :attr:`md5sum` are found by asking the provider. A call sends the md5sum of the
     definition that fills the request, so that the provider refuses one of another layout; a
-    ``md5sum`` set by hand is sent instead, until it is set to None. :attr:`response` is the last
-    call's. May be called from several threads at once.
+    ``md5sum`` set by hand is sent instead, until it is set to None. May be called from several
+    threads at once.
+
+    :ivar master: the :class:`Master` that it is of
+    :ivar name: its full name
+    :ivar caller_id: in whose name it is called
+    :ivar persistent: whether connections are kept between calls
+    :ivar response: that of the last call; None before the first
+    :ivar uri: the URI of the provider
     """
 
     def __init__(
@@ -191,8 +197,9 @@ class Service:
         deadline = None if timeout is None else time.monotonic() + timeout
         self.response = None
         self._check_definition(deadline)
-        messages.check_not_hidden(self.service_class._request_class, block, timeout=timeout)
-        request = self._request(block, fields)
+        cls = self.service_class._request_class
+        messages.check_not_hidden(cls, block, timeout=timeout)
+        request = messages.ready_or_built(cls, block, fields, self.name)
         self._calls += 1
         request = numbered(request, self._calls)
         waiting = Interruption()
@@ -212,19 +219,6 @@ class Service:
                 ' still running?'
             ) from error
         return response  # not self.response, which is another thread's by now
-
-    def _request(self, filler: Any, fields: Dict[str, Any]) -> genpy.Message:
-        """A request that is filled, or the ready one itself."""
-        cls = self.service_class._request_class
-        if not isinstance(filler, genpy.Message):
-            return messages.build(cls, filler, fields)
-        if filler._md5sum != cls._md5sum:
-            raise MessageTypeError(
-                f'{self.name} is called with a {cls._type} ({messages.describe_fields(cls)}), not'
-                f' {filler._type}'
-            )
-        messages.check_alone(filler, fields)
-        return filler
 
     def _check_definition(self, deadline: Optional[float]) -> None:
         """Refuse a definition that is not the provider's, before anybody wonders which fields a

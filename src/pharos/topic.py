@@ -51,6 +51,9 @@ class Topic:
     The report: "When a node asks for information or publishes information, it asks the right
     instance of PhaROSTopic to give it the correct channel." Topics hold no state: ask
     :meth:`Master.topic <pharos.Master.topic>` as you like.
+
+    :ivar master: the :class:`Master` that it is of
+    :ivar name: its full name
     """
 
     def __init__(self, master: 'Master', name: str) -> None:

@@ -30,6 +30,11 @@ class ScriptNode(Node):
     registers the node. :meth:`stop` ends it, ``restart()`` also runs it again, and the node stops
     when it has ended by itself.
 
+    :ivar path: the file of the program
+    :ivar args: its arguments
+    :ivar cwd: its working directory; None: this process's
+    :ivar output: where what it prints goes, as below
+    :ivar init_timeout: seconds that :meth:`start` waits for its ``rospy.init_node``
     :param path: the file of the program
     :param args: its arguments, ROS's among them
     :param params: ``{name: value}`` of private parameters, set when it calls ``init_node``

@@ -44,11 +44,15 @@ class Graph:
     """What :meth:`Master.graph <pharos.Master.graph>` returns: a picture of a
     :class:`~pharos.live.snapshot.Snapshot`.
 
-    :attr:`nodes`, :attr:`topics` and :attr:`services` are ``{name: what was seen of it}``,
-    :attr:`edges` a list of
-    :class:`~pharos.live.edges.Edge`, :attr:`rates` ``{topic: messages a second}`` where that
-    was measured. Each is what the picture shows; :attr:`snapshot` has all.
-
+    :ivar nodes: ``{name: what was seen of it}``, of those that the picture shows
+    :ivar topics: the same of topics
+    :ivar services: the same of services
+    :ivar edges: the arrows, each an :class:`~pharos.live.edges.Edge`
+    :ivar rates: ``{topic: messages a second}``, where that was measured
+    :ivar snapshot: all that was seen
+    :ivar nodes_only: whether arrows go from node to node, instead of topics
+    :ivar group: what the frames are: 'process', 'namespace' or 'none'
+    :ivar namespaces: those of the nodes that it shows
     :param snapshot: what was seen
     :param rates: ``{topic: messages a second}``
     :param options: as of :meth:`Master.graph <pharos.Master.graph>`

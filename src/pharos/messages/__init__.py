@@ -28,6 +28,7 @@ from pharos.messages.fields import (
     fields_of,
     fill,
     nested_class,
+    ready_or_built,
 )
 from pharos.messages.from_publishers import (
     class_from_publishers,
@@ -57,5 +58,6 @@ __all__ = [
     'known_types',
     'message_class',
     'nested_class',
+    'ready_or_built',
     'service_class',
 ]

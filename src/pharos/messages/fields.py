@@ -103,6 +103,24 @@ def check_alone(message: genpy.Message, fields: Dict[str, Any]) -> None:
         )
 
 
+def ready_or_built(
+    cls: MessageClass, filler: Any, fields: Dict[str, Any], service: str
+) -> genpy.Message:
+    """The request of a call: ``filler`` where it is one that is ready, else as :func:`build` has it.
+
+    :param service: the name of the service
+    :raises MessageTypeError: if it is another message
+    """
+    if not isinstance(filler, genpy.Message):
+        return build(cls, filler, fields)
+    if filler._md5sum != cls._md5sum:
+        raise MessageTypeError(
+            f'{service} is called with a {cls._type} ({describe_fields(cls)}), not {filler._type}'
+        )
+    check_alone(filler, fields)
+    return filler
+
+
 def build(cls: MessageClass, filler: Any, fields: Dict[str, Any]) -> genpy.Message:
     """A new message that is filled by ``filler(message)``, or by the fields in it where it is a
     dict, and then by ``fields`` by name.
