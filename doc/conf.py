@@ -47,7 +47,7 @@ nitpicky = True
 nitpick_ignore_regex = [
     # types in signatures that have no page here: those of others, type variables, what is internal
     ('py:(class|exc)', r'(genpy|rospy|rosgraph|threading|os|subprocess|_pytest)\..*'),
-    ('py:class', r'(Init|Init\.k?w?args|.*\.Self|(.*\.)?(NodeType|Value)|Block|Peer|Image)'),
+    ('py:class', r'(Init|Init\.k?w?args|.*\.Self|(.*\.)?(\w+Type|Value)|Block|Peer|Image)'),
     (
         'py:class',
         r'(Run|pharos\.run\.Run|pharos\.channel\.Channel|pharos\.failures\.Failure(s|List))',
@@ -100,17 +100,21 @@ def _apart(field):
     return '\n'.join(f':{field[1]} {name}:{field[3]}' for name in field[2].split(', '))
 
 
-def let_folders_be(app, environment, node, text):
-    """Leave links to folders to who reads the clone: there is no page of a folder."""
-    folder = (ROOT / node['refdoc']).parent / node['reftarget']
-    return text if node.get('refdomain') != 'py' and folder.is_dir() else None
+def let_folders_be(app, name, source):
+    """Make text of links to folders, which are for who reads the clone: a folder has no page."""
+    page = ROOT / name
+
+    def text_of(link):
+        return link[1] if (page.parent / link[2]).is_dir() else link[0]
+
+    source[0] = re.sub(r'(?<!!)\[([^][]+)\]\(([^)\s]+)\)', text_of, source[0])
 
 
 def setup(app):
     """What Sphinx calls first."""
     app.connect('source-read', draw_flowcharts)
     app.connect('source-read', tell_programs)
+    app.connect('source-read', let_folders_be)
     app.connect('autodoc-process-docstring', take_fields_apart)
-    app.connect('missing-reference', let_folders_be)
     for kind in 'debugger', 'ipython':  # of what is typed in the tutorial
         app.add_lexer(kind, TextLexer)

@@ -38,7 +38,8 @@ def pattern_of(printed):
 
 
 @pytest.mark.parametrize('block', blocks(), ids=lambda block: block.where)
-def test_a_block_of_a_page_does_what_it_says(block, master, monkeypatch, capfd, tmp_path):
+def test_a_block_of_a_page_does_what_it_says(block, capfd, master, monkeypatch, tmp_path):
+    # capfd comes first, so that it ends last: the nodes, which print, have stopped by then
     monkeypatch.chdir(tmp_path)
     if re.search(r'^def test_', block.text, re.MULTILINE):
         (tmp_path / 'test_page.py').write_text(block.text)
