@@ -1,5 +1,6 @@
 """The how-to pages of doc/: each block of Python in them, run by itself at a master, prints what
 stands below it."""
+import io
 import re
 import sys
 from typing import NamedTuple
@@ -11,6 +12,7 @@ from pharos.testing import until
 from programs import ROOT, run
 
 BLOCK = re.compile(r'^```python\n(.*?)^```\n(?:\n```text\n(.*?)^```\n)?', re.DOTALL | re.MULTILINE)
+PYTEST = sys.executable, '-m', 'pytest', '-q', '-p', 'pharos.testing'
 
 
 class Block(NamedTuple):
@@ -37,24 +39,35 @@ def pattern_of(printed):
     return re.compile(r'^' + r'$(?:.*\n)*?^'.join(lines) + r'$', re.MULTILINE)
 
 
+class Printed(io.TextIOBase):
+    """Standard output that threads write to while another one reads what there is so far, of which
+    pytest's own can crash."""
+
+    def __init__(self):
+        self._parts = []
+
+    def write(self, text):
+        self._parts.append(text)
+
+    def __str__(self):
+        return ''.join(self._parts)
+
+
 @pytest.mark.parametrize('block', blocks(), ids=lambda block: block.where)
-def test_a_block_of_a_page_does_what_it_says(block, capfd, master, monkeypatch, tmp_path):
-    # capfd comes first, so that it ends last: the nodes, which print, have stopped by then
+def test_a_block_of_a_page_does_what_it_says(block, master, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     if re.search(r'^def test_', block.text, re.MULTILINE):
         (tmp_path / 'test_page.py').write_text(block.text)
-        ended = run(
-            master.url, sys.executable, '-m', 'pytest', '-q', '-p', 'pharos.testing', cwd=tmp_path
-        )
+        ended = run(master.url, *PYTEST, cwd=tmp_path)
         assert ended.returncode == 0, ended.stdout
         return
-    pattern, seen = pattern_of(block.printed), []
+    pattern, printed = pattern_of(block.printed), Printed()
+    monkeypatch.setattr(sys, 'stdout', printed)
 
     def is_printed():
-        seen.append(capfd.readouterr().out)
-        return pattern.search(''.join(seen))
+        return pattern.search(str(printed))
 
     # what spin() waits for, Ctrl-C, comes when all is printed
     monkeypatch.setattr(pharos, 'spin', lambda: until(is_printed, what=block.printed))
     exec(compile(block.text, block.where, 'exec'), {'__name__': '__main__'})
-    assert is_printed(), f'{"".join(seen)}\nis printed, and not\n{block.printed}'
+    assert is_printed(), f'{printed}\nis printed, and not\n{block.printed}'
