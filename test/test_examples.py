@@ -1,4 +1,5 @@
 """examples/: what each does, with peers of ROS, and that its picture is true."""
+import ast
 import contextlib
 import re
 import signal
@@ -112,36 +113,36 @@ def test_what_has_failed_or_stopped_is_restarted(master):
 # -- all of them
 
 
-def started_all(url, *arguments):
-    """All of them, side by side, to their ends: ``{name: (status, output, errors)}``."""
+@NAMES
+def test_it_says_what_there_is_to_see(name):
+    source = examples.path_of(name).read_text()
+    assert 'Ctrl-C' in ast.get_docstring(ast.parse(source))
+    assert source.endswith(f"    sys.exit(program.run('{name}', main, about=__doc__))\n")
+
+
+def test_help_is_that():
+    path = examples.path_of('camera')
+    ended = run(refused_url(), sys.executable, str(path), '--help')
+    assert (ended.returncode, ended.stderr) == (0, '')
+    assert ended.stdout.strip() == ast.get_docstring(ast.parse(path.read_text()))
+
+
+def test_without_a_master_it_is_said_in_one_line():
+    url = refused_url()
     running = {
         name: subprocess.Popen(
-            [sys.executable, str(examples.path_of(name)), *arguments],
+            [sys.executable, str(examples.path_of(name))],
             env=environment(url),
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
         )
         for name in examples.NAMES
-        if arguments or 'Master.embedded()' not in examples.path_of(name).read_text()
+        if 'Master.embedded()' not in examples.path_of(name).read_text()
     }
-    ended = {}
     for name, process in running.items():
         output, errors = process.communicate(timeout=2 * TIMEOUT)
-        ended[name] = process.returncode, output, errors
-    return ended
-
-
-def test_help_tells_what_there_is_to_see():
-    for name, (status, output, errors) in started_all(refused_url(), '--help').items():
-        assert (status, errors) == (0, '')
-        assert output.strip() in examples.path_of(name).read_text()
-        assert 'Ctrl-C' in output
-
-
-def test_without_a_master_it_is_said_in_one_line():
-    for name, (status, output, errors) in started_all(refused_url()).items():
-        assert (status, output) == (1, '')
+        assert (process.returncode, output) == (1, '')
         assert re.fullmatch(f'{name}: no ROS master answers at .*roscore.*\n', errors)
 
 
