@@ -15,7 +15,7 @@ from pharos.live import program
 def lead(robot):
     for turn in robot.every(0.2):
         position = {'x': math.cos(turn / 10), 'y': math.sin(turn / 10)}
-        robot.send_to('/leader', typed_as='geometry_msgs/Point', **position)
+        robot.send_to('/leader', position, typed_as='geometry_msgs/Point')
 
 
 def follow(point, channel):
