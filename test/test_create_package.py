@@ -207,7 +207,9 @@ def test_what_cannot_be_the_name_of_a_package_is_refused(source, name, text):
         (['import'], 'a word of Python'),
         (['none'], 'its class would be None'),
         (['keyboard_interrupt'], 'its class would be KeyboardInterrupt'),
-        (['one', 'two', 'one'], "'one' is named twice"),
+        (['one', 'two', 'one'], "'one' and 'one' would both be the class One"),
+        (['arm_1', 'arm1'], "'arm_1' and 'arm1' would both be the class Arm1"),
+        (['all_in_one', 'other'], 'is the program that runs all nodes'),
     ],
 )
 def test_what_cannot_be_the_name_of_a_node_is_refused(source, nodes, text):

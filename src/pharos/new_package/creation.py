@@ -13,7 +13,7 @@ from typing import Iterator, List, NamedTuple, Optional, Sequence
 import rospkg
 
 from pharos.errors import PharosError, suggest
-from pharos.new_package.files import Package, class_name, files_of
+from pharos.new_package.files import IN_ONE, Package, class_name, files_of
 
 NAME = re.compile(r'[a-z][a-z0-9]*(_[a-z0-9]+)*', re.ASCII)
 #: what catkin takes for an address: it builds no package whose maintainer has another
@@ -95,8 +95,14 @@ def _check_nodes(nodes: Sequence[str]) -> None:
                 f'{node!r} cannot be the name of a node: its class would be {class_name(node)}, and'
                 ' Python has that: choose another name'
             )
-        if node in nodes[:number]:
-            raise ValueError(f'the node {node!r} is named twice: each has a name of its own')
+        if node == IN_ONE:
+            raise ValueError(f'{node!r} is the program that runs all nodes: choose another name')
+        for former in nodes[:number]:
+            if class_name(former) == class_name(node):
+                raise ValueError(
+                    f'the nodes {former!r} and {node!r} would both be the class {class_name(node)}:'
+                    ' choose another name for one'
+                )
 
 
 def _check_name(name: str, what: str) -> None:

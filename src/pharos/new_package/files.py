@@ -1,6 +1,6 @@
 """The files of a new package: their texts, in which ``@word@`` stands for what differs."""
 import re
-from typing import Dict, List, NamedTuple
+from typing import Dict, Iterable, List, NamedTuple, Tuple
 from xml.sax.saxutils import escape, quoteattr
 
 PACKAGE_XML = '''\
@@ -117,6 +117,35 @@ if __name__ == '__main__':
     main()
 '''
 
+ALL_IN_ONE = '''\
+#!/usr/bin/python3
+"""Runs all nodes of @package@ in one process, until Ctrl-C."""
+import sys
+
+import pharos
+@imports@
+
+
+def main() -> None:
+    """Make them one after the other; each hears what the one before says."""
+    argv = [
+        *sys.argv,
+@remappings@
+    ]
+    try:
+        master = pharos.Master()
+@creations@
+        pharos.spin()
+    except KeyboardInterrupt:
+        pass
+    except (pharos.PharosError, ValueError) as error:
+        sys.exit(f'@program@: {error}')
+
+
+if __name__ == '__main__':
+    main()
+'''
+
 CONFTEST = '''\
 """Fixtures: a ROS master for each test, and nodes that end with it."""
 import pathlib
@@ -183,7 +212,7 @@ While that runs:
     rostopic pub --once /@first@/input std_msgs/String hello
     rosrun pharos graph
 
-`rosrun @package@ @first@` runs one node, `rosrun pharos compose @package@ @package@.launch` all of them in one process.
+`rosrun @package@ @first@` runs one node@all_in_one@.
 
 ## Tests
 
@@ -195,10 +224,14 @@ Here, whether it is built or not, or in the workspace:
 ## Files
 
 - `src/@package@`: the nodes, each a class in a module.
-- `scripts`: a program for each, which is listed in `CMakeLists.txt`, too.
+- `scripts`: a program for each; all are listed in `CMakeLists.txt`.
 - `launch/@package@.launch`: all of them, with their names, parameters and remappings.
 - `test`: a file for each node, whose tests have a ROS master of their own.
 '''
+
+
+#: the program that has all nodes, where there are several
+IN_ONE = 'all_in_one'
 
 
 class Package(NamedTuple):
@@ -218,12 +251,17 @@ def class_name(node: str) -> str:
 
 def files_of(package: Package) -> Dict[str, str]:
     """``{path in the package: text}``; those in scripts are programs."""
+    is_one = len(package.nodes) == 1
+    programs = package.nodes if is_one else [*package.nodes, IN_ONE]
     words = {
         'package': package.name,
         'first': package.nodes[0],
         'node_names': ', '.join(package.nodes),
-        'script_lines': '\n'.join(f'    scripts/{node}' for node in sorted(package.nodes)),
+        'script_lines': '\n'.join(f'    scripts/{program}' for program in sorted(programs)),
         'launched': '\n'.join(_launched(package)).rstrip('\n'),
+        'all_in_one': ''
+        if is_one
+        else f', `rosrun {package.name} {IN_ONE}` all of them in one process',
         'author_text': escape(package.author),
         'email_attribute': quoteattr(package.email),
         'license_text': escape(package.license),
@@ -243,16 +281,41 @@ def files_of(package: Package) -> Dict[str, str]:
         texts[f'src/{package.name}/{node}.py'] = _fill(NODE, words)
         texts[f'scripts/{node}'] = _fill(SCRIPT, words)
         texts[f'test/test_{node}.py'] = _fill(TEST, words)
+    if not is_one:
+        texts[f'scripts/{IN_ONE}'] = _all_in_one(package)
     return texts
+
+
+def _all_in_one(package: Package) -> str:
+    classes = {node: class_name(node) for node in package.nodes}
+    lines = {
+        'imports': [
+            f'from {package.name}.{node} import {classes[node]}' for node in sorted(package.nodes)
+        ],
+        'remappings': [
+            f"        '{node}:~input:={former}/output'," for former, node in _pairs(package)
+        ],
+        'creations': [
+            f"        master.create({classes[node]}, named='{node}', argv=argv)"
+            for node in package.nodes
+        ],
+    }
+    words = {word: '\n'.join(text) for word, text in lines.items()}
+    return _fill(ALL_IN_ONE, {**words, 'package': package.name, 'program': IN_ONE})
+
+
+def _pairs(package: Package) -> Iterable[Tuple[str, str]]:
+    """Each node but the first, after the one that it hears."""
+    return zip(package.nodes, package.nodes[1:])
 
 
 def _launched(package: Package) -> List[str]:
     """The nodes of the launch file, each of which hears the one before."""
     names = {'package': package.name}
     first = _fill(LAUNCHED, {**names, 'node': package.nodes[0]})
-    pairs = zip(package.nodes, package.nodes[1:])
     others = [
-        _fill(LAUNCHED_NEXT, {**names, 'former': former, 'node': node}) for former, node in pairs
+        _fill(LAUNCHED_NEXT, {**names, 'former': former, 'node': node})
+        for former, node in _pairs(package)
     ]
     return [first, *others]
 

@@ -1,0 +1,1 @@
+"""The nodes of the package patrol, each a class in a module of its own."""
