@@ -117,10 +117,12 @@ def pid_of(master, name):
 
 @pytest.mark.parametrize('space', SPACES)
 def test_it_is_launched_respawned_and_ended(master, workspace, space):
-    """Namespaces, groups, remappings, parameters, two nodes of one process, respawn, required."""
+    """Namespaces, groups, remappings, parameters, two nodes of one process, one of them rospy's,
+    respawn, required."""
     ear = create(master, '/ear')
     hall = Mailbox(ear, '/hall/position', 'std_msgs/Float64')
     yard = Mailbox(ear, '/yard/whereabouts', 'std_msgs/Float64')
+    tower = Mailbox(ear, '/tower/seen', 'std_msgs/Float64')
     built = workspace(SPACES[space])
     with built.launch(master, space, 'patrol patrol.launch length:=1.0') as launched:
         for end in 1.0, 0.0:  # the guard of the same process has another length than the yard's
@@ -130,6 +132,8 @@ def test_it_is_launched_respawned_and_ended(master, workspace, space):
         names = {node.name for node in master.nodes()}
         assert {'/hall/walker', '/hall/guard', '/yard/walker', '/yard/guard', '/shift'} <= names
         assert master.parameters['/hall/guard/length'] == 1.0
+        tower.wait_for(lambda message: message.data == 0.5)
+        assert pid_of(master, '/tower/lookout') == pid_of(master, '/tower/walker')
         assert pid_of(master, '/hall/walker') == pid_of(master, '/hall/guard')
 
         killed = pid_of(master, '/yard/walker')

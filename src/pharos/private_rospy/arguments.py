@@ -2,16 +2,19 @@
 process.
 
 ``__name:=``, ``__ns:=``, remappings and private parameters are for the node that is the whole
-program. Here the first node created with them takes the name, and all else is for all. What is for
-one alone says so as in ROS 2: ``detector:image:=/camera/image``.
+program. Here the first node takes the name, which is the program itself where it is a rospy node or
+a script, else the first that is created with them; all else is for all. What is for one alone says
+so as in ROS 2: ``detector:image:=/camera/image``.
 """
 import re
 import threading
 from typing import Any, List
 
 import rosgraph.names
+from rosgraph.rosenv import get_master_uri
 
 from pharos.private_rospy.addresses import is_same_master
+from pharos.private_rospy.process_rospy import rospy
 
 _FOR_ONE = re.compile(r'([A-Za-z]\w*):(?!=)(.*)', re.ASCII | re.DOTALL)
 _MISTYPED = re.compile(r'\d[\w/]*:=', re.ASCII)  # rosgraph ignores it, and nobody hears of that
@@ -58,12 +61,15 @@ def mappings_for(arguments, node):
     return for_all, for_one
 
 
-def takes_name(master_url, arguments, node):
+def takes_name(master_url, arguments, name, node):
     """Whether the ``__name`` in the arguments is for the node: it is for the first that asks, now
-    and later.
+    and later, but where the program is a rospy node itself, which has it then.
 
+    :param name: that ``__name``
     :param node: the full name that the node has without it
     """
+    if _is_name_of_program(name, master_url):
+        return False
     arguments = tuple(arguments)
     with _lock:
         for url, others, taker in _takers:
@@ -71,3 +77,11 @@ def takes_name(master_url, arguments, node):
                 return taker == node
         _takers.append((master_url, arguments, node))
         return True
+
+
+def _is_name_of_program(name, master_url):
+    return (
+        rospy.core.is_initialized()
+        and rospy.names.get_mappings().get('__name') == name
+        and is_same_master(get_master_uri(), master_url)
+    )

@@ -67,8 +67,11 @@ class Settings:
         namespace = _namespace(name, given)
         base = for_one.get('__name', own_base)
         if '__name' in for_all:
-            if '__name' not in for_one and takes_name(master_url, arguments, namespace + base):
-                base = for_all['__name']
+            given_name = for_all['__name']
+            if '__name' not in for_one and takes_name(
+                master_url, arguments, given_name, namespace + base
+            ):
+                base = given_name
                 if given is not None:
                     namespace = _namespace('', given)
             else:
@@ -106,6 +109,9 @@ class Settings:
             self.name = unique_name(self.name)
         elif '__name' not in mappings:  # which roslaunch gives
             self.argv.append(f'__name{rosgraph.names.REMAP}{self.base_name}')
+        if '__name' in rosgraph.names.load_mappings(self.argv):
+            # before the nodes that the program creates with its arguments
+            takes_name(self.master_url, self.argv, None, self.name)
         self.environ.update(env)
         self.private_name = private_name
         self.params = {}

@@ -17,6 +17,7 @@ class Walker(pharos.Node):
     def aim(self, message: std_msgs.msg.Float64, channel: pharos.InputChannel) -> None:
         """Somebody has another goal for it."""
         self.goal = message.data
+        self.log(f'goes to {self.goal:g} m')
 
     def walk(self) -> None:
         """A step towards the goal, again and again."""
