@@ -3,6 +3,7 @@ import ast
 import importlib.util
 import keyword
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -26,8 +27,7 @@ LICENSE = 'BSD-3-Clause'
 def run(*command, cwd, **variables):
     """Run a program there to its end; returns its status and all that it printed."""
     environ = {**os.environ, 'PYTHONPATH': str(ROOT / 'src'), **variables}
-    for name in 'PYTEST_ADDOPTS', 'ROS_MASTER_URI':
-        environ.pop(name, None)
+    environ.pop('PYTEST_ADDOPTS', None)
     ended = subprocess.run(
         command,
         cwd=cwd,
@@ -35,7 +35,7 @@ def run(*command, cwd, **variables):
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        timeout=2 * TIMEOUT,
+        timeout=6 * TIMEOUT,  # mypy reads all that the package imports
         check=False,
     )
     return ended.returncode, ended.stdout
@@ -90,6 +90,19 @@ def test_its_tests_pass_in_the_clone_with_nothing_built(made):
     status, printed = run(sys.executable, '-m', 'pytest', '-q', 'test', cwd=package)
     assert status == 0, printed
     assert '2 passed' in printed
+
+
+@pytest.mark.parametrize('program', [*NODES, 'all_in_one'])
+def test_its_programs_say_what_they_are_for_and_what_is_wrong(made, program):
+    package, _ = made
+    path = os.pathsep.join([str(ROOT / 'src'), str(package / 'src')])
+    variables = {'PYTHONPATH': path, 'ROS_MASTER_URI': 'http://127.0.0.1:1/'}
+    status, printed = run(package / 'scripts' / program, '--help', cwd=package, **variables)
+    assert status == 0
+    assert re.match('Runs .* until Ctrl-C', printed)
+    status, printed = run(package / 'scripts' / program, cwd=package, **variables)
+    assert status == 1
+    assert re.fullmatch(f'{program}: .*127.0.0.1:1.*\n', printed)
 
 
 def test_black_flake8_and_mypy_have_nothing_to_say(made):

@@ -54,7 +54,7 @@ ROSPYS_NAMES = {
         '_TopicImpl',
     ),
     *('_handlerList', '_handlers', '_marshaled_dispatch', '_tcp_server_callback', '_shutdown'),
-    *('_xmlrpc_cache', '_init_node_args', '_preshutdown_hooks'),
+    *('_xmlrpc_cache', '_init_node_args', '_preshutdown_hooks', '_signalChain'),
 }
 ROSPYS_INSIDE = re.compile(
     r'rospy\.impl|rospy\.(core|topics|names)\._|_topic_manager|protocol_handlers'

@@ -12,12 +12,13 @@ COMMANDS = {
     'compose': 'run the Python nodes of a launch file in one process',
     'top': 'a live table of nodes, processes and topics',
     'graph': 'who talks with whom, as text or as a picture',
+    'create_package': 'make a catkin package with nodes and tests',
 }
 
 
 def main() -> int:
     """Run the command that the arguments name; returns its exit status."""
-    lines = '\n'.join(f'  {name:<11}{what}' for name, what in COMMANDS.items())
+    lines = '\n'.join(f'  {name:<16}{what}' for name, what in COMMANDS.items())
     parser = argparse.ArgumentParser(
         prog='pharos',
         description='Several ROS nodes in one process, and tools to see and change them live.',

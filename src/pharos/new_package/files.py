@@ -100,21 +100,17 @@ import sys
 
 import pharos
 from @package@.@node@ import @class@
+from pharos.live import program
 
 
 def main() -> None:
     """Run it, with the names and parameters that rosrun or roslaunch give."""
-    try:
-        pharos.Master().create(@class@, named='@node@', argv=sys.argv)
-        pharos.spin()
-    except KeyboardInterrupt:
-        pass
-    except (pharos.PharosError, ValueError) as error:
-        sys.exit(f'@node@: {error}')
+    pharos.Master().create(@class@, named='@node@', argv=sys.argv)
+    pharos.spin()
 
 
 if __name__ == '__main__':
-    main()
+    sys.exit(program.run('@node@', main, about=__doc__))
 '''
 
 ALL_IN_ONE = '''\
@@ -124,6 +120,7 @@ import sys
 
 import pharos
 @imports@
+from pharos.live import program
 
 
 def main() -> None:
@@ -132,18 +129,13 @@ def main() -> None:
         *sys.argv,
 @remappings@
     ]
-    try:
-        master = pharos.Master()
+    master = pharos.Master()
 @creations@
-        pharos.spin()
-    except KeyboardInterrupt:
-        pass
-    except (pharos.PharosError, ValueError) as error:
-        sys.exit(f'@program@: {error}')
+    pharos.spin()
 
 
 if __name__ == '__main__':
-    main()
+    sys.exit(program.run('@program@', main, about=__doc__))
 '''
 
 CONFTEST = '''\
@@ -296,7 +288,7 @@ def _all_in_one(package: Package) -> str:
             f"        '{node}:~input:={former}/output'," for former, node in _pairs(package)
         ],
         'creations': [
-            f"        master.create({classes[node]}, named='{node}', argv=argv)"
+            f"    master.create({classes[node]}, named='{node}', argv=argv)"
             for node in package.nodes
         ],
     }
