@@ -8,7 +8,7 @@ import xmlrpc.server
 import pytest
 import rosgraph
 
-from helpers import InProcessMaster, create
+from helpers import InProcessMaster, create, ended, in_thread
 from pharos.testing import Mailbox, TIMEOUT, until
 from pharos import Master, MasterUnreachableError, NodeStoppedError, node_registry
 from pharos.private_rospy.instance import PrivateRospy
@@ -408,6 +408,7 @@ def test_a_master_no_longer_calls_where_a_stopped_node_was(master):
     for name in '~rate', '/gains', '/gains/p':
         Changes(node).of(node.parameter(name))
     assert node.ros.get_param_cached('~rate', 1) == 1  # rospy itself subscribes here
+    assert node.parameter('/read').value is None
     node.stop()
     calls = Mailbox()
     with _Server(('127.0.0.1', node.xmlrpc_port), logRequests=False) as server:
@@ -417,7 +418,7 @@ def test_a_master_no_longer_calls_where_a_stopped_node_was(master):
         thread = threading.Thread(target=server.serve_forever, args=(0.01,))
         thread.start()
         master.api(node.name).subscribeParam(node.uri, '/sentinel')
-        for name in PRIVATE, '/gains', '/gains/p', '/sentinel':
+        for name in PRIVATE, '/gains', '/gains/p', '/read', '/sentinel':
             master.parameters[name] = 5
         assert calls.next() == '/sentinel/'  # a master calls one node in order
         server.shutdown()
@@ -497,6 +498,156 @@ def told_of(changes, master, name, value):
     it."""
     master.parameters[name] = value
     return not changes._mailbox.empty() and changes.until_now()
+
+
+# -- values that are kept
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """The names of the parameters whose values the master was asked for."""
+    names, call = [], Master.call
+
+    def note(self, method, *args, **options):
+        if method == 'getParam':
+            names.append(args[0])
+        return call(self, method, *args, **options)
+
+    monkeypatch.setattr(Master, 'call', note)
+    return names
+
+
+def until_told(node, parameter):
+    """Wait until the node has heard what the master had to tell of the parameter by now."""
+    Changes(node).until_now()
+    return parameter.value
+
+
+@pytest.mark.parametrize('value', [5, 2.5, 'text', True, [1, 2], {'p': 1}, None])
+def test_a_value_is_asked_for_once_and_then_kept(master, asked, value):
+    parameter = create(master).parameter('~kept')
+    if value is not None:
+        parameter.set(value)
+    del asked[:]
+    for _ in range(3):
+        assert parameter.value == value
+    assert parameter.node.parameter('~kept').value == value
+    assert asked == ['/node/kept']
+
+
+def test_what_another_program_sets_or_deletes_is_known_as_soon_as_the_master_tells(master, asked):
+    rate = create(master, '/robot1/driver').parameter('~rate', initialized=1.0)
+    assert rate.value == 1.0
+    for given, value in ('2.5', 2.5), ('3', 3.0):
+        assert run(master.url, 'rosparam', 'set', PRIVATE, given).returncode == 0
+        assert until_told(rate.node, rate) == value
+    assert run(master.url, 'rosparam', 'delete', PRIVATE).returncode == 0
+    assert until_told(rate.node, rate) is None
+    assert run(master.url, 'rosparam', 'set', PRIVATE, '4').returncode == 0
+    assert until_told(rate.node, rate) == 4.0
+    assert asked == 5 * [PRIVATE]
+
+
+@pytest.mark.parametrize(
+    'change, value',
+    [
+        (lambda node, other: node.parameter('/gains').set({'p': 7}), {'p': 7}),
+        (lambda node, other: node.parameter('/gains/p').set(7), {'p': 7, 'i': [1, 2]}),
+        (lambda node, other: other.parameter('/gains').set({'p': 7}), {'p': 7}),
+        (lambda node, other: other.parameter('/gains/p').set(7), {'p': 7, 'i': [1, 2]}),
+        (lambda node, other: node.ros.set_param('gains/p', 7), {'p': 7, 'i': [1, 2]}),
+        (lambda node, other: other.ros.set_param('gains/p', 7), {'p': 7, 'i': [1, 2]}),
+        (lambda node, other: node.ros.delete_param('gains/p'), {'i': [1, 2]}),
+        (lambda node, other: other.ros.delete_param('gains'), None),
+        (lambda node, other: node.master.parameters.update({'/gains/p': 7}), {'p': 7, 'i': [1, 2]}),
+        (lambda node, other: node.master.parameters.pop('/gains/p'), {'i': [1, 2]}),
+        (lambda node, other: node.master.parameters.pop('/gains'), None),
+        (lambda node, other: node.parameter('/gains').set(5), 5),
+    ],
+)
+def test_what_this_process_changes_is_known_at_once(master, change, value):
+    node, other = create(master), create(master, '/other')
+    node.parameter('/gains').set({'p': 1, 'i': [1, 2]})
+    read = [
+        each.parameter(name)
+        for each in (node, other)
+        for name in ('/gains', '/gains/p', '/gains/i', '/gains/d')
+    ]
+    parts = [value.get(name) for name in 'pid'] if isinstance(value, dict) else 3 * [None]
+    for _ in range(3):
+        change(node, other)
+        assert [each.value for each in read] == 2 * [value, *parts]
+        node.parameter('/gains').set({'p': 1, 'i': [1, 2]})
+        assert [each.value for each in read] == 2 * [{'p': 1, 'i': [1, 2]}, 1, [1, 2], None]
+
+
+def test_what_is_done_to_a_value_is_not_done_to_the_one_that_is_kept(master, asked):
+    gains = create(master).parameter('/gains', {'limits': [1, 2], 'pid': {'p': 1}})
+    for _ in range(2):  # the first one was asked for, the second one is kept
+        gains.value['limits'].append(3)
+        gains.value['pid']['p'] = 5
+        gains.value.clear()
+    assert gains.value == {'limits': [1, 2], 'pid': {'p': 1}}
+    assert asked == ['/gains']
+
+
+def test_a_block_for_changes_reads_the_value_that_it_is_told(master):
+    rate = create(master).parameter('~rate', 1)
+    read = Mailbox()
+    rate.on_change(lambda value: read((value, rate.value), None))
+    for value in range(20):
+        assert rate.value is not None
+        if value % 2:
+            rate.set(value)
+        else:
+            master.parameters[rate.name] = value
+        assert read.next() == (value, value)
+    assert rate.node.failures == []
+
+
+def test_of_many_who_set_it_at_once_the_last_value_stays(master):
+    nodes = [create(master, f'/node{number}') for number in range(3)]
+    rates = [node.parameter('/rate', 0) for node in nodes]
+
+    def work(number):
+        for value in range(20):
+            rates[number].set(100 * number + value)
+            master.api('/elsewhere').setParam('/rate', -value)
+            rates[number - 1].value
+
+    threads = [in_thread(work, number) for number in range(3)]
+    assert all(map(ended, threads))
+    last = master.parameters['/rate']
+    assert [until_told(node, rate) for node, rate in zip(nodes, rates)] == 3 * [last]
+
+
+def test_a_kept_value_is_of_one_run_and_one_master(mortal_master):
+    master = Master(mortal_master.url)
+    node = create(master)
+    rate, free = node.parameter('~rate', 1), node.parameter('~free')
+    rate.set(2)
+    free.set('set')
+    assert (rate.value, free.value) == (2, 'set')
+    node.stop()
+    master.parameters[rate.name] = 3
+    node.start()
+    assert (rate.value, free.value) == (3, 'set')
+    mortal_master.end()
+    assert (rate.value, free.value) == (3, 'set')  # what was known last
+    mortal_master.come_back()
+    until(lambda: (rate.value, free.value) == (1, None))
+    master.parameters[free.name] = 'again'
+    assert until_told(node, free) == 'again'
+
+
+def test_a_set_that_fails_leaves_nothing_that_may_be_old(mortal_master):
+    rate = create(Master(mortal_master.url)).parameter('~rate', 1)
+    assert rate.value == 1
+    mortal_master.end()
+    with pytest.raises(MasterUnreachableError):
+        rate.set(2)  # nobody knows whether it has been set
+    with pytest.raises(MasterUnreachableError):
+        rate.value
 
 
 def test_a_master_that_is_away_is_named(monkeypatch):

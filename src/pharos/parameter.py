@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, List
 import rosgraph
 
 from pharos.blocks import Block, BlockOf, check_block
-from pharos.private_rospy.parameters import as_stored
+from pharos.private_rospy.parameters import as_stored, changing
 
 if TYPE_CHECKING:
     from pharos.node import Node
@@ -39,12 +39,23 @@ class Parameter:
 
     @property
     def value(self) -> Any:
-        """Its value on the parameter server now; None where it has none.
+        """Its value on the parameter server; None where it has none.
+
+        It is asked for once, and then kept here until the master tells that it has changed, within
+        milliseconds; what this process sets is known at once. A master that has come back empty is
+        noticed within about a second, and while it is away the value is the last one. The dict or
+        list that it may be is the caller's own.
 
         :raises ValueError: if somebody has set it to a value of another type
-        :raises MasterUnreachableError: if there is no answer
+        :raises MasterUnreachableError: if it is not known yet, and there is no answer
         """
-        return self._checked(self._get())
+        parameters = self.node.current_run.rospy.parameters  # raises where it is stopped
+        try:
+            value = parameters.kept(self.name)
+        except KeyError:
+            with self.node.master.reached():
+                value = parameters.read(self.name, self._get)
+        return self._checked(value)
 
     def _get(self) -> Any:
         self.node.current_run  # raises where it is stopped
@@ -66,7 +77,8 @@ class Parameter:
             )
         value = self._checked(as_stored(self.name, value))
         watched = self.node.current_run.rospy.parameters
-        self.node.master.call('setParam', self.name, value, caller_id=self.node.name)
+        with changing(self.name):
+            self.node.master.call('setParam', self.name, value, caller_id=self.node.name)
         with self.node.master.reached():
             watched.tell_of_own(self.name, value)
 

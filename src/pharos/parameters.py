@@ -6,6 +6,7 @@ import rosgraph
 from pharos.errors import suggest
 from pharos.private_rospy.names import global_name
 from pharos.private_rospy.parameters import as_stored as as_stored  # for compose, too
+from pharos.private_rospy.parameters import changing
 
 if TYPE_CHECKING:
     from pharos.master import Master
@@ -27,12 +28,16 @@ class Parameters(MutableMapping[str, Any]):
     def __setitem__(self, name: str, value: Any) -> None:
         if name == '/' and not isinstance(value, dict):
             raise ValueError(f'/ holds all parameters, and is set to a dict of them, not {value!r}')
-        self._call('setParam', _global(name), as_stored(name, value))
+        full_name = _global(name)
+        with changing(full_name):
+            self._call('setParam', full_name, as_stored(name, value))
 
     def __delitem__(self, name: str) -> None:
         if name == '/':
             raise ValueError('/ holds all parameters, and cannot be deleted: set it to {}')
-        self._call('deleteParam', self._global_or_there(name))
+        full_name = self._global_or_there(name)
+        with changing(full_name):
+            self._call('deleteParam', full_name)
 
     def __iter__(self) -> Iterator[str]:
         return iter(sorted(self._master.call('getParamNames')))

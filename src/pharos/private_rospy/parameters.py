@@ -1,8 +1,11 @@
-"""Parameters that a node watches, through the master's paramUpdate calls."""
+"""Parameters that a node watches, or keeps the values of, through the master's paramUpdate calls."""
 import contextlib
+import copy
 import reprlib
 import threading
+import weakref
 import xmlrpc.client
+from typing import Any
 
 import rosgraph
 
@@ -10,9 +13,18 @@ from pharos.private_rospy import registration
 from pharos.private_rospy.proxies import master_api
 
 
+_of_all_nodes: Any = weakref.WeakSet()  # the WatchedParameters of this process
+_adding = threading.Lock()  # guards it
+
+
 class WatchedParameters:
-    """The parameters that one :class:`~.instance.PrivateRospy` watches, or has given a first
-    value."""
+    """The parameters that one :class:`~.instance.PrivateRospy` watches, has given a first value, or
+    has read.
+
+    A value that was read is kept until the master, or somebody in this process, says that it has
+    changed; then it is asked for anew. What the master says is not taken for the value: it may be
+    older than what the node itself has set meanwhile, of which the master does not tell it.
+    """
 
     def __init__(self, node):
         self._node = node
@@ -23,6 +35,11 @@ class WatchedParameters:
         self.cached = set()  # global names of which rospy itself has the master tell
         self._lock = threading.Lock()  # held to add to _watched
         self._subscribing = threading.Lock()  # guards _subscribed
+        self._kept = {}  # global name -> value, None where it has none
+        self._changes = 0  # how often something changed
+        self._keeping = threading.Lock()  # held to change these two
+        with _adding:
+            _of_all_nodes.add(self)
 
     def may_subscribe(self):
         """Whether the master may still be asked to tell the node of a parameter."""
@@ -60,30 +77,61 @@ class WatchedParameters:
                 self._watched.remove(entry)
             raise
 
+    def kept(self, name):
+        """The value of a parameter that was read before, None where it has none.
+
+        :raises KeyError: if it was not, or has changed since
+        """
+        return _own(self._kept[name])
+
+    def read(self, name, ask):
+        """The value of a parameter, which is kept from now on.
+
+        :param ask: ``ask()`` asks the master for it
+        """
+        before = self._changes
+        is_told = self._subscribe(name)
+        value = ask()
+        with self._keeping:
+            if is_told and before == self._changes:  # else what came may be older
+                self._kept[name] = value
+        return _own(value)
+
+    def forget(self, key):
+        """A parameter has changed: its value, those in it and those around it are asked for anew."""
+        with self._keeping:
+            self._changes += 1
+            for name in list(self._kept):
+                if _contains(name, key) or _contains(key, name):
+                    del self._kept[name]
+
     @property
     def listeners(self):
         """Those that :meth:`watch` was given."""
         return [listener for _, listener in self._watched]
 
     def _subscribe(self, name):
+        """Have the master tell of the parameter; returns whether it does."""
         master, uri = self._master(), self._node.uri
         with self._subscribing:
             if not self.may_subscribe():
-                return
+                return False
             if any(_contains(other, name) for other in self._subscribed):
-                return
+                return True
             if not registration.keeps_name(self._node):
-                return
+                return False
             master.subscribeParam(uri, name)
             within = {other for other in self._subscribed if _contains(name, other)}
             self._subscribed = self._subscribed - within | {name}
             for other in within - self.cached:
                 master.unsubscribeParam(uri, other)
+            return True
 
     def _set_where_missing(self, name, value):
         master = self._master()
         if not master.hasParam(name):
-            master.setParam(name, value)
+            with changing(name):
+                master.setParam(name, value)
 
     def _master(self):
         return master_api(self._node.settings.master_url, self._node.name)
@@ -102,6 +150,7 @@ class WatchedParameters:
             self.cached.discard(name)
         with self._subscribing:
             self._subscribed.clear()
+        self.forget('/')
         self.renew()
 
     def tell_of_own(self, key, value):
@@ -114,8 +163,9 @@ class WatchedParameters:
 
     def tell(self, key, value, within=True):
         """Tell the listeners of a parameter, and of what is around and ``within`` it; returns
-        whether there are any."""
+        whether the master is to go on telling of it."""
         key = '/' + key.strip('/')
+        self.forget(key)
         told = [
             (name, listener)
             for name, listener in tuple(self._watched)
@@ -123,7 +173,7 @@ class WatchedParameters:
         ]
         for name, listener in told:
             listener(value if name == key else self._value(name))
-        return bool(told)
+        return bool(told) or any(_contains(name, key) for name in tuple(self._subscribed))
 
     def unsubscribe(self, calls):
         """Add to the calls those that end the watch: a master keeps the name of a node that does
@@ -138,6 +188,20 @@ class WatchedParameters:
             return None
 
 
+@contextlib.contextmanager
+def changing(key):
+    """Within this, somebody in this process sets or deletes a parameter: no node of it has the old
+    value afterwards, whenever the master comes to tell it, and whether or not an error came back.
+    """
+    try:
+        yield
+    finally:
+        with _adding:
+            nodes = list(_of_all_nodes)
+        for parameters in nodes:
+            parameters.forget(key)
+
+
 def as_stored(name, value):
     """The value as the parameter server brings it back: with lists for tuples.
 
@@ -150,6 +214,11 @@ def as_stored(name, value):
             f'{name} cannot be {reprlib.repr(value)}: the parameter server holds booleans, numbers '
             f'(integers of 32 bits), strings, and lists and dicts of them ({error})'
         ) from error
+
+
+def _own(value):
+    """The value, for somebody who may change it."""
+    return copy.deepcopy(value) if isinstance(value, (dict, list)) else value
 
 
 def _contains(namespace, name):

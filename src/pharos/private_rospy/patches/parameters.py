@@ -1,4 +1,5 @@
 """Parameters: subscriptions that rospy makes for itself are known, and none is made late."""
+from pharos.private_rospy.parameters import changing
 from pharos.private_rospy.patches.table import patch
 
 
@@ -21,3 +22,22 @@ def get_param_cached(self, key, *, node, original, module):
     if name in node.parameters.cached:
         return module.rospy.impl.paramserver.get_param_server_cache().get(name)
     return original(self, key) if node.parameters.may_subscribe() else self[key]
+
+
+@patch(
+    'rospy.msproxy',
+    'MasterProxy.__setitem__',
+    'tells what nodes of the process keep of it by the master alone, which is later, and never tells'
+    ' who sets it',
+)
+def set_item(self, key, val, *, original, module):
+    """Have the nodes of this process ask anew for what they have kept of it."""
+    with changing(module.rospy.names.resolve_name(key)):
+        original(self, key, val)
+
+
+@patch('rospy.msproxy', 'MasterProxy.__delitem__', 'tells nobody but the master')
+def delete_item(self, key, *, original, module):
+    """Have the nodes of this process ask anew for what they have kept of it."""
+    with changing(module.rospy.names.resolve_name(key)):
+        original(self, key)
