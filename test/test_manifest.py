@@ -164,4 +164,4 @@ def test_the_tools_install_what_debian_has_under_that_name():
         missing = {
             name for name in needed if name.startswith('python3-') and f' {name} ' not in text
         }
-        assert missing - {'python3-rospkg', 'python3-tk'} == UNNEEDED[tool], tool
+        assert missing - {'python3-rospkg', 'python3-tk', 'python3-yaml'} == UNNEEDED[tool], tool

@@ -12,7 +12,7 @@ import time
 
 import pytest
 
-from pharos.testing import Mailbox, TIMEOUT
+from pharos.testing import Mailbox, TIMEOUT, until
 from pharos import PharosError, BlockNode, ExternalNode, RosProcess, UnknownNodeError
 from programs import PROGRAMS, Program
 from sockets import wait_for_end
@@ -262,6 +262,189 @@ def test_a_block_that_raises_does_not_end_the_program_or_its_output(master, pack
         master.run('fake_robot', 'two', on_line=lambda: None)
 
 
+# -- keys and lines that are typed
+
+
+def key_program(package, language):
+    """A program that reads keys from its terminal."""
+    keys = package / 'scripts' / 'keys'
+    if language == 'Python':
+        shutil.copy(PROGRAMS / 'keys.py', keys)
+    else:
+        build(PROGRAMS / 'keys.cpp', keys)
+    return keys.name
+
+
+def build(source, program):
+    """Compile a program written with roscpp."""
+    if not (shutil.which('g++') and os.path.exists('/usr/include/ros/ros.h')):
+        pytest.skip('needs g++ and the headers of roscpp')
+    libraries = 'roscpp', 'rosconsole', 'rostime', 'roscpp_serialization', 'pthread'
+    linked = [f'-l{library}' for library in libraries]
+    subprocess.run(['g++', '-O0', source, '-o', program, *linked], check=True)
+
+
+@pytest.mark.parametrize('language', ['Python', 'C++'])
+def test_a_program_that_reads_keys_is_driven(master, package, language, monkeypatch):
+    monkeypatch.setenv('PYTHONUNBUFFERED', '')  # it prints as it does at a terminal
+    pressed, lines = Mailbox(), queue.SimpleQueue()
+    master.create(BlockNode, named='/listener', delegate=pressed).interested_in(
+        '/pressed', 'std_msgs/String'
+    )
+    with master.run('fake_robot', key_program(package, language), on_line=lines.put) as process:
+        while 'key' not in lines.get(timeout=TIMEOUT):
+            pass
+        for key in 'w', 'a':
+            process.send(key)
+            assert pressed.next().data == key
+            assert 'pressed' in lines.get(timeout=TIMEOUT)
+        process.send('sdq')
+        assert process.wait(TIMEOUT) == 3
+        printed = [line for line in process.output.split('\n') if 'pressed' in line]
+        quotes = "'" if language == 'Python' else ''
+        assert printed == [f'pressed {quotes}{key}{quotes}' for key in 'wasd']
+        assert not any(character in process.output for character in '\r\x1b')
+        with pytest.raises(PharosError, match='keys has ended, and reads nothing any more: run it'):
+            process.send('w')
+
+
+def test_a_program_that_reads_lines_gets_what_is_sent_and_prints_no_echo_of_it(master, package):
+    echo = program(
+        package, 'echo', 'while read line; do echo "<$line>"; done; printf "the "; echo end'
+    )
+    with master.run('fake_robot', echo) as process:
+        process.send('one\ntw')
+        process.send('o\nÄöü\n' + 4000 * 'x' + '\n')
+        with pytest.raises(ValueError, match='a line of more than 4095 bytes'):
+            process.send(4096 * 'x')
+        with pytest.raises(TypeError, match="is a text, not b'x'"):
+            process.send(b'x')
+        process.send('\x04')
+        assert process.wait(TIMEOUT) == 0
+        assert process.output.split('\n') == [
+            '<one>',
+            '<two>',
+            '<Äöü>',
+            f"<{4000 * 'x'}>",
+            'the end',
+        ]
+
+
+def test_the_beginning_of_a_line_is_in_the_output(master, package):
+    asks = program(package, 'asks', 'printf "name? "; read name; echo "hello $name"')
+    with master.run('fake_robot', asks) as process:
+        until(lambda: process.output == 'name? ')
+        process.send('bob\n')
+        assert process.wait(TIMEOUT) == 0
+        assert process.output == 'name? hello bob'
+
+
+def test_a_program_that_does_not_read_is_sent_no_more_than_it_could(master, package):
+    """Who sends waits, until the program ends."""
+    raised = queue.SimpleQueue()
+    process = master.run('fake_robot', program(package, 'deaf', 'stty raw; echo up; sleep 1000'))
+    until(lambda: process.output == 'up')
+
+    def send():
+        try:
+            process.send(1000000 * 'x')
+        except PharosError as error:
+            raised.put(str(error))
+
+    thread = threading.Thread(target=send, daemon=True)
+    thread.start()
+    process.terminate()
+    assert raised.get(timeout=TIMEOUT).endswith('reads nothing any more: run it again')
+    thread.join(TIMEOUT)
+
+
+def test_output_has_no_colours_and_no_carriage_returns(master, package):
+    colourful = (
+        'tput setaf 1 2>/dev/null; printf "\\033[31mred\\033[0m\\r\\nplain\\n"; echo >&2 $TERM'
+    )
+    lines = queue.SimpleQueue()
+    with master.run(
+        'fake_robot', program(package, 'colourful', colourful), on_line=lines.put
+    ) as process:
+        assert process.wait(TIMEOUT) == 0
+        assert process.output.split('\n') == ['red', 'plain', 'dumb']
+    assert [lines.get(timeout=TIMEOUT) for _ in range(3)] == ['red', 'plain', 'dumb']
+
+
+def test_a_program_of_c_prints_at_once(master, package, tmp_path):
+    if not shutil.which('gcc'):
+        pytest.skip('needs gcc')
+    source = tmp_path / 'prints.c'
+    source.write_text(
+        '#include <stdio.h>\nint main(void) { puts("up"); getchar(); puts("ends"); return 0; }\n'
+    )
+    prints, lines = package / 'scripts' / 'prints', queue.SimpleQueue()
+    subprocess.run(['gcc', source, '-o', prints], check=True)
+    with master.run('fake_robot', 'prints', on_line=lines.put) as process:
+        assert lines.get(timeout=TIMEOUT) == 'up'
+        process.send('\n')
+        assert process.wait(TIMEOUT) == 0
+        assert process.output == 'up\nends'
+
+
+def test_much_output_is_whole(master, package):
+    with master.run('fake_robot', program(package, 'much', 'seq 200000')) as process:
+        assert process.wait(TIMEOUT) == 0
+        until(lambda: process.output.endswith('\n200000'))
+        assert process.output.split('\n') == [str(number) for number in range(190001, 200001)]
+
+
+# -- parameters
+
+
+VALUES = {
+    'integer': 7,
+    'number': 2.0,
+    'large': 1e20,
+    'truth': True,
+    'text': 'two words',
+    'digits': '1',
+    'yes': 'true',
+    'nothing': '',
+    'blank': ' x ',
+    'list': [1, '1', 2.5, [True]],
+    'dict': {'p': 1, 'q': {'r': '2'}},
+}
+
+
+@pytest.mark.parametrize('namespace', [None, '/robots'])
+def test_parameters_keep_their_types(master, package, namespace):
+    for name in None, 'robot7':
+        remap = {'__ns': namespace} if namespace else None
+        with master.run('fake_robot', 'talker', name=name, remap=remap, params=VALUES):
+            node = f"{namespace or ''}/{name or 'talker'}"
+            master.wait_for_node(node, TIMEOUT)
+            found = master.parameters.pop(node)
+            assert found == VALUES
+            assert [type(value) for value in found.values()] == [
+                type(VALUES[name]) for name in found
+            ]
+
+
+def test_parameters_of_a_program_that_reads_no_yaml_keep_their_types_or_are_refused(master):
+    relay = 'topic_tools', 'relay', '/untyped', '/b'
+    with master.run(*relay, name='passes_on', params=VALUES):
+        master.wait_for_node('/passes_on', TIMEOUT)
+        assert master.parameters.pop('/passes_on') == VALUES
+    plain = {name: VALUES[name] for name in ('integer', 'number', 'large', 'truth', 'text')}
+    with master.run(*relay, remap={'__name': 'passes_on'}, params=plain):
+        master.wait_for_node('/passes_on', TIMEOUT)
+        assert master.parameters.pop('/passes_on') == plain
+    for name in VALUES.keys() - plain:
+        with pytest.raises(ValueError, match=f'the parameter {name} of .*relay cannot be given as'):
+            master.run(*relay, params={name: VALUES[name]})
+    with pytest.raises(ValueError, match='~bad cannot be <object'):
+        master.run(*relay, params={'bad': object()})
+
+
+# -- statuses
+
+
 def test_its_exit_status_is_told(master, package):
     with master.run('fake_robot', program(package, 'fail', 'exit 7')) as process:
         assert process.wait(TIMEOUT) == 7 == process.poll()
@@ -331,25 +514,9 @@ def test_nothing_of_a_node_without_handlers_stays_registered(master, package, ha
 
 
 def test_a_roscpp_node_without_handlers_is_ended_through_ros(master, package, tmp_path):
-    if not (shutil.which('g++') and os.path.exists('/usr/include/ros/ros.h')):
-        pytest.skip('needs g++ and the headers of roscpp')
     source, robot = tmp_path / 'robot.cpp', package / 'scripts' / 'robot'
     source.write_text(NO_HANDLER_IN_ROSCPP)
-    subprocess.run(
-        [
-            'g++',
-            '-O0',
-            source,
-            '-o',
-            robot,
-            '-lroscpp',
-            '-lrosconsole',
-            '-lrostime',
-            '-lroscpp_serialization',
-            '-lpthread',
-        ],
-        check=True,
-    )
+    build(source, robot)
     lines = queue.SimpleQueue()
     process = master.run('fake_robot', 'robot', on_line=lines.put)
     assert lines.get(timeout=TIMEOUT) == 'up'

@@ -177,14 +177,14 @@ class Master(MasterServices):
         :param args: its further arguments
         :param name: the name of its node, for ``__name:=``
         :param remap: ``{name: name}`` of remappings
-        :param params: ``{name: value}`` of private parameters
+        :param params: ``{name: value}`` of private parameters, which keep their types: with ``name``,
+            they are set on the parameter server, else by the program
         :param on_line: block called as ``on_line(text)`` for each line of its output, in a thread
             of its own
         :raises UnknownNodeError: if there is no such package or program
-        :raises TypeError, ValueError: if an argument or name cannot be one
+        :raises TypeError, ValueError: if an argument, name or parameter cannot be one
         """
-        arguments = ros_process.arguments_of(args, name, remap, params)
-        return ros_process.run(self, package, executable, arguments, on_line)
+        return ros_process.run(self, package, executable, args, name, remap, params, on_line)
 
     def launch(
         self,

@@ -26,19 +26,26 @@ import rosgraph.network
 
 from pharos import node_registry
 from pharos.blocks import Block, check_block, name_of
+from pharos.errors import PharosError
 from pharos.failures import Failures
+from pharos.program_arguments import (
+    arguments_of,
+    parameter_arguments,
+    parameters_of,
+    set_parameters,
+)
 from pharos.program_files import AnyPath, find, find_launch_file
 from pharos.private_rospy.deadlines import time_limit
-from pharos.private_rospy.names import check_name
 from pharos.private_rospy.proxies import ServerProxy
 from pharos.private_rospy.registration import COMMUNICATION_ERRORS, unregister_all
+from pharos.pseudo_terminal import PseudoTerminal, without_colors
 from pharos.seconds import check_limit, check_seconds
 from pharos.transcript import Transcript
 
 if TYPE_CHECKING:
     from pharos.master import Master
 
-# What they print is wanted line by line, as on a terminal, and not in blocks of 4 KiB
+# For those programs that it starts with pipes of their own
 LINE_BY_LINE = {'PYTHONUNBUFFERED': '1', 'ROSCONSOLE_STDOUT_LINE_BUFFERED': '1'}
 
 KILL_TIMEOUT = 1.0  # seconds that processes may take to end when they are killed
@@ -55,24 +62,37 @@ class RosProcess:
     """
 
     def __init__(
-        self, command: List[str], master: 'Master', on_line: Optional[Block] = None
+        self,
+        command: List[str],
+        master: 'Master',
+        on_line: Optional[Block] = None,
+        in_colors: bool = False,
     ) -> None:
+        """:param in_colors: whether lines keep the colours that they have on a terminal"""
         self.command = command
         self._on_line = check_block(on_line, 'on_line', ('text',))
+        self._in_colors = in_colors
         self._failures = Failures(lambda line, details: Transcript.show(line))
         self._lines: Deque[str] = collections.deque(maxlen=10000)
+        self._begun: List[str] = []  # the beginning of a line that is not complete yet
+        # What a program prints to a terminal comes at once, and there are keys to be read from one.
+        self._terminal = PseudoTerminal()
         # a session of its own, so that what it starts ends with it, and Ctrl-C is the program's to
         # handle
-        self._process = subprocess.Popen(
-            command,
-            env={**LINE_BY_LINE, **os.environ, 'ROS_MASTER_URI': master.url},
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            errors='replace',
-            start_new_session=True,
-        )
+        try:
+            self._process = subprocess.Popen(
+                command,
+                env={**LINE_BY_LINE, **os.environ, 'TERM': 'dumb', 'ROS_MASTER_URI': master.url},
+                stdin=self._terminal.slave,
+                stdout=self._terminal.slave,
+                stderr=self._terminal.slave,
+                start_new_session=True,
+            )
+        except BaseException:
+            self._terminal.close()
+            raise
+        finally:
+            os.close(self._terminal.slave)
         self._nodes = _Nodes(master)
         node_registry.at_end(self.terminate)
         self._reader = threading.Thread(
@@ -81,17 +101,40 @@ class RosProcess:
         self._reader.start()
 
     def _read(self) -> None:
-        assert self._process.stdout
-        with self._process.stdout as output:
-            for line in output:
-                line = line.rstrip('\n')
-                self._lines.append(line)
+        for text, is_whole in self._terminal.lines():
+            text = text if self._in_colors else without_colors(text)
+            self._begun = [] if is_whole else [text]
+            if is_whole:
+                self._lines.append(text)
                 if self._on_line is not None:
-                    self._show(line)
+                    self._show(text)
+        self._terminal.close()
         self._process.wait()
         # what it left behind; not later, when its number may be another's
         self._signal(signal.SIGKILL)
         node_registry.not_at_end(self.terminate)
+
+    def send(self, text: str) -> None:
+        """Type the text, at the terminal that the program has for its standard input.
+
+        ``send('go\\n')`` is a line, for a program that reads lines, which ``'\\x04'`` (Ctrl-D) ends;
+        ``send('w')`` is a key, for one that reads keys: send it when the program has set its
+        terminal so, for it discards what came before. No character is a signal, as Ctrl-C is at
+        other terminals: :meth:`terminate` ends the program. It waits where the program does not
+        read.
+
+        :raises TypeError: if it is no text
+        :raises ValueError: if a line is longer than the terminal takes, 4095 bytes
+        :raises PharosError: if the program has ended
+        """
+        if not isinstance(text, str):
+            raise TypeError(f'what is sent to a program is a text, not {text!r}')
+        try:
+            self._terminal.write(text)
+        except OSError as error:
+            raise PharosError(
+                f'{self.command[0]} has ended, and reads nothing any more: run it again'
+            ) from error
 
     def _show(self, line: str) -> None:
         try:
@@ -107,8 +150,8 @@ class RosProcess:
 
     @property
     def output(self) -> str:
-        """What it has printed so far, standard output and errors together."""
-        return '\n'.join(self._lines)
+        """What it has printed so far, standard output and errors together; the last 10,000 lines."""
+        return '\n'.join([*self._lines, *self._begun])
 
     def poll(self) -> Optional[int]:
         """Its exit status, None while it runs."""
@@ -257,46 +300,24 @@ class _Nodes:
         return port in self._ports and rosgraph.network.is_local_address(address.hostname)
 
 
-def arguments_of(
-    args: Sequence[object],
-    name: Optional[str],
-    remap: Optional[Mapping[str, str]],
-    params: Optional[Mapping[str, object]],
-) -> List[str]:
-    """The arguments of a program, as rosrun takes them; see :meth:`Master.run`.
-
-    :raises TypeError, ValueError: if one of them cannot be one
-    """
-    if None in args:
-        raise TypeError(f'the arguments of a program are texts or numbers, not None: {args}')
-    for what, given in ('remap', remap), ('params', params):
-        if not isinstance(given, (Mapping, type(None))):
-            raise TypeError(f'{what} is a dict by name, not {given!r}')
-    mappings: Dict[str, object] = {}
-    for left, right in (remap or {}).items():
-        if not (isinstance(left, str) and left.startswith('__')):  # else it is no name, as __ns
-            check_name(left, 'remapped', private=True)
-            check_name(right, 'remapped', private=True)
-        mappings[left] = right
-    for key, value in (params or {}).items():
-        mappings['_' + check_name(key, 'parameter').lstrip('/')] = value
-    if name is not None:
-        mappings['__name'] = check_name(name, 'node', base=True)
-    return [*map(str, args), *(f'{left}:={right}' for left, right in mappings.items())]
-
-
 def run(
     master: 'Master',
     package: str,
     executable: str,
-    args: List[str],
+    args: Sequence[object],
+    name: Optional[str],
+    remap: Optional[Mapping[str, str]],
+    params: Optional[Mapping[str, object]],
     on_line: Optional[Block] = None,
 ) -> RosProcess:
-    """Start a program as ``rosrun`` would, at the master given.
-
-    :raises UnknownNodeError: if there is no such package or program
-    """
-    return RosProcess([find(package, executable)[0], *args], master, on_line)
+    """Start a program as ``rosrun`` would, at the master given; see :meth:`Master.run`."""
+    arguments, parameters = arguments_of(args, name, remap), parameters_of(params)
+    path = find(package, executable)[0]
+    if name is None:
+        arguments += parameter_arguments(path, parameters)
+    else:
+        set_parameters(master, name, remap, parameters)
+    return RosProcess([path, *arguments], master, on_line)
 
 
 def launch(

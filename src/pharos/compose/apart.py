@@ -38,8 +38,9 @@ class ApartNodes:
             pickle.dump(config, file)
         # as a file and not as a module: PYTHONPATH is for the nodes as it is
         command = [sys.executable, apart_program.__file__, file.name, str(os.getpid())]
+        shows_colors = sys.stdout is not None and sys.stdout.isatty()
         #: roslaunch
-        self.process = RosProcess(command, composition.master, Transcript.show)
+        self.process = RosProcess(command, composition.master, Transcript.show, shows_colors)
         threading.Thread(target=self._wait, name='nodes apart', daemon=True).start()
 
     def _wait(self) -> None:

@@ -15,7 +15,7 @@ from pharos.errors import NodeStoppedError, PharosError
 from pharos.lifecycle import Lifecycle
 from pharos.node import Node
 from pharos.restarts import is_restarting
-from pharos.ros_process import arguments_of
+from pharos.program_arguments import arguments_of
 from pharos.run import Run
 from pharos.watcher import watcher_of
 
@@ -274,7 +274,7 @@ def load(
         raise TypeError(f'namespace is a name, not {namespace!r}')
     if namespace:
         named = rosgraph.names.ns_join(namespace, named)
-    arguments = arguments_of(args, None, remap, None)
+    arguments = arguments_of(args, None, remap)
     return master.create(
         ScriptNode, named, path=path, args=arguments, takes_own_name=name is None, **options
     )
