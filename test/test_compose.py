@@ -288,8 +288,3 @@ def test_what_cannot_be_started_is_told_and_the_others_go_on(compose, transcript
     assert 'missing.launch: /without_program is not started: Cannot locate node' in program
     assert "missing.launch: /with_syntax_error (composed_robot/broken) is not started" in syntax
     assert "'return' outside function" in syntax
-
-
-def test_to_share_connections_is_to_come(compose):
-    with pytest.raises(pharos.PharosError, match='share_connections is to come'):
-        compose('chat.launch', share_connections=True)

@@ -54,6 +54,23 @@ def test_a_launch_file_is_composed_until_ctrl_c(master, compose):
     assert nodes(master) == {'/hearer'}
 
 
+def test_nodes_share_connections_where_asked_for(master, compose):
+    compose('--share-connections', 'composed_robot', 'mirrors.launch')
+    sender = create(master, '/sender').output_channel('/where', STRING)
+    boxes = [Mailbox(sender.node, f'/{side}/mirrored', STRING) for side in ('left', 'right')]
+    for box in boxes:
+        box.next(TIMEOUT)  # what it says when it has started
+    until(lambda: all(hears(master, f'/{side}/mirror', sender) for side in ('left', 'right')))
+    assert len(sender.connections) == 1
+    sender.send(data='?')
+    folders = [box.next(TIMEOUT).data for box in boxes]
+    assert folders[0] == folders[1]
+
+
+def hears(master, name, channel):
+    return any(uri == channel.node.uri for _, uri, *_ in master.bus_info(name) or ())
+
+
 def test_it_tells_how_far_it_has_come_and_what_has_become_of_each(compose):
     program = compose('composed_robot', 'missing.launch')
     program.wait_for('with_syntax_error (composed_robot/broken) is not started')

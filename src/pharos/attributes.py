@@ -263,6 +263,7 @@ def make(
         node: NodeType = node_class.__new__(node_class)
     finally:
         del _made_here.node_class
+    settings['shares_connections'] = master.share_connections
     node._configure(master, Settings(named, master.url, **settings), soul, delegate)
     node.__init__(*args, **kwargs)
     return node

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Set
 from pharos.errors import MasterUnreachableError
 from pharos.private_rospy.deadlines import time_limit
 from pharos.private_rospy.registration import REGISTER_TIMEOUT
+from pharos.private_rospy.shared_connections import SHARED
 
 if TYPE_CHECKING:
     from pharos.output_channel import OutputChannel
@@ -41,12 +42,24 @@ def wait_for_known_subscribers(channel: 'OutputChannel', timeout: float, deadlin
 
     rospy.wait_until(connected, min(deadline - time.monotonic(), ANSWER_TIMEOUT))
     if not connected() and node.is_running:
-        # those that do not answer any more, killed for example, are not worth the wait
         with time_limit(deadline - time.monotonic()):
-            missing.intersection_update(filter(node.master.is_node_alive, tuple(missing)))
+            missing.intersection_update(
+                name for name in tuple(missing) if _may_connect(channel, name)
+            )
         rospy.wait_until(connected, deadline - time.monotonic())
         if timeout and not connected() and node.is_running:
             _tell_who_is_late(channel, missing, timeout)
+
+
+def _may_connect(channel: 'OutputChannel', name: str) -> bool:
+    """Whether a subscriber is worth the wait: it answers, was not killed for example, and does not
+    hear the channel through the connection of another node of its process."""
+    node = channel.node
+    connections = node.master.bus_info(name)
+    return connections is not None and not any(
+        uri == node.uri and topic == channel.topic and about and SHARED in about[-1]
+        for _, uri, _, _, topic, *about in connections
+    )
 
 
 def _tell_who_is_late(channel: 'OutputChannel', names: Set[str], timeout: float) -> None:

@@ -56,10 +56,14 @@ class Master(MasterServices):
     :ivar url: its URL
     :param url: URL of the ROS master; None: ROS_MASTER_URI, else ROS's default. Makes no connection
         yet.
+    :param share_connections: the nodes that it creates, and others of this process that do so, share
+        one TCPROS connection to each publisher elsewhere, which sends to one of them alone, and
+        whose messages are read once
     :raises ValueError: if it is no URL
     """
 
-    def __init__(self, url: Optional[str] = None) -> None:
+    def __init__(self, url: Optional[str] = None, *, share_connections: bool = False) -> None:
+        self.share_connections = share_connections
         self.url: str = (
             check_url(rosgraph.get_master_uri(), ROS_MASTER_URI) if url is None else check_url(url)
         )
@@ -273,7 +277,7 @@ class Master(MasterServices):
         :param file: the name of the launch file in it; None: ``package`` is its path
         :param only: the names of the nodes that are wanted; all, if there are none
         :param apart: the names of Python nodes that are to have processes of their own
-        :param share_connections: is to come
+        :param share_connections: the nodes share connections, as those of :class:`Master` with that
         :param args: the launch file's arguments
         :raises UnknownNodeError: if there is no such package, launch file, argument or node in it
         :raises PharosError: if roslaunch cannot read the file

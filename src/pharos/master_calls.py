@@ -135,15 +135,30 @@ class MasterCalls:
         :param or_busy: whether one counts, too, that does not answer in time but refuses nothing
         """
         try:
-            node = ServerProxy(self.api().lookupNode(name), PING_TIMEOUT)
-        except (rosgraph.MasterException, *COMMUNICATION_ERRORS):
-            return False
-        try:
-            with interruption(node):
-                node.getPid('/pharos')
+            return self._ask_node(name, 'getPid') is not None
         except COMMUNICATION_ERRORS as error:
             return or_busy and not isinstance(error, ConnectionRefusedError)
-        return True
+
+    def bus_info(self, name: str) -> Optional[List[Any]]:
+        """The connections of the node of that name as ROS's getBusInfo has them; None where it does
+        not answer."""
+        try:
+            answer = self._ask_node(name, 'getBusInfo')
+        except COMMUNICATION_ERRORS:
+            return None
+        return answer and answer[2]
+
+    def _ask_node(self, name: str, method: str) -> Any:
+        """What the XML-RPC server of a node answers, None where the master knows no such node.
+
+        :raises COMMUNICATION_ERRORS: if it does not, in time
+        """
+        try:
+            node = ServerProxy(self.api().lookupNode(name), PING_TIMEOUT)
+        except (rosgraph.MasterException, *COMMUNICATION_ERRORS):
+            return None
+        with interruption(node):
+            return getattr(node, method)('/pharos')
 
     def graph(
         self,

@@ -48,6 +48,11 @@ def read_arguments(
         '--apart', nargs='+', metavar='NODE', default=[], help='these in processes of their own'
     )
     parser.add_argument(
+        '--share-connections',
+        action='store_true',
+        help='have the nodes share one connection to each publisher elsewhere',
+    )
+    parser.add_argument(
         '--allow-remote-load',
         action='store_true',
         help="have any host load programs, not only this one and the master's",
@@ -133,6 +138,7 @@ def main() -> int:
         if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         master, own_master = find_master(progress)
+        master.share_connections = options.share_connections
         composition = Composition(master, progress)
         try:
             container = create_container(

@@ -1,4 +1,5 @@
 """Compositions: launch files whose Python nodes run in this process."""
+import copy
 import dataclasses
 import os
 import threading
@@ -15,7 +16,6 @@ from pharos.compose.launch_file import LaunchedNode, LaunchFile, Problem
 from pharos.compose.output import SCREEN
 from pharos.compose.progress import Progress
 from pharos.compose.script import ScriptNode
-from pharos.errors import PharosError
 from pharos.program_files import AnyPath
 from pharos.ros_process import RosProcess
 
@@ -214,10 +214,8 @@ def compose(
 ) -> Composition:
     """What :meth:`Master.compose` does."""
     if share_connections:
-        raise PharosError(
-            'share_connections is to come: each node of this process has its own connections to'
-            ' publishers elsewhere. Leave it out'
-        )
+        master = copy.copy(master)
+        master.share_connections = True
     launch_file = LaunchFile(master.url, package, file, args, only, apart)
     composition = Composition(master, progress)
     try:

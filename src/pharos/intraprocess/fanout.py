@@ -86,13 +86,15 @@ class Fanout:
     Any thread may publish: ``lock`` is held meanwhile, but not while delegates run inline.
 
     :param lock: the publisher's, reentrant
+    :param sockets: None: there are no subscribers elsewhere
+    :param numbers: whether ``header.seq`` is to be filled in
     """
 
     # Slots keep what each message needs close together in memory: a message that comes after a pause
     # then waits for fewer of the processor's cache lines.
     __slots__ = (
         '_lock',
-        '_closed',
+        'is_closed',
         'seq',
         '_has_header',
         '_freeze',
@@ -106,12 +108,17 @@ class Fanout:
     )
 
     def __init__(
-        self, message_class: Type[genpy.Message], lock: ContextManager[Any], sockets: Sockets
+        self,
+        message_class: Type[genpy.Message],
+        lock: ContextManager[Any],
+        sockets: Optional[Sockets],
+        numbers: bool = True,
     ) -> None:
-        self._lock, self._sockets = lock, sockets
-        self._closed = False
+        self._lock = lock
+        self._sockets: Any = sockets
+        self.is_closed = False
         self.seq = 0  #: the number of the last message
-        self._has_header = getattr(message_class, '_has_header', False)
+        self._has_header = numbers and getattr(message_class, '_has_header', False)
         self._freeze, self._thaw, self._size = copier_for(message_class)[:3]
         self._latches: Dict[Latch, None] = {}  # those that hold something, in order
         self._last_wake = 0.0  # when the last message woke a dispatcher
@@ -143,7 +150,7 @@ class Fanout:
         :raises Exception: what ``message.serialize()`` raises
         """
         with self._lock:
-            if self._closed:
+            if self.is_closed:
                 raise ClosedError('publish() to a closed topic')
             inboxes, remote, dispatchers, inline, mark = self._ways
             if to is not None or connection is not None:
@@ -265,7 +272,7 @@ class Fanout:
 
     def close(self) -> None:
         """Nothing is sent any more."""
-        self._closed = True
+        self.is_closed = True
         self.set_connections(())
 
 

@@ -8,13 +8,14 @@ from typing import Any, Dict
 from pharos.errors import NodeStoppedError
 from pharos.private_rospy.addresses import is_same_master
 from pharos.private_rospy.names import Resolved
-from pharos.private_rospy import changes, registration
+from pharos.private_rospy import changes, registration, shared_connections
 from pharos.private_rospy.deadlines import time_limit
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.proxies import ServerProxy
 from pharos.private_rospy.registration import UNREGISTER_TIMEOUT, registered
 from pharos.private_rospy.socket_callback import SocketCallback
 
+TCPROS = 'TCPROS'  # as ROS calls it
 # bytes read from a socket at once; rospy's 64 KiB let subscribers of images fall behind
 BUFFER_SIZE = 1 << 20
 
@@ -236,6 +237,15 @@ class Connections:
             changes.notify()
         return answer
 
+    def connect_later(self, subscriber, uri, delay):
+        """Connect a subscription to the publisher at that URI in so many seconds, unless it, or the
+        node, ends before."""
+        self._node.start_thread(self._connect_later, (subscriber, uri, delay), 'reconnect')
+
+    def _connect_later(self, subscriber, uri, delay):
+        if not self._node.ended.wait(delay) and not subscriber.closed:
+            self.connect(subscriber.resolved_name, uri)
+
     def _negotiate(self, topic, uri):
         """What rospy's ROSHandler._connect_topic does, for as long as the node is interested."""
         while True:
@@ -260,6 +270,8 @@ class Connections:
     def _open(self, transports, topic, uri, chosen):
         for transport in transports:
             if chosen and transport.supports(chosen[0]):
+                if chosen[0] == TCPROS and self._node.settings.shares_connections:
+                    return shared_connections.connect(self._node, topic, uri, tuple(chosen[1:]))
                 try:
                     return transport.create_transport(topic, uri, chosen)
                 except AttributeError:  # rospy's, where there is no subscription any more

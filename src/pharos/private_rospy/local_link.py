@@ -28,6 +28,36 @@ _name_protocol()
 os.register_at_fork(after_in_child=_name_protocol)
 
 
+class End(rospy.impl.transport.Transport):
+    """One end of a link, as rospy's topics keep it among their connections."""
+
+    transport_type = 'INTRAPROCESS'
+    callerid_pub = 'unknown'  # the publisher's name, when it sends through the link
+    latch = None  # those who come late get latched messages from the link
+    is_heard = True  # its publisher is of the right type
+
+    def __init__(self, link, direction, topic, peer, node):
+        super().__init__(direction, topic)
+        # getBusStats tells the connections of a node apart by this, which its own rospy counts
+        self.id = node.module.impl.transport.Transport(direction).id
+        self.link, self.endpoint_id, self.header = link, peer, link.header
+        self._first = link.publisher.fanout.seq
+
+    # what getBusStats tells; no bytes go through
+    stat_num_msg = property(
+        lambda self: self.link.publisher.fanout.seq - self._first, lambda self, value: None
+    )
+
+    def get_transport_info(self):
+        return f'INTRAPROCESS connection to [{self.endpoint_id}]'
+
+    def close(self):
+        if not self.done:
+            self.done = True  # before any lock is taken: nothing more is sent through it
+            super().close()
+            self.link.close(self)
+
+
 class LocalLink(Link):
     """A link between rospy's _PublisherImpl of one node and the _SubscriberImpl of another.
 
@@ -35,15 +65,17 @@ class LocalLink(Link):
     :param other: the publisher's
     """
 
+    end_class = End
+
     def __init__(self, publisher, subscriber, node, other):
         super().__init__(publisher.data_class, other.connection_header(publisher))
         self.publisher, self.subscriber = publisher, subscriber
         self._node, self._other = node, other
         self._callbacks = self._statistics = None  # the receivers that are no channels
-        self.sending = _End(
+        self.sending = self.end_class(
             self, rospy.impl.transport.OUTBOUND, publisher.resolved_name, node.name, other
         )
-        self.receiving = _End(
+        self.receiving = self.end_class(
             self, rospy.impl.transport.INBOUND, subscriber.resolved_name, other.uri, node
         )
 
@@ -132,36 +164,6 @@ class LocalLink(Link):
         )
         if not other.done:
             node.start_thread(other.close, name='closing')
-
-
-class _End(rospy.impl.transport.Transport):
-    """One end of a link, as rospy's topics keep it among their connections."""
-
-    transport_type = 'INTRAPROCESS'
-    callerid_pub = 'unknown'  # the publisher's name, when it sends through the link
-    latch = None  # those who come late get latched messages from the link
-    is_heard = True  # its publisher is of the right type
-
-    def __init__(self, link, direction, topic, peer, node):
-        super().__init__(direction, topic)
-        # getBusStats tells the connections of a node apart by this, which its own rospy counts
-        self.id = node.module.impl.transport.Transport(direction).id
-        self.link, self.endpoint_id, self.header = link, peer, link.header
-        self._first = link.publisher.fanout.seq
-
-    # what getBusStats tells; no bytes go through
-    stat_num_msg = property(
-        lambda self: self.link.publisher.fanout.seq - self._first, lambda self, value: None
-    )
-
-    def get_transport_info(self):
-        return f'INTRAPROCESS connection to [{self.endpoint_id}]'
-
-    def close(self):
-        if not self.done:
-            self.done = True  # before any lock is taken: nothing more is sent through it
-            super().close()
-            self.link.close(self)
 
 
 class IntraprocessHandler(rospy.impl.transport.ProtocolHandler):

@@ -190,11 +190,12 @@ def examine(node, connection, topic, uri):
         return
     known = header if 'md5sum' in header else None
     node.refusals.publisher_refused(
-        subscription, uri, header['error'], lambda: known or _ask(address, topic)
+        subscription, uri, header['error'], lambda: known or ask(address, topic)
     )
 
 
-def _ask(address, topic):
+def ask(address, topic):
+    """The connection header of a publisher, None where it does not tell."""
     try:
         header = publisher_header(address, topic, time.monotonic() + TIMEOUT)
     except OSError:

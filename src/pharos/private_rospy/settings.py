@@ -34,6 +34,8 @@ class Settings:
     :param xmlrpc_port: XML-RPC port, 0 for any free one
     :param argv: ROS remappings and private parameters, see :mod:`.arguments`; what is no remapping
         is ignored
+    :param shares_connections: whether the node shares connections to publishers elsewhere with
+        others of this process
     :raises TypeError: if ``argv`` is no list of strings
     :raises ValueError: if a name, port or address cannot be one, or the value of a private
         parameter
@@ -50,8 +52,10 @@ class Settings:
         tcp_port: int = 0,
         xmlrpc_port: int = 0,
         argv: Optional[List[str]] = None,
+        shares_connections: bool = False,
     ) -> None:
         self.master_url = master_url
+        self.shares_connections = shares_connections
         self.tcp_port = check_port('tcp_port', tcp_port)
         self.xmlrpc_port = check_port('xmlrpc_port', xmlrpc_port)
         arguments = [] if argv is None else argv

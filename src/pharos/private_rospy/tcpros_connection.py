@@ -29,13 +29,14 @@ class TcprosConnection:
     :param address: (host, port)
     :param header: ours, kept as :attr:`sent`
     :param deadline: by ``time.monotonic()``, for the whole handshake; None: no limit
+    :param buffer_size: bytes that are read from the socket at once
     :raises OSError: if there is no answer, or none that can be read (socket.timeout: not in time)
     """
 
-    def __init__(self, address, header, deadline):
+    def __init__(self, address, header, deadline, buffer_size=io.DEFAULT_BUFFER_SIZE):
         self.sent = header
         self._socket = socket.create_connection(address, seconds_left(deadline))
-        self._file = io.BufferedReader(DeadlineReader(self._socket, deadline))
+        self._file = io.BufferedReader(DeadlineReader(self._socket, deadline), buffer_size)
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             # an answer may take any time, while its host is there
@@ -61,6 +62,11 @@ class TcprosConnection:
             self._socket.sendall(struct.pack('<I', len(request)) + request)
             ok = self._read(1) != b'\0'
             return ok, self._read_sized(self._read(4), _LIMIT)
+
+    def read_message(self):
+        """The next message of a topic, serialized; waits for it without limit."""
+        self._file.raw.deadline = None
+        return self._read_sized(self._read(4), _LIMIT)
 
     def _read_sized(self, size, limit):
         (size,) = struct.unpack('<I', size)
@@ -89,6 +95,10 @@ class TcprosConnection:
         except OSError:
             pass
         return False  # closed, or it says something unasked
+
+    def shut_down(self):
+        """Have the thread end that waits for what comes."""
+        shutdown_socket(self._socket)
 
     def close(self):
         """Close it."""

@@ -74,12 +74,7 @@ def remove_connection(self, c, *, node, original):
     else:
         delay = registration.RETRY_DELAY if c.dest_address else None
     if delay is not None:
-        node.start_thread(_reconnect, (node, self, c.endpoint_id, delay), 'reconnect')
-
-
-def _reconnect(node, subscriber, uri, delay):
-    if not node.ended.wait(delay) and not subscriber.closed:
-        node.connections.connect(subscriber.resolved_name, uri)
+        node.connections.connect_later(self, c.endpoint_id, delay)
 
 
 @patch('rospy.topics', '_SubscriberImpl.add_callback', 'knows nothing of links and their inboxes')

@@ -1,0 +1,226 @@
+"""One connection to a publisher elsewhere for the nodes of this process: what each of them gets is
+what its own connection would bring."""
+import pytest
+from std_msgs.msg import Int32, String
+
+from helpers import create, in_thread, speak_tcpros_only
+from pharos import Master
+from pharos.testing import Mailbox, TIMEOUT, until
+import programs
+
+COUNT = 200  # messages sent while something changes
+
+
+@pytest.fixture
+def sharing(master):
+    """The master, by which nodes share connections."""
+    return Master(master.url, share_connections=True)
+
+
+def listen(sharing, *names, topic='/shared', typed_as=Int32, **options):
+    """Nodes that hear a topic through sockets alone, each with a mailbox."""
+    boxes = []
+    for name in names:
+        box = Mailbox()
+        node = speak_tcpros_only(create(sharing, name))
+        node.interested_in(topic, typed_as, delegate=box, **options)
+        boxes.append((node, box))
+    return boxes
+
+
+def sender_of(master, *heard_by, topic='/shared', typed_as=Int32, **options):
+    """A channel, once these nodes hear it."""
+    channel = create(master, '/sender').output_channel(topic, typed_as, **options)
+    wait_until_heard(channel, *heard_by)
+    return channel
+
+
+def wait_until_heard(channel, *nodes):
+    name = channel.node.name
+    for node in nodes:
+        until(lambda: (name, 'TCPROS') in node.channels[0].connections)
+
+
+def data(box, count):
+    """The numbers in all messages that came, after so many more."""
+    box.take(count)
+    return [message.data for message in box.all()]
+
+
+def test_the_nodes_share_one_connection_and_each_has_a_message_of_its_own(master, sharing):
+    (first, one), (second, two) = listen(sharing, '/first', '/second', typed_as=String)
+    channel = sender_of(master, first, second, typed_as=String)
+    assert [name in ('/first', '/second') for name, _ in channel.connections] == [True]
+    channel.send(data='hello')
+    mine, other = one.next(), two.next()
+    assert mine == other and mine is not other
+    for message in mine, other:
+        assert message._connection_header['callerid'] == '/sender'
+        assert message._connection_header['type'] == 'std_msgs/String'
+    assert first.channels[0].received == second.channels[0].received == 1
+
+
+def test_those_who_take_shared_messages_get_one_and_the_same(master, sharing):
+    (first, one), (second, two) = listen(sharing, '/first', '/second', shared=True)
+    sender_of(master, first, second).send(data=1)
+    assert one.next() is two.next()
+
+
+def test_who_comes_late_gets_what_is_latched_once(master, sharing):
+    ((first, one),) = listen(sharing, '/first')
+    channel = sender_of(master, first, latch=True)
+    channel.send(data=1)
+    assert one.next().data == 1
+    ((late, two),) = listen(sharing, '/late')
+    assert two.next().data == 1
+    channel.send(data=2)
+    assert data(one, 1) == data(two, 1) == [1, 2]
+    assert len(channel.connections) == 1
+
+
+def test_header_seq_is_the_publishers(master, sharing):
+    ((first, one),) = listen(sharing, '/first', typed_as='std_msgs/Header')
+    channel = sender_of(master, first, typed_as='std_msgs/Header')
+    ((late, two),) = listen(sharing, '/late', topic='/pose', typed_as='geometry_msgs/PoseStamped')
+    poses = channel.node.output_channel('/pose', 'geometry_msgs/PoseStamped')
+    wait_until_heard(poses, late)
+    for expected in 1, 2:
+        poses.send()
+        assert two.next().header.seq == expected
+
+
+@pytest.mark.parametrize('leaves', [0, 1], ids=['the one that connected', 'another'])
+def test_when_one_stops_the_others_miss_nothing_and_get_nothing_twice(master, sharing, leaves):
+    listeners = listen(sharing, '/first', '/second', '/third')
+    channel = sender_of(master, *(node for node, _ in listeners))
+    by_name = {node.name: node for node, _ in listeners}
+    connected = by_name[channel.connections[0][0]]
+    others = [node for node, _ in listeners if node is not connected]
+    stopped = [connected, *others][leaves]
+
+    def publish():
+        for number in range(COUNT):
+            channel.send(data=number)
+
+    publishing = in_thread(publish)
+    until(lambda: listeners[2][0].channels[0].received > COUNT // 10)
+    stopped.stop()
+    publishing.join(TIMEOUT)
+    for node, box in listeners:
+        if node is not stopped:
+            assert data(box, COUNT) == list(range(COUNT))
+    assert len(channel.connections) == 1
+
+
+def test_when_the_last_has_stopped_the_connection_is_closed(master, sharing):
+    (first, one), (second, two) = listen(sharing, '/first', '/second')
+    channel = sender_of(master, first, second)
+    first.stop()
+    assert len(channel.connections) == 1
+    second.stop()
+    until(lambda: not channel.connections)
+    ((third, three),) = listen(sharing, '/third')
+    wait_until_heard(channel, third)
+    channel.send(data=1)
+    assert three.next().data == 1
+
+
+def test_a_publisher_that_comes_back_is_heard_by_all(master, sharing):
+    (first, one), (second, two) = listen(sharing, '/first', '/second')
+    channel = sender_of(master, first, second)
+    channel.node.stop()
+    until(lambda: not first.channels[0].connections and not second.channels[0].connections)
+    channel.node.start()
+    wait_until_heard(channel, first, second)
+    channel.send(data=1)
+    assert one.next().data == two.next().data == 1
+    assert len(channel.connections) == 1
+
+
+def test_a_node_that_is_busy_holds_no_other_up_and_its_queue_drops_the_oldest(master, sharing):
+    busy = speak_tcpros_only(create(sharing, '/busy'))
+    begun, goes_on = Mailbox(), Mailbox()
+
+    def work(message, channel):
+        begun(message, channel)
+        goes_on.next()
+
+    busy.interested_in('/shared', Int32, delegate=work, queue_size=1)
+    ((other, box),) = listen(sharing, '/other')
+    channel = sender_of(master, busy, other)
+    channel.send(data=0)
+    begun.next()
+    for number in range(1, 10):
+        channel.send(data=number)
+    assert data(box, 10) == list(range(10))
+    until(lambda: busy.channels[0].dropped == 8)
+    goes_on(None, None)
+    assert begun.next().data == 9
+    goes_on(None, None)
+
+
+def test_a_plain_subscriber_and_one_of_any_type_hear_it_too(master, sharing):
+    ((first, box),) = listen(sharing, '/first')
+    plain = speak_tcpros_only(create(sharing, '/plain'))
+    any_type = speak_tcpros_only(create(sharing, '/any_type'))
+    channel = sender_of(master, first)
+    heard, raw = Mailbox(), Mailbox()
+    plain.ros.Subscriber('/shared', Int32, lambda message: heard(message, None))
+    any_type.ros.Subscriber('/shared', plain.ros.AnyMsg, lambda message: raw(message, None))
+    # one who takes any type says another md5sum to the publisher
+    until(lambda: len(channel.connections) == 2)
+    until(lambda: plain.latest_run.rospy.connections.hears('/shared'))
+    channel.send(data=7)
+    assert box.next().data == heard.next().data == 7
+    assert raw.next()._buff == b'\7\0\0\0'
+
+
+def test_one_of_another_type_is_refused_and_the_others_hear_on(master, sharing):
+    ((first, box),) = listen(sharing, '/first')
+    channel = sender_of(master, first)
+    ((wrong, _),) = listen(sharing, '/wrong', typed_as=String)
+    until(lambda: wrong.errors)
+    assert 'std_msgs/Int32' in str(wrong.errors[0])
+    channel.send(data=1)
+    assert box.next().data == 1
+
+
+def test_only_messages_of_a_node_asked_for_come(master, sharing):
+    (first, one), (second, two) = listen(sharing, '/first', '/second')
+    ((choosy, three),) = listen(sharing, '/choosy', from_='/other')
+    channel = sender_of(master, first, second)
+    other = create(master, '/other').output_channel('/shared', Int32)
+    wait_until_heard(other, first, second, choosy)
+    channel.send(data=1)
+    other.send(data=2)
+    assert three.next().data == 2
+    assert sorted(data(one, 2)) == [1, 2]
+    assert three.empty()
+
+
+def test_the_first_message_of_a_publisher_elsewhere_waits_for_no_connection_of_their_own(
+    master, sharing
+):
+    (first, one), (second, two) = listen(sharing, '/first', '/second')
+    sender = create(master, '/sender')
+    sender.connect_timeout = 10 * TIMEOUT  # which the test would not wait for
+    sender.send_to('/shared', data=1)
+    assert one.next().data == two.next().data == 1
+
+
+def test_nodes_of_other_masters_objects_have_connections_of_their_own(master, sharing):
+    (first, one), (second, two) = listen(sharing, '/first', '/second')
+    ((own, three),) = listen(master, '/own')
+    channel = sender_of(master, first, second, own)
+    assert len(channel.connections) == 2
+    channel.send(data=1)
+    assert one.next().data == two.next().data == three.next().data == 1
+
+
+def test_rosnode_shows_it_at_each_node(master, sharing):
+    (first, _), (second, _) = listen(sharing, '/first', '/second')
+    sender_of(master, first, second)
+    for name in '/first', '/second':
+        said = programs.run(master.url, 'rosnode', 'info', name).stdout
+        assert 'topic: /shared\n    * to: /sender' in said
+        assert 'transport: TCPROS' in said
