@@ -227,10 +227,10 @@ class Pharos(Player):
         import pharos
 
         super().__init__(options)
-        self._master = pharos.Master()
+        self._master = pharos.Master(share_connections=options.share_connections)
         self._options = {'inline': options.inline, 'shared': options.shared}
         self._pharos = pharos
-        self._nodes = []
+        self._nodes, self._heard = [], []
         self._publisher = self._node('publisher') if self.sends else None
 
     def _node(self, name):
@@ -238,23 +238,33 @@ class Pharos(Player):
             self._pharos.BlockNode, named=f'{self.options.name}/{name}', domain='127.0.0.1'
         )
 
+    def begin(self, *what):
+        deadline = clock() + PATIENCE
+        while not all(channel.connections for channel in self._heard):
+            if clock() > deadline:
+                raise SystemExit(f'not connected: {self._heard}')
+            time.sleep(0.01)
+        return super().begin(*what)
+
     def opened(self, kind, topic, receivers, queue_size):
         if self.receives:
             while len(self._nodes) < receivers:
                 self._nodes.append(self._node(f'receiver{len(self._nodes)}'))
             for node in self._nodes[:receivers]:
-                node.interested_in(
+                channel = node.interested_in(
                     topic,
                     typed_as=kind.ros_class,
                     delegate=kind.noter(self.sent, self.took),
                     queue_size=queue_size,
                     **self._options,
                 )
+                self._heard.append(channel)
         if self.sends:
             channel = self._publisher.output_channel(
                 topic, typed_as=kind.ros_class, queue_size=queue_size
             )
-            if not channel.wait_for_subscribers(receivers, PATIENCE):
+            connections = 1 if self.options.share_connections else receivers
+            if not channel.wait_for_subscribers(connections, PATIENCE):
                 raise SystemExit(f'not connected: {channel!r}')
             return self._sending_to(topic) if self.options.send_to else channel.publish
 
@@ -325,6 +335,11 @@ def main():
     )
     parser.add_argument(
         '--shared', action='store_true', help='pharos: the receiver gets the published instance'
+    )
+    parser.add_argument(
+        '--share-connections',
+        action='store_true',
+        help='pharos: the receivers have one connection to the sender',
     )
     parser.add_argument(
         '--send-to', action='store_true', help='pharos: node.send_to(topic, block), not publish'

@@ -37,6 +37,7 @@ PYTHON_ROWS = {
     'rospy, 1 process': ['rospy'],
     'rospy, 1 process, tuned': ['rospy', '--tuned'],
     'pharos, 2 processes': ['pharos', '--two'],
+    'pharos, 2 pr., sharing': ['pharos', '--share-connections', '--two'],
     'rospy, 2 processes': ['rospy', '--two'],
     'rospy, 2 proc., tuned': ['rospy', '--tuned', '--two'],
 }
