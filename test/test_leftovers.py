@@ -12,7 +12,8 @@ import weakref
 
 import pytest
 
-from pharos.testing import Mailbox
+from helpers import create
+from pharos.testing import Mailbox, until
 import pharos
 from pharos import BlockNode
 from programs import PROGRAMS, environment
@@ -96,7 +97,7 @@ def test_what_a_stopped_node_held_is_freed(master):
 
 
 def test_closed_channels_hold_no_descriptor(master):
-    """rospy's topics keep an epoll descriptor each until the cycle collector comes."""
+    """rospy's topics have an epoll descriptor each, until the cycle collector comes."""
     with master.create(BlockNode, named='/opens_and_closes', domain='127.0.0.1') as node:
         gc.collect()
         gc.disable()
@@ -108,6 +109,20 @@ def test_closed_channels_hold_no_descriptor(master):
             assert len(os.listdir('/proc/self/fd')) < before + 20
         finally:
             gc.enable()
+
+
+def test_a_node_holds_a_descriptor_for_each_port_and_one_for_rosout(monkeypatch):
+    """Of three hundred nodes, each more is another three hundred."""
+    monkeypatch.setenv('ROS_HOSTNAME', '127.0.0.1')
+    with pharos.Master.embedded() as master:
+        nodes = [create(master, '/frugal')]
+        before = len(os.listdir('/proc/self/fd'))
+        nodes += [create(master, f'/frugal{number}') for number in range(10)]
+        for node in nodes:
+            node.interested_in('/frugal', 'std_msgs/String')
+        nodes[0].send_to('/frugal', data='to all')
+        # their connections to the master are closed in a while, and its to them
+        until(lambda: len(os.listdir('/proc/self/fd')) < before + 4 * 10)
 
 
 def test_questions_to_the_master_and_to_nodes_hold_no_descriptor(master):

@@ -22,8 +22,11 @@ class Limits:
     clients = 128  #: of one server, that have something to say before they are served
     grace = 0.25  #: seconds that each of them has in any case
     handshake_timeout = 5.0  #: seconds for a whole TCPROS handshake, however slowly it comes
-    #: seconds from one XML-RPC answer until the next request has come, however slowly
+    #: seconds until an XML-RPC request has come, however slowly
     request_timeout = 30.0
+    #: seconds from one XML-RPC answer until the next request has begun; each client that stays is a
+    #: descriptor and a thread
+    idle_timeout = 1.0
     #: lines about the clients of one server that the log takes in a period; the rest is counted
     rejection_lines = 100
     rejection_period = 10.0  #: seconds

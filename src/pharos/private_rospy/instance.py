@@ -177,6 +177,7 @@ class PrivateRospy:
         except BaseException:
             self.finish_stop(0)
             raise
+        self._close_idle_proxies()
         self.xmlrpc_port = self.lifetime.xmlrpc.port
         self.domain = self.import_library('rosgraph.network').get_host_name()
         if not self.lifetime.has_program:  # which goes on after that, to its end
@@ -311,6 +312,7 @@ class PrivateRospy:
         nothing."""
         if not self.is_registered:
             return
+        self._close_idle_proxies()
         try:
             if registration.repair(self, state, was_away):
                 self.module.logwarn(
@@ -323,6 +325,10 @@ class PrivateRospy:
             self.module.logdebug(
                 'cannot register with the master %s: %s', self.settings.master_url, error
             )
+
+    def _close_idle_proxies(self):
+        for proxy in list(self.module.core._xmlrpc_cache.values()):
+            proxy.close_if_idle()
 
     @property
     def is_registered(self):

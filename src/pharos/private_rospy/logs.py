@@ -38,6 +38,7 @@ def private_logging(imports):
         getLoggerClass=lambda: manager.loggerClass,
         # fileConfig clears these two lists, the process's own if they were shared
         _handlers=weakref.WeakValueDictionary(),
+        handlers=imports.twin(logging.handlers, RotatingFileHandler=_LogFile),
         _handlerList=[],
     )
     imports.modules['logging'] = module
@@ -56,6 +57,22 @@ def close_handlers(module):
             logger.removeHandler(handler)
             with contextlib.suppress(OSError):
                 handler.close()
+
+
+class _LogFile(logging.handlers.RotatingFileHandler):
+    """A log file that is open only while a line is written, for descriptors run out with many
+    nodes; what cannot be written is lost."""
+
+    def emit(self, record):
+        """Called by logging, with the handler's lock."""
+        super().emit(record)
+        stream, self.stream = self.stream, None
+        if stream is not None:
+            with contextlib.suppress(OSError):  # the disk is full
+                stream.close()
+
+    def handleError(self, record):
+        """Called by logging."""
 
 
 class StartupLines(Latch):

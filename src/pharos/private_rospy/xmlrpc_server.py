@@ -42,7 +42,9 @@ class RequestHandler(xmlrpc.server.SimpleXMLRPCRequestHandler):
     def handle_one_request(self):
         """Called by http.server, until close_connection is set."""
         self.server.acceptor.start_handshake(self.connection)
-        self.rfile.raw.deadline = time.monotonic() + self.server.node.limits.request_timeout
+        limits = self.server.node.limits
+        patience = limits.idle_timeout if self.is_answered else limits.request_timeout
+        self.rfile.raw.deadline = time.monotonic() + patience
         self.raw_requestline = b''
         try:
             super().handle_one_request()
@@ -66,6 +68,7 @@ class RequestHandler(xmlrpc.server.SimpleXMLRPCRequestHandler):
 
     def do_POST(self):
         """Called by http.server for a request whose header has come."""
+        self.rfile.raw.deadline = time.monotonic() + self.server.node.limits.request_timeout
         length = self.headers.get('content-length', '')
         if not self.is_rpc_path_valid():
             self.send_error(404)

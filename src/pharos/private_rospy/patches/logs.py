@@ -1,6 +1,8 @@
-"""What a node logs on the screen."""
+"""What a node logs, on the screen and in its file."""
 import contextlib
 import sys
+
+import rospkg
 
 from pharos.private_rospy.module_proxy import ModuleProxy
 from pharos.private_rospy.patches.table import patch, substitute
@@ -16,6 +18,14 @@ def default_formatter(*, original):
     return ModuleProxy(
         original, format=lambda record: original.format(record).replace('${', _ESCAPED)
     )
+
+
+@substitute(
+    'rosgraph.roslogging', 'rospkg', 'reads the manifests of all packages at the start of each node'
+)
+def packages():
+    """Read them once."""
+    return ModuleProxy(rospkg, RosPack=rospkg.RosPack.get_instance)
 
 
 class _Screen:

@@ -4,7 +4,7 @@ import contextlib
 import xmlrpc.client
 
 from pharos.private_rospy import registration
-from pharos.private_rospy.patches.table import patch
+from pharos.private_rospy.patches.table import addition, patch
 from pharos.private_rospy.proxies import ServerProxy
 
 _KINDS = {
@@ -45,6 +45,17 @@ def reg_added(self, resolved_name, data_type_or_uri, reg_type, *, node, module):
         self.publisher_update(resolved_name, value)
     elif reg_type == 'pub':
         node.connections.subscribers_at_registration[resolved_name] = value
+
+
+@addition('rospy.core', '_LockedServerProxy.close_if_idle', 'keeps its connection for ever')
+def close_if_idle(self):
+    """Give it back: it is a descriptor here, and one and a thread of the master's; the next call
+    makes another."""
+    if self._lock.acquire(blocking=False):
+        try:
+            self('close')()
+        finally:
+            self._lock.release()
 
 
 @patch(

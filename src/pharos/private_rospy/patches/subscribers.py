@@ -1,21 +1,17 @@
-"""rospy's subscriptions: they lose neither links nor callbacks, and hear links of this process."""
+"""rospy's subscriptions: they lose neither links nor callbacks, and hear links of this process; and
+what all topics have."""
+import select
 import traceback
 
 from pharos.intraprocess.link import links_of
 from pharos.private_rospy.plain_receivers import plain_callbacks
 from pharos.private_rospy.socket_callback import SocketCallback
-from pharos.private_rospy.patches.table import addition, patch
+from pharos.private_rospy.patches.table import addition, patch, substitute
 from pharos.private_rospy import registration
 from pharos.signals import is_from_signal
 
+LEFT = select.POLLHUP | select.POLLERR | select.POLLRDHUP  # what a socket says whose peer has gone
 RECONNECT_DELAY = 0.05  # seconds; a publisher that accepts and closes at once is not to be stormed
-
-
-@patch('rospy.topics', '_TopicImpl.close', 'keeps its epoll descriptor until the cycle collector')
-def close_topic(self, *, original):
-    """Close that, too."""
-    original(self)
-    self.connection_poll.poller.close()
 
 
 @patch('rospy.topics', '_SubscriberImpl.__init__', 'does not know its publishers')
@@ -112,3 +108,28 @@ def run_callbacks(self, message):
     """Run the callbacks that are no channels' for a message of a link."""
     for callback, arguments in plain_callbacks(self):
         self._invoke_callback(message, callback, arguments)
+
+
+@substitute('rospy.topics', 'Poller', 'has a descriptor for each topic, which runs out with many')
+def poller():
+    """Look at the sockets without one."""
+    return _Poller
+
+
+class _Poller:
+    """Finds sockets whose peers have left; any thread may call it."""
+
+    def __init__(self):
+        self._watched = set()  # descriptors
+        self.add_fd, self.remove_fd = self._watched.add, self._watched.discard
+
+    def error_iter(self):
+        """The descriptors of those sockets."""
+        poll = select.poll()
+        for descriptor in tuple(self._watched):
+            poll.register(descriptor, LEFT)
+        for descriptor, event in poll.poll(0):
+            if event & select.POLLNVAL:  # it was closed
+                self._watched.discard(descriptor)
+            else:
+                yield descriptor
