@@ -167,7 +167,7 @@ def test_debians_package_comes_with_all_that_importing_pharos_loads():
 
 def test_the_manual_page_names_every_command():
     page = (ROOT / 'debian' / 'pharos.1').read_text()
-    found = re.findall(r'^\.TP\n\.B ([a-z]+)\n(.*)', page, re.MULTILINE)
+    found = re.findall(r'^\.TP\n\.B ([a-z_]+)\n(.*)', page, re.MULTILINE)
     assert dict(found) == COMMANDS
 
 
