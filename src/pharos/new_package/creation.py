@@ -4,6 +4,7 @@ import contextlib
 import getpass
 import importlib.util
 import keyword
+import os
 import pathlib
 import re
 import shutil
@@ -43,7 +44,7 @@ def create_package(
     :raises PharosError: if there is such a folder already, or none can be made there
     """
     nodes = list(nodes) or [f'{name}_node']
-    path = directory.resolve() / name
+    path = pathlib.Path(os.path.abspath(directory)) / name
     _check_package_name(name, path.parent)
     _check_nodes(nodes)
     if not license_name.strip():

@@ -55,6 +55,7 @@ endif()
 
 SETUP = '''\
 """Read by catkin_python_setup() in CMakeLists.txt; name and version are those of package.xml."""
+
 from catkin_pkg.python_setup import generate_distutils_setup
 from setuptools import setup
 
@@ -67,6 +68,7 @@ INIT = '''\
 
 NODE = '''\
 """The node @node@."""
+
 import pharos
 import std_msgs.msg
 
@@ -96,6 +98,7 @@ class @class@(pharos.Node):
 SCRIPT = '''\
 #!/usr/bin/python3
 """Runs the node @node@ until Ctrl-C."""
+
 import sys
 
 import pharos
@@ -116,6 +119,7 @@ if __name__ == '__main__':
 ALL_IN_ONE = '''\
 #!/usr/bin/python3
 """Runs all nodes of @package@ in one process, until Ctrl-C."""
+
 import sys
 
 import pharos
@@ -140,6 +144,7 @@ if __name__ == '__main__':
 
 CONFTEST = '''\
 """Fixtures: a ROS master for each test, and nodes that end with it."""
+
 import pathlib
 import sys
 
@@ -151,6 +156,7 @@ from pharos.testing import create_node, expect_failures, master  # noqa: E402, F
 
 TEST = '''\
 """The node @node@."""
+
 import pharos
 from pharos import testing
 from @package@.@node@ import @class@
