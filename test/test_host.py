@@ -1,5 +1,6 @@
 """A program that is a rospy node itself, and has nodes of this package beside it."""
 import os
+import re
 import signal
 import sys
 
@@ -38,6 +39,15 @@ def drives(position, length):
     """Wait until the rospy node has sent the walker to both ends of its way."""
     for end in length, 0.0:
         position.wait_for(lambda message: message.data == end)
+
+
+def test_the_program_of_the_page_runs(master):
+    page = (ROOT / 'doc' / 'packages.md').read_text()
+    (code,) = re.findall(r'^```py\n(.*?)^```$', page, re.DOTALL | re.MULTILINE)
+    with Program(master.url, sys.executable, '-c', code) as program:
+        program.wait_for('who goes there?')
+        assert {'/tower', '/ear'} <= names(master)
+        assert program.end() == 0
 
 
 @pytest.mark.parametrize('with_signal', [signal.SIGINT, signal.SIGTERM])
