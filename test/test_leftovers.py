@@ -6,6 +6,7 @@ nodes alone; the master and the peers are elsewhere.
 import gc
 import json
 import os
+import resource
 import subprocess
 import sys
 import weakref
@@ -123,6 +124,36 @@ def test_a_node_holds_a_descriptor_for_each_port_and_one_for_rosout(monkeypatch)
         nodes[0].send_to('/frugal', data='to all')
         # their connections to the master are closed in a while, and its to them
         until(lambda: len(os.listdir('/proc/self/fd')) < before + 4 * 10)
+
+
+def test_a_thread_that_waits_for_clients_holds_no_number_of_a_descriptor(monkeypatch):
+    """Linux's accept takes one before it waits: of a thousand, those are soon all."""
+    monkeypatch.setenv('ROS_HOSTNAME', '127.0.0.1')
+    with pharos.Master.embedded() as master:
+        before = held_numbers()
+        for number in range(10):
+            create(master, f'/waiting{number}')
+        until(lambda: held_numbers() <= before + 5)
+
+
+def held_numbers():
+    """How many numbers below the lowest free one have no descriptor."""
+    with open(os.devnull) as lowest:
+        listed = {int(number) for number in os.listdir('/proc/self/fd')}
+        return len(set(range(lowest.fileno())) - listed)
+
+
+def test_a_node_for_which_there_are_no_descriptors_says_so(master):
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    create(master, '/one')
+    used = len(os.listdir('/proc/self/fd'))
+    resource.setrlimit(resource.RLIMIT_NOFILE, (used + 5, before[1]))
+    try:
+        with pytest.raises(pharos.PharosError, match='/one_more cannot start: .* ulimit -n'):
+            create(master, '/one_more')
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+    assert create(master, '/one_more').is_running
 
 
 def test_questions_to_the_master_and_to_nodes_hold_no_descriptor(master):

@@ -15,7 +15,7 @@ from pharos.intraprocess.dispatcher import Dispatcher
 from pharos.intraprocess.fanout import Latch
 from pharos.lifecycle import Lifecycle
 from pharos.output_channel import OutputChannel
-from pharos.private_rospy import changes
+from pharos.private_rospy import changes, descriptors
 from pharos.private_rospy.instance import PrivateRospy
 from pharos.private_rospy.names import Resolved, check_name
 from pharos.private_rospy.process_rospy import rospy
@@ -64,6 +64,7 @@ class Run:
         self.successor: Optional[Run] = None
         #: the restart that ends this one
         self.restart: Optional[Restart] = None
+        descriptors.check_left(settings.name)
         self.rospy = PrivateRospy(settings, self._stop_for_ros, lambda: node.allow_remote_shutdown)
         self.dispatcher = Dispatcher(self.rospy.start_thread)
         self.rospy.on_received = self.dispatcher.run

@@ -1,6 +1,7 @@
 """How the clients of a server come in: none is waited for, and none is trusted to say what it ought
 to."""
 import collections
+import contextlib
 import errno
 import threading
 import time
@@ -11,6 +12,7 @@ from pharos.private_rospy.lifetime import keep_alive, shutdown_socket
 BACKLOG = 1024
 # seconds until the next attempt to accept a client where there are no descriptors left
 PAUSE = 0.05
+LONG = 86400.0  # seconds; some time limit
 TEXT_LIMIT = 300  # characters of a client's in a line of the log
 _EXHAUSTED = errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM
 _SHUT = errno.EINVAL, errno.EBADF
@@ -63,6 +65,10 @@ class Acceptor:
         :param listener: a socket that listens already: one that is shut before this runs would
             listen again
         """
+        # With a time limit Python waits before it calls accept, which holds the number of the next
+        # descriptor for as long as it waits itself: of a thousand, two for each node.
+        with contextlib.suppress(OSError):  # it is closed already
+            listener.settimeout(LONG)
         while True:
             self._make_room(wait=True)
             try:
