@@ -4,6 +4,7 @@ import inspect
 import logging
 import os
 import pathlib
+import re
 import subprocess
 import sys
 
@@ -128,3 +129,67 @@ def test_a_node_whose_log_file_finds_the_disk_full_stops_and_starts_again(
         node.stop()
         node.start()
     assert node.is_running
+
+
+# -- on the screen
+
+
+def told(master, *arguments, **variables):
+    """What the program prints, on standard output and error: of each line what it ends with."""
+    process = subprocess.run(
+        [sys.executable, PROGRAMS / 'tells.py', *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT if variables.pop('one_screen', True) else subprocess.PIPE,
+        text=True,
+        env=environment(master.url, **variables),
+        timeout=2 * TIMEOUT,
+        check=True,
+    )
+    return process.stdout, process.stderr or ''
+
+
+def test_lines_on_the_screen_name_the_node(master):
+    printed, _ = told(master)
+    assert re.search(r'^\[INFO\] \[[\d.]+\]: /first: hello$', printed, re.M)
+    assert re.search(r'^\[WARN\] \[[\d.]+\]: /robot/second: careful$', printed, re.M)
+
+
+def test_a_format_of_ones_own_says_what_a_line_on_the_screen_has(master):
+    printed, _ = told(master, ROSCONSOLE_FORMAT='${severity} of ${node}: ${message}')
+    assert 'INFO of /first: hello\n' in printed
+    assert 'WARN of /robot/second: careful\n' in printed
+    printed, _ = told(master, ROSCONSOLE_FORMAT='${message}')
+    assert {'hello', 'careful'} <= set(printed.splitlines())
+
+
+def test_a_failure_is_told_once_where_the_log_and_the_transcript_come_on_one_screen(master):
+    printed, _ = told(master)
+    for what in 'soul <lambda> of /first raised', 'service /fails <lambda> of /robot/second raised':
+        assert printed.count(what) == 1
+    assert printed.count('Traceback') == 2
+
+
+def test_a_failure_is_told_by_the_log_and_the_transcript_where_they_go_apart(master):
+    printed, errors = told(master, one_screen=False)
+    for text in printed, errors:
+        assert text.count('soul <lambda> of /first raised ValueError') == 1
+        assert text.count('service /fails <lambda> of /robot/second raised ValueError') == 1
+    assert (printed.count('Traceback'), errors.count('Traceback')) == (0, 2)
+
+
+def test_a_receiver_of_the_transcript_gets_what_is_on_the_screen(master):
+    printed, _ = told(master, 'redirect')
+    assert printed.endswith('the Transcript was given 2\n')
+    assert printed.count('raised ValueError') == 2
+
+
+def test_a_failure_is_told_where_the_log_shows_nothing_on_the_screen(master, tmp_path):
+    """As where a logging configuration of one's own has files alone."""
+    configuration = tmp_path / 'logging.conf'
+    configuration.write_text(
+        '[loggers]\nkeys=root\n[handlers]\nkeys=\n[formatters]\nkeys=\n'
+        '[logger_root]\nlevel=INFO\nhandlers=\n'
+    )
+    printed, _ = told(master, ROS_PYTHON_LOG_CONFIG_FILE=str(configuration))
+    assert printed.count('raised ValueError') == 2
+    assert 'hello' not in printed

@@ -10,6 +10,7 @@ from pharos import node_registry
 from pharos.errors import NodeStoppedError
 from pharos.failures import FailureList, Failures
 from pharos.lifecycle import Lifecycle
+from pharos.private_rospy.logs import lines_shown
 from pharos.private_rospy.settings import Settings
 from pharos.seconds import check_seconds
 from pharos.transcript import Transcript
@@ -216,8 +217,18 @@ class NodeAttributes:
         return self._errors.all()
 
     def _tell_failure(self, line: str, details: str) -> None:
-        attempt(lambda: self.log(f'{line}\n{details}' if details else line, level='error'))
-        Transcript.show(line)
+        text = f'{line}\n{details}' if details else line
+        if self._has_no_log:
+            Transcript.show(text)
+            return
+        before = lines_shown()
+        attempt(lambda: self.log(text, level='error'))
+        if lines_shown() == before or not Transcript.is_where_errors_are:
+            Transcript.show(line)
+
+    @property
+    def _has_no_log(self) -> bool:
+        return self.latest_run is None or self.latest_run.is_over
 
     def log(self, text: str, level: str = 'info') -> None:
         """Log a line on /rosout, the node's log file and the screen, with the file and line of the
@@ -229,7 +240,7 @@ class NodeAttributes:
             level = _LEVELS[level]
         except KeyError:
             raise ValueError(f"no log level {level!r}: there are {', '.join(_LEVELS)}") from None
-        if self.latest_run is None or self.latest_run.is_over:
+        if self._has_no_log:
             Transcript.show(f'[{level.upper()}] {self.name}: {text_of(text)}')
         else:
             log = self.latest_run.rospy.log

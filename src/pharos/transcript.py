@@ -1,4 +1,5 @@
 """The Transcript: where blocks show things."""
+import os
 import sys
 import threading
 from typing import Any, Callable, Optional
@@ -65,8 +66,20 @@ class _Transcript:
             self._is_failing = False
         return before
 
+    @property
+    def is_where_errors_are(self) -> bool:
+        """Whether what it shows comes where standard error goes: to the same terminal or file."""
+        return self._receiver is None and bool(attempt(_is_one_output))
+
     def __repr__(self) -> str:
         return f"<Transcript to {'standard output' if self._receiver is None else self._receiver}>"
+
+
+def _is_one_output() -> bool:
+    if sys.stdout is sys.stderr:
+        return True
+    out, err = (os.fstat(stream.fileno()) for stream in (sys.stdout, sys.stderr))
+    return os.path.samestat(out, err)
 
 
 def _print(line: str) -> None:

@@ -140,6 +140,7 @@ class ScriptRun(Run):
         folder = (node.cwd or os.getcwd()) if working_directory.is_possible() else None
         self.rospy.expect_program(folder)
         is_again = isinstance(node.latest_run, ScriptRun)
+        self.rospy.names_log_lines = node.output is None
         self._file = redirect(self.rospy.system, node.output, lambda: node.name, is_again)
 
     def start(self, reopens: bool) -> None:

@@ -38,6 +38,8 @@ class PrivateRospy:
     :param allows_remote_shutdown: ``allows_remote_shutdown()``: whether any host may ask for that
     """
 
+    #: whether its log lines on the screen begin with its name; what a program prints may have it
+    names_log_lines = True
     #: called where another process asks for the node's health; returns what XML-RPC has
     tell_health: Any = dict
 

@@ -9,6 +9,7 @@ hooks.
 import contextlib
 import logging
 import logging.handlers
+import threading
 import time
 import weakref
 
@@ -16,6 +17,8 @@ from pharos.intraprocess.fanout import Latch
 
 # seconds after the start in which log lines are kept for listeners that connect later
 STARTUP = 2.0
+
+_shown = threading.local()  # .lines: how many the thread has had shown
 
 
 def private_logging(imports):
@@ -73,6 +76,16 @@ class _LogFile(logging.handlers.RotatingFileHandler):
 
     def handleError(self, record):
         """Called by logging."""
+
+
+def note_shown():
+    """This thread has had a line of a node's log shown on the screen."""
+    _shown.lines = lines_shown() + 1
+
+
+def lines_shown() -> int:
+    """How many lines of nodes' logs this thread has had shown on the screen."""
+    return getattr(_shown, 'lines', 0)
 
 
 class StartupLines(Latch):

@@ -4,6 +4,7 @@ import sys
 
 import rospkg
 
+from pharos.private_rospy.logs import note_shown
 from pharos.private_rospy.module_proxy import ModuleProxy
 from pharos.private_rospy.patches.table import patch, substitute
 
@@ -11,13 +12,20 @@ _ESCAPED = '$\0{'  # for '${', by which rosgraph's format names the parts of a l
 
 
 @substitute(
-    'rosgraph.roslogging', '_defaultFormatter', "takes '${time:' in a message for its own format"
+    'rosgraph.roslogging',
+    '_defaultFormatter',
+    "takes '${time:' in a message for its own format; does not say which node of a process logs",
 )
-def default_formatter(*, original):
-    """Escape what looks like a part of a line."""
-    return ModuleProxy(
-        original, format=lambda record: original.format(record).replace('${', _ESCAPED)
-    )
+def default_formatter(*, node, module, original):
+    """Escape what looks like a part of a line, and name the node, unless a format says what a line
+    has."""
+
+    def format_(record):
+        text = original.format(record).replace('${', _ESCAPED)
+        is_named = node.names_log_lines and 'ROSCONSOLE_FORMAT' not in module.os.environ
+        return f'{node.name}: {text}' if is_named else text
+
+    return ModuleProxy(original, format=format_)
 
 
 @substitute(
@@ -68,3 +76,4 @@ def write(self, fd, msg, color, *, original):
         fd = fd.present
     if fd is not None:  # the program was started without that one
         original(self, fd, msg.replace(_ESCAPED, '${'), color)
+        note_shown()
