@@ -8,6 +8,7 @@ import sys
 import xml.etree.ElementTree
 import zipfile
 
+import catkin_pkg.changelog
 import pytest
 
 import pharos
@@ -189,3 +190,12 @@ def run_here(*command):
 def test_the_version_is_the_same_everywhere():
     debians = re.match(r'pharos \((\S+)\) ', (ROOT / 'debian' / 'changelog').read_text())
     assert pharos.__version__ == MANIFEST.findtext('version') == debians.group(1)
+
+
+def test_the_changelog_tells_of_this_version_with_its_date_and_then_of_those_before():
+    changelog = catkin_pkg.changelog.get_changelog_from_path(str(ROOT), 'pharos')
+    released = [version for version, _, _ in changelog.foreach_version(reverse=True)]
+    assert released == sorted(released, key=lambda text: [*map(int, text.split('.'))], reverse=True)
+    assert released[0] == pharos.__version__
+    dates = [changelog.get_date_of_version(version) for version in released]
+    assert dates == sorted(dates, reverse=True)
