@@ -1,6 +1,8 @@
 """The documentation: it is built without a warning, nothing is missing in it, and no link is dead."""
+import pathlib
 import re
 import subprocess
+import sys
 import zlib
 from urllib.parse import unquote
 
@@ -85,6 +87,22 @@ def test_flowcharts_are_drawn(html):
     assert '<svg' in (html / 'doc' / 'architecture.html').read_text() or list(
         (html / '_images').glob('graphviz-*.svg')
     )
+
+
+def test_the_pictures_of_the_benchmarks_show_the_figures_of_their_tables(tmp_path):
+    pytest.importorskip('matplotlib')
+    command = [sys.executable, ROOT / 'benchmark' / 'picture', '--output', tmp_path]
+    drawn = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.split()
+    assert len(drawn) == 3
+    for path in map(pathlib.Path, drawn):
+        assert texts(path) == texts(ROOT / 'doc' / path.name), 'benchmark/picture --output doc'
+
+
+def texts(picture):
+    """What is written in a picture, but for the marks of its axes, which depend on matplotlib."""
+    found = re.findall(r'<text [^>]*>([^<]+)</text>', picture.read_text())
+    assert 'direct call' in found or 'six processes' in found
+    return [text for text in found if not re.fullmatch(r'[\d.]+', text) or '.' in text]
 
 
 def test_an_unknown_argument_of_tools_doc_is_refused():
