@@ -53,8 +53,6 @@ nitpick_ignore_regex = [
         r'(Run|pharos\.run\.Run|pharos\.channel\.Channel|pharos\.failures\.Failure(s|List))',
     ),
     ('py:class', r'pharos\.(live\.(snapshot|edges)|compose\.(progress|launch_file|kept_node))\..*'),
-    # attributes that their class's docstring tells
-    ('py:attr', r'.*'),
 ]
 
 html_theme = 'furo'

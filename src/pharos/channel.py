@@ -86,7 +86,7 @@ class Channel:
         """End it: the node no longer publishes, or is interested. Harmless when done twice.
 
         When it returns, no delegate runs for the channel any more; but for the one that calls it,
-        if one does, and one that does not end within the node's :attr:`stop_timeout`.
+        if one does, and one that does not end within the node's ``stop_timeout``.
         """
         self.closed = True  # where it is only just being opened, it is closed right after that
         self._run.forget(self)

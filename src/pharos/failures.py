@@ -170,8 +170,9 @@ class Failures(Sequence[BaseException]):
     thread.
 
     It is the sequence of the exceptions, the newest last. Who has seen to them may ``pop`` or
-    ``clear`` them. :attr:`total` counts all failures, identical ones and those taken out too.
+    ``clear`` them.
 
+    :ivar total: how many failures there were, identical ones and those taken out too
     :param tell: called as ``tell(line, details)`` for those that are worth it; what it raises
         changes nothing
     """

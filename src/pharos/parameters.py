@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class Parameters(MutableMapping[str, Any]):
-    """``{global name: value}`` of a master's parameter server; made by :attr:`Master.parameters`.
+    """``{global name: value}`` of a master's parameter server; made by :attr:`~pharos.Master.parameters`.
 
     A name may be a namespace, whose value is a dict of what it holds. Iteration gives all full
     names. Setting a value that the server cannot hold is a ValueError.

@@ -27,12 +27,16 @@ NAME = 'workspace'  # of the node that a session has, where it is free
 class Workspace:
     """What a session has: a master, a node of its own, and the names that can be typed.
 
-    :attr:`master` is the ROS master's proxy, :attr:`me` the node, :attr:`namespace` the names.
-    Where no master is named and none answers, there is one of the session's own
-    (:attr:`is_embedded`), which ROS_MASTER_URI names until :meth:`close`.
+    Where no master is named and none answers, there is one of the session's own, which
+    ROS_MASTER_URI names until :meth:`close`.
 
+    :ivar master: the ROS master's proxy
+    :ivar me: the node
+    :ivar namespace: the names, a dict
+    :ivar is_embedded: whether the master is the session's own
+    :ivar sought: where a master was looked for, a URL
     :param url: URL of the ROS master; None: ROS_MASTER_URI's, or a master of its own
-    :param argv: ROS remappings and private parameters of :attr:`me`
+    :param argv: ROS remappings and private parameters of ``me``
     :raises ValueError: if ROS_MASTER_URI or ``url`` is no URL
     :raises MasterUnreachableError: if no master answers at ``url``
     """
@@ -40,7 +44,7 @@ class Workspace:
     def __init__(self, url: Optional[str] = None, argv: Optional[List[str]] = None) -> None:
         self.master = Master(url)
         self.is_embedded = url is None and not self.master.is_reachable()
-        self.sought = self.master.url  #: where a master was looked for
+        self.sought = self.master.url
         self._former_uri = os.environ.get(ROS_MASTER_URI)
         if self.is_embedded:
             self.master = Master.embedded()
