@@ -84,14 +84,15 @@ def tell_programs(app, name, source):
 
 
 def take_fields_apart(app, what, name, thing, options, lines):
-    """Make of ``:raises A, B: why``, and of ``:param a, b: what``, a field for each of them."""
+    """Make of ``:raises A, B: why``, and of ``:param a, b: what``, a field for each of them; and have
+    the underscore at the end of a name stay one, which is that of a link otherwise."""
     fields = re.sub(
         r'^:(raises|param) (\w+(?:, \w+)+):(.*(?:\n[ \t]+.*)*)',
         _apart,
         '\n'.join(lines),
         flags=re.M,
     )
-    lines[:] = fields.split('\n')
+    lines[:] = re.sub(r'^(:\w+ \w+)_:', r'\1\\_:', fields, flags=re.M).split('\n')
 
 
 def _apart(field):
