@@ -11,7 +11,7 @@ import xml.etree.ElementTree
 
 import pytest
 from catkin_pkg.package import parse_package_string
-from hypothesis import given, settings, strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
 from pharos import PharosError
 from pharos.new_package.creation import NAME, create_package
@@ -279,14 +279,17 @@ def test_what_cannot_be_written_leaves_nothing(source):
 
 # -- any names
 
-names = st.from_regex(NAME, fullmatch=True).filter(lambda name: not keyword.iskeyword(name))
+names = st.from_regex(r'[a-z][a-z0-9]{0,5}(_[a-z0-9]{1,5}){0,2}', fullmatch=True).filter(
+    lambda name: not keyword.iskeyword(name)
+)
 texts = st.text().map(lambda text: ''.join(filter(str.isprintable, text)))
 
 
-@settings(max_examples=50)
+@settings(max_examples=50, deadline=None, suppress_health_check=list(HealthCheck), database=None)
 @given(names, st.lists(names, min_size=1, max_size=3, unique=True), texts, texts)
 def test_whatever_the_names_the_files_can_be_read(name, nodes, author, license_name):
     files = files_of(Package(name, nodes, author, 'ada@example.org', license_name))
+    assert NAME.fullmatch(name)
     for path, text in files.items():
         if path.endswith('.py') or path.startswith('scripts/'):
             ast.parse(text)
