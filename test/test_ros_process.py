@@ -10,7 +10,10 @@ import sys
 import threading
 import time
 
+import genpy
 import pytest
+import rosbag
+from std_msgs.msg import String
 
 from pharos.testing import Mailbox, TIMEOUT, until
 from pharos import PharosError, BlockNode, ExternalNode, RosProcess, UnknownNodeError
@@ -306,6 +309,18 @@ def test_a_program_that_reads_keys_is_driven(master, package, language, monkeypa
         assert not any(character in process.output for character in '\r\x1b')
         with pytest.raises(PharosError, match='keys has ended, and reads nothing any more: run it'):
             process.send('w')
+
+
+def test_the_space_bar_pauses_rosbag_play(master, tmp_path):
+    with rosbag.Bag(str(tmp_path / 'said.bag'), 'w') as bag:
+        for number in range(100):
+            bag.write('/said', String(str(number)), genpy.Time(100 + number // 10))
+    with master.run('rosbag', 'play', tmp_path / 'said.bag') as process:
+        until(lambda: '[RUNNING]' in process.output)
+        process.send(' ')
+        until(lambda: '[PAUSED ]' in process.output)
+        process.send(' ')
+        until(lambda: '[RUNNING]' in process.output.rpartition('[PAUSED ]')[2])
 
 
 def test_a_program_that_reads_lines_gets_what_is_sent_and_prints_no_echo_of_it(master, package):
