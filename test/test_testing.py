@@ -6,7 +6,8 @@ import sys
 
 import pytest
 
-from pharos.testing import TIMEOUT
+from helpers import create
+from pharos.testing import Mailbox, TIMEOUT
 from programs import ROOT
 
 ROBOT = ROOT / 'test' / 'programs' / 'robot'
@@ -54,3 +55,12 @@ def test_it_is_a_plugin(tmp_path):
     (tmp_path / 'test_it.py').write_text(test)
     status, printed = run_tests(tmp_path)
     assert status == pytest.ExitCode.OK, printed
+
+
+def test_a_mailbox_in_which_nothing_comes_names_its_channels(master):
+    node = create(master, '/hears_nothing')
+    by_channel = Mailbox(node, '/misspelt', 'std_msgs/String')
+    with pytest.raises(TimeoutError, match=r'/misspelt std_msgs/String .*: not connected'):
+        by_channel.next(0)
+    with pytest.raises(TimeoutError, match='no channel: nothing is heard'):
+        Mailbox().next(0)

@@ -25,7 +25,7 @@ from typing import Any, Callable, Dict, Iterable, Iterator, List, Optional, Set,
 
 import pytest
 
-from pharos import Failure, InputChannel, Master, Node
+from pharos import Failure, InputChannel, Master, Node, node_registry
 
 #: seconds; a bound on waits for events, which a test that passes never reaches
 TIMEOUT = 30.0
@@ -84,9 +84,21 @@ class Mailbox:
         try:
             return self._waiting.get(timeout=timeout)
         except queue.Empty:
+            through = ', '.join(map(repr, self._channels())) or 'no channel: nothing is heard'
             raise TimeoutError(
-                f'no message came within {timeout:g} s, after {len(self._came)} others'
+                f'no message came within {timeout:g} s, after {len(self._came)} others, through'
+                f' {through}'
             ) from None
+
+    def _channels(self) -> List[InputChannel]:
+        """Those whose messages come here."""
+        blocks: Dict[InputChannel, Any] = {
+            channel: node.delegate if channel.delegate is None else channel.delegate
+            for node in node_registry.nodes()
+            for channel in node.channels
+            if isinstance(channel, InputChannel)
+        }
+        return [channel for channel, block in blocks.items() if block is self]
 
     def take(self, count: int) -> List[Any]:
         """The next ``count`` messages."""

@@ -1,7 +1,8 @@
 """Runs the Python nodes of a launch file, or several programs, unmodified, in one process, where
 messages go from one to the other without a socket.
 
-  compose PKG FILE.launch [arg:=value ...]     as roslaunch; what is not Python runs apart, as there
+  compose PKG FILE.launch [arg:=value ...]     as roslaunch; what is not Python runs apart, as there,
+                                               and so do programs that use pharos themselves
   compose FILE.launch [arg:=value ...]         the same, by its path
   compose --script PKG/EXECUTABLE ...          programs, as rosrun finds them
   compose                                      none at first

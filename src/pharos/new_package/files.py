@@ -91,7 +91,7 @@ class @class@(pharos.Node):
 
     def speak(self) -> None:
         """Run in a thread of its own, until the node stops."""
-        for _ in self.every(self.period.value):
+        for _ in self.every(self.period.value):  # as it is when this begins
             self.send_to('~output', data=f'heard {self.heard}', typed_as='std_msgs/String')
 '''
 
