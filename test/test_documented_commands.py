@@ -25,7 +25,7 @@ PAGES = [
     ROOT / 'benchmark' / 'README.md',
 ]
 BLOCK = re.compile(
-    r'^```(\w+)\n(.*?)^```$|(?<=\n\n)((?: {4}[^\n]*\n|\n(?= {4}))+)', re.DOTALL | re.MULTILINE
+    r'^```(\w+)\n(.*?)^```$|^(?:#[^\n]*)?\n((?: {4}[^\n]*\n|\n(?= {4}))+)', re.DOTALL | re.MULTILINE
 )
 #: programs that begin a line which is a command of the shell, beside those of this clone
 SHELL = set(
@@ -61,6 +61,19 @@ OUTPUT = {
 }
 
 
+#: what each kind of fence is, and who looks at it
+FENCES = {
+    'python': 'README.md: here; the tutorial: test_tutorial.py; other pages of doc/: test_how_to.py',
+    'py': 'here: a program of its own',
+    'text': 'what the block before prints, which the same tests compare',
+    'console': 'test_tutorial.py types it',
+    'debugger': 'the same',
+    'ipython': 'the same',
+    'mermaid': 'test_docs.py sees it drawn',
+    'xml': 'here: roslaunch reads it',
+}
+
+
 class Block(NamedTuple):
     """A block of code of a page; `kind` is that of its fence, or '' where it is indented."""
 
@@ -79,7 +92,12 @@ def blocks():
         source = page.read_text()
         for found in BLOCK.finditer(source):
             text = found[2] if found[1] else re.sub(r'^ {4}', '', found[3], flags=re.MULTILINE)
-            yield Block(page, source.count('\n', 0, found.start()) + 1, found[1] or '', text)
+            yield Block(
+                page,
+                source.count('\n', 0, found.start(2 if found[1] else 3)) + 1,
+                found[1] or '',
+                text,
+            )
 
 
 def is_command(line):
@@ -134,6 +152,24 @@ def test_an_indented_block_is_commands_or_python_or_known_output(block):
     assert (
         is_shell(block) or is_python(block) or any(map(block.text.__contains__, OUTPUT))
     ), block.text
+
+
+def test_what_is_not_run_is_there():
+    lines = [line for _, line in commands()]
+    gone = [start for start in NOT_RUN if not any(line.startswith(start) for line in lines)]
+    assert gone == [], 'no page has it any more'
+
+
+def test_a_fence_is_of_a_kind_that_a_test_looks_at():
+    assert {block.kind for block in blocks()} - {''} <= FENCES.keys()
+
+
+@pytest.mark.parametrize('block', [each for each in blocks() if each.kind == 'xml'], ids=identify)
+def test_roslaunch_reads_lines_of_a_launch_file(block, tmp_path):
+    (tmp_path / 'a.launch').write_text(f'<launch>{block.text}</launch>')
+    ended = run('http://127.0.0.1:1/', 'roslaunch', '--nodes', str(tmp_path / 'a.launch'))
+    assert ended.returncode == 0, ended.stderr
+    assert block.text.count('<node ') == len(ended.stdout.split())
 
 
 # -- commands
@@ -321,6 +357,15 @@ def test_three_lines_run(block, master, monkeypatch, tmp_path):
     shown = {'master': master, 'node': master.create(BlockNode, named='/node')}
     exec(f'from pharos import *\n{block.text}', shown)
     forget_parameters(master.url)
+
+
+@pytest.mark.parametrize('block', [each for each in blocks() if each.kind == 'py'], ids=identify)
+def test_a_program_prints_something_until_it_is_told_to_end(block, master, tmp_path):
+    (tmp_path / 'program.py').write_text(block.text)
+    with Program(master.url, '/usr/bin/python3', str(tmp_path / 'program.py')) as program:
+        program.wait_for('')
+        assert program.end() == 0
+    assert 'Traceback' not in program.read_to_the_end()
 
 
 @pytest.mark.parametrize('block', filter(is_python, blocks()), ids=identify)
