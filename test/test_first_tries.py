@@ -144,9 +144,7 @@ def test_a_stop_that_does_not_call_super_stops_the_node(master):
     ],
 )
 def test_a_name_of_rospys_is_told_by_what_it_is_here(master, name, said):
-    node = create(master)
-    channel = node.output_channel('/guessed', 'std_msgs/String')
-    for thing in node, master, channel, pharos:
+    for thing in create(master), master, pharos:
         assert not hasattr(thing, name)
         with pytest.raises(AttributeError, match=f"has no attribute '{name}': .*{said}"):
             getattr(thing, name)
@@ -195,3 +193,10 @@ def test_a_value_in_the_place_of_a_message_is_told_by_the_name_of_its_field(mast
     with pytest.raises(pharos.UnknownTypeError, match="did you mean 'std_msgs/String'"):
         node.output_channel('/never_said', 'String')
     assert node.channels == [channel]
+
+
+def test_a_block_in_the_place_of_a_type_is_told_where_it_goes(master):
+    node = create(master)
+    for give in node.interested_in, lambda name, block: node.serve(name, block, 'std_srvs/Empty'):
+        with pytest.raises(pharos.UnknownTypeError, match='malformed .*a block comes after the ty'):
+            give('/guessed_type', lambda *arguments: None)

@@ -72,7 +72,7 @@ EXPORTS = """
 ON_DEMAND = (
     *('pharos.compose', 'pharos.live', 'pharos.messages.numeric_field', 'pharos.probe'),
     *('pharos.testing', 'IPython', 'PIL', 'jedi', 'matplotlib', 'prompt_toolkit', 'pytest'),
-    *('pharos.new_package', 'rich'),
+    *('pharos.mypy_plugin', 'pharos.new_package', 'mypy', 'rich'),
 )
 
 # -- what the source breaks of the rules; each culprit is a line of text, without numbers of lines

@@ -124,6 +124,12 @@ class NodeAttributes:
     def __setattr__(self, name: str, value: Any) -> None:
         if name in ('start', 'stop') or name in _SET_ONCE and name in vars(self):
             raise _not_to_be_set(name)
+        if name == 'name':
+            raise AttributeError(
+                f'{self.name} is the name by which the master knows the node: give another one to'
+                f' create(), as named={value!r}, and what else {type(self).__name__} is called to'
+                ' another attribute'
+            )
         super().__setattr__(name, self._checked(name, value))
 
     @classmethod
@@ -132,7 +138,7 @@ class NodeAttributes:
         if name in _CHECKS:
             return _CHECKS[name](name, value)
         is_taken = name in cls._methods and not callable(value)
-        if is_taken or name in cls._properties and name != 'name':  # which says more
+        if is_taken or name in cls._properties:
             raise _not_to_be_set(name)
         return value
 
@@ -182,14 +188,6 @@ class NodeAttributes:
     def name(self) -> str:
         """The node's name, as the master knows it: '/robot1/driver'."""
         return self._settings.name
-
-    @name.setter
-    def name(self, value: Any) -> None:
-        raise AttributeError(
-            f'{self.name} is the name by which the master knows the node: give another one to'
-            f' create(), as named={value!r}, and what else {type(self).__name__} is called to'
-            ' another attribute'
-        )
 
     @property
     def tcp_port(self) -> int:

@@ -9,7 +9,6 @@ from pharos import on_demand
 from pharos.blocks import Block, check_delegate
 from pharos.errors import NodeStoppedError, PharosError
 from pharos.intraprocess.inbox import Inbox, SocketInbox
-from pharos.wrong_guesses import getattr_with_hint
 
 if TYPE_CHECKING:
     from pharos.live.plot import Plot
@@ -24,8 +23,6 @@ class Channel:
     """
 
     refused: Any = 0  # how many of the other end the channel cannot hear
-    if not TYPE_CHECKING:
-        __getattr__ = getattr_with_hint
 
     def __init__(
         self, node: 'Node', topic: str, message_class: Type[genpy.Message], queue_size: int

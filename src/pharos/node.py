@@ -1,5 +1,5 @@
 """Nodes: real ROS nodes of this process, written with blocks."""
-from typing import TYPE_CHECKING, Any, Callable, Optional, Union
+from typing import TYPE_CHECKING, Any, Callable, Optional, TypeVar, Union
 
 from pharos import node_registry, on_demand
 from pharos.becoming import become
@@ -11,6 +11,9 @@ from pharos.restarts import restart
 from pharos.run import Run
 from pharos.seconds import check_seconds
 from pharos.starts import of_one_run
+
+
+Self = TypeVar('Self', bound='Node')
 
 
 class Node(NodeWithTopics, is_base=True):
@@ -166,7 +169,7 @@ class Node(NodeWithTopics, is_base=True):
             )
         become(self, node_class)
 
-    def __enter__(self) -> 'Node':
+    def __enter__(self: Self) -> Self:
         return self
 
     def __exit__(self, *error: Any) -> None:

@@ -35,6 +35,7 @@ def check_name(kind: str, type_: Any) -> None:
         raise UnknownTypeError(
             f"malformed {_KINDS[kind]} type {reprlib.repr(type_)}{hint}: give 'package/Type', in "
             "ASCII letters, digits and _, or a class"
+            + ('; a block comes after the type, or by its keyword' if callable(type_) else '')
         )
 
 
