@@ -117,6 +117,17 @@ def test_what_each_node_has_is_not_hidden_by_a_class_of_its_own(master, name):
     assert not node.errors
 
 
+def test_what_each_node_has_is_not_hidden_by_another_base_either():
+    class Named:
+        name = 'arm'
+
+    with pytest.raises(
+        AttributeError, match=r'^name is what each Node has.*\(a node.s name is given'
+    ):
+        type('Arm', (Named, Node), {})
+    type('Arm', (Node, Named), {})
+
+
 def test_a_stop_that_does_not_call_super_stops_the_node(master):
     class Silent(Node):
         def stop(self):

@@ -7,7 +7,8 @@ import sys
 import pytest
 
 from helpers import create
-from pharos.testing import Mailbox, TIMEOUT
+from pharos.testing import Mailbox, NodeFactory, TIMEOUT
+import pharos
 from programs import ROOT
 
 ROBOT = ROOT / 'test' / 'programs' / 'robot'
@@ -64,3 +65,17 @@ def test_a_mailbox_in_which_nothing_comes_names_its_channels(master):
         by_channel.next(0)
     with pytest.raises(TimeoutError, match='no channel: nothing is heard'):
         Mailbox().next(0)
+
+
+def test_a_name_that_the_nodes_init_waits_for_is_refused(master):
+    """The node was called so, and its __init__ never got it, in silence."""
+    create_node = NodeFactory(master)
+
+    class Named(pharos.Node):
+        def __init__(self, name='arm'):
+            self.called = name
+
+    with pytest.raises(TypeError, match=r'create_node\(\) takes name= for itself.* my_name'):
+        create_node(Named, name='left')
+    assert create_node(Named).called == 'arm'
+    create_node.close()

@@ -79,8 +79,8 @@ class NodeAttributes:
     latest_run: 'Run' = None  # type: ignore[assignment]
     #: names of the methods of Node, without which it could not work, nor stop
     _methods: FrozenSet[str] = frozenset()
-    #: names of what can be asked of it, and is not set
-    _properties: FrozenSet[str] = frozenset()
+    #: what can be asked of it, and is not set, by name
+    _properties: Dict[str, property] = {}
 
     if not TYPE_CHECKING:  # who reads its arguments takes them for those of the nodes
 
@@ -103,9 +103,12 @@ class NodeAttributes:
             methods = inspect.getmembers(cls, inspect.isfunction)
             cls._methods = frozenset(name for name, _ in methods)
             properties = inspect.getmembers(cls, lambda member: isinstance(member, property))
-            cls._properties = frozenset(name for name, _ in properties)
+            cls._properties = dict(properties)
             return
-        for name in (cls._properties | _SET_ONCE).intersection(vars(cls)):
+        for name, own in cls._properties.items():
+            if inspect.getattr_static(cls, name) is not own:  # by the class, or another base of it
+                raise _not_to_be_set(name)
+        for name in _SET_ONCE.intersection(vars(cls)):
             raise _not_to_be_set(name)
         for name in ('soul', 'delegate'):
             if name in vars(cls) and not isinstance(vars(cls)[name], property):
@@ -266,7 +269,7 @@ def make(
             f' write @dataclass(eq=False), or give {name} no __eq__'
         )
     taken = {'named': named, 'soul': soul, 'delegate': delegate, **settings}
-    _check_not_taken(node_class, [name for name, value in taken.items() if value])
+    check_not_taken(node_class, [name for name, value in taken.items() if value])
     _made_here.node_class = node_class
     try:
         node: NodeType = node_class.__new__(node_class)
@@ -278,14 +281,14 @@ def make(
     return node
 
 
-def _check_not_taken(node_class: type, given: List[str]) -> None:
-    """Raise TypeError where a keyword that create() was given, and takes for itself, is one that the
-    class's own __init__ waits for."""
-    parameters = inspect.signature(node_class.__init__).parameters  # type: ignore[misc]
+def check_not_taken(node_class: Any, given: List[str], taker: str = 'create()') -> None:
+    """Raise TypeError where a keyword that ``taker`` was given, and takes for itself, is one that the
+    class's own __init__ waits for, too."""
+    parameters = inspect.signature(node_class.__init__).parameters
     for name in given:
         if name in parameters:
             raise TypeError(
-                f'create() takes {name}= for itself, so that {node_class.__name__}.__init__ would'
+                f'{taker} takes {name}= for itself, so that {node_class.__name__}.__init__ would'
                 f' never get it: give that parameter another name, such as my_{name}'
             )
 

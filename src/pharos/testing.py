@@ -26,6 +26,7 @@ from typing import Any, Callable, Dict, Iterable, Iterator, List, Optional, Set,
 import pytest
 
 from pharos import Failure, InputChannel, Master, Node, node_registry
+from pharos.attributes import check_not_taken
 
 #: seconds; a bound on waits for events, which a test that passes never reaches
 TIMEOUT = 30.0
@@ -215,6 +216,8 @@ class NodeFactory:
         """
         if name is None:
             name = self._free_name(node_class)
+        else:
+            check_not_taken(node_class, ['name'], 'create_node()')
         node = self.master.create(node_class, named=name, domain=domain, **kwargs)
         self.nodes.append(node)
         return node
