@@ -54,6 +54,7 @@ class Master(MasterServices):
     looked up where two are compared.
 
     :ivar url: its URL
+    :ivar share_connections: whether its nodes share connections, as below
     :param url: URL of the ROS master; None: ROS_MASTER_URI, else ROS's default. Makes no connection
         yet.
     :param share_connections: the nodes that it creates, and others of this process that do so, share
