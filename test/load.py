@@ -24,7 +24,7 @@ from std_srvs.srv import SetBool
 
 from helpers import create
 from pharos.testing import TIMEOUT, until
-from pharos import ServiceCallError, UnknownServiceError, node_registry
+from pharos import NodeStoppedError, ServiceCallError, UnknownServiceError, node_registry
 
 NODES, TOPICS = 100, 1000
 IMAGE_SIZE = 640 * 480 * 3
@@ -187,14 +187,13 @@ class Traffic:
 
     @contextlib.contextmanager
     def _judged(self, what):
-        """Services may be gone when they are called, and stop while they answer; that is all that
-        may go wrong."""
+        """Services may be gone when they are called, and stop while they answer, and so may the node
+        that calls; that is all that may go wrong."""
         try:
             yield
         except Exception as error:
-            if not isinstance(error, (UnknownServiceError, ServiceCallError)) or 'in time' in str(
-                error
-            ):
+            expected = NodeStoppedError, ServiceCallError, UnknownServiceError
+            if not isinstance(error, expected) or 'in time' in str(error):
                 self._problems.append(f'{what}: {traceback.format_exc()}')
             self._count('calls refused')
 

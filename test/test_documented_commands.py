@@ -241,6 +241,8 @@ def packages(monkeypatch):
     """This clone, and the packages that the pages take for examples, are on ROS_PACKAGE_PATH."""
     path = os.pathsep.join([str(ROOT), str(PROGRAMS / 'documented'), '/usr/share'])
     monkeypatch.setenv('ROS_PACKAGE_PATH', path)
+    # nothing is built: in a workspace, roslaunch would find each launch file twice
+    monkeypatch.delenv('CMAKE_PREFIX_PATH', raising=False)
     monkeypatch.setenv('PYTHONPATH', str(ROOT / 'src'))
 
 
@@ -320,6 +322,8 @@ def test_a_command_runs(block, line, master, robot, tmp_path):
             status = process.wait(2 * TIMEOUT)
     said = log.read_text()
     assert status in (0, 130, -signal.SIGINT, 128 + signal.SIGTERM), said
+    # one that had printed all was just ending
+    said = re.sub(r'Exception ignored in atexit(.|\n)*KeyboardInterrupt', '', said)
     assert 'Traceback' not in said.replace('KeyboardInterrupt', ''), said
 
 

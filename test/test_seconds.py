@@ -75,7 +75,7 @@ def test_a_wait_without_end_ends_with_what_is_waited_for(master, node, seconds):
     assert master.wait(seconds) is master
     assert master.wait_for_node('/waiting', seconds) is node
     assert master.lookup_service('/waiting/get_loggers').call(timeout=seconds).loggers
-    assert next(node.every(seconds)) is None
+    assert next(node.every(seconds)) == 0
     node.interested_in('/seconds_known', 'std_msgs/Empty')
     assert node.output_channel('/seconds_known').wait_for_subscribers(timeout=seconds)
     node.send_to('/seconds_known', connect_timeout=seconds, wait=seconds)

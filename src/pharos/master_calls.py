@@ -3,6 +3,7 @@ import contextlib
 import threading
 import time
 import urllib.parse
+import xmlrpc.client
 from typing import (
     TYPE_CHECKING,
     Any,
@@ -144,6 +145,8 @@ class MasterCalls:
         not answer."""
         try:
             answer = self._ask_node(name, 'getBusInfo')
+        except xmlrpc.client.Fault:  # it has no such method
+            return []
         except COMMUNICATION_ERRORS:
             return None
         return answer and answer[2]

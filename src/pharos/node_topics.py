@@ -8,6 +8,7 @@ from pharos.blocks import Block, attempt, check_filler
 from pharos.channel import InputChannel
 from pharos.next_message import next_message
 from pharos.output_channel import OutputChannel
+from pharos.private_rospy.deadlines import time_limit
 from pharos.seconds import check_seconds
 from pharos.souls import NodeWithSouls
 from pharos.topic import QUEUE_SIZE, Topic
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 
 TypedAs = Union[str, Type[genpy.Message], None]
 Channel = Union[InputChannel, OutputChannel]
+
+HINT_TIMEOUT = 0.5  # seconds that the master may take for what only makes an error clearer
 
 
 class NodeWithTopics(NodeWithSouls, is_base=True):
@@ -125,9 +128,11 @@ class NodeWithTopics(NodeWithSouls, is_base=True):
         """
         run = self.current_run
         channel = run.send_channels.get(topic) if isinstance(topic, str) else None
+        own = {'to': to, 'connect_timeout': connect_timeout, 'wait': wait or None}
         if to is not None or connect_timeout is not None or wait != 0:
-            cls = channel.message_class if channel else attempt(self._class_finder(topic, typed_as))
-            own = {'to': to, 'connect_timeout': connect_timeout, 'wait': wait or None}
+            with time_limit(HINT_TIMEOUT):
+                find = self._class_finder(topic, typed_as)
+                cls = channel.message_class if channel else attempt(find)
             messages.check_not_hidden(cls, block, **own)
         if to is not None:
             to = run.resolve_peer(to)
@@ -144,6 +149,7 @@ class NodeWithTopics(NodeWithSouls, is_base=True):
                 typed_as = self._topic(topic).class_for(block)
             channel = run.sender(self._topic(topic), typed_as, connect_timeout, wait)
             run.send_channels[topic] = channel
+            messages.check_not_hidden(channel.message_class, block, **own)
         if typed_as not in (None, channel.message_class, channel.type):
             self._topic(topic).message_class(self._node, typed_as)  # refuses another type
         # another thread may be opening it just now
