@@ -77,7 +77,7 @@ def _by_graphviz(flowchart):
 def tell_programs(app, name, source):
     """Have the page of the programs show what each says to --help."""
     if name == 'doc/reference/programs':
-        for script in sorted((ROOT / 'scripts').iterdir()):
+        for script in sorted(filter(pathlib.Path.is_file, (ROOT / 'scripts').iterdir())):
             source[
                 0
             ] += f'\n## {script.name}\n\n```{{program-output}} {sys.executable} {script} --help\n```\n'

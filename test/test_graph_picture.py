@@ -209,6 +209,7 @@ def test_counting_ends_with_the_node_whose_soul_counts(master):
 
     thread = node.fork(count)
     assert began.wait(TIMEOUT)
+    until(lambda: node.latest_run.rospy.lifetime.interruptions)  # it waits
     node.stop()
     assert ended(thread) and ends
 

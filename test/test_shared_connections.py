@@ -224,3 +224,17 @@ def test_rosnode_shows_it_at_each_node(master, sharing):
         said = programs.run(master.url, 'rosnode', 'info', name).stdout
         assert 'topic: /shared\n    * to: /sender' in said
         assert 'transport: TCPROS' in said
+
+
+def test_a_message_that_could_not_be_sent_on_comes_all_the_same(master, sharing):
+    """Deserializing makes of many nanoseconds more seconds than the wire takes."""
+    listeners = listen(sharing, '/first', '/second', typed_as='std_msgs/Time')
+    channel = sender_of(master, *(node for node, _ in listeners), typed_as='std_msgs/Time')
+    latest = 2**32 - 1
+    time = channel.message_class()
+    time.data.secs = time.data.nsecs = latest
+    channel.publish(time)
+    channel.send(data={'secs': 1, 'nsecs': 0})
+    for _, box in listeners:
+        assert box.next().data.secs == latest + 4
+        assert box.next().data.secs == 1

@@ -2,6 +2,7 @@
 import time
 from typing import (
     Any,
+    Callable,
     ContextManager,
     Dict,
     Iterable,
@@ -87,7 +88,8 @@ class Fanout:
 
     :param lock: the publisher's, reentrant
     :param sockets: None: there are no subscribers elsewhere
-    :param numbers: whether ``header.seq`` is to be filled in
+    :param freeze: ``freeze(message)`` makes of a message that comes from elsewhere what is kept of it;
+        None: they are of this process, and ``header.seq`` is to be filled in
     """
 
     # Slots keep what each message needs close together in memory: a message that comes after a pause
@@ -112,14 +114,15 @@ class Fanout:
         message_class: Type[genpy.Message],
         lock: ContextManager[Any],
         sockets: Optional[Sockets],
-        numbers: bool = True,
+        freeze: Optional[Callable[[Any], Frozen]] = None,
     ) -> None:
         self._lock = lock
         self._sockets: Any = sockets
         self.is_closed = False
         self.seq = 0  #: the number of the last message
-        self._has_header = numbers and getattr(message_class, '_has_header', False)
+        self._has_header = freeze is None and getattr(message_class, '_has_header', False)
         self._freeze, self._thaw, self._size = copier_for(message_class)[:3]
+        self._freeze = freeze or self._freeze
         self._latches: Dict[Latch, None] = {}  # those that hold something, in order
         self._last_wake = 0.0  # when the last message woke a dispatcher
         self.set_connections(())

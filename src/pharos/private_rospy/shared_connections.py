@@ -9,6 +9,7 @@ import threading
 import weakref
 from typing import Any, Dict
 
+from pharos.intraprocess.copier import copier_for
 from pharos.intraprocess.fanout import ClosedError, Fanout, Latch
 from pharos.private_rospy import changes, registration
 from pharos.private_rospy.deadlines import deadline_in
@@ -47,7 +48,9 @@ class SharedConnection:
         self.bytes = 0  # that have come
         self._connection = connection
         self._publock = threading.RLock()
-        self.fanout = Fanout(data_class, self._publock, None, numbers=False)
+        self._data = b''  # the message that has just come, serialized
+        self._freeze_message = copier_for(data_class).freeze
+        self.fanout = Fanout(data_class, self._publock, None, self._freeze)
         self._latch = Latch() if connection.header.get('latching') == '1' else None
         self._thread = None
 
@@ -99,7 +102,7 @@ class SharedConnection:
         """Hand on what comes, until either side closes."""
         try:
             while not self.fanout.is_closed:
-                data = self._connection.read_message()
+                self._data = data = self._connection.read_message()
                 self.bytes += 4 + len(data)
                 self.fanout.publish(self.data_class().deserialize(data), self._latch)
         except (OSError, ClosedError):
@@ -110,6 +113,14 @@ class SharedConnection:
         finally:
             self._close()
             self._connection.close()
+
+    def _freeze(self, message):
+        """What is kept of it; where it could not be sent on, for deserializing has put seconds of a
+        time beyond what the wire takes, what has come."""
+        try:
+            return self._freeze_message(message)
+        except Exception:
+            return self._data
 
     def _close(self):
         with self._publock:
