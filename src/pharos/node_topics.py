@@ -128,8 +128,9 @@ class NodeWithTopics(NodeWithSouls, is_base=True):
         """
         run = self.current_run
         channel = run.send_channels.get(topic) if isinstance(topic, str) else None
-        own = {'to': to, 'connect_timeout': connect_timeout, 'wait': wait or None}
+        own: Optional[Dict[str, Any]] = None
         if to is not None or connect_timeout is not None or wait != 0:
+            own = {'to': to, 'connect_timeout': connect_timeout, 'wait': wait or None}
             with time_limit(HINT_TIMEOUT):
                 find = self._class_finder(topic, typed_as)
                 cls = channel.message_class if channel else attempt(find)
@@ -149,7 +150,8 @@ class NodeWithTopics(NodeWithSouls, is_base=True):
                 typed_as = self._topic(topic).class_for(block)
             channel = run.sender(self._topic(topic), typed_as, connect_timeout, wait)
             run.send_channels[topic] = channel
-            messages.check_not_hidden(channel.message_class, block, **own)
+            if own:
+                messages.check_not_hidden(channel.message_class, block, **own)
         if typed_as not in (None, channel.message_class, channel.type):
             self._topic(topic).message_class(self._node, typed_as)  # refuses another type
         # another thread may be opening it just now
