@@ -49,6 +49,7 @@ def master(request, ros_master, monkeypatch):
     with check:
         yield master
         node_registry.stop_all()
+    ros_master.forget_types()
 
 
 @pytest.fixture

@@ -50,6 +50,7 @@ def next_command(node):
 def classes_of(name):
     """A script as a module."""
     loader = importlib.machinery.SourceFileLoader(name, script(name))
+    loader.set_data = lambda *args, **kwargs: None  # no __pycache__ beside the scripts
     module = importlib.util.module_from_spec(importlib.util.spec_from_loader(name, loader))
     loader.exec_module(module)
     return module
