@@ -160,6 +160,6 @@ def test_the_launch_file_drives_a_turtle_that_runs_already(master, monkeypatch):
         linear=0.5,
     ):
         assert next_command(turtle) == (0.5, 1.0)
-        names = {node.name for node in master.nodes()}
-    assert {'/turtlesim', '/turtle_driver', '/turtle_logger'} <= names
+        for name in '/turtlesim', '/turtle_driver', '/turtle_logger':
+            master.wait_for_node(name, TIMEOUT)
     assert not [name for name in master.api().getParamNames() if 'background' in name]
