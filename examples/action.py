@@ -12,8 +12,7 @@ import sys
 
 from actionlib.msg import TestAction, TestFeedback, TestGoal, TestResult
 
-from pharos import BlockNode, Master, Node, spin
-from pharos.live import program
+from pharos import BlockNode, Master, Node, program, spin
 
 
 class Server(Node):

@@ -12,8 +12,7 @@ import itertools
 import sys
 import threading
 
-from pharos import BlockNode, Master, Node, ServiceCallError, spin
-from pharos.live import program
+from pharos import BlockNode, Master, Node, ServiceCallError, program, spin
 
 
 class Arm(Node):

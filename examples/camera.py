@@ -12,8 +12,7 @@ import sys
 
 import numpy
 
-from pharos import BlockNode, Master, Node, Transcript, spin
-from pharos.live import program
+from pharos import BlockNode, Master, Node, Transcript, program, spin
 
 HEIGHT, WIDTH = 480, 640
 SIZE = {'height': HEIGHT, 'width': WIDTH, 'step': WIDTH, 'encoding': 'mono8'}

@@ -11,8 +11,7 @@ import pathlib
 import sys
 import tempfile
 
-from pharos import BlockNode, Master, Node, Transcript
-from pharos.live import program
+from pharos import BlockNode, Master, Node, Transcript, program
 
 
 def drive(robot):

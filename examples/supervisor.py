@@ -11,8 +11,7 @@ terminals:
 import random
 import sys
 
-from pharos import BlockNode, Master, spin
-from pharos.live import program
+from pharos import BlockNode, Master, program, spin
 
 
 def work(worker):

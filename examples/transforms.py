@@ -12,8 +12,7 @@ import sys
 
 from geometry_msgs.msg import TransformStamped
 
-from pharos import BlockNode, Master, spin
-from pharos.live import program
+from pharos import BlockNode, Master, program, spin
 
 
 def transform(stamp, parent, child, x, y, yaw=0.0):

@@ -8,8 +8,7 @@ what to type meanwhile, in other terminals, it says itself.
 import math
 import sys
 
-from pharos import BlockNode, Master, Transcript, spin
-from pharos.live import program
+from pharos import BlockNode, Master, Transcript, program, spin
 
 
 def lead(robot):

@@ -6,8 +6,8 @@ import sys
 import pytest
 
 from helpers import create
-from pharos import MasterUnreachableError, PharosError
-from pharos.live import dot, graphviz, program
+from pharos import MasterUnreachableError, PharosError, program
+from pharos.live import dot, graphviz
 from pharos.testing import TIMEOUT
 from programs import environment, run, script
 from terminal import Terminal
@@ -52,6 +52,11 @@ def test_a_program_replaces_what_its_output_cannot_encode(monkeypatch, tmp_path)
         monkeypatch.setattr(sys, 'stdout', output)
         assert program.run('odd', lambda: print('a…b') or 0) == 0
     assert (tmp_path / 'out').read_text() == 'a?b\n'
+
+
+def test_a_program_of_nodes_needs_no_output(monkeypatch):
+    monkeypatch.setattr(sys, 'stdout', None)
+    assert program.run('odd', lambda: print('nowhere')) == 0
 
 
 def test_a_program_tells_our_errors_in_one_line(capsys):

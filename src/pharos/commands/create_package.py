@@ -15,7 +15,7 @@ from typing import List
 
 import rosgraph
 
-from pharos.live import program
+from pharos import program
 from pharos.new_package.creation import create_package
 
 

@@ -16,9 +16,8 @@ from typing import List
 
 import rosgraph
 
-from pharos import Master, MasterUnreachableError, PharosError
+from pharos import Master, MasterUnreachableError, PharosError, program
 from pharos.errors import suggest
-from pharos.live import program
 from pharos.live.graph import GROUPS, HIDEABLE, Graph
 from pharos.live.graphviz import check_format
 
@@ -127,6 +126,8 @@ def watch(master: Master, options: argparse.Namespace, last: Graph) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Look once, and again if asked to; returns the exit status."""
+    if not options.output:
+        program.check_output()
     master = Master()
     graph = look(master, options)
     if not options.watch:

@@ -22,9 +22,9 @@ from typing import Any, List
 
 import rosgraph
 
-from pharos import Master, PharosError
+from pharos import Master, PharosError, program
 from pharos.errors import missing
-from pharos.live import program, top
+from pharos.live import top
 from pharos.live.terminal import is_interactive
 from pharos.seconds import check_seconds
 
@@ -88,6 +88,7 @@ def load_screen() -> Any:
 
 def run(options: argparse.Namespace) -> int:
     """Do it; returns the exit status."""
+    program.check_output()
     master = Master()
     screen = None if options.json else load_screen()
     if screen and not options.once and is_interactive():

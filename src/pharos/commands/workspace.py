@@ -12,7 +12,7 @@ import sys
 
 import rosgraph
 
-from pharos import PharosError
+from pharos import program
 from pharos.live import workspace
 
 
@@ -24,10 +24,6 @@ def main() -> int:
     parser.add_argument('script', nargs='?', metavar='SCRIPT', help='a program to be run first')
     parser.add_argument('args', nargs=argparse.REMAINDER, metavar='ARGUMENT', help='its arguments')
     options = parser.parse_args(rosgraph.myargv()[1:])
-    try:
-        return workspace.run(options.script, options.args, argv=sys.argv)
-    except KeyboardInterrupt:
-        return 0
-    except (PharosError, ValueError, FileNotFoundError) as error:
-        print(f'workspace: {error}', file=sys.stderr)
-        return 1
+    return program.run(
+        'workspace', lambda: workspace.run(options.script, options.args, argv=sys.argv)
+    )

@@ -14,7 +14,7 @@ from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple
 from rosgraph.rosenv import ROS_MASTER_URI
 
 import pharos
-from pharos import node_registry, signals
+from pharos import node_registry, program, signals
 from pharos.errors import PharosError, missing
 from pharos.live import completion, debugger, explanation, mistakes, notebook
 from pharos.master import Master
@@ -178,9 +178,10 @@ def run(
     :param args: its further arguments
     :param argv: as for :class:`Workspace`
     :raises FileNotFoundError: if there is no such script
-    :raises PharosError: if IPython is not installed
+    :raises PharosError: if IPython is not installed, or there is no standard output
     :raises ValueError, MasterUnreachableError: as :class:`Workspace`
     """
+    program.check_output()
     application = ipython().terminal.ipapp.TerminalIPythonApp
     if script is not None and not os.path.isfile(script):
         raise FileNotFoundError(f'there is no script {script}: give the path of a Python program')

@@ -103,7 +103,7 @@ import sys
 
 import pharos
 from @package@.@node@ import @class@
-from pharos.live import program
+from pharos import program
 
 
 def main() -> None:
@@ -124,7 +124,7 @@ import sys
 
 import pharos
 @imports@
-from pharos.live import program
+from pharos import program
 
 
 def main() -> None:

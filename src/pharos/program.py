@@ -1,4 +1,4 @@
-"""What the programs of the command line have in common: how they end."""
+"""What programs have in common: how they end."""
 import os
 import sys
 from typing import Any, Callable, Optional
@@ -7,7 +7,7 @@ from pharos.errors import PharosError
 
 
 def run(name: str, main: Callable[[], Optional[int]], about: Optional[str] = None) -> int:
-    """Run a program that prints; returns its exit status, 0 after Ctrl-C.
+    """Run the ``main`` of a program; returns its exit status, 0 after Ctrl-C.
 
     What is wrong is told in one line; who reads its output may stop early, or read no UTF-8::
 
@@ -19,16 +19,16 @@ def run(name: str, main: Callable[[], Optional[int]], about: Optional[str] = Non
     :param about: what is printed instead where the program was called with ``--help``; None: that
         is left to ``main``
     """
+    output: Any = sys.stdout  # None where the program was started without one
     try:
-        if sys.stdout is None:
-            raise PharosError('its standard output is closed: give it a file or a terminal')
-        output: Any = sys.stdout
-        output.reconfigure(errors='replace')
+        if output is not None:
+            output.reconfigure(errors='replace')
         if about is not None and {'-h', '--help'} & {*sys.argv[1:]}:
             status: Optional[int] = print(about.strip())
         else:
             status = main()
-        output.flush()
+        if output is not None:
+            output.flush()
         return status or 0
     except KeyboardInterrupt:
         return 0
@@ -44,6 +44,16 @@ def run(name: str, main: Callable[[], Optional[int]], about: Optional[str] = Non
     return 1
 
 
+def check_output() -> None:
+    """For a program that is there to print.
+
+    :raises PharosError: if it was started without a standard output
+    """
+    if sys.stdout is None:
+        raise PharosError('its standard output is closed: give it a file or a terminal')
+
+
 def _print_to_nobody() -> None:
     """What Python still has to print at its end would fail again."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    if sys.stdout is not None:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
