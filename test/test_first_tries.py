@@ -211,3 +211,54 @@ def test_a_block_in_the_place_of_a_type_is_told_where_it_goes(master):
     for give in node.interested_in, lambda name, block: node.serve(name, block, 'std_srvs/Empty'):
         with pytest.raises(pharos.UnknownTypeError, match='malformed .*a block comes after the ty'):
             give('/guessed_type', lambda *arguments: None)
+
+
+# -- keywords
+
+
+@pytest.mark.parametrize(
+    'call, said',
+    [
+        (
+            lambda master: master.create(BlockNode, name='/x'),
+            r"'named' \(did you mean 'named='\?\)$",
+        ),
+        (lambda master: master.create(BlockNode, nmaed='/x'), "did you mean 'named='"),
+        (lambda master: master.create(BlockNode, '/x', delagate=print), "did you mean 'delegate='"),
+        (lambda master: master.create(Driver, '/x', sped=2), "did you mean 'speed='"),
+        (lambda master: create(master).interested_in('/t', callback=print), "'delegate='"),
+        (lambda master: create(master).interested_in('/t', type='a_b/C'), "'typed_as='"),
+        (lambda master: create(master).output_channel('/t', msg_type='a_b/C'), "'typed_as='"),
+        (lambda master: create(master).wait_for_message('/t', timout=1), "'timeout='"),
+        (lambda master: create(master).serve('/s', 'a_b/C', handler=print), "'block='"),
+        (lambda master: create(master).parameter('~p', default=1), "'initialized='"),
+        (lambda master: create(master).every(hz=5), r"'seconds='\?\), which is 1 / hz$"),
+        (lambda master: create(master).sleep(duration=5), "'seconds='"),
+        (lambda master: master.lookup_service('/s', callerid='/x'), "'caller_id='"),
+        (lambda master: master.run('pharos', 'graph', nam='x'), "'name='"),
+        (lambda master: master.compose('pharos', 'turtle.launch', 'linear:=1'), 'takes .* given$'),
+    ],
+)
+def test_a_keyword_of_others_is_told_by_what_it_is_here(master, call, said):
+    with pytest.raises(TypeError, match=said):
+        call(master)
+
+
+def test_what_a_call_raises_that_was_right_is_as_it_was(master):
+    class Failing(Node):
+        def start(self):
+            raise TypeError('of its own')
+
+    with pytest.raises(TypeError, match='^of its own$'):
+        master.create(Failing, named='/failing')
+
+
+def test_a_name_of_the_report_s_is_told_by_what_it_is_here(master):
+    node = create(master)
+    for thing, name, meant in (
+        (node, 'sendTo', 'send_to'),
+        (node, 'interestedin', 'interested_in'),
+        (master, 'lookupService', 'lookup_service'),
+    ):
+        with pytest.raises(AttributeError, match=f"'{name}' .did you mean '{meant}'"):
+            getattr(thing, name)

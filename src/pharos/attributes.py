@@ -14,7 +14,7 @@ from pharos.private_rospy.logs import lines_shown
 from pharos.private_rospy.settings import Settings
 from pharos.seconds import check_seconds
 from pharos.transcript import Transcript
-from pharos.wrong_guesses import getattr_with_hint
+from pharos.wrong_guesses import getattr_with_hint, keyword_hint
 
 if TYPE_CHECKING:
     from pharos.master import Master
@@ -277,7 +277,14 @@ def make(
         del _made_here.node_class
     settings['shares_connections'] = master.share_connections
     node._configure(master, Settings(named, master.url, **settings), soul, delegate)
-    node.__init__(*args, **kwargs)
+    try:
+        node.__init__(*args, **kwargs)
+    except TypeError as error:
+        known = [*taken, *inspect.signature(node_class.__init__).parameters]
+        hint = keyword_hint(known, kwargs)
+        if hint:
+            error.args = (f'{error}{hint}',)
+        raise
     return node
 
 

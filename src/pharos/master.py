@@ -30,6 +30,7 @@ from pharos.ros_process import RosProcess
 from pharos.seconds import check_limit
 from pharos.topic import Topic
 from pharos.watcher import watcher_of
+from pharos.wrong_guesses import tells_keywords
 
 if TYPE_CHECKING:
     from typing_extensions import ParamSpec  # part of typing since Python 3.10
@@ -110,6 +111,7 @@ class Master(MasterServices):
         if self._child is not None:
             self.stop()
 
+    @tells_keywords
     def create(
         self,
         node_class: 'Callable[Init, NodeType]',
@@ -167,6 +169,7 @@ class Master(MasterServices):
         starts.start_made(node)
         return node
 
+    @tells_keywords
     def run(
         self,
         package: str,
@@ -213,6 +216,7 @@ class Master(MasterServices):
         """
         return ros_process.launch(self, package, file, args, on_line)
 
+    @tells_keywords
     def load(
         self,
         package: AnyPath,
@@ -257,6 +261,7 @@ class Master(MasterServices):
         )
         return node
 
+    @tells_keywords
     def compose(
         self,
         package: Optional[AnyPath],

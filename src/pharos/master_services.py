@@ -10,6 +10,7 @@ from pharos.master_calls import TIMEOUT, MasterCalls
 from pharos.private_rospy.deadlines import MARGIN, time_limit
 from pharos.seconds import check_limit
 from pharos.service import Service
+from pharos.wrong_guesses import tells_keywords
 
 if TYPE_CHECKING:
     from pharos.master import Master
@@ -28,6 +29,7 @@ class MasterServices(MasterCalls):
         """Names of all services."""
         return sorted(self.system_state()[2])
 
+    @tells_keywords
     def lookup_service(
         self,
         name: str,
@@ -55,6 +57,7 @@ class MasterServices(MasterCalls):
             return Service(self._master, name, caller_id, persistent)
         return _Awaited(self._master, name, caller_id, persistent).wait(check_limit('wait', wait))
 
+    @tells_keywords
     def wait_for_service(
         self, name: str, timeout: Optional[float] = None, caller_id: str = '/pharos'
     ) -> Service:

@@ -11,6 +11,7 @@ from pharos.restarts import restart
 from pharos.run import Run
 from pharos.seconds import check_seconds
 from pharos.starts import of_one_run
+from pharos.wrong_guesses import tells_keywords
 
 
 Self = TypeVar('Self', bound='Node')
@@ -177,6 +178,7 @@ class Node(NodeWithTopics, is_base=True):
 
     # -- services, parameters, log
 
+    @tells_keywords
     def serve(
         self,
         name: str,
@@ -197,6 +199,7 @@ class Node(NodeWithTopics, is_base=True):
         name = self.current_run.resolve(name, 'service')
         return OfferedService(self, name, typed_as, block, only_nearby)
 
+    @tells_keywords
     def parameter(self, name: str, initialized: Any = None) -> Parameter:
         """The :class:`Parameter` of that name ('~rate' is private); set to ``initialized`` where it
         has no value."""

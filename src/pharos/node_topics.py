@@ -12,6 +12,7 @@ from pharos.private_rospy.deadlines import time_limit
 from pharos.seconds import check_seconds
 from pharos.souls import NodeWithSouls
 from pharos.topic import QUEUE_SIZE, Topic
+from pharos.wrong_guesses import tells_keywords
 
 if TYPE_CHECKING:
     from pharos.external_node import ExternalNode
@@ -28,6 +29,7 @@ HINT_TIMEOUT = 0.5  # seconds that the master may take for what only makes an er
 class NodeWithTopics(NodeWithSouls, is_base=True):
     """The part of a Node that is about topics."""
 
+    @tells_keywords
     def interested_in(
         self,
         topic: str,
@@ -68,6 +70,7 @@ class NodeWithTopics(NodeWithSouls, is_base=True):
             self._node, typed_as, delegate, queue_size, inline, shared, from_, wait
         )
 
+    @tells_keywords
     def output_channel(
         self,
         topic: str,
@@ -162,6 +165,7 @@ class NodeWithTopics(NodeWithSouls, is_base=True):
         """Finds the class of what is sent on a topic, before a channel is opened."""
         return lambda: self._topic(topic).message_class(self._node, typed_as)
 
+    @tells_keywords
     def wait_for_message(
         self,
         topic: str,

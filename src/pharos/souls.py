@@ -10,6 +10,7 @@ from pharos.errors import NodeStoppedError, PharosError
 from pharos.lifecycle import Lifecycle
 from pharos.private_rospy.process_rospy import rospy
 from pharos.seconds import check_seconds
+from pharos.wrong_guesses import tells_keywords
 
 if TYPE_CHECKING:
     from pharos.run import Run
@@ -92,6 +93,7 @@ class Souls:
         """Run a soul, as it is now, in this thread."""
         return self._execute(soul, self._checked(soul))
 
+    @tells_keywords
     def fork(self, block: Optional[Block], name: str) -> threading.Thread:
         """Run the node's soul, or ``block``, in a thread of its own, and return the thread."""
         node = self._run.node
@@ -224,6 +226,7 @@ class NodeWithSouls(NodeAttributes, is_base=True):
         """
         self.current_run.souls.renew()
 
+    @tells_keywords
     def sleep(self, seconds: float) -> None:
         """Wait for ``seconds`` of ROS time, or until the node stops; a soul is ended by that. A
         jump back in simulated time, as when a bag is played again, ends the wait alone.
@@ -237,6 +240,7 @@ class NodeWithSouls(NodeAttributes, is_base=True):
             run.rospy.module.sleep(seconds)
         run.souls.end()
 
+    @tells_keywords
     def every(self, seconds: float) -> Iterator[int]:
         """An iterator that turns at once and then every ``seconds`` of ROS time, without drift,
         until the node stops, or its soul begins anew (see :meth:`renew`). It counts its turns, from

@@ -1,6 +1,9 @@
 """What those who know rospy, or ROS 2, try first under a name that is not there: what to write."""
-from typing import Any
+import functools
+import inspect
+from typing import Any, Callable, Dict, List, TypeVar, cast
 
+from pharos.errors import suggest
 from pharos.private_rospy.process_rospy import rospy
 
 _PUBLISH = "node.send_to('/topic', typed_as='std_msgs/String', data='x'), or node.output_channel()"
@@ -13,6 +16,8 @@ _PARAMETER = "node.parameter('~name', initialized=1).value, or master.parameters
 _RUNS = 'node.is_running; and a loop over node.every(seconds) ends with the node by itself'
 _STOP = 'node.stop()'
 _TIME = 'node.ros.Time.now()'
+
+_RATES = ['hz', 'rate', 'frequency']
 
 # name -> what to write in its place
 _TABLE = {
@@ -61,11 +66,59 @@ _TABLE = {
     'get_rostime': _TIME,
     'get_clock': _TIME,
     'now': _TIME,
+    'create_node': "master.create(BlockNode, named='/name')",
+    'param': _PARAMETER,
+    'parameters': "node.parameter('~name'), or node.master.parameters",
     'topics': 'node.channels, or master.topics()',
     'connections': 'channel.connections, for each channel in node.channels',
     'get_published_topics': 'master.topics()',
     'myargv': 'sys.argv, which create(..., argv=sys.argv) takes for a node',
 }
+
+#: keyword -> those that are guessed in its place
+_KEYWORDS: Dict[str, List[str]] = {
+    'named': ['name', 'node_name'],
+    'typed_as': ['type', 'data_class', 'msg_type', 'srv_type', 'topic_type', 'service_class'],
+    'delegate': ['callback', 'cb', 'block', 'handler'],
+    'block': ['callback', 'cb', 'handler', 'delegate'],
+    'initialized': ['default', 'value', 'default_value'],
+    'from_': ['sender', 'node'],
+    'seconds': ['period', 'duration', *_RATES],
+}
+Function = TypeVar('Function', bound=Callable[..., Any])
+
+
+def tells_keywords(function: Function) -> Function:
+    """Decorator: where a call of the function has a keyword that it does not take, the error says
+    which was meant. A call that is right is not looked at."""
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        try:
+            return function(*args, **kwargs)
+        except TypeError as error:
+            frames = error.__traceback__
+            if frames is not None and frames.tb_next is None:  # the function has not begun
+                known = list(inspect.signature(function).parameters)
+                error.args = (f'{error}{keyword_hint(known, kwargs)}',)
+            raise
+
+    return cast(Function, call)
+
+
+def keyword_hint(known: List[str], given: Dict[str, Any]) -> str:
+    """The end of the complaint that a keyword is not known, or one is missing; empty where nothing
+    is near.
+
+    :param known: the keywords that there are
+    :param given: those of the call
+    """
+    for wrong in given:
+        if wrong not in known:
+            meant = [f'{name}=' for name in known if wrong in _KEYWORDS.get(name, ())]
+            found = suggest(f'{wrong}=', [f'{name}=' for name in known], meant)
+            return found + (f', which is 1 / {wrong}' if meant and wrong in _RATES else '')
+    return ''
 
 
 def hint(name: str) -> str:
@@ -87,5 +140,13 @@ def getattr_with_hint(thing: Any, name: str) -> Any:
         return object.__getattribute__(thing, name)
     except AttributeError as error:
         if not hasattr(type(thing), name):
-            error.args = (f'{error}{hint(name)}',)
+            error.args = (f'{error}{hint(name) or _spelt_otherwise(thing, name)}',)
         raise
+
+
+def _spelt_otherwise(thing: Any, name: str) -> str:
+    """The hint at a name that is spelt so but for capitals and underscores, as in the report's
+    Smalltalk: ``sendTo``."""
+    plain = name.replace('_', '').lower()
+    names = [own for own in dir(type(thing)) if not own.startswith('_')]
+    return suggest(name, (), [own for own in names if own.replace('_', '') == plain])
