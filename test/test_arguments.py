@@ -199,6 +199,20 @@ def test_what_is_no_mapping_is_ignored_as_by_ros(master, argv):
     assert node.parameter('~p').value is None
 
 
+@pytest.mark.parametrize('arguments', [['__name:=eye'], ['__name:=eye', '__ns:=/r']], ids=str)
+def test_a_name_that_the_first_has_taken_from_another_is_told(master, argv, arguments):
+    arguments = argv(*arguments)
+    first = create(master, 'arm', argv=arguments)
+    with pytest.raises(
+        pharos.NodeNameInUseError,
+        match=f"name {first.name} is taken by .* 'arm', which took it from __name:= in argv, .*<node>",
+    ):
+        create(master, 'eye', argv=arguments)
+    with pytest.raises(pharos.NodeNameInUseError, match='this process: choose'):
+        create(master, 'other', argv=argv())
+        create(master, 'other', argv=argv())
+
+
 # -- roslaunch
 
 

@@ -378,14 +378,16 @@ def test_a_start_that_does_not_call_super_is_told_so(master, nothing_left):
         def __init__(self):
             self.interested_in('/never', 'std_msgs/Empty')
 
-    with pytest.raises(
-        pharos.PharosError, match=r'/node did not start: Silent.start.* call super\(\).start\(\)'
-    ):
-        create(master, '/node', node_class=Silent)
-    with pytest.raises(
-        pharos.NodeStoppedError, match=r'/node is new: .* call super\(\).start\(\) before'
-    ):
-        create(master, '/node', node_class=Early)
+    class Named(pharos.Node):
+        def start(self):
+            super().start  # without the brackets
+
+    for cls in Silent, Early, Named:
+        with pytest.raises(
+            pharos.NodeStoppedError,
+            match=rf'/node is not started: {cls.__name__}.start\(\) .* call super\(\).start\(\) before',
+        ):
+            create(master, '/node', node_class=cls)
     with pytest.raises(
         pharos.NodeStoppedError, match=r'when __init__ has run; .* start\(\) .* super\(\).start\(\)'
     ):

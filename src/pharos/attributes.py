@@ -179,12 +179,12 @@ class NodeAttributes:
         run, lifecycle = self.latest_run, self.lifecycle
         if run is not None and lifecycle in (Lifecycle.RUNNING, Lifecycle.STOPPING):
             return run
+        if lifecycle is Lifecycle.NEW and node_registry.is_in_start(self):
+            raise NodeStoppedError(needs_super(self))
         hint = ''
         if lifecycle is Lifecycle.NEW:
-            hint = '; a start() of its own has to call super().start() before anything else'
-            if not node_registry.is_in_start(self):
-                hint = ', which create() does when __init__ has run; what needs it'
-                hint += ' goes into a start() of its own, after super().start()'
+            hint = ', which create() does when __init__ has run; what needs it'
+            hint += ' goes into a start() of its own, after super().start()'
         raise NodeStoppedError(f'{self.name} is {lifecycle.value}: start() it first{hint}')
 
     @property
@@ -286,6 +286,15 @@ def make(
             error.args = (f'{error}{hint}',)
         raise
     return node
+
+
+def needs_super(node: NodeAttributes) -> str:
+    """What is said of a start() of a class's own that uses the node before it is started, or does
+    not start it."""
+    return (
+        f'{node.name} is not started: {type(node).__name__}.start() has to call super().start()'
+        ' before anything else'
+    )
 
 
 def check_not_taken(node_class: Any, given: List[str], taker: str = 'create()') -> None:

@@ -110,8 +110,9 @@ def rename(node: 'Node', name: str) -> None:
 def _claim_name(node: 'Node', name: str) -> None:
     other = _nodes.setdefault((node.master, name), node)
     if other is not node:
+        took = other.latest_run.rospy.settings.origin_of_name if other.latest_run else ''
         raise NodeNameInUseError(
-            f'the node name {name} is taken by a {other.lifecycle.value} node of this process:'
+            f'the node name {name} is taken by a {other.lifecycle.value} node of this process{took}:'
             ' choose another name, or stop() that node first'
         )
 

@@ -3,7 +3,8 @@ import functools
 from typing import TYPE_CHECKING, Any, Callable
 
 from pharos import node_registry, reloading
-from pharos.errors import PharosError
+from pharos.attributes import needs_super
+from pharos.errors import NodeStoppedError
 
 if TYPE_CHECKING:
     from pharos.node import Node
@@ -12,17 +13,14 @@ if TYPE_CHECKING:
 def start_made(node: 'Node') -> None:
     """Start a node that has just been made; where that fails, nothing of it is left.
 
-    :raises PharosError: if its own start() does not start it
+    :raises NodeStoppedError: if its own start() does not start it
     """
     reloading.follow()
     with node_registry.start_of(node):
         try:
             node.start()
             if node.latest_run is None:
-                raise PharosError(
-                    f'{node.name} did not start: {type(node).__name__}.start() has to call '
-                    'super().start() before anything else'
-                )
+                raise NodeStoppedError(needs_super(node))
         except BaseException:
             node_registry.stop(node)
             raise

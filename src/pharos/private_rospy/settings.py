@@ -43,6 +43,8 @@ class Settings:
 
     #: the node in whose namespace its private names are; None: itself
     private_name: Optional[str] = None
+    #: whence it has its name, for who may not have that, where the program gives it another
+    origin_of_name = ''
 
     def __init__(
         self,
@@ -82,6 +84,10 @@ class Settings:
                 mappings.pop('__log', None)  # roslaunch has named this file after the other node
         self.base_name = check_name(base, 'node', base=True)
         self.name = check_name(namespace + base, 'node', limit=NODE_LIMIT)
+        if base not in (own_base, for_one.get('__name')):
+            self.origin_of_name = (
+                f', {name!r}, which took it from __name:= in argv, as of a <node> in a launch file'
+            )
         self.environ[ROS_NAMESPACE] = namespace.rstrip('/') or '/'
         for left in '__master', '__ns', '__name':  # the settings say this
             mappings.pop(left, None)
