@@ -7,6 +7,11 @@ import pytest
 from helpers import create
 import pharos
 from pharos import BlockNode, Node, wrong_guesses
+from pharos.testing import Mailbox, until
+from std_msgs.msg import String
+from std_srvs.srv import Empty
+
+STRING, TWIST, HEADER = 'std_msgs/String', 'geometry_msgs/Twist', 'std_msgs/Header'
 
 # -- nodes made, and named, in another way than by create()
 
@@ -211,6 +216,76 @@ def test_a_block_in_the_place_of_a_type_is_told_where_it_goes(master):
     for give in node.interested_in, lambda name, block: node.serve(name, block, 'std_srvs/Empty'):
         with pytest.raises(pharos.UnknownTypeError, match='malformed .*a block comes after the ty'):
             give('/guessed_type', lambda *arguments: None)
+
+
+# -- messages and types
+
+
+def test_a_message_for_which_there_is_no_delegate_is_told_once(master, mailbox):
+    """It was silent. Nothing is said before one is lost, for the delegate may be set later."""
+    told = Mailbox(create(master, '/other'), '/rosout', 'rosgraph_msgs/Log')
+    node, sender = create(master), create(master, '/sender')
+    late, silent = (node.interested_in(name, STRING) for name in ('/late', '/silent'))
+    node.delegate = mailbox
+    sender.send_to('/late', data='heard')
+    assert mailbox.next().data == 'heard'
+    node.delegate = None
+    for text in 'lost', 'again':
+        sender.send_to('/silent', data=text)
+    until(lambda: silent.received == 2)
+    silent.delegate = mailbox
+    sender.send_to('/silent', data='heard')
+    assert mailbox.next().data == 'heard'
+    node.log('end')
+    told.wait_for(lambda line: line.msg == 'end')
+    lines = [line.msg for line in told.all() if 'delegate' in line.msg]
+    assert len(lines) == 1, lines
+    assert lines[0].startswith('/node has no delegate for what comes on /silent')
+
+
+def test_a_field_that_a_block_reads_in_vain_is_told_by_those_that_there_are(master):
+    node, sender = create(master), create(master, '/sender')
+    node.interested_in('/cmd', TWIST, delegate=lambda message, channel: message.lineer)
+    node.interested_in('/near', TWIST, delegate=lambda message, channel: message.linear.w)
+    node.interested_in('/at', HEADER, delegate=lambda message, channel: message.stamp.sec)
+    node.interested_in('/own', STRING, delegate=lambda message, channel: Driver.sped)
+    node.serve('/s', 'std_srvs/SetBool', lambda request: request.dta)
+    for topic, cls in ('/cmd', TWIST), ('/near', TWIST), ('/at', HEADER), ('/own', STRING):
+        sender.send_to(topic, typed_as=cls)
+    with pytest.raises(pharos.ServiceCallError, match="no field 'dta' .did you mean 'data'"):
+        master.lookup_service('/s').call(data=True)
+    until(lambda: len(node.errors) == 5)
+    texts = {failure.channel and failure.channel.topic: failure.text for failure in node.failures}
+    assert "has no field 'lineer' (did you mean 'linear'?); its fields are linear" in texts['/cmd']
+    assert 'geometry_msgs/Vector3 has no field' in texts['/near']
+    assert 'its fields are secs: uint32, nsecs: uint32' in texts['/at']
+    assert texts['/own'] == "type object 'Driver' has no attribute 'sped'"
+
+
+@pytest.mark.parametrize(
+    'use, said',
+    [
+        (lambda node: node.interested_in(STRING, '/t'), 'it comes after the name'),
+        (lambda node: node.serve('std_srvs/Empty', '/s', print), 'it comes after the name'),
+        (lambda node: node.interested_in('/t', 'std_srvs/Empty'), "the type of a service$"),
+        (lambda node: node.interested_in('/t', Empty), 'this is the class of a service$'),
+        (lambda node: node.serve('/s', STRING, print), 'the type of a message$'),
+        (lambda node: node.serve('/s', String, print), 'this is the class of a message$'),
+        (
+            lambda node: node.serve('/s', 'std_srvs/SetBoolRequest', print),
+            "mean 'std_srvs/SetBool'",
+        ),
+        (
+            lambda node: node.send_to(
+                '/t', lambda it: setattr(it.stamp, 'sec', 1), typed_as=HEADER
+            ),
+            "Time has no field 'sec' .did you mean 'secs'",
+        ),
+    ],
+)
+def test_a_type_or_field_of_something_else_is_told(master, use, said):
+    with pytest.raises((pharos.UnknownTypeError, pharos.MessageTypeError), match=said):
+        use(create(master))
 
 
 # -- keywords

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Tuple, Ty
 import genpy
 
 from pharos import on_demand
-from pharos.blocks import Block, check_delegate
+from pharos.blocks import Block, attempt, check_delegate
 from pharos.errors import NodeStoppedError, PharosError
 from pharos.intraprocess.inbox import Inbox, SocketInbox
 
@@ -154,6 +154,7 @@ class InputChannel(Channel):
         self.received = 0
         self.dropped = 0
         self._dropping = threading.Lock()  # held to change that
+        self._has_told = False  # that there is no delegate
         self._begin()
 
     def open(self) -> None:
@@ -271,6 +272,7 @@ class InputChannel(Channel):
         if block is None:
             block = self.node.delegate
             if block is None:
+                self._tell_of_no_delegate()
                 return
         if header is not None:
             message._connection_header = header
@@ -278,6 +280,16 @@ class InputChannel(Channel):
             block(message, self)
         except BaseException as error:
             self._run.report(error, block, 'delegate', self, message)
+
+    def _tell_of_no_delegate(self) -> None:
+        """Say so once, and not before a message is lost by it: the delegate may be set later."""
+        if not self._has_told:
+            self._has_told = True
+            text = (
+                f'{self.node.name} has no delegate for what comes on {self.topic}, which goes'
+                ' nowhere: give interested_in() one, or set that of the node or channel'
+            )
+            attempt(lambda: self.node.log(text, level='warning'))
 
     def report(self, error: BaseException) -> None:
         """A message could not be made for the delegate."""

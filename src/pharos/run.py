@@ -356,6 +356,7 @@ class Run:
             error, (NodeStoppedError, rospy.ROSInterruptException)
         ):
             return  # that is how the stop of a node ends its souls
+        attempt(lambda: messages.add_fields(error, message))
         where = f'{what} {name_of(block)} of {self.node.name}'
         if channel is not None:
             where += f' on {channel.topic}'

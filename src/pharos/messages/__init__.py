@@ -19,6 +19,7 @@ from pharos.messages.classes import (
     service_class,
 )
 from pharos.messages.fields import (
+    add_fields,
     build,
     check_alone,
     check_fits,
@@ -38,6 +39,7 @@ from pharos.messages.from_publishers import (
 from pharos.messages.lookup import known_types
 
 __all__ = [
+    'add_fields',
     'build',
     'check_alone',
     'check_fits',

@@ -188,13 +188,28 @@ def check_fits(message: genpy.Message) -> None:
 def explain(error: AttributeError, message: genpy.Message) -> None:
     """Raise `MessageTypeError` if an `AttributeError` names a field that the message, or one nested
     in it, has not."""
-    wrong = re.match(r"'(\w+)' object has no attribute '(\w+)'", str(error))
-    pending = [type(message)]
+    wrong = re.fullmatch(r"'(\w+)' object has no attribute '(\w+)'", str(error))
+    pending = [type(message), *_TIMES.values()]
     while wrong and pending:
         cls = pending.pop(0)
         if cls.__name__ == wrong[1]:
-            raise _no_field(cls, cls._type, wrong[2]) from error
-        pending += nested_classes(cls)
+            raise _no_field(cls, getattr(cls, '_type', cls.__name__), wrong[2]) from error
+        if issubclass(cls, genpy.Message):
+            pending += nested_classes(cls)
+
+
+def add_fields(error: BaseException, message: Any) -> None:
+    """Have the text of an `AttributeError` say which fields there are, where it names one that a
+    message has not.
+
+    :param message: what the block that raised it was run on
+    """
+    if isinstance(error, AttributeError):
+        owner = getattr(error, 'obj', None)  # since Python 3.10
+        try:
+            explain(error, owner if isinstance(owner, genpy.Message) else message)
+        except MessageTypeError as told:
+            error.args = (f'{error}: {told}',)
 
 
 def _no_field(cls: MessageClass, path: str, name: str) -> MessageTypeError:

@@ -34,8 +34,7 @@ def check_name(kind: str, type_: Any) -> None:
         hint = _near_types(kind, str(type_)[:99])
         raise UnknownTypeError(
             f"malformed {_KINDS[kind]} type {reprlib.repr(type_)}{hint}: give 'package/Type', in "
-            "ASCII letters, digits and _, or a class"
-            + ('; a block comes after the type, or by its keyword' if callable(type_) else '')
+            f"ASCII letters, digits and _, or a class{_misplaced(type_)}"
         )
 
 
@@ -51,6 +50,11 @@ def find(kind: str, type_: str) -> Known:
         provisional.add((kind, type_))
         return DEFINITIONS[kind][type_]
     package, _, name = type_.partition('/')
+    other = 'srv' if kind == 'msg' else 'msg'
+    if type_ in known_types(other):
+        raise UnknownTypeError(
+            f'unknown {_KINDS[kind]} type {type_!r}: that is the type of a {_KINDS[other]}'
+        )
     define = 'define_message' if kind == 'msg' else 'define_service'
     raise UnknownTypeError(
         f'unknown {_KINDS[kind]} type {type_!r}{_near_types(kind, type_)}: Python has no'
@@ -89,7 +93,9 @@ def installed(kind: str, type_: str) -> Optional[type]:
             return None
     get = genpy.message.get_message_class if kind == 'msg' else genpy.message.get_service_class
     try:
-        return get(type_)
+        cls: Optional[type] = get(type_)
+        # the class of a request is in the same module as that of its service
+        return cls if kind == 'msg' or hasattr(cls, '_request_class') else None
     except Exception as error:
         raise UnknownTypeError(
             f'{type_}: importing {package}.{kind} failed ({error}): reinstall it'
@@ -123,6 +129,17 @@ def known_types(kind: str) -> Set[str]:
     names = {f"{file.parts[-3]}/{file.stem.lstrip('_')}" for file in files}
     names.update(DEFINITIONS[kind], (type_ for known_kind, type_ in [*found] if known_kind == kind))
     return names
+
+
+def _misplaced(type_: Any) -> str:
+    """The hint at what was given in the place of a type."""
+    if hasattr(type_, '_request_class'):
+        return '; this is the class of a service'
+    if isinstance(type_, type) and issubclass(type_, genpy.Message):
+        return '; this is the class of a message'
+    if callable(type_):
+        return '; a block comes after the type, or by its keyword'
+    return '; it comes after the name' if str(type_).startswith('/') else ''
 
 
 def _near_types(kind: str, type_: str) -> str:
