@@ -50,6 +50,8 @@ def test_dropped_messages_and_errors_are_counted(master):
 
 def test_a_node_that_stopped(master):
     node = create(master, '/over')
+    node.output_channel('/said', 'std_msgs/String')
+    assert '/over running, 1 channel: ' in repr(node)
     node.stop()
     assert node.health() == (False, None, {}, 0, 0, 0, 0)
     assert str(node.health()) == 'not registered, 0 dropped, 0 errors, 0 threads'
@@ -83,6 +85,7 @@ def test_a_master_that_goes_and_comes_back(monkeypatch):
     'health, line',
     [
         ((None, None, {}, 0, 0, 4), 'master away, 0 dropped, 0 errors, 4 threads'),
+        ((None, None, {}, 1, 1, 1), 'master away, 1 dropped, 1 error, 1 thread'),
         ((True, None, {}, 0, 0, 4), 'registered, 0 dropped, 0 errors, 4 threads'),
         (
             (False, None, {'TCPROS': 2, 'INTRAPROCESS': 1}, 3, 4, 5),

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any, Counter, Dict, Iterator, NamedTuple, Opti
 
 import rosgraph
 
+from pharos.counts import counted
 from pharos.errors import MasterUnreachableError
 from pharos.watcher import watcher_of
 
@@ -45,8 +46,8 @@ class Health(NamedTuple):
         if self.refused:
             yield f'{self.refused} refused'
         yield f'{self.dropped} dropped'
-        yield f'{self.errors} errors'
-        yield f'{self.threads} threads'
+        yield counted(self.errors, 'error')
+        yield counted(self.threads, 'thread')
 
 
 def health_of(node: 'Node', ask: bool) -> Health:

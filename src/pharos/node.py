@@ -3,6 +3,7 @@ from typing import TYPE_CHECKING, Any, Callable, Optional, TypeVar, Union
 
 from pharos import node_registry, on_demand
 from pharos.becoming import become
+from pharos.counts import counted
 from pharos.health import Health, health_of
 from pharos.node_topics import NodeWithTopics
 from pharos.offered_service import OfferedService
@@ -252,7 +253,7 @@ class Node(NodeWithTopics, is_base=True):
         health = f': {health_of(self, ask=False)}' if self.is_running else ''
         return (
             f'<{type(self).__name__} {self.name} {self.lifecycle.value},'
-            f' {len(self.channels)} channels{health}>'
+            f' {counted(len(self.channels), "channel")}{health}>'
         )
 
 

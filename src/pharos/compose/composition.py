@@ -16,6 +16,7 @@ from pharos.compose.launch_file import LaunchedNode, LaunchFile, Problem
 from pharos.compose.output import SCREEN
 from pharos.compose.progress import Progress
 from pharos.compose.script import ScriptNode
+from pharos.counts import counted
 from pharos.program_files import AnyPath
 from pharos.ros_process import RosProcess
 
@@ -189,7 +190,8 @@ class Composition:
 
     def __repr__(self) -> str:
         apart = '' if self.process is None else f', {self.process!r} apart'
-        return f'<Composition of {len(self.kept)} nodes at {self.master.url}{apart}>'
+        nodes = counted(len(self.kept), 'node')
+        return f'<Composition of {nodes} at {self.master.url}{apart}>'
 
 
 def _with_log(launched: LaunchedNode, folder: str, number: int) -> LaunchedNode:

@@ -6,6 +6,7 @@ import time
 from typing import TYPE_CHECKING, Dict, Iterable, Iterator, List, Optional, Tuple
 from xml.sax.saxutils import escape
 
+from pharos.counts import counted
 from pharos.live.answers import ALIVE, DEAD
 from pharos.live.colors import BLUE, GREEN, VERMILION
 from pharos.live.edges import HEARS, OFFERS, SENDS, Edge
@@ -257,9 +258,9 @@ def _legend(graph: 'Graph') -> str:
     if graph.group == 'process':
         cells.append('<td bgcolor="#F5F7F9" border="1" color="#9AA5B1">frame: process</td>')
     when = time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(seen.time))
-    about = f'{seen.master}, {when}: {len(graph.nodes)} nodes'
+    about = f'{seen.master}, {when}: {counted(len(graph.nodes), "node")}'
     if not graph.nodes_only:
-        about += f', {len(graph.topics)} topics'
+        about += f', {counted(len(graph.topics), "topic")}'
     return (
         '<table border="0" cellborder="0" cellspacing="4">'
         f'<tr>{"".join(cells)}</tr>'

@@ -6,9 +6,9 @@ from typing import Any, Callable, Dict, Iterable, Iterator, List, Optional
 
 from pharos import messages
 from pharos.channel import Channel, InputChannel
+from pharos.counts import counted
 from pharos.errors import PharosError
 from pharos.external_node import ExternalNode
-from pharos.live.graph_text import counted
 from pharos.master import Master
 from pharos.node import Node
 from pharos.offered_service import OfferedService
@@ -88,8 +88,8 @@ def _master(master: Master, seconds: float) -> Iterator[str]:
     local = {node.name for node in master.local_nodes()}
     yield f'  nodes of this process {_all([name for name in names if name in local])}'
     yield f'  others {_all([name for name in names if name not in local])}'
-    topics = counted(len(master.topics()), 'topic', 'topics')
-    yield f"  {topics}, {counted(len(master.services()), 'service', 'services')}"
+    topics = counted(len(master.topics()), 'topic')
+    yield f"  {topics}, {counted(len(master.services()), 'service')}"
 
 
 def _fields(title: str, find_class: Callable[[], Any]) -> Iterator[str]:

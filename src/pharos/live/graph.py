@@ -7,12 +7,13 @@ from typing import Any, Collection, Dict, Iterable, Iterator, List, Set, Tuple, 
 
 import rosgraph.names
 
+from pharos.counts import counted
 from pharos.errors import PharosError, suggest
 from pharos.live import graphviz, snapshot
 from pharos.live.answers import ALIVE
 from pharos.live.dot import dot_of, sorry
 from pharos.live.edges import HEARS, OFFERS, PUBLISHES, SENDS, Edge
-from pharos.live.graph_text import counted, text_of_graph
+from pharos.live.graph_text import text_of_graph
 from pharos.live.snapshot import Host, Process, SeenNode, SeenService, SeenTopic, Snapshot
 from pharos.live.traffic import Traffic
 from pharos.lookers import is_looker
@@ -217,9 +218,9 @@ class Graph:
     def __repr__(self) -> str:
         return (
             f'<Graph of {self.snapshot.master}:'
-            f" {counted(len(self.nodes), 'node', 'nodes')},"
-            f" {counted(len(self.topics), 'topic', 'topics')},"
-            f" {counted(len(self.edges), 'edge', 'edges')};"
+            f" {counted(len(self.nodes), 'node')},"
+            f" {counted(len(self.topics), 'topic')},"
+            f" {counted(len(self.edges), 'edge')};"
             " print(graph.text()) shows it, graph.save('graph.svg') draws it>"
         )
 

@@ -1,6 +1,7 @@
 """A graph as text, for a terminal."""
 from typing import TYPE_CHECKING, Collection, Dict, Iterator, List, Tuple
 
+from pharos.counts import counted
 from pharos.live.answers import ALIVE
 from pharos.live.edges import SENDS, Edge
 from pharos.live.figures import rate_text
@@ -31,18 +32,13 @@ def _lines(graph: 'Graph') -> Iterator[str]:
 def _summary(graph: 'Graph') -> str:
     processes = sum(len(host.processes) for host in graph.hosts)
     counts = [
-        (len(graph.nodes), 'node', 'nodes'),
-        (processes, 'process', 'processes'),
-        (len(graph.hosts), 'host', 'hosts'),
+        counted(len(graph.nodes), 'node'),
+        counted(processes, 'process', 'processes'),
+        counted(len(graph.hosts), 'host'),
     ]
     if not graph.nodes_only:
-        counts.append((len(graph.topics), 'topic', 'topics'))
-    return ', '.join(counted(*count) for count in counts)
-
-
-def counted(count: int, one: str, many: str) -> str:
-    """``1 process``, ``2 processes``."""
-    return f'{count} {one if count == 1 else many}'
+        counts.append(counted(len(graph.topics), 'topic'))
+    return ', '.join(counts)
 
 
 class _Uses:

@@ -11,6 +11,7 @@ import genpy
 
 from pharos import node_registry
 from pharos.channel import InputChannel
+from pharos.counts import counted
 from pharos.errors import NodeStoppedError, PharosError, missing
 from pharos.live import graphviz
 from pharos.live.colors import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION
@@ -121,7 +122,9 @@ class Plot:
             marker = '.' if len(rows) <= 50 else ''
             axes.plot(times, values, color=color, linestyle=dash, marker=marker, label=field)
         axes.set_xlabel('seconds')
-        axes.set_title(f'{self.topic} ({self.type}): {len(rows)} messages', fontsize='medium')
+        axes.set_title(
+            f'{self.topic} ({self.type}): {counted(len(rows), "message")}', fontsize='medium'
+        )
         axes.grid(color='#E0E0E0')
         axes.legend(loc='best')
         return figure
@@ -143,8 +146,8 @@ class Plot:
 
     def __repr__(self) -> str:
         state = 'collecting' if self._looker.is_running else 'closed'
-        fields = ', '.join(self.fields)
-        return f'<Plot of {fields} of {self.topic}: {len(self._collected.rows)} messages, {state}>'
+        fields, count = ', '.join(self.fields), counted(len(self._collected.rows), 'message')
+        return f'<Plot of {fields} of {self.topic}: {count}, {state}>'
 
 
 class _Collected:

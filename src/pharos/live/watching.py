@@ -7,12 +7,13 @@ import dataclasses
 import itertools
 import statistics
 import threading
-from typing import Any, Callable, Iterator, List, Optional
+from typing import Any, Callable, Iterator, Optional
 
 import genpy
 import rosgraph
 
 from pharos.blocks import check_block
+from pharos.counts import counted
 from pharos.errors import NodeStoppedError, UnknownTopicError, suggest
 from pharos.live.figures import number_text, rate_text, size_text
 from pharos.live.message_text import text_of_message
@@ -212,13 +213,8 @@ def _show(message: genpy.Message) -> None:
 
 def _counted(result: Any) -> str:
     """How many messages a Rate or Bandwidth is of, and what to keep in mind of that."""
-    words: List[str] = [_messages(result.window), f'in {number_text(result.seconds)} s']
+    count = counted(result.window, 'message') if result.window else 'no messages'
+    words = [count, f'in {number_text(result.seconds)} s']
     if result.is_time_simulated:
         words.append('of wall time, though time is simulated')
     return ' '.join(words)
-
-
-def _messages(count: int) -> str:
-    if count == 1:
-        return '1 message'
-    return f"{count or 'no'} messages"

@@ -15,6 +15,7 @@ from rosgraph.rosenv import ROS_MASTER_URI
 
 import pharos
 from pharos import node_registry, program, signals
+from pharos.counts import counted
 from pharos.errors import PharosError, missing
 from pharos.live import completion, debugger, explanation, mistakes, notebook
 from pharos.master import Master
@@ -82,7 +83,7 @@ class Workspace:
             )
         else:
             count = len(self.master.nodes())
-            where = f'{count} nodes are at the ROS master {self.master.url}'
+            where = f'{counted(count, "node is", "nodes are")} at the ROS master {self.master.url}'
         return (
             f'PhaROS {pharos.__version__}: {where}\n'
             f'master is that master, me the node {self.me.name} of this session; all of pharos is'
