@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from helpers import create
-from pharos import Master
+from pharos import Master, ServiceCallError
 from pharos.testing import Mailbox, TIMEOUT, until
 from programs import ROOT, Program, environment, forget_parameters, run, script
 
@@ -106,6 +106,20 @@ def test_a_program_that_is_no_node_is_told_as_such(compose, tmp_path):
     program = compose('--script', str(path))
     assert program.process.wait(TIMEOUT) == 0
     assert f'{path} has run, and never called rospy.init_node' in program.read_to_the_end()
+
+
+def test_a_script_that_makes_its_nodes_itself_is_a_process_of_its_own(master, compose):
+    own = 'composed_robot/own_nodes'
+    program = compose('--script', own, 'composed_robot/talker')
+    program.wait_for(f'{own} makes its nodes itself, with pharos: it runs apart')
+    program.wait_for('started /talker')
+    pid = master.wait_for_node('/own_node', TIMEOUT).pid
+    assert pid != program.process.pid
+    assert program.end(signal.SIGINT) == 0
+    printed = program.read_to_the_end()
+    assert f'{own}: ran apart, and ended with 0' in printed
+    assert 'rospy.init_node' not in printed
+    assert nodes(master) == set()
 
 
 def test_nodes_are_chosen_of_a_file_alone(compose):
@@ -242,11 +256,19 @@ def test_a_program_is_loaded_by_a_relative_name(master, compose):
     assert nodes(master) == {'/robot/manager'}
 
 
+def test_a_program_that_makes_its_nodes_itself_is_not_loaded(master, compose):
+    compose()
+    load = master.wait_for_service('/compose/load_nodelet', TIMEOUT)
+    with pytest.raises(ServiceCallError, match='own_nodes makes its nodes itself, with pharos'):
+        load.call(name='own', type='composed_robot/own_nodes')
+
+
 def test_a_program_that_is_unloaded_ends_and_nodelet_with_it(master, compose):
     compose()
+    loaded = master.wait_for_service('/compose/list', TIMEOUT)
+    unload = master.wait_for_service('/compose/unload_nodelet', TIMEOUT)
     with Program(master.url, *LOAD) as loader:
-        master.wait_for_node('/talker_in_compose', TIMEOUT)
-        unload = master.lookup_service('/compose/unload_nodelet')
+        until(lambda: '/talker' in loaded.call().nodelets)
         assert unload.call(name='/talker').success
         assert loader.process.wait(TIMEOUT) == 0
     until(lambda: nodes(master) == {'/compose'})

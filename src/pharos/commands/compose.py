@@ -1,11 +1,12 @@
 """Runs the Python nodes of a launch file, or several programs, unmodified, in one process, where
 messages go from one to the other without a socket.
 
-  compose PKG FILE.launch [arg:=value ...]     as roslaunch; what is not Python runs apart, as there,
-                                               and so do programs that use pharos themselves
+  compose PKG FILE.launch [arg:=value ...]     as roslaunch; what is not Python runs apart, as there
   compose FILE.launch [arg:=value ...]         the same, by its path
   compose --script PKG/EXECUTABLE ...          programs, as rosrun finds them
   compose                                      none at first
+
+Programs that use pharos themselves make their nodes by themselves, and run apart.
 
 It is a node, /compose by default (__name:= names it otherwise), with the services of a nodelet
 manager: `rosrun nodelet nodelet load PKG/EXECUTABLE compose __name:=talker` loads one more. It ends
@@ -25,7 +26,7 @@ from pharos import Composition, Master, NodeNameInUseError, PharosError, Unknown
 from pharos.compose.container import Container
 from pharos.compose.launch_file import LaunchedNode, LaunchFile, Problem
 from pharos.compose.output import SCREEN
-from pharos.compose.programs import find_program
+from pharos.compose.programs import find_program, uses_pharos
 from pharos.compose.progress import PrintedProgress
 
 
@@ -123,9 +124,14 @@ def launch(composition: Composition, options: argparse.Namespace, args: Dict[str
     scripts = []
     for text in options.script:
         try:
-            scripts.append(script(text))
+            launched = script(text)
         except PharosError as error:
             composition.refuse(Problem(text, '', str(error)))
+            continue
+        if uses_pharos(launched.path):
+            composition.run_apart(launched)
+        else:
+            scripts.append(launched)
     composition.start(scripts)
 
 

@@ -1,4 +1,4 @@
-"""The nodes of a launch file that run apart, by roslaunch in a process of its own."""
+"""What of a composition runs apart, in processes of its own."""
 import contextlib
 import os
 import pickle
@@ -7,7 +7,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from typing import TYPE_CHECKING, Any, Iterator, Tuple
+from typing import TYPE_CHECKING, Any, Iterator, List, Tuple
 
 import rosgraph.names
 
@@ -24,28 +24,62 @@ if TYPE_CHECKING:
 END_TIMEOUT = 5.0  # seconds that roslaunch may take to end its nodes in its own manner
 
 
-class ApartNodes:
-    """They run from now on.
+class Apart:
+    """A process, which runs from now on.
+
+    :param names: what runs in it
+    """
+
+    def __init__(self, composition: 'Composition', names: List[str], command: List[str]) -> None:
+        self.names = names
+        shows_colors = sys.stdout is not None and sys.stdout.isatty()
+        self.process = RosProcess(command, composition.master, Transcript.show, shows_colors)
+        self._composition = composition
+        threading.Thread(target=self._wait, name='nodes apart', daemon=True).start()
+
+    def _wait(self) -> None:
+        self._ended(self.process.wait())
+        node_registry.notify()
+
+    def _ended(self, status: int) -> None:
+        """Called when it has ended, in a thread of its own."""
+
+    @property
+    def is_over(self) -> bool:
+        """Whether it has ended."""
+        return self.process.poll() is not None
+
+    def outcomes(self) -> Iterator[Tuple[str, str]]:
+        """What has become of each that runs in it, in a few words: ``(name, outcome)``."""
+        outcome = self._outcome(self.process.poll())
+        for name in self.names:
+            yield name, outcome
+
+    def _outcome(self, status: Any) -> str:
+        return 'runs apart' if status is None else f'ran apart, and ended with {status}'
+
+    def stop(self) -> None:
+        """End it, as every RosProcess."""
+        self.process.terminate()
+
+
+class ApartNodes(Apart):
+    """The nodes of a launch file, which roslaunch runs.
 
     :param config: roslaunch's configuration of them
     """
 
     def __init__(self, composition: 'Composition', config: Any) -> None:
-        self._composition = composition
-        #: their full names
-        self.names = [rosgraph.names.ns_join(node.namespace, node.name) for node in config.nodes]
+        names = [rosgraph.names.ns_join(node.namespace, node.name) for node in config.nodes]
         with tempfile.NamedTemporaryFile('wb', suffix='.launch', delete=False) as file:
             pickle.dump(config, file)
         # as a file and not as a module: PYTHONPATH is for the nodes as it is
         command = [sys.executable, apart_program.__file__, file.name, str(os.getpid())]
-        shows_colors = sys.stdout is not None and sys.stdout.isatty()
-        #: roslaunch
-        self.process = RosProcess(command, composition.master, Transcript.show, shows_colors)
-        threading.Thread(target=self._wait, name='nodes apart', daemon=True).start()
+        super().__init__(composition, names, command)
 
-    def _wait(self) -> None:
-        """Wait for the end of roslaunch, and tell why it has ended."""
-        status, names = self.process.wait(), ', '.join(self.names)
+    def _ended(self, status: int) -> None:
+        """Tell why roslaunch has ended."""
+        names = ', '.join(self.names)
         if status == apart_program.REQUIRED_ENDED:
             self._composition.end_because(f'a required one of {names}, which run apart, has ended')
         elif status and not self._composition.is_ending:
@@ -56,7 +90,6 @@ class ApartNodes:
             )
             if status < 0:  # killed, it has not ended them
                 self._shut_down()
-        node_registry.notify()
 
     def _shut_down(self) -> None:
         """Ask them to end, as rosnode kill does."""
@@ -64,21 +97,12 @@ class ApartNodes:
             with contextlib.suppress(PharosError):  # it is none, or is gone
                 ExternalNode(self._composition.master, name).shutdown()
 
-    @property
-    def is_over(self) -> bool:
-        """Whether roslaunch has ended."""
-        return self.process.poll() is not None
-
-    def outcomes(self) -> Iterator[Tuple[str, str]]:
-        """What has become of each, in a few words: ``(name, outcome)``."""
-        status = self.process.poll()
-        outcome = f'ran apart, by roslaunch, which ended with {status}'
+    def _outcome(self, status: Any) -> str:
         if status is None:
-            outcome = 'runs apart, by roslaunch'
-        elif status < 0:
-            outcome = 'ran apart: asked to end, as roslaunch was killed'
-        for name in self.names:
-            yield name, outcome
+            return 'runs apart, by roslaunch'
+        if status < 0:
+            return 'ran apart: asked to end, as roslaunch was killed'
+        return f'ran apart, by roslaunch, which ended with {status}'
 
     def stop(self) -> None:
         """End roslaunch as Ctrl-C does, which ends its nodes in order, and else as every
@@ -87,4 +111,4 @@ class ApartNodes:
             os.kill(self.process.pid, signal.SIGINT)
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self.process.wait(END_TIMEOUT)
-        self.process.terminate()
+        super().stop()

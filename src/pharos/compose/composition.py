@@ -2,15 +2,16 @@
 import copy
 import dataclasses
 import os
+import sys
 import threading
 import time
-from typing import TYPE_CHECKING, Collection, Dict, Iterator, List, Optional, Tuple
+from typing import TYPE_CHECKING, Collection, Dict, Iterator, List, Optional, Tuple, Union
 
 import roslaunch.core
 import rospkg
 
 from pharos import node_registry, signals
-from pharos.compose.apart import ApartNodes
+from pharos.compose.apart import Apart, ApartNodes
 from pharos.compose.kept_node import KeptNode
 from pharos.compose.launch_file import LaunchedNode, LaunchFile, Problem
 from pharos.compose.output import SCREEN
@@ -46,7 +47,7 @@ class Composition:
         #: what was started in this process, whether it has come to be a node or not; replaced when
         #: it changes
         self.kept: List[KeptNode] = []
-        self._apart: Optional[ApartNodes] = None
+        self._apart: List[Apart] = []
         self._stopping = threading.RLock()
         node_registry.before_stop_all(self._begin_end)
 
@@ -58,7 +59,7 @@ class Composition:
     @property
     def process(self) -> Optional[RosProcess]:
         """The process in which roslaunch runs the nodes apart; None: there are none."""
-        return None if self._apart is None else self._apart.process
+        return self._apart[0].process if self._apart else None
 
     # -- start
 
@@ -78,7 +79,7 @@ class Composition:
             if problem.ends_all:
                 return self.end_because(f'{problem.name}, which is required, cannot be started')
         if file.apart:
-            self._apart = ApartNodes(self, file.config_apart())
+            self._apart.append(ApartNodes(self, file.config_apart()))
         logs = os.path.join(rospkg.get_log_dir(env=os.environ), run_id)
         for folder in logs, rospkg.get_ros_home():  # roslaunch makes them, too
             os.makedirs(folder, exist_ok=True)
@@ -108,6 +109,12 @@ class Composition:
         self.progress.all_begun([kept.name for kept in started if not kept.settled.is_set()])
         return started
 
+    def run_apart(self, launched: LaunchedNode) -> None:
+        """Run a program that makes its nodes itself in a process of its own."""
+        self.progress.tell(f'{launched.program} makes its nodes itself, with pharos: it runs apart')
+        command = [sys.executable, launched.path, *launched.args]
+        self._apart.append(Apart(self, [launched.program], command))
+
     def _run_id(self) -> str:
         """The identifier that all launches at a master have in common, and their folder of logs."""
         parameters = self.master.parameters
@@ -120,15 +127,18 @@ class Composition:
     @property
     def is_over(self) -> bool:
         """Whether all that it has started has ended."""
-        is_over_apart = self._apart is None or self._apart.is_over
-        return is_over_apart and all(kept.is_over for kept in self.kept)
+        return all(started.is_over for started in self._started)
+
+    @property
+    def _started(self) -> List[Union[KeptNode, Apart]]:
+        return [*self.kept, *self._apart]
 
     def outcomes(self) -> Iterator[Tuple[str, str]]:
         """What has become of each node, in a few words: ``(name, outcome)``."""
         for kept in self.kept:
             yield kept.name, kept.outcome
-        if self._apart is not None:
-            yield from self._apart.outcomes()
+        for apart in self._apart:
+            yield from apart.outcomes()
         for problem in self.problems:
             yield problem.name, 'did not start'
 
@@ -145,7 +155,7 @@ class Composition:
                 raise TimeoutError(f'{left} have not ended within {timeout:g} s: stop() them')
         self.stop()
         has_failed = [kept.problem is not None for kept in self.kept]
-        is_nothing_started = all(has_failed) and self._apart is None
+        is_nothing_started = all(has_failed) and not self._apart
         is_failure = is_nothing_started and bool(has_failed or self.problems)
         return 1 if is_failure or self.reason is not None else 0
 
@@ -171,10 +181,7 @@ class Composition:
         """End all nodes, those apart too, side by side. Harmless when done twice."""
         self._begin_end()
         with signals.held(), self._stopping:
-            ends = [kept.stop for kept in reversed(self.kept)]
-            if self._apart is not None:
-                ends.append(self._apart.stop)
-            threads = [threading.Thread(target=end, daemon=True) for end in ends]
+            threads = [threading.Thread(target=each.stop, daemon=True) for each in self._started]
             for thread in threads:
                 thread.start()
             deadline = time.monotonic() + node_registry.STOP_LIMIT

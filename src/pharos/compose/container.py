@@ -7,7 +7,7 @@ from pharos import node_registry
 from pharos.compose.kept_node import KeptNode
 from pharos.compose.launch_file import LaunchedNode
 from pharos.compose.output import SCREEN
-from pharos.compose.programs import find_program
+from pharos.compose.programs import find_program, uses_pharos
 from pharos.errors import PharosError, UnknownNodeError, suggest
 from pharos.node import Node
 
@@ -50,6 +50,12 @@ class Container(Node):
         package, _, executable = request.type.partition('/')
         if not package or not executable or '/' in executable:
             raise PharosError(f'{request.type!r} names no program: it is to be PACKAGE/EXECUTABLE')
+        path = find_program(package, executable)
+        if uses_pharos(path):
+            raise PharosError(
+                f'{request.type} makes its nodes itself, with pharos, and they would not be unloaded'
+                ' with it: start it as a process of its own'
+            )
         full_name = self._full_name(request.name)
         if full_name in self._running():
             raise PharosError(f'{full_name} is loaded already: unload it first, or name another')
@@ -63,7 +69,7 @@ class Container(Node):
         launched = LaunchedNode(
             name=name,
             program=request.type,
-            path=find_program(package, executable),
+            path=path,
             args=[*request.my_argv, *(f'{source}:={target}' for source, target in remaps)],
             private_name=full_name,
             output=SCREEN,

@@ -30,14 +30,12 @@ import rospkg
 from roslaunch.substitution_args import SubstitutionException
 
 from pharos import working_directory
-from pharos.compose.programs import source_of
+from pharos.compose.programs import uses_pharos
 from pharos.errors import PharosError, UnknownNodeError, suggest
 from pharos.parameters import as_stored
 from pharos.program_files import AnyPath, find_launch_file
 
 _PYTHON = re.compile(r'python(3(\.\d+)?)?')
-#: a program of ours makes its nodes itself: within another one they would not end with it
-_USES_PHAROS = re.compile(rb'^\s*(from|import) pharos\b', re.MULTILINE)
 #: what roslaunch lacks in the file, and its words for that
 _MISSING_ARG = re.compile(r"requires the '(\S+)' arg to be set")
 
@@ -340,10 +338,7 @@ def _lacks(path: str, node: Any) -> str:
 
 def _runs_here(path: str) -> bool:
     """Whether a program is Python's, for this interpreter, as its first line says."""
-    if not any(map(_is_python, _interpreter(path))):
-        return False
-    with open(source_of(path), 'rb') as file:
-        return not _USES_PHAROS.search(file.read())
+    return any(map(_is_python, _interpreter(path))) and not uses_pharos(path)
 
 
 def _is_python(word: str) -> bool:

@@ -13,6 +13,8 @@ _WRAPPER = re.compile(
     rb'# generated from catkin/cmake/template/script.py.in.*^python_script = (.+?)$',
     re.MULTILINE | re.DOTALL,
 )
+#: a program of ours makes its nodes itself: within another one they would not end with it
+_USES_PHAROS = re.compile(rb'^\s*(from|import) pharos\b', re.MULTILINE)
 _ELF = b'\x7fELF'  # how compiled programs begin
 
 
@@ -49,6 +51,12 @@ def source_of(path: str) -> str:
     with open(path, 'rb') as file:
         wrapper = _WRAPPER.search(file.read(2000))
     return str(ast.literal_eval(wrapper.group(1).decode())) if wrapper else path
+
+
+def uses_pharos(path: str) -> bool:
+    """Whether a program makes nodes with pharos itself, and so is to be a process of its own."""
+    with open(source_of(path), 'rb') as file:
+        return _USES_PHAROS.search(file.read()) is not None
 
 
 def check_source(path: str) -> None:
