@@ -36,7 +36,7 @@ class Arm(Node):
 
 
 def ask(me):
-    pick = me.master.lookup_service('/arm/pick', caller_id=me.name)
+    pick = me.lookup_service('arm/pick')
     for _ in me.every(2):
         try:
             me.log(pick.call(timeout=2).message)

@@ -154,6 +154,7 @@ def test_a_stop_that_does_not_call_super_stops_the_node(master):
         ('create_subscription', r"write node.interested_in\('/topic', delegate=lambda"),
         ('Rate', r'write for _ in node.every\(0.1\)'),
         ('is_shutdown', 'node.is_running'),
+        ('ServiceProxy', r'write node.lookup_service\(name\).call\(field=value\)'),
         ('get_param', r"write node.parameter\('~name', initialized=1\).value"),
         ('loginfo', r'write node.log\(text\)'),
         ('Timer', r'rospy has by that name is node.ros.Timer$'),

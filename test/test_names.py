@@ -53,6 +53,8 @@ USES = {
         name, 'std_srvs/Empty', lambda request: None
     ),
     'a service looked up': lambda node, name: node.master.lookup_service(name),
+    'a service looked up by a node': lambda node, name: node.lookup_service(name),
+    'a service waited for by a node': lambda node, name: node.wait_for_service(name, 0.01),
     'a caller': lambda node, name: node.master.lookup_service('/s', caller_id=name),
     'a parameter': lambda node, name: node.parameter(name),
     'a parameter set': lambda node, name: node.master.parameters.__setitem__(name, 1),
@@ -280,6 +282,39 @@ def test_from_is_resolved_like_the_nodes_other_names(master, mailbox, peer):
     master.node('/team/peer').send_to('talk', data='this')
     assert mailbox.next().data == 'this'
     assert mailbox.empty()
+
+
+@pytest.mark.parametrize('find', ['lookup_service', 'wait_for_service'])
+def test_a_service_is_found_by_the_name_that_the_node_means_and_called_in_the_nodes(master, find):
+    """The master knows neither the namespace nor the remappings that a launch file gives it."""
+    node = create(master, '/team/node', argv=['stop:=other/reset'])
+    for provider in create(master, '/team/detector'), create(master, '/team/other'), node:
+        provider.serve(
+            '~reset',
+            'std_srvs/Trigger',
+            lambda request: (True, request._connection_header['callerid']),
+        )
+    meant = {
+        'detector/reset': '/team/detector/reset',
+        '/team/other/reset': '/team/other/reset',
+        'stop': '/team/other/reset',
+        '~reset': '/team/node/reset',
+    }
+    for name, full_name in meant.items():
+        service = getattr(node, find)(name)
+        assert service.name == full_name
+        assert service.call(timeout=TIMEOUT).message == '/team/node'
+
+
+def test_a_node_that_looks_a_service_up_may_wait_and_keep_the_connection(master):
+    node = create(master, '/team/node')
+    with pytest.raises(pharos.UnknownServiceError, match='offered /team/reset within 0.01 s'):
+        node.lookup_service('reset', wait=0.01)
+    node.serve('reset', 'std_srvs/Empty', lambda request: None)
+    assert node.lookup_service('reset', wait=TIMEOUT, persistent=True).persistent
+    node.stop()
+    with pytest.raises(pharos.NodeStoppedError, match='start'):
+        node.lookup_service('reset')
 
 
 def test_a_private_name_is_that_of_a_node_below(master, mailbox):

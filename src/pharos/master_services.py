@@ -39,7 +39,8 @@ class MasterServices(MasterCalls):
     ) -> Service:
         """The :class:`Service` of that name, to be called in the name of ``caller_id``.
 
-        The report (listing 3.5): ``master lookupService: '/clear' with: '/myID'``. A provider that
+        The report (listing 3.5): ``master lookupService: '/clear' with: '/myID'``. It knows nothing
+        of a node's namespace and remappings: in a node, :meth:`Node.lookup_service` does. A provider that
         says nothing for a quarter of a second, because it is busy or stopped, is not waited for: it
         is asked for its type again when that is needed, for a call for one.
 

@@ -11,6 +11,7 @@ from pharos.parameter import Parameter
 from pharos.restarts import restart
 from pharos.run import Run
 from pharos.seconds import check_seconds
+from pharos.service import Service
 from pharos.starts import of_one_run
 from pharos.wrong_guesses import tells_keywords
 
@@ -199,6 +200,26 @@ class Node(NodeWithTopics, is_base=True):
         """
         name = self.current_run.resolve(name, 'service')
         return OfferedService(self, name, typed_as, block, only_nearby)
+
+    @tells_keywords
+    def lookup_service(
+        self, name: str, persistent: bool = False, wait: Optional[float] = 0
+    ) -> Service:
+        """The :class:`Service` of that name, to be called in the name of this node.
+
+        Its name is resolved as the node's other names are: in its namespace, remapped, '~reset' for
+        one of its own. All else is as in :meth:`Master.lookup_service`, which knows full names
+        alone.
+        """
+        name = self.current_run.resolve(name, 'service')
+        return self.master.lookup_service(name, self.name, persistent, wait)
+
+    @tells_keywords
+    def wait_for_service(self, name: str, timeout: Optional[float] = None) -> Service:
+        """Wait until a service of that name, resolved as in :meth:`lookup_service`, is offered, and
+        return it; see :meth:`Master.wait_for_service`."""
+        name = self.current_run.resolve(name, 'service')
+        return self.master.wait_for_service(name, timeout, self.name)
 
     @tells_keywords
     def parameter(self, name: str, initialized: Any = None) -> Parameter:

@@ -9,7 +9,7 @@ from pharos.private_rospy.process_rospy import rospy
 _PUBLISH = "node.send_to('/topic', typed_as='std_msgs/String', data='x'), or node.output_channel()"
 _SUBSCRIBE = "node.interested_in('/topic', delegate=lambda message, channel: ...)"
 _SERVE = 'node.serve(name, typed_as, block)'
-_CALL = 'master.lookup_service(name).call(field=value)'
+_CALL = 'node.lookup_service(name).call(field=value)'
 _LOOP = 'for _ in node.every(0.1), which turns ten times a second'
 _LOG = "node.log(text), or node.log(text, level='warning')"
 _PARAMETER = "node.parameter('~name', initialized=1).value, or master.parameters['/name']"
@@ -35,7 +35,7 @@ _TABLE = {
     'ServiceProxy': _CALL,
     'call_service': _CALL,
     'create_client': _CALL,
-    'wait_for_service': 'node.master.wait_for_service(name, timeout)',
+    'wait_for_service': 'node.wait_for_service(name, timeout)',
     'Rate': _LOOP,
     'create_rate': _LOOP,
     'create_timer': 'a soul, in a thread of its own by fork(), and there: ' + _LOOP,
