@@ -154,14 +154,44 @@ def test_a_soul_that_was_taken_away_ends_when_it_is_to_begin_anew(master):
     assert not node.errors
 
 
-def test_only_souls_that_run_begin_anew(master, transcript):
-    node = create(master, soul=lambda me: 1 / 0)
+def fails(me):
+    raise ArithmeticError('no period of 0')
+
+
+def test_only_souls_that_run_begin_anew_and_that_one_has_failed_is_said(master, transcript):
+    node = create(master, soul=fails)
     assert ended(node.fork())
-    with pytest.raises(pharos.PharosError, match='no soul of /node runs.*fork'):
+    told = r'soul fails raised ArithmeticError: no period of 0, .*failures.* fork\(\) '
+    with pytest.raises(pharos.PharosError, match=f'^no soul of /node runs in .*{told}it again$'):
+        node.renew()
+    node.soul = lambda me: None
+    assert ended(node.fork())
+    with pytest.raises(pharos.PharosError, match=r'of its own: fork\(\) it$'):
         node.renew()
     node.stop()
     with pytest.raises(pharos.NodeStoppedError):
         node.renew()
+
+
+def test_a_soul_that_failed_and_that_its_class_forks_is_back_after_a_restart(master, transcript):
+    taken, periods = queue.SimpleQueue(), iter([0, 0.01])
+
+    class Scanner(pharos.Node):
+        def start(self):
+            super().start()
+            self.thread = self.fork(Scanner.scan)
+
+        def scan(self):
+            for _ in self.every(next(periods)):
+                taken.put('turns')
+
+    node = create(master, '/scanner', Scanner)
+    assert ended(node.thread)
+    with pytest.raises(pharos.PharosError, match=r'soul .*scan raised ValueError: .*: restart\(\)'):
+        node.renew()
+    node.restart()
+    assert taken.get(timeout=TIMEOUT) == 'turns'
+    node.renew()
 
 
 # -- restart

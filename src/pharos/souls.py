@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, Callable, Iterator, List, Optional
 
 from pharos import node_registry, signals
 from pharos.attributes import NodeAttributes
-from pharos.blocks import Block, BlockOf, check_soul
+from pharos.blocks import Block, BlockOf, check_soul, name_of, text_of
 from pharos.errors import NodeStoppedError, PharosError
 from pharos.lifecycle import Lifecycle
 from pharos.private_rospy.process_rospy import rospy
@@ -43,6 +43,7 @@ class Soul:
 
 #: the maker of souls that the ``start()`` of the node's class forks
 START = 'start'
+FORK = 'fork() it'  # what to do where none runs
 
 
 class Souls:
@@ -53,6 +54,7 @@ class Souls:
         #: those that are forked and have not ended; after the stop, those that it has ended
         self.forked: List[Soul] = []
         self._here = threading.local()  # .soul: the one whose thread this is
+        self._what_to_do = FORK
         self._threads: List[int] = []  # identifiers of threads, once for each soul they run
 
     def execute(self) -> Any:
@@ -80,6 +82,9 @@ class Souls:
                 return block(self._run.node)
         except BaseException as error:
             node = self._run.node
+            told = f'soul {name_of(block)} raised {type(error).__name__}: {text_of(error)}'
+            way = 'restart() the node, which forks it' if soul.maker is START else FORK
+            self._what_to_do = f'{told}, as node.failures tells, and has ended: {way} again'
 
             def again(nothing: Any) -> None:
                 node.current_run.souls.run(soul)
@@ -100,6 +105,7 @@ class Souls:
         maker = START if node_registry.is_in_start(node) else getattr(self._here, 'soul', None)
         soul = Soul(None if block is None else BlockOf(node, block, is_soul=True), name, maker)
         first = self._checked(soul)
+        self._what_to_do = FORK
         self.forked.append(soul)
         return self._run.fork(lambda: self._run_forked(soul, first), name)
 
@@ -140,7 +146,7 @@ class Souls:
         forked = list(self.forked)
         if not forked:
             raise PharosError(
-                f'no soul of {self._run.node.name} runs in a thread of its own: fork() it'
+                f'no soul of {self._run.node.name} runs in a thread of its own: {self._what_to_do}'
             )
         for soul in forked:
             soul.is_asked = True
