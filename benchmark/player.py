@@ -82,12 +82,15 @@ class Kind:
 class Player:
     """Sends and receives; subclasses say by which way, in :meth:`opened`."""
 
+    kind_class = Kind
+    commands = 'open', 'begin', 'send', 'result'  # methods
+
     def __init__(self, options):
         self.options = options
         self.sends = options.role in ('both', 'send')
         self.receives = options.role in ('both', 'receive')
         self.took = []
-        if options.role == 'both':
+        if not options.stamps:
             self.sent = [0.0] * STAMPS
         else:
             with open(options.stamps, 'r+b') as file:
@@ -103,7 +106,7 @@ class Player:
 
     def open(self, *what):
         name, receivers, queue_size = what
-        kind = Kind(name)
+        kind = self.kind_class(name)
         topic = '/'.join(['', self.options.name, name.replace('.', '_'), receivers, queue_size])
         self._ways[what] = kind, self.opened(kind, topic, int(receivers), int(queue_size))
         return {}
@@ -164,12 +167,8 @@ class Player:
     def serve(self, commands, answers):
         for line in commands:
             name, *arguments = line.split()
-            answer = {
-                'open': self.open,
-                'begin': self.begin,
-                'send': self.send,
-                'result': self.result,
-            }[name](*arguments)
+            assert name in self.commands, name
+            answer = getattr(self, name)(*arguments)
             print(json.dumps(answer), file=answers, flush=True)
 
 
@@ -319,11 +318,14 @@ class Rospy(Player):
             return publisher.publish
 
 
-def main():
+WAYS = {'direct': Direct, 'queue': Queue, 'pharos': Pharos, 'rospy': Rospy}
+
+
+def make_parser(ways, text=__doc__):
+    """A parser of what all players are told."""
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        description=text, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    ways = {'direct': Direct, 'queue': Queue, 'pharos': Pharos, 'rospy': Rospy}
     parser.add_argument('way', choices=ways)
     parser.add_argument('name', help='of the row: for topics and nodes')
     parser.add_argument('--role', choices=('both', 'send', 'receive'), default='both')
@@ -347,13 +349,18 @@ def main():
     parser.add_argument(
         '--tuned', action='store_true', help='rospy: tcp_nodelay, and a large buff_size'
     )
-    options = parser.parse_args()
+    return parser
+
+
+def play(player_class, options):
+    """Play until standard input ends."""
     answers = os.fdopen(os.dup(1), 'w')
     os.dup2(2, 1)  # what ROS prints is no answer
-    ways[options.way](options).serve(sys.stdin, answers)
+    player_class(options).serve(sys.stdin, answers)
     answers.flush()
     os._exit(0)  # no nodes to be stopped tidily: all that is measured is over
 
 
 if __name__ == '__main__':
-    main()
+    arguments = make_parser(WAYS).parse_args()
+    play(WAYS[arguments.way], arguments)

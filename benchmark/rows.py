@@ -1,5 +1,6 @@
 """The rows of the table: each is a player, a process of its own, or two where messages go from one
 to another."""
+import contextlib
 import ctypes
 import json
 import os
@@ -8,6 +9,8 @@ import signal
 import socket
 import subprocess
 import sys
+import time
+import xmlrpc.client
 from typing import List, NamedTuple
 
 from player import STAMPS
@@ -90,6 +93,13 @@ class Row:
         duration = max(receiver['last'] - sent['begun'], sent['took'])
         return Slice(receiver['took'], expected, receiver['received'], duration, cpu)
 
+    def ask_receiver(self, *words):
+        """What the receiving player answers."""
+        self._players[0].signal(signal.SIGCONT)
+        answer = self._players[0].ask(*words)
+        self._pause()
+        return answer
+
     def _pause(self):
         for player in self._players:
             player.signal(signal.SIGSTOP)
@@ -109,7 +119,7 @@ class _Player:
             stderr=errors,
             text=True,
             env=environment,
-            preexec_fn=_end_with_parent,
+            preexec_fn=end_with_parent,
         )
 
     def ask(self, *words):
@@ -133,7 +143,8 @@ class _Player:
         self._process.wait()
 
 
-def _end_with_parent():
+def end_with_parent():
+    """Has a child process end with the thread that starts it."""
     # PR_SET_PDEATHSIG: a stopped player would stay for ever
     ctypes.CDLL(None).prctl(1, signal.SIGKILL)
 
@@ -160,7 +171,7 @@ def make(names, environment, folder, beside=()):
             rows.append(
                 Row(
                     name + "'" * number,
-                    _commands(words, label, folder),
+                    commands(words, label, folder),
                     {**environment, 'PYTHONPATH': str(source)},
                     errors,
                 )
@@ -168,10 +179,14 @@ def make(names, environment, folder, beside=()):
     return rows
 
 
-def _commands(words, label, folder):
+def commands(words, label, folder, program=('/usr/bin/python3', str(HERE / 'player.py'))):
+    """The command of each player of a row, as Row takes them.
+
+    :param words: of PYTHON_ROWS
+    :param label: of the row, for topics and files
+    """
     command = [
-        '/usr/bin/python3',
-        str(HERE / 'player.py'),
+        *program,
         words[0],
         label,
         *(word for word in words[1:] if word != '--two'),
@@ -207,6 +222,39 @@ def build_cpp():
         if done.returncode:
             sys.exit(f"{' '.join(command)} failed in {BUILD}:\n{done.stdout}")
     return []
+
+
+@contextlib.contextmanager
+def ros_master(folder):
+    """A ROS master as a child process; gives the environment for nodes of it."""
+    port = free_port()
+    environment = {
+        **os.environ,
+        'ROS_MASTER_URI': f'http://127.0.0.1:{port}/',
+        'ROS_HOSTNAME': '127.0.0.1',
+        'ROS_LOG_DIR': str(folder),
+        'ROS_HOME': str(folder),
+    }
+    process = subprocess.Popen(
+        ['/usr/bin/rosmaster', '--core', '-p', str(port)],
+        env=environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        deadline = time.monotonic() + 20
+        while True:
+            try:
+                xmlrpc.client.ServerProxy(environment['ROS_MASTER_URI']).getPid('/benchmark')
+                break
+            except OSError:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(0.05)
+        yield environment
+    finally:
+        process.terminate()
+        process.wait()
 
 
 def free_port():

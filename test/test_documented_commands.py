@@ -58,6 +58,8 @@ OUTPUT = {
     '| latency at 100 Hz': 'the output of benchmark/channels on one machine',
     'p50      p95': 'the same',
     'image p50, ms': 'the output of benchmark/compose on one machine',
+    'Twist at 100 Hz, us': 'the output of benchmark/middleware on one machine',
+    'written into': 'the same',
 }
 
 
@@ -204,7 +206,7 @@ def test_a_long_command_has_the_options_that_it_is_given(line):
     )
 
 
-@pytest.mark.parametrize('name', ['nodes', 'channels', 'services', 'compose'])
+@pytest.mark.parametrize('name', ['nodes', 'channels', 'services', 'compose', 'middleware'])
 def test_each_benchmark_can_be_seen_to_work_quickly(name):
     assert '--quick' in help_of(['/usr/bin/python3', f'benchmark/{name}'])
 
