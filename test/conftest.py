@@ -49,7 +49,8 @@ def master(request, ros_master, monkeypatch):
     with check:
         yield master
         node_registry.stop_all()
-    ros_master.forget_types()
+    if isinstance(ros_master, InProcessMaster):  # not a process of its own
+        ros_master.forget_types()
 
 
 @pytest.fixture
