@@ -34,9 +34,10 @@ def blocks():
     ]
 
 
-def statements(text):
-    """The text, parted where a line begins that is not indented."""
-    return [part.strip('\n') for part in re.split(r'^(?=\S)', text, flags=re.MULTILINE) if part]
+def pieces(block):
+    """What is entered at once: the lines of a debugger one by one, else the block as it is pasted,
+    of which IPython answers the last expression alone."""
+    return block.text.splitlines() if block.kind == 'debugger' else [block.text.strip('\n')]
 
 
 def pattern_of(expected):
@@ -66,9 +67,9 @@ class Reader:
             return
         self.terminal.wait_for(PROMPTS[block.kind])
         self._shown = len(self.terminal.text.splitlines()) - 1
-        for statement in statements(block.text):
+        for piece in pieces(block):
             self.terminal.wait_for(PROMPTS[block.kind])
-            self.terminal.paste(statement)
+            self.terminal.paste(piece)
             self.terminal.press(*(['Enter'] if block.kind == 'debugger' else ['Escape', 'Enter']))
 
     def _open(self, text):
