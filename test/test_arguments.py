@@ -92,6 +92,25 @@ def test_remappings_and_parameters_hold_for_all(master, argv):
     assert master.parameters['/eye/rate'] == master.parameters['/b/rate'] == 5
 
 
+def test_where_the_first_gives_up_its_own_name_that_is_told_once(master, argv, capsys):
+    arguments = argv('__name:=perception', '__ns:=/robot')
+    named = '/detector', '/controller', '/planner'
+    nodes = [create(master, name, argv=arguments) for name in named]
+    nodes[1].restart()
+    (told,) = capsys.readouterr().err.splitlines()
+    assert '/robot/controller: __name:=perception' in told
+    assert "has named the node that it creates first, 'detector'" in told
+    assert 'write <node name="detector">' in told
+
+
+@pytest.mark.parametrize('given', ['__name:=detector', 'detector:__name:=eye', 'image:=/image'])
+def test_where_each_has_the_name_that_is_meant_nothing_is_told(master, argv, capsys, given):
+    arguments = argv(given)
+    for name in '/detector', '/controller':
+        create(master, name, argv=arguments)
+    assert capsys.readouterr().err == ''
+
+
 # -- for one node alone
 
 

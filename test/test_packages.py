@@ -10,7 +10,7 @@ import xml.etree.ElementTree
 import pytest
 
 from pharos import PharosError
-from pharos.testing import Mailbox, until
+from pharos.testing import Mailbox, TIMEOUT, until
 from helpers import create
 from programs import ROOT, Program, environment
 
@@ -229,6 +229,30 @@ def test_all_nodes_of_a_created_package_run_in_one_process(master, workspace):
         said.wait_for(has_heard_three)
         assert pid_of(master, '/camera') == pid_of(master, '/controller')
         assert program.end() == 0
+
+
+def test_the_page_about_packages_names_both_nodes_of_a_process(master, workspace, tmp_path):
+    """And gives each its parameter; what it says of args holds, too."""
+    page = (ROOT / 'doc' / 'packages.md').read_text()
+    (block,) = re.findall('^```xml\n(.*?)^```$', page, re.DOTALL | re.MULTILINE)
+    (args,) = re.findall('`(args="[^`]*")`', page)
+    other = re.sub(' output="screen"', f' {args}', block).replace('robot1', 'robot2')
+    file = tmp_path / 'page.launch'
+    file.write_text(f'<launch>{block}{other}</launch>')
+    ear = create(master, '/ear')
+    said = Mailbox(ear, '/said', 'std_msgs/String')
+    with workspace('catkin_make').launch(master, 'devel', str(file)):
+        said.wait_for(has_heard_three)
+        for name in '/robot1/camera', '/robot1/controller', '/robot2/camera', '/robot2/pilot':
+            master.wait_for_node(name, TIMEOUT)
+    periods = {name: value for name, value in master.parameters.items() if 'period' in name}
+    assert periods == {
+        '/robot1/camera/period': 0.1,
+        '/robot1/controller/period': 0.5,
+        '/robot2/camera/period': 0.1,
+        '/robot2/controller/period': 0.5,  # that of the launch file
+        '/robot2/pilot/period': 0.5,
+    }
 
 
 # -- at the prompt

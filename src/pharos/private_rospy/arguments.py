@@ -8,7 +8,7 @@ so as in ROS 2: ``detector:image:=/camera/image``.
 """
 import re
 import threading
-from typing import Any, List
+from typing import List
 
 import rosgraph.names
 from rosgraph.rosenv import get_master_uri
@@ -18,9 +18,41 @@ from pharos.private_rospy.process_rospy import rospy
 
 _FOR_ONE = re.compile(r'([A-Za-z]\w*):(?!=)(.*)', re.ASCII | re.DOTALL)
 _MISTYPED = re.compile(r'\d[\w/]*:=', re.ASCII)  # rosgraph ignores it, and nobody hears of that
-# (master URL, arguments, node that takes the __name in them): for good, since nodes start again
-_takers: List[Any] = []
-_lock = threading.Lock()  # guards it
+_lock = threading.Lock()  # guards what follows
+
+
+class Taker:
+    """The node that takes the ``__name`` in the arguments of a program, for good, since nodes start
+    again.
+
+    :param node: the full name that it has without it
+    """
+
+    def __init__(self, master_url, arguments, node):
+        self._master_url, self._arguments, self.node = master_url, arguments, node
+        self._is_told = False
+
+    def is_of(self, master_url, arguments):
+        """Whether it is that of these arguments at that master."""
+        return self._arguments == arguments and is_same_master(self._master_url, master_url)
+
+    def note(self, name):
+        """What to tell one of the others where it has given up its own name for ``name``; nothing
+        where that was told before."""
+        own = self.node.rpartition('/')[2]
+        with _lock:
+            if own == name or self._is_told:
+                return ''
+            self._is_told = True
+        return (
+            f'__name:={name}, which roslaunch or the command line gave this program, has named the'
+            f' node that it creates first, {own!r}, and the others keep theirs: write <node'
+            f' name="{own}"> for that one to keep its own, too (doc/packages.md, "Two nodes of a'
+            ' process in a launch file")'
+        )
+
+
+_takers: List[Taker] = []
 
 
 def mappings_for(arguments, node):
@@ -61,22 +93,22 @@ def mappings_for(arguments, node):
     return for_all, for_one
 
 
-def takes_name(master_url, arguments, name, node):
-    """Whether the ``__name`` in the arguments is for the node: it is for the first that asks, now
-    and later, but where the program is a rospy node itself, which has it then.
+def taker_of_name(master_url, arguments, name, node):
+    """The :class:`Taker` of the ``__name`` in the arguments, which is the node if it is the first that
+    asks; None where the program is a rospy node itself, which has that name then.
 
     :param name: that ``__name``
     :param node: the full name that the node has without it
     """
     if _is_name_of_program(name, master_url):
-        return False
+        return None
     arguments = tuple(arguments)
     with _lock:
-        for url, others, taker in _takers:
-            if others == arguments and is_same_master(url, master_url):
-                return taker == node
-        _takers.append((master_url, arguments, node))
-        return True
+        for taker in _takers:
+            if taker.is_of(master_url, arguments):
+                return taker
+        _takers.append(Taker(master_url, arguments, node))
+        return _takers[-1]
 
 
 def _is_name_of_program(name, master_url):

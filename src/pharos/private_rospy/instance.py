@@ -185,6 +185,9 @@ class PrivateRospy:
         if not self.lifetime.has_program:  # which goes on after that, to its end
             # rospy.signal_shutdown called by the node's own code
             self.module.core.add_preshutdown_hook(self._request_own_stop)
+        if settings.note:
+            self.warn(settings.note)
+            settings.note = ''
         if not rosgraph.network.is_local_address(self.domain):
             self.warn(
                 f'{self.domain}, which {self.name} tells others to come to, is no address of this'

@@ -16,7 +16,7 @@ from pharos.private_rospy.addresses import (
     default_domain,
     is_same_master,
 )
-from pharos.private_rospy.arguments import mappings_for, takes_name
+from pharos.private_rospy.arguments import mappings_for, taker_of_name
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.names import NODE_LIMIT, check_name, unique_name
 from pharos.private_rospy.parameters import as_stored
@@ -45,6 +45,8 @@ class Settings:
     private_name: Optional[str] = None
     #: whence it has its name, for who may not have that, where the program gives it another
     origin_of_name = ''
+    #: what is to be told of its name when it starts
+    note = ''
 
     def __init__(
         self,
@@ -73,15 +75,16 @@ class Settings:
         namespace = _namespace(name, given)
         base = for_one.get('__name', own_base)
         if '__name' in for_all:
-            given_name = for_all['__name']
-            if '__name' not in for_one and takes_name(
-                master_url, arguments, given_name, namespace + base
-            ):
+            given_name, own_name, taker = for_all['__name'], namespace + base, None
+            if '__name' not in for_one:
+                taker = taker_of_name(master_url, arguments, given_name, own_name)
+            if taker and taker.node == own_name:
                 base = given_name
                 if given is not None:
                     namespace = _namespace('', given)
             else:
                 mappings.pop('__log', None)  # roslaunch has named this file after the other node
+                self.note = taker.note(given_name) if taker else ''
         self.base_name = check_name(base, 'node', base=True)
         self.name = check_name(namespace + base, 'node', limit=NODE_LIMIT)
         if base not in (own_base, for_one.get('__name')):
@@ -121,7 +124,7 @@ class Settings:
             self.argv.append(f'__name{rosgraph.names.REMAP}{self.base_name}')
         if '__name' in rosgraph.names.load_mappings(self.argv):
             # before the nodes that the program creates with its arguments
-            takes_name(self.master_url, self.argv, None, self.name)
+            taker_of_name(self.master_url, self.argv, None, self.name)
         self.environ.update(env)
         self.private_name = private_name
         self.params = {}
