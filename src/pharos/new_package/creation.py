@@ -196,7 +196,11 @@ def _advice(path: pathlib.Path, files: List[str], author: Author) -> str:
             'catkin would not take the address: write yours into package.xml.',
             '',
         ]
-    lines += ['Its tests pass as it is:', f'  /usr/bin/python3 -m pytest {path}/test', '']
+    lines += [
+        'Its tests pass as it is, where a workspace that has pharos was sourced, or pharos is installed:',
+        f'  /usr/bin/python3 -m pytest {path}/test',
+        '',
+    ]
     if workspace is None:
         lines += [
             f'{path.parent} is not the src of a catkin workspace. Move the package to one:',

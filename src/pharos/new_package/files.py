@@ -214,7 +214,7 @@ While that runs:
 
 ## Tests
 
-Here, whether it is built or not, or in the workspace:
+In a shell that has sourced the workspace, here, or, when it is built, in the workspace:
 
     /usr/bin/python3 -m pytest test
     catkin_make run_tests_@package@ && catkin_test_results build/test_results
