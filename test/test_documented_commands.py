@@ -43,7 +43,7 @@ NOT_RUN = {
     'catkin_test_results': 'it is about what catkin_make has built',
     'source devel/setup.bash': 'it is about what catkin_make has built',
     '/usr/bin/python3 -m venv': 'test_packaging.py makes one, and runs the commands in it',
-    'robot/bin/': 'the same',
+    '.venv/bin/': 'the same',
     '/usr/bin/python3 -m pytest test': 'test_packages.py runs the tests of a package that was made',
     'rosrun pharos workspace': 'it wants a terminal: test_tutorial.py types into it',
     'rosrun pharos bridge http://robot': 'there are no such hosts; test_masters.py runs the bridge',
@@ -66,7 +66,7 @@ OUTPUT = {
 #: what each kind of fence is, and who looks at it
 FENCES = {
     'python': 'README.md: here; the tutorial: test_tutorial.py; other pages of doc/: test_how_to.py',
-    'py': 'here: a program of its own',
+    'py': 'here: a program of its own, or a file for the commands of its page',
     'text': 'what the block before prints, which the same tests compare',
     'console': 'test_tutorial.py types it',
     'debugger': 'the same',
@@ -104,7 +104,7 @@ def blocks():
 
 def is_command(line):
     first = line.split()[0]
-    return first in SHELL or first.startswith(('tools/', 'benchmark/', 'robot/bin/'))
+    return first in SHELL or first.startswith(('tools/', 'benchmark/', '.venv/bin/'))
 
 
 def is_shell(block):
@@ -136,6 +136,12 @@ def is_heavy(line):
 
 def is_run(line):
     return not is_heavy(line) and not line.startswith(tuple(NOT_RUN))
+
+
+def file_name(block):
+    """The name of the file that the block is, as its first line may say."""
+    named = block.kind == 'py' and re.match(r'# (\w+\.py)\n', block.text)
+    return named[1] if named else ''
 
 
 def python_of(page):
@@ -289,15 +295,17 @@ def test_a_command_runs(block, line, master, robot, tmp_path):
     log = tmp_path / 'log'
     folder = tmp_path / 'folder'
     folder.mkdir()
+    for each in blocks():
+        if each.page == block.page and file_name(each):
+            (folder / file_name(each)).write_text(each.text)
     variables = {'ROS_HOME': str(tmp_path), 'PATH': DEBIANS}
     if 'create_package' in line:
         variables['ROS_PACKAGE_PATH'] = str(ROOT)  # there is no package of that name yet
 
     def is_up():
         if 'pharos compose' in line:
-            last = (
-                'detector' if '--only' in line else 'planner' if 'my_robot' in line else 'listener'
-            )
+            is_whole = '.launch' in line and '--only' not in line
+            last = 'planner' if is_whole else 'detector' if 'my_robot' in line else 'listener'
             return f'/{last}' in names(master)
         # what each says when all of it has started
         if 'roslaunch pharos' in line:
@@ -365,7 +373,11 @@ def test_three_lines_run(block, master, monkeypatch, tmp_path):
     forget_parameters(master.url)
 
 
-@pytest.mark.parametrize('block', [each for each in blocks() if each.kind == 'py'], ids=identify)
+@pytest.mark.parametrize(
+    'block',
+    [each for each in blocks() if each.kind == 'py' and not file_name(each)],
+    ids=identify,
+)
 def test_a_program_prints_something_until_it_is_told_to_end(block, master, tmp_path):
     (tmp_path / 'program.py').write_text(block.text)
     with Program(master.url, '/usr/bin/python3', str(tmp_path / 'program.py')) as program:
