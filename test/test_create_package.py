@@ -1,8 +1,10 @@
 """rosrun pharos create_package: what it makes is in order, and what cannot be is refused."""
 import ast
+import importlib
 import importlib.util
 import keyword
 import os
+import queue
 import re
 import shutil
 import subprocess
@@ -13,10 +15,11 @@ import pytest
 from catkin_pkg.package import parse_package_string
 from hypothesis import HealthCheck, given, settings, strategies as st
 
+from helpers import create
 from pharos import PharosError
 from pharos.new_package.creation import NAME, create_package
 from pharos.new_package.files import Package, files_of
-from pharos.testing import TIMEOUT
+from pharos.testing import TIMEOUT, until
 from programs import ROOT, script
 
 SCRIPT = script('create_package')
@@ -81,7 +84,9 @@ def test_it_says_what_it_has_made_and_what_to_do_next(made):
     for file in 'package.xml', 'launch/my_robot.launch', 'scripts/camera', 'test/test_camera.py':
         assert file in files
         assert f'  {file}\n' in printed
-    assert f'  cd {package.parent.parent}\n  catkin_make && source devel/setup.bash\n' in printed
+    make = 'catkin_make -DPYTHON_EXECUTABLE=/usr/bin/python3'
+    assert f'  cd {package.parent.parent}\n  {make} && source devel/setup.bash\n' in printed
+    assert f'    {make}\n' in (package / 'README.md').read_text()
     assert '  roslaunch my_robot my_robot.launch\n' in printed
 
 
@@ -90,6 +95,23 @@ def test_its_tests_pass_in_the_clone_with_nothing_built(made):
     status, printed = run(sys.executable, '-m', 'pytest', '-q', 'test', cwd=package)
     assert status == 0, printed
     assert '2 passed' in printed
+
+
+def test_its_node_follows_its_parameter(made, master, monkeypatch):
+    package, _ = made
+    monkeypatch.syspath_prepend(package / 'src')
+    camera = importlib.import_module('my_robot.camera')
+    slept = queue.SimpleQueue()
+
+    class Camera(camera.Camera):
+        def sleep(self, seconds):
+            slept.put(seconds)
+            super().sleep(0.001)
+
+    create(master, '/camera', Camera)
+    assert slept.get(timeout=TIMEOUT) == 1.0
+    master.parameters['/camera/period'] = 7
+    until(lambda: slept.get(timeout=TIMEOUT) == 7)
 
 
 @pytest.mark.parametrize('program', [*NODES, 'all_in_one'])

@@ -14,7 +14,7 @@ from typing import Iterator, List, NamedTuple, Optional, Sequence
 import rospkg
 
 from pharos.errors import PharosError, suggest
-from pharos.new_package.files import IN_ONE, Package, class_name, files_of
+from pharos.new_package.files import CATKIN_MAKE, IN_ONE, Package, class_name, files_of
 
 NAME = re.compile(r'[a-z][a-z0-9]*(_[a-z0-9]+)*', re.ASCII)
 #: what catkin takes for an address: it builds no package whose maintainer has another
@@ -210,7 +210,7 @@ def _advice(path: pathlib.Path, files: List[str], author: Author) -> str:
     lines += [
         'Build and run it:',
         f'  cd {workspace or "~/catkin_ws"}',
-        '  catkin_make && source devel/setup.bash',
+        f'  {CATKIN_MAKE} && source devel/setup.bash',
         f'  roslaunch {path.name} {path.name}.launch',
     ]
     return '\n'.join(lines)

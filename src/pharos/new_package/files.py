@@ -91,8 +91,9 @@ class @class@(pharos.Node):
 
     def speak(self) -> None:
         """Run in a thread of its own, until the node stops."""
-        for _ in self.every(self.period.value):  # as it is when this begins
+        while self.is_running:
             self.send_to('~output', data=f'heard {self.heard}', typed_as='std_msgs/String')
+            self.sleep(max(0.01, self.period.value))  # as it is by now, whoever has set it
 '''
 
 SCRIPT = '''\
@@ -200,7 +201,7 @@ Nodes written with pharos: @node_names@.
 
 It goes into the `src` of a catkin workspace that has pharos, or is built on one that has it. In the workspace:
 
-    catkin_make
+    @catkin_make@
     source devel/setup.bash
     roslaunch @package@ @package@.launch
 
@@ -228,6 +229,8 @@ In a shell that has sourced the workspace, here, or, when it is built, in the wo
 '''
 
 
+#: builds a workspace, also where another python3 is before Debian's, which alone has catkin and rospy
+CATKIN_MAKE = 'catkin_make -DPYTHON_EXECUTABLE=/usr/bin/python3'
 #: the program that has all nodes, where there are several
 IN_ONE = 'all_in_one'
 
@@ -253,6 +256,7 @@ def files_of(package: Package) -> Dict[str, str]:
     programs = package.nodes if is_one else [*package.nodes, IN_ONE]
     words = {
         'package': package.name,
+        'catkin_make': CATKIN_MAKE,
         'first': package.nodes[0],
         'node_names': ', '.join(package.nodes),
         'script_lines': '\n'.join(f'    scripts/{program}' for program in sorted(programs)),
