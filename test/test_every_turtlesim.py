@@ -7,7 +7,7 @@ import pytest
 from pharos.testing import Mailbox, TIMEOUT
 from programs import ROOT, Program, forget_parameters, run, script
 
-from pharos import BlockNode, Node
+from pharos import BlockNode, Node, PharosError
 from pharos_turtle import commands
 from pharos_turtle.commands import TWIST, VELOCITY
 
@@ -146,6 +146,45 @@ def test_a_type_that_commands_no_turtle_is_an_error_that_says_what_to_do(master)
     assert done.returncode == 1
     assert '/chatter is of type std_msgs/String, and a turtle takes' in done.stderr
     assert done.stderr.count('\n') == 1
+
+
+@pytest.mark.parametrize(
+    'program, arguments, said',
+    [
+        ('block_publisher', ['_topic:=5'], "'5' cannot be a topic name"),
+        ('block_publisher', ['_topic:=/a b'], "'/a b' cannot be a topic name"),
+        (
+            'block_publisher',
+            ['_topic:=/x', '_type:=spam'],
+            '/x is of type spam, and a turtle takes',
+        ),
+        ('turtle_logger', ['_topic:=5'], "'5' cannot be a topic name"),
+        ('turtle_driver', ['_linear:=fast'], "linear holds float, and 'fast' is none"),
+        (
+            'turtle_simulator',
+            ['_window:=perhaps'],
+            "~window is 'perhaps': give auto, true or false",
+        ),
+    ],
+)
+def test_a_parameter_that_can_be_none_is_told_at_once(master, program, arguments, said):
+    """A driver waited for a turtle on a topic of no possible name; a number in its place was a
+    traceback."""
+    done = run(master.url, script(program), *arguments)
+    assert done.returncode == 1
+    assert f'{program}: ' in done.stderr
+    assert said in done.stderr
+    assert 'Traceback' not in done.stderr
+
+
+def test_the_launch_file_refuses_a_simulator_that_it_does_not_know(master, monkeypatch):
+    monkeypatch.setenv('ROS_PACKAGE_PATH', os.pathsep.join([str(ROOT), '/usr/share']))
+    with master.launch(ROOT / 'launch' / 'turtle.launch', simulator='gazebo') as process:
+        assert process.wait(TIMEOUT) != 0
+    said = 'there is no simulator:=gazebo, but pharos, turtlesim and none'
+    assert said in process.output
+    with pytest.raises(PharosError, match=said):
+        master.compose(ROOT / 'launch' / 'turtle.launch', simulator='gazebo')
 
 
 def test_the_launch_file_drives_a_turtle_that_runs_already(master, monkeypatch):

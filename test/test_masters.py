@@ -333,7 +333,7 @@ def test_a_bridge_that_cannot_start_says_why_in_one_line(masters):
     for arguments, reason in (
         ((url, refused_url(), '/t'), 'bridge: no ROS master answers at '),
         ((refused_url(), url, '/t'), 'bridge: no ROS master answers at '),
-        ((url, url, '/t'), 'bridge: the node name /bridge is taken'),
+        ((url, url, '/t'), f'bridge: {url} and {url} are one master: give two'),
         ((url, 'robot-b', '/t'), "bridge: 'robot-b' is not the URL of a ROS master"),
     ):
         ended = run(url, script('bridge'), *arguments)

@@ -428,14 +428,15 @@ def test_a_picture_that_cannot_be_written_is_said_so(master, tmp_path):
         assert 'turtle_simulator: ' in program.read_to_the_end()
 
 
-def test_it_follows_its_name_its_namespace_and_remappings(master, client, tmp_path):
+@pytest.mark.parametrize('no_picture', ["_picture:=''", '_picture:='])
+def test_it_follows_its_name_its_namespace_and_remappings(master, client, tmp_path, no_picture):
     with Program(
         master.url,
         script('turtle_simulator'),
         '__name:=sim',
         '__ns:=/robot1',
         'turtle1/pose:=where',
-        "_picture:=''",
+        no_picture,
         cwd=tmp_path,
     ) as program:
         program.wait_for('Starting turtlesim with node name /robot1/sim')

@@ -26,13 +26,17 @@ class Commands(NamedTuple):
 
         :raises ValueError: if messages of this type command no turtle
         """
+        self.check()
         if self.type == TWIST:
             message.linear.x = linear
             message.angular.z = angular
-        elif self.type == VELOCITY:
+        else:
             message.linear = linear
             message.angular = angular
-        else:
+
+    def check(self) -> None:
+        """Raise ValueError if messages of this type command no turtle."""
+        if self.type not in (TWIST, VELOCITY):
             raise ValueError(
                 f'{self.topic} is of type {self.type}, and a turtle takes {TWIST} or {VELOCITY}:'
                 ' name the topic with _topic:=, its type with _type:='
@@ -53,10 +57,11 @@ def possible_commands(node: Node) -> List[Commands]:
     """Where commands may come: both of turtlesim's topics, or what the private parameters ~topic
     and ~type of the node name.
 
-    :raises ValueError: if turtlesim has no topic of that type
+    :raises ValueError: if turtlesim has no topic of that type, or no topic can have that name
     """
-    topic, type_name = (node.ros.get_param(name, '') for name in ('~topic', '~type'))
+    topic, type_name = (str(node.ros.get_param(name, '')) for name in ('~topic', '~type'))
     if topic:
+        node.current_run.resolve(topic, 'topic')  # raises where it is no name
         return [Commands(topic, type_name or _type_of(node, topic))]
     found = [commands for commands in TURTLESIM if type_name in ('', commands.type)]
     if not found:
@@ -75,7 +80,10 @@ def find_commands(node: Node) -> Commands:
     :raises ValueError: as :func:`possible_commands` does
     :raises NodeStoppedError: if the node stops meanwhile
     """
-    expected = ' or '.join(map(str, possible_commands(node)))
+    possible = possible_commands(node)
+    for commands in possible:
+        commands.check()
+    expected = ' or '.join(map(str, possible))
     found = _turtle(node)
     if found is None:
         node.log(f'waits for a turtle, which listens to {expected}')
