@@ -266,6 +266,29 @@ def test_a_field_that_a_block_reads_in_vain_is_told_by_those_that_there_are(mast
 @pytest.mark.parametrize(
     'use, said',
     [
+        # as create_publisher of ROS 2 has it, where it is a number of messages
+        (
+            lambda node: node.output_channel('/t', STRING, 10),
+            'latch is True or False, not 10: .*queue_',
+        ),
+        (lambda node: node.interested_in('/t', STRING, inline='no'), "inline is True .* not 'no'"),
+        (lambda node: node.interested_in('/t', STRING, shared=5), 'shared is True .* not 5'),
+        (lambda node: node.master.uri_of(None), 'a node name is a string, not None'),
+        (
+            lambda node: node.ros_import('tf2_ros/Buffer'),
+            "by its name, such as 'actionlib', not as 't",
+        ),
+        (lambda node: setattr(node, 'latest_run', node), 'latest_run is what each Node has'),
+    ],
+)
+def test_a_value_in_another_one_s_place_is_told(master, use, said):
+    with pytest.raises((ValueError, TypeError, AttributeError), match=said):
+        use(create(master))
+
+
+@pytest.mark.parametrize(
+    'use, said',
+    [
         (lambda node: node.interested_in(STRING, '/t'), 'it comes after the name'),
         (lambda node: node.serve('std_srvs/Empty', '/s', print), 'it comes after the name'),
         (lambda node: node.interested_in('/t', 'std_srvs/Empty'), "the type of a service$"),

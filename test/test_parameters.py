@@ -3,6 +3,7 @@ import datetime
 import itertools
 import socketserver
 import threading
+import types
 import xmlrpc.server
 
 import pytest
@@ -243,6 +244,13 @@ def test_initialized_with_none_any_value_is_taken(master):
         '\ud800',
         {1, 2},
         datetime.date(2020, 2, 3),
+        # each was stored as a dict of its attributes, which is empty for a function
+        len,
+        lambda: 1,
+        ValueError('x'),
+        types.SimpleNamespace(a=1),
+        Master,
+        [types.SimpleNamespace(a=1)],
     ],
 )
 def test_a_value_that_the_server_cannot_hold_is_refused_by_name(master, value):

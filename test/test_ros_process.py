@@ -184,9 +184,19 @@ def test_a_namespace_is_given_as_a_remapping(master, package):
         master.wait_for_node('/robots/talker', TIMEOUT)
 
 
-def test_an_argument_that_is_none_is_refused(master, package):
-    with pytest.raises(TypeError, match='texts or numbers, not None'):
-        master.run('fake_robot', 'talker', None)
+@pytest.mark.parametrize('argument', [None, ['a', 'b'], b'a', {'a': 1}])
+def test_an_argument_that_is_none_is_refused(master, package, argument):
+    with pytest.raises(TypeError, match=f'texts or numbers, not {re.escape(repr(argument))}'):
+        master.run('fake_robot', 'talker', argument)
+
+
+@pytest.mark.parametrize('text', ['#!/nowhere/python3\n', 'no first line\n', ''], ids=repr)
+def test_what_the_system_cannot_start_is_told(master, package, text):
+    write(package / 'scripts' / 'broken', text, 0o755)
+    with pytest.raises(PharosError, match='scripts/broken cannot be started .*#!/usr/bin/python3'):
+        master.run('fake_robot', 'broken', params={'a': 1})
+    with pytest.raises(UnknownNodeError, match="topic_tools has no program '/'"):
+        master.run('topic_tools', '/')
 
 
 # -- what they are told, and what they tell

@@ -3,11 +3,12 @@ import os
 import re
 import subprocess
 import sys
+import threading
 
 import pytest
 
 from helpers import create
-from pharos.testing import Mailbox, NodeFactory, TIMEOUT
+from pharos.testing import Mailbox, NodeFactory, TIMEOUT, until
 import pharos
 from programs import ROOT
 
@@ -65,6 +66,37 @@ def test_a_mailbox_in_which_nothing_comes_names_its_channels(master):
         by_channel.next(0)
     with pytest.raises(TimeoutError, match='no channel: nothing is heard'):
         Mailbox().next(0)
+
+
+@pytest.mark.parametrize('timeout', ['5', float('nan'), [5]], ids=repr)
+def test_a_limit_that_is_no_number_of_seconds_is_refused(timeout):
+    for wait in (
+        lambda: until(lambda: True, timeout),
+        lambda: Mailbox().next(timeout),
+        lambda: Mailbox().wait_for(lambda message: True, timeout),
+    ):
+        with pytest.raises(ValueError, match='timeout is a number of seconds, not'):
+            wait()
+
+
+def test_a_limit_may_be_longer_than_the_system_can_wait_or_over_by_now():
+    mailbox = Mailbox()
+    threading.Timer(0.01, lambda: mailbox('message', None)).start()
+    assert mailbox.next(float('inf')) == 'message'
+    for limit in 0, -1:
+        with pytest.raises(TimeoutError):
+            mailbox.next(limit)
+
+
+def test_a_predicate_that_would_always_hold_is_refused():
+    async def later():
+        pass
+
+    for wrong in later, 5, lambda message: True:
+        with pytest.raises(TypeError, match='a predicate is called'):
+            until(wrong, 1)
+    with pytest.raises(TypeError, match=r'called as predicate\(message\)'):
+        Mailbox().wait_for(lambda: True)
 
 
 def test_a_name_that_the_nodes_init_waits_for_is_refused(master):

@@ -33,7 +33,7 @@ def _check_bytes(name: str, value: Any) -> Any:
 
 
 def _check_run(name: str, value: Any) -> Any:
-    if value is not None and not isinstance(getattr(value, 'lifecycle', None), Lifecycle):
+    if value is not None and not hasattr(value, 'dispatcher'):  # which a Run has
         raise _not_to_be_set(name)
     return value
 

@@ -16,6 +16,13 @@ if TYPE_CHECKING:
     from pharos.run import Run
 
 
+def check_flag(name: str, value: Any, hint: str = '') -> bool:
+    """``value`` if it is True or False, else ValueError."""
+    if value not in (True, False):
+        raise ValueError(f'{name} is True or False, not {value!r}{hint}')
+    return bool(value)
+
+
 class Channel:
     """What the two ends have in common.
 
@@ -148,8 +155,8 @@ class InputChannel(Channel):
     ) -> None:
         super().__init__(node, topic, message_class, queue_size)
         self.delegate = delegate
-        self.inline = inline
-        self.shared = shared
+        self.inline = check_flag('inline', inline)
+        self.shared = check_flag('shared', shared)
         self.from_ = None if from_ is None else str(self._run.resolve_peer(from_))
         self.received = 0
         self.dropped = 0

@@ -70,5 +70,5 @@ def suggest(name: str, names: Iterable[str], meant: Optional[List[str]] = None) 
     :param meant: what is suggested instead, if that is anything
     :returns: nothing where there is nothing to suggest
     """
-    meant = meant or difflib.get_close_matches(name, list(names), 3, 0.7)
+    meant = meant or difflib.get_close_matches(str(name), list(names), 3, 0.7)
     return f" (did you mean {' or '.join(map(repr, meant))}?)" if meant else ''

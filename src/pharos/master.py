@@ -320,7 +320,10 @@ class Master(MasterServices):
         """The URI of the XML-RPC server of the node of that name.
 
         :raises UnknownNodeError: if the master knows none
+        :raises ValueError: if it is no text
         """
+        if not isinstance(name, str):
+            raise ValueError(f'a node name is a string, not {name!r}')
         try:
             return str(self.call('lookupNode', name))
         except rosgraph.MasterError:

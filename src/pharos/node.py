@@ -238,7 +238,7 @@ class Node(NodeWithTopics, is_base=True):
     def ros_import(self, name: str) -> Any:
         """A library written on rospy ('actionlib', 'message_filters', 'tf2_ros'), bound to this run
         of the node."""
-        if not isinstance(name, str):
+        if not (isinstance(name, str) and all(map(str.isidentifier, name.split('.')))):
             raise TypeError(f"a library is given by its name, such as 'actionlib', not as {name!r}")
         return self.current_run.rospy.import_library(name)
 

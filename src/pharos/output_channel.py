@@ -8,7 +8,7 @@ import genpy
 
 from pharos import first_message, messages
 from pharos.blocks import check_filler, check_runs
-from pharos.channel import Channel
+from pharos.channel import Channel, check_flag
 from pharos.errors import MessageTypeError, NodeStoppedError
 from pharos.intraprocess.copier import copier_for
 from pharos.intraprocess.fanout import ClosedFanout
@@ -45,7 +45,7 @@ class OutputChannel(Channel):
         connect_timeout: Optional[float] = None,
     ) -> None:
         super().__init__(node, topic, message_class, queue_size)
-        self.latch = latch
+        self.latch = check_flag('latch', latch, ': a number of messages is queue_size=')
         self.latched = self._run.latch_for(topic, message_class) if latch else None
         self.sent = 0
         self._uninterested: Set[str] = set()  # names of nodes of which the log says so

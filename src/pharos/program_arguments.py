@@ -1,5 +1,7 @@
 """What ROS programs are told when they start: arguments, remappings, parameters of their nodes."""
 import math
+import numbers
+import os
 from typing import TYPE_CHECKING, Any, Dict, List, Mapping, Optional, Sequence
 
 import rosgraph.names
@@ -19,8 +21,12 @@ def arguments_of(
 
     :raises TypeError, ValueError: if one of them cannot be one
     """
-    if None in args:
-        raise TypeError(f'the arguments of a program are texts or numbers, not None: {args}')
+    for argument in args:
+        if not isinstance(argument, (str, numbers.Number, os.PathLike)):
+            raise TypeError(
+                f'the arguments of a program are texts or numbers, not {argument!r}: each is given'
+                ' by itself'
+            )
     mappings: Dict[str, object] = {}
     for left, right in _checked('remap', remap).items():
         if not (isinstance(left, str) and left.startswith('__')):  # else it is no name, as __ns
@@ -81,8 +87,11 @@ def _checked(what: str, given: Optional[Mapping[str, Any]]) -> Mapping[str, Any]
 
 
 def _is_python(path: str) -> bool:
-    with open(path, 'rb') as file:
-        first = file.readline(200)
+    try:
+        with open(path, 'rb') as file:
+            first = file.readline(200)
+    except OSError:  # it may be run, and not read
+        return False
     return first.startswith(b'#!') and b'python' in first
 
 

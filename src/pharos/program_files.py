@@ -36,7 +36,7 @@ def _find(package: str, executable: str) -> List[str]:
         if not folders:
             raise
         paths = [os.path.join(folder, executable) for folder in folders]
-        return [path for path in paths if os.access(path, os.X_OK)]
+        return [path for path in paths if os.path.isfile(path) and os.access(path, os.X_OK)]
 
 
 def find_launch_file(package: Optional[AnyPath], file: Optional[AnyPath]) -> str:

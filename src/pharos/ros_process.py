@@ -70,7 +70,7 @@ class RosProcess:
     ) -> None:
         """:param in_colors: whether lines keep the colours that they have on a terminal"""
         self.command = command
-        self._on_line = check_block(on_line, 'on_line', ('text',))
+        self._on_line = check_block(on_line, 'block on_line', ('text',))
         self._in_colors = in_colors
         self._failures = Failures(lambda line, details: Transcript.show(line))
         self._lines: Deque[str] = collections.deque(maxlen=10000)
@@ -88,9 +88,14 @@ class RosProcess:
                 stderr=self._terminal.slave,
                 start_new_session=True,
             )
-        except BaseException:
+        except BaseException as error:
             self._terminal.close()
-            raise
+            if not isinstance(error, OSError):
+                raise
+            raise PharosError(
+                f'{command[0]} cannot be started ({error}): is it a program, may you run it, and'
+                ' does its first line name an interpreter that is there, as #!/usr/bin/python3?'
+            ) from error
         finally:
             os.close(self._terminal.slave)
         self._nodes = _Nodes(master)

@@ -27,6 +27,8 @@ import pytest
 
 from pharos import Failure, InputChannel, Master, Node, node_registry
 from pharos.attributes import check_not_taken
+from pharos.blocks import check_block
+from pharos.seconds import check_seconds
 
 #: seconds; a bound on waits for events, which a test that passes never reaches
 TIMEOUT = 30.0
@@ -43,7 +45,8 @@ def until(predicate: Callable[[], Value], timeout: Optional[float] = None, what:
     :returns: the first value of ``predicate()`` that is true
     :raises TimeoutError: if none is in time
     """
-    timeout = TIMEOUT if timeout is None else timeout
+    check_block(predicate, 'predicate', ())
+    timeout = _limit(timeout)
     pause, deadline = threading.Event(), time.monotonic() + timeout
     while True:
         value = predicate()
@@ -81,9 +84,9 @@ class Mailbox:
 
     def next_with_channel(self, timeout: Optional[float] = None) -> Tuple[Any, InputChannel]:
         """The same, as ``(message, the channel that it came through)``."""
-        timeout = TIMEOUT if timeout is None else timeout
+        timeout = _limit(timeout)
         try:
-            return self._waiting.get(timeout=timeout)
+            return self._waiting.get(timeout=max(0.0, timeout))
         except queue.Empty:
             through = ', '.join(map(repr, self._channels())) or 'no channel: nothing is heard'
             raise TimeoutError(
@@ -111,7 +114,8 @@ class Mailbox:
         :param timeout: seconds for all of them, None: :data:`TIMEOUT`
         :raises TimeoutError: if there is none in time
         """
-        deadline = time.monotonic() + (TIMEOUT if timeout is None else timeout)
+        check_block(predicate, 'predicate', ('message',))
+        deadline = time.monotonic() + _limit(timeout)
         while True:
             message = self.next(max(0.0, deadline - time.monotonic()))
             if predicate(message):
@@ -124,6 +128,10 @@ class Mailbox:
     def empty(self) -> bool:
         """Whether there is no message that was not taken."""
         return self._waiting.empty()
+
+
+def _limit(timeout: Optional[float]) -> float:
+    return TIMEOUT if timeout is None else check_seconds('timeout', timeout)
 
 
 def registrations(master: Master) -> Dict[str, Set[str]]:

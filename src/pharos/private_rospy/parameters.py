@@ -202,13 +202,26 @@ def changing(key):
             parameters.forget(key)
 
 
+class _Marshaller(xmlrpc.client.Marshaller):
+    """Refuses what xmlrpc would store as a dict of its attributes: a function as an empty one."""
+
+    dispatch: Any = dict(xmlrpc.client.Marshaller.dispatch)
+
+    def dump_instance(self, value, write):
+        if type(value) not in xmlrpc.client.WRAPPERS:
+            raise TypeError(f'cannot marshal {type(value)} objects')
+        super().dump_instance(value, write)
+
+    dispatch['_arbitrary_instance'] = dump_instance
+
+
 def as_stored(name, value):
     """The value as the parameter server brings it back: with lists for tuples.
 
     :raises ValueError: if it can hold no such value
     """
     try:
-        return xmlrpc.client.loads(xmlrpc.client.dumps((value,)))[0][0]
+        return xmlrpc.client.loads(_Marshaller('utf-8').dumps((value,)))[0][0]
     except Exception as error:  # of several kinds; text with characters that XML has not, for one
         raise ValueError(
             f'{name} cannot be {reprlib.repr(value)}: the parameter server holds booleans, numbers '
