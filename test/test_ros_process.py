@@ -169,6 +169,7 @@ def test_what_is_no_name_of_a_package_or_program_is_refused(master, package, giv
         ({'params': [1]}, TypeError, r'params is a dict by name, not \[1\]'),
         ({'remap': 'a:=b'}, TypeError, "remap is a dict by name, not 'a:=b'"),
         ({'params': {'1st': 2}}, ValueError, "'1st' cannot be a parameter name"),
+        ({'params': {'/rate': 2}}, ValueError, "'/rate' is not private to the node: set it by"),
         ({'remap': {'talk': 'a b'}}, ValueError, "'a b' cannot be a remapped name"),
         ({'remap': {'1': '/b'}}, ValueError, "'1' cannot be a remapped name"),
         ({'name': '/ns/talker'}, ValueError, "'/ns/talker' cannot be a node name"),
@@ -207,9 +208,8 @@ def test_name_remappings_and_parameters_reach_it(master, package):
     master.create(BlockNode, named='/listener', delegate=mailbox).interested_in(
         '/said', 'std_msgs/String'
     )
-    with master.run(
-        'fake_robot', 'talker', name='robot7', remap={'talk': '/said'}, params={'text': 'two words'}
-    ):
+    params = {'~text': 'two words'}
+    with master.run('fake_robot', 'talker', name='robot7', remap={'talk': '/said'}, params=params):
         assert mailbox.next().data == 'two words'
         assert master.wait_for_node('/robot7', TIMEOUT).publications['/said'] == 'std_msgs/String'
         assert master.parameters.pop('/robot7/text') == 'two words'

@@ -185,8 +185,8 @@ class Master(MasterServices):
         :param args: its further arguments
         :param name: the name of its node, for ``__name:=``
         :param remap: ``{name: name}`` of remappings
-        :param params: ``{name: value}`` of private parameters, which keep their types: with ``name``,
-            they are set on the parameter server, else by the program
+        :param params: ``{name: value}`` of private parameters, called 'rate' or '~rate', which keep
+            their types: with ``name``, they are set on the parameter server, else by the program
         :param on_line: block called as ``on_line(text)`` for each line of its output, in a thread
             of its own
         :raises UnknownNodeError: if there is no such package or program
@@ -241,7 +241,7 @@ class Master(MasterServices):
             ``init_node``
         :param namespace: the namespace of its node, for ``__ns:=``
         :param remap: ``{name: name}`` of remappings
-        :param params: ``{name: value}`` of private parameters
+        :param params: as of :meth:`run`
         :param output: 'screen': what it prints has the name of its node before each line; a path:
             it goes to that file, but for its errors; None: it goes where this program prints
         :raises UnknownNodeError: if there is no such package or program

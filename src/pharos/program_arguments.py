@@ -39,13 +39,20 @@ def arguments_of(
 
 
 def parameters_of(params: Optional[Mapping[str, object]]) -> Dict[str, Any]:
-    """``{name: value}`` of the private parameters of a program's node; see :meth:`Master.run`.
+    """``{name: value}`` of the private parameters of a program's node, given as 'rate' or '~rate'; see
+    :meth:`Master.run`.
 
     :raises TypeError, ValueError: if one of them cannot be one
     """
-    given = _checked('params', params).items()
-    names = [check_name(name, 'parameter').lstrip('/') for name, _ in given]
-    return {name: as_stored(f'~{name}', value) for name, (_, value) in zip(names, given)}
+    parameters = {}
+    for name, value in _checked('params', params).items():
+        own = name[1:] if isinstance(name, str) and name.startswith('~') else name
+        if check_name(own, 'parameter').startswith('/'):
+            raise ValueError(
+                f'{name!r} is not private to the node: set it by master.parameters[{name!r}]'
+            )
+        parameters[own] = as_stored(f'~{own}', value)
+    return parameters
 
 
 def set_parameters(

@@ -15,7 +15,7 @@ from pharos.errors import NodeStoppedError, PharosError
 from pharos.lifecycle import Lifecycle
 from pharos.node import Node
 from pharos.restarts import is_restarting
-from pharos.program_arguments import arguments_of
+from pharos.program_arguments import arguments_of, parameters_of
 from pharos.run import Run
 from pharos.watcher import watcher_of
 
@@ -32,6 +32,7 @@ class ScriptNode(Node):
 
     :ivar path: the file of the program
     :ivar args: its arguments
+    :ivar params: ``{name: value}`` of private parameters that it is given
     :ivar cwd: its working directory; None: this process's
     :ivar output: where what it prints goes, as below
     :ivar init_timeout: seconds that :meth:`start` waits for its ``rospy.init_node``
@@ -68,14 +69,8 @@ class ScriptNode(Node):
         super().__init__()
         found = find_program(path)
         self.path, self.args = source_of(found), [str(argument) for argument in args]
-        self._settings.for_program(
-            found,
-            self.args,
-            {} if params is None else params,
-            env or {},
-            takes_own_name,
-            private_name,
-        )
+        self.params = parameters_of(params)
+        self._settings.for_program(found, self.args, env or {}, takes_own_name, private_name)
         if cwd is not None and not os.path.isdir(cwd):
             raise ValueError(f'{found} cannot run in {cwd!r}: there is no such folder')
         self.cwd = cwd
@@ -238,7 +233,7 @@ class ScriptRun(Run):
         node_registry.rename(node, name)
         settings.xmlrpc_port = xmlrpc_port or settings.xmlrpc_port
         settings.tcp_port = tcpros_port or settings.tcp_port
-        for parameter, value in settings.params.items():
+        for parameter, value in node.params.items():
             full_name = f'{name}/{parameter}'
             node.master.parameters[full_name] = value
             self.rospy.parameters.initialize(full_name, value)

@@ -4,7 +4,7 @@ rospy takes them from ``os.environ`` and ``sys.argv``; a node gets private ones,
 function need be overridden and the process's own stay untouched.
 """
 import os
-from typing import List, Mapping, Optional
+from typing import List, Optional
 
 import rosgraph.names
 from rosgraph.rosenv import ROS_HOSTNAME, ROS_IP, ROS_MASTER_URI, ROS_NAMESPACE
@@ -97,19 +97,16 @@ class Settings:
         self.argv = [self.base_name, *map(rosgraph.names.REMAP.join, mappings.items())]
         check_private_parameters(self.argv)
 
-    def for_program(self, path, args, params, env, takes_own_name, private_name):
+    def for_program(self, path, args, env, takes_own_name, private_name):
         """Have them be those of a program that calls ``init_node`` itself.
 
         :param path: what it finds as ``sys.argv[0]``
-        :param params: ``{name: value}`` of private parameters
         :param env: ``{name: value}`` of further environment variables
         :param takes_own_name: whether it has the name that it gives to ``init_node``; until then it
             has one that is nobody else's
         :param private_name: the node in whose namespace its private names are; None: itself
-        :raises TypeError, ValueError: if one of them cannot be
+        :raises ValueError: if one of them cannot be
         """
-        if not isinstance(params, Mapping):
-            raise TypeError(f'params is a dict by name, not {params!r}')
         check_private_parameters(args)
         mappings = rosgraph.names.load_mappings(args)
         if not is_same_master(mappings.get('__master', self.master_url), self.master_url):
@@ -127,14 +124,6 @@ class Settings:
             taker_of_name(self.master_url, self.argv, None, self.name)
         self.environ.update(env)
         self.private_name = private_name
-        self.params = {}
-        for name, value in params.items():
-            key = name[1:] if isinstance(name, str) and name.startswith('~') else name
-            if check_name(key, 'parameter').startswith('/'):
-                raise ValueError(
-                    f'{name!r} is not private to the node: set it by master.parameters[{name!r}]'
-                )
-            self.params[key] = as_stored('~' + key, value)
 
     def _set_domain(self, domain, mappings):
         """Have rosgraph find the address to advertise, which is checked."""
