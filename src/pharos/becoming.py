@@ -28,9 +28,8 @@ class Place(NamedTuple):
     of: str  # what that is of
     block: BlockOf
     parameters: Sequence[str]  # that it is called with
-    take: Optional[
-        Callable[[Any], Any]
-    ]  # takes what it becomes; None: the place looks that up itself
+    # takes what it becomes; None: the place looks that up itself
+    take: Optional[Callable[[Any], Any]]
 
 
 def become(node: 'Node', node_class: type) -> None:

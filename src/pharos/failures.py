@@ -97,9 +97,8 @@ class Failure:
             return self._traceback
         error, frames = self.error, self._frames
         lines = attempt(lambda: traceback.format_exception(type(error), error, frames))
-        if (
-            lines is None
-        ):  # its __str__, or that of its cause, raises what traceback does not expect
+        if lines is None:
+            # its __str__, or that of its cause, raises what traceback does not expect
             lines = attempt(lambda: traceback.format_tb(frames), [])
         return _brief(''.join(lines), 10 * TEXT_LIMIT)
 

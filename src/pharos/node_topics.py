@@ -1,5 +1,5 @@
 """What nodes send and hear."""
-from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Type, Union
+from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Union
 
 import genpy
 
@@ -11,7 +11,7 @@ from pharos.output_channel import OutputChannel
 from pharos.private_rospy.deadlines import time_limit
 from pharos.seconds import check_seconds
 from pharos.souls import NodeWithSouls
-from pharos.topic import QUEUE_SIZE, Topic
+from pharos.topic import QUEUE_SIZE, Topic, TypedAs
 from pharos.wrong_guesses import tells_keywords
 
 if TYPE_CHECKING:
@@ -20,8 +20,7 @@ if TYPE_CHECKING:
 
     Peer = Union[str, Node, ExternalNode, None]
 
-TypedAs = Union[str, Type[genpy.Message], None]
-Channel = Union[InputChannel, OutputChannel]
+AnyChannel = Union[InputChannel, OutputChannel]
 
 HINT_TIMEOUT = 0.5  # seconds that the master may take for what only makes an error clearer
 
@@ -197,7 +196,7 @@ class NodeWithTopics(NodeWithSouls, is_base=True):
         return next_message(self._node, self._topic(topic), typed_as, timeout, where)
 
     @property
-    def channels(self) -> List[Channel]:
+    def channels(self) -> List[AnyChannel]:
         """The channels that the node has open."""
         return self.latest_run.channels if self.latest_run else []
 

@@ -190,9 +190,8 @@ class LaunchFile:
                 f'{self.path} needs the ROS package {package!r}, which is not on ROS_PACKAGE_PATH:'
                 " install it, or source its workspace's setup.bash"
             )
-        lines = dict.fromkeys(
-            line.strip() for line in str(error).splitlines() if line
-        )  # once, in a circle
+        # each once: a circle of includes has them many times
+        lines = dict.fromkeys(line.strip() for line in str(error).splitlines() if line)
         text = '; '.join(lines)
         missing = _MISSING_ARG.search(text)
         if missing:

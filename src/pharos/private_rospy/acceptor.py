@@ -52,9 +52,8 @@ class Acceptor:
         self._handshakes = {}  # socket -> since when; the longest first
         self._is_crowded = False  # and the log says so
         self._limits = node.limits
-        self._rejections = collections.deque(
-            maxlen=node.limits.rejection_lines
-        )  # when the last were logged
+        # when the last were logged
+        self._rejections = collections.deque(maxlen=node.limits.rejection_lines)
         self._not_logged = 0  # since then
 
     def accept(self, listener, serve):

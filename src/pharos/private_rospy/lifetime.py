@@ -34,11 +34,15 @@ class ProgramCutOff(SystemExit):
     """Ends a thread of a program that goes on when the time that it has after the stop is up."""
 
 
-@contextlib.contextmanager
 def on_nobodys_behalf():
     """Within this, what waits in this thread ends with no node, whose thread it may be."""
+    return _on_behalf_of(None)
+
+
+@contextlib.contextmanager
+def _on_behalf_of(lifetime):
     before = getattr(_thread, 'lifetime', None)
-    _thread.lifetime = None
+    _thread.lifetime = lifetime
     try:
         yield
     finally:
@@ -149,16 +153,10 @@ class Lifetime:
                 raise
             hook(threading.ExceptHookArgs([*sys.exc_info(), threading.current_thread()]))
 
-    @contextlib.contextmanager
     def interrupts_waits(self):
         """Within this, what waits in this thread does so on behalf of the node, and ends with
         it."""
-        before = getattr(_thread, 'lifetime', None)
-        _thread.lifetime = self
-        try:
-            yield
-        finally:
-            _thread.lifetime = before
+        return _on_behalf_of(self)
 
     def begin_shutdown(self):
         """Begin the stop: all that waits on behalf of the node ends."""
