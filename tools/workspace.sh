@@ -37,6 +37,11 @@ quietly() {
   return 1
 }
 
+# free_port: prints a port of the loopback's that nobody has.
+free_port() {
+  python3 -c 'import socket; s = socket.socket(); s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])'
+}
+
 # install_packages NAME...: those that are missing; nothing is asked of the network where none is.
 install_packages() {
   local installed package missing=()

@@ -53,7 +53,7 @@ class Rate:
         if self.rate:
             found += f' ({number_text(self.min)} to {number_text(self.max)} s apart'
             found += f', std dev {number_text(self.std_dev)} s)'
-        return f'{found}, {_counted(self)}'
+        return f'{found}, {_basis(self)}'
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Bandwidth:
             if self.min != self.max:
                 found += f', {size_text(self.min)} to {size_text(self.max)}'
             found += ')'
-        return f'{found}, {_counted(self)}'
+        return f'{found}, {_basis(self)}'
 
 
 def hz(topic: Topic, seconds: float) -> Rate:
@@ -211,7 +211,7 @@ def _show(message: genpy.Message) -> None:
     Transcript.show(f'{text_of_message(message)}\n---')
 
 
-def _counted(result: Any) -> str:
+def _basis(result: Any) -> str:
     """How many messages a Rate or Bandwidth is of, and what to keep in mind of that."""
     count = counted(result.window, 'message') if result.window else 'no messages'
     words = [count, f'in {number_text(result.seconds)} s']
