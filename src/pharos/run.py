@@ -11,6 +11,7 @@ from pharos.channel import InputChannel
 from pharos.errors import MessageTypeError, NodeStoppedError
 from pharos.external_node import ExternalNode
 from pharos.health import told
+from pharos.intraprocess import common_thread
 from pharos.intraprocess.dispatcher import Dispatcher
 from pharos.intraprocess.fanout import Latch
 from pharos.lifecycle import Lifecycle
@@ -66,7 +67,9 @@ class Run:
         self.restart: Optional[Restart] = None
         descriptors.check_left(settings.name)
         self.rospy = PrivateRospy(settings, self._stop_for_ros, lambda: node.allow_remote_shutdown)
-        self.dispatcher = Dispatcher(self.rospy.start_thread)
+        self.dispatcher = Dispatcher(
+            self.rospy.start_thread, on_behalf=self.rospy.lifetime.run_on_behalf
+        )
         self.rospy.on_received = self.dispatcher.run
         self.rospy.on_failure = self._hook_failed
         self.rospy.refusals.on_refused = self._report_refusal
@@ -144,6 +147,8 @@ class Run:
                     ends.callback(end, *limit)
         finally:
             self._become(Lifecycle.STOPPED)
+            if not node_registry.nodes():
+                common_thread.end()
             memory.collect(len(node_registry.nodes()))
             watcher_of(self.node.master).check()
 
@@ -220,7 +225,8 @@ class Run:
         """Whether a stop() of the node may have to wait for this thread."""
         if self.is_starting:
             return self._starter == threading.get_ident()
-        return threading.current_thread() in self.rospy.lifetime.threads
+        is_nodes = threading.current_thread() in self.rospy.lifetime.threads
+        return is_nodes or self.dispatcher.is_run_elsewhere_here()
 
     def _stop_for_ros(self, reason: str) -> None:
         attempt(lambda: self.node.log(f'stops: {reason}'))

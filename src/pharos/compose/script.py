@@ -124,6 +124,7 @@ class ScriptRun(Run):
 
     def __init__(self, node: ScriptNode, settings: Any) -> None:
         super().__init__(node, settings)
+        self.dispatcher.keep_to_thread()
         self.exit_code: Optional[int] = None
         self._process = os.getpid()
         self.is_registered = False

@@ -1,12 +1,12 @@
 """Runs the delegates of one node, one at a time, and hands messages to it quickly.
 
-A node's delegates run in one of two threads: in the thread that brings the message (a TCPROS
-connection's, where the delegate is fast, or the publisher's where a channel is inline), or in the
-node's dispatcher thread. No one who brings a message waits for a busy node: what comes meanwhile
-waits in its inbox for whoever is running the node. So no wiring deadlocks or recurses. (The
-``close()`` of a channel and the ``retry()`` of a failure do wait for the delegate that runs.) Nor
-does a thread run a node for long because others bring messages: those it leaves to the dispatcher
-thread.
+A node's delegates run in the thread that brings the message (a TCPROS connection's, where the
+delegate is fast, or the publisher's where a channel is inline), in the node's dispatcher thread, or
+where they are fast in the common one (see :mod:`~.common_thread`). No one who brings a message
+waits for a busy node: what comes meanwhile waits in its inbox for whoever is running the node. So
+no wiring deadlocks or recurses. (The ``close()`` of a channel and the ``retry()`` of a failure do
+wait for the delegate that runs.) Nor does a thread run a node for long because others bring
+messages: those it leaves to the dispatcher thread.
 """
 import collections
 import threading
@@ -24,6 +24,11 @@ YIELD_LIMIT = 1e-3
 CLOSED_INTERVAL = 0.1
 # seconds for which a thread that brings a message also runs what others bring meanwhile
 COURTESY = 1e-3
+# A turn of the dispatcher thread that takes so many seconds, from its waking on, is slow.
+FAST_TURN = 1e-3
+# A thread that runs others, too, may run a node with so much credit: each turn that is not slow adds
+# one, up to a limit, and a slow one takes ten, so that one of ten may be, as on a busy machine.
+FAST_CREDIT, MAX_CREDIT, SLOW_COST = 30, 40, 10
 
 # identifier of a thread -> the dispatcher in which it waits for its turn; guarded by the lock, so
 # that of threads that wait for one another one alone gives up
@@ -32,7 +37,7 @@ _looking = threading.Lock()
 
 
 class Runnable(Protocol):
-    """What a dispatcher runs: an inbox."""
+    """What a dispatcher runs: an inbox, or another dispatcher."""
 
     def run_next(self) -> bool:
         """Deliver the oldest message, if there is one; returns whether there was, and raises nothing."""
@@ -43,13 +48,24 @@ class Dispatcher:
     are inline or came through a socket, :meth:`wake` for others if the thread is :attr:`idle`.
 
     :param start_thread: ``start_thread(target, name=name)``
+    :param on_behalf: ``on_behalf(run, name)`` calls ``run()`` in another thread than the node's as if
+        it were that; None: no thread that runs other nodes, too, is to run this one
     """
 
-    def __init__(self, start_thread: Callable[..., Any], name: str = 'dispatcher') -> None:
+    def __init__(
+        self,
+        start_thread: Callable[..., Any],
+        name: str = 'dispatcher',
+        on_behalf: Optional[Callable[[Callable[[], Any], str], Any]] = None,
+    ) -> None:
         self.inline: Deque[Runnable] = collections.deque()  # that whoever comes by may run
         self.scheduled: Deque[Runnable] = collections.deque()  # for the dispatcher thread
         self.idle = False  # whether that thread waits for inboxes
         self.is_yielded_to = True  # whether publishers that wake it let it run before they go on
+        self.is_fast = False  # whether a thread that runs others, too, may run it
+        self._on_behalf = on_behalf
+        self._credit = 0  # for turns that were fast
+        self._is_elsewhere = False  # whether such a thread runs it, for whose delegate a stop waits
         self._running = threading.Lock()  # held by the thread that runs delegates,
         self._runner: Optional[int] = None  # which is this one, by its identifier
         self._start_thread, self._name = start_thread, name
@@ -168,7 +184,7 @@ class Dispatcher:
     def need_thread(self) -> None:
         """Have the dispatcher thread, from the first channel on that is not inline."""
         if self._thread_claim.acquire(blocking=False):
-            self._start_thread(self._loop, name=self._name)
+            self._start_thread(self._run_thread, name=self._name)
 
     def schedule(self, inbox: Runnable) -> None:
         """Have the dispatcher thread run an inbox."""
@@ -187,21 +203,70 @@ class Dispatcher:
         busy publisher."""
         self._awake_signal.acquire(True, YIELD_LIMIT)
 
+    def keep_to_thread(self) -> None:
+        """Have no thread that runs other nodes, too, run this one."""
+        self._on_behalf = None
+
+    def run_next(self) -> bool:
+        """Run what is scheduled, in the thread of another dispatcher; raises nothing."""
+        begun = time.perf_counter()
+        try:
+            assert self._on_behalf
+            self._on_behalf(self._run_scheduled, self._name)
+        finally:
+            self._note_turn(time.perf_counter() - begun)
+            self.idle = True
+            # what came meanwhile, also for a thread that found the node busy
+            if self.scheduled or self.inline:
+                self._leave_to_thread()
+        return True
+
+    def _run_scheduled(self) -> None:
+        """Run a message of each inbox that is scheduled, unless another thread is running the
+        node."""
+        if not self._running.acquire(False):
+            return
+        self._runner, self._is_elsewhere = get_ident(), True
+        try:
+            for _ in range(len(self.scheduled)):
+                if self._closed:
+                    return
+                self.scheduled.popleft().run_next()
+        except IndexError:
+            pass  # close() cleared it, or the node's own thread takes them
+        finally:
+            self._runner, self._is_elsewhere = None, False
+            self._running.release()
+
+    def is_run_elsewhere_here(self) -> bool:
+        """Whether this thread runs a delegate in the place of the node's own thread."""
+        return self._is_elsewhere and self.is_run_here()
+
+    def _run_thread(self) -> None:
+        self._loop()
+        if self._is_elsewhere:
+            with self._running:
+                pass  # who waits for this thread waits for the delegate
+
     def _loop(self) -> None:
         scheduled, inline = self.scheduled, self.inline
         acquire, release = self._running.acquire, self._running.release  # ``with`` costs more
         me = get_ident()
+        begun: Optional[float] = None  # when the turn began, where its length matters
         while True:
             try:
                 inbox = scheduled.popleft()
             except IndexError:
                 if self._closed or self._finishing:
                     return
+                if begun is not None:
+                    self._note_turn(time.perf_counter() - begun)
                 self.idle = True
                 if not (scheduled or self._closed or self._finishing):
                     self._wake_signal.acquire()
                     _release(self._awake_signal)
                 self.idle = False
+                begun = None if self.is_fast or not self._on_behalf else time.perf_counter()
                 continue
             acquire()
             self._runner = me
@@ -215,6 +280,13 @@ class Dispatcher:
             if inline:
                 self.run()
 
+    def _note_turn(self, seconds: float) -> None:
+        if seconds < FAST_TURN:
+            self._credit = min(self._credit + 1, MAX_CREDIT)
+        else:
+            self._credit = max(self._credit - SLOW_COST, 0)
+        self.is_fast = self._credit >= FAST_CREDIT and not self._closed
+
     def finish(self) -> None:
         """End the thread when all that is scheduled has run."""
         self._finishing = True
@@ -222,7 +294,9 @@ class Dispatcher:
 
     def close(self) -> None:
         """Forget what has not run, and end the thread; a delegate that runs goes on to its end."""
-        self._closed = True
+        self._closed, self.is_fast = True, False
+        if self.is_run_here():
+            self._is_elsewhere = False  # its delegate ends the node, and nobody waits for that one
         self.inline.clear()
         self.scheduled.clear()
         self.wake()

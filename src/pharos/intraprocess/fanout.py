@@ -16,7 +16,7 @@ from typing import (
 
 import genpy
 
-from pharos.intraprocess import sharing
+from pharos.intraprocess import common_thread, sharing
 from pharos.intraprocess.copier import Frozen, copier_for
 from pharos.intraprocess.dispatcher import BURST_INTERVAL, Dispatcher
 from pharos.intraprocess.inbox import Inbox
@@ -200,16 +200,18 @@ class Fanout:
 
     def _wake(self, dispatchers: List[Dispatcher]) -> None:
         """Wake those that are idle, and let them have the interpreter, but not within a burst."""
-        woken = None
+        last, self._last_wake = self._last_wake, _clock()
+        yields = self._last_wake - last > BURST_INTERVAL
+        common = common_thread.take(dispatchers) if yields and len(dispatchers) > 1 else None
+        woken: Optional[Dispatcher] = None
         for dispatcher in dispatchers:
             if dispatcher.idle:
                 dispatcher.wake()
                 if dispatcher.is_yielded_to:
                     woken = dispatcher
-        if woken is not None:
-            last, self._last_wake = self._last_wake, _clock()
-            if self._last_wake - last > BURST_INTERVAL:
-                woken.yield_gil()
+        woken = common or woken
+        if yields and woken is not None:
+            woken.yield_gil()
 
     def run(self) -> None:
         """Run the delegates that are inline, without the lock, which others may wait for."""

@@ -129,6 +129,18 @@ class Lifetime:
         thread.start()
         return thread
 
+    def run_on_behalf(self, job, name):
+        """Call ``job()`` in this thread, which is the process's, as in one of that name of the
+        node's."""
+        thread = threading.current_thread()
+        process_name, thread.name = thread.name, f'{self.name} {name}'
+        _thread.lifetime = self
+        try:
+            job()
+        finally:
+            _thread.lifetime = None
+            thread.name = process_name
+
     def makes_daemons(self):
         """Whether threads that this one makes are daemons, unless they are told otherwise."""
         maker = threading.current_thread()
