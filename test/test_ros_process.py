@@ -94,12 +94,22 @@ def test_an_unknown_package_or_program_is_said(master, package):
         UnknownNodeError, match="fake_robot has no program 'listener'.*rosrun fake_robot <Tab>"
     ):
         master.run('fake_robot', 'listener')
-    with pytest.raises(UnknownNodeError, match="topic_tools has no program 'relai'"):
+    with pytest.raises(UnknownNodeError, match="topic_tools has no program 'relai': see"):
         master.run('topic_tools', 'relai')
     with pytest.raises(UnknownNodeError, match="no ROS package 'no_such_robot'"):
         master.launch('no_such_robot', 'a.launch')
     with pytest.raises(UnknownNodeError, match="fake_robot has no launch file 'b.launch': is it"):
         master.launch('fake_robot', 'b.launch')
+
+
+@pytest.mark.parametrize('start', ['run', 'load'])
+def test_a_program_that_may_not_be_executed_is_said(master, package, start):
+    write(package / 'nodes' / 'listener.py', '#!/usr/bin/python3', 0o644)
+    with pytest.raises(
+        UnknownNodeError,
+        match=r"no program 'listener.py', but .* not executable: chmod \+x /.*nodes/listener.py$",
+    ):
+        getattr(master, start)('fake_robot', 'listener.py')
 
 
 @pytest.mark.parametrize(

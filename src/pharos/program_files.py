@@ -20,10 +20,11 @@ def find(package: str, executable: str) -> List[str]:
     with _known(package, executable):
         paths = _find(package, executable)
     if not paths:
-        raise UnknownNodeError(
-            f'the ROS package {package} has no program {executable!r}: see what it has with rosrun'
-            f' {package} <Tab>'
-        )
+        what = f': see what it has with rosrun {package} <Tab>'
+        with contextlib.suppress(rospkg.ResourceNotFound):  # it has no package.xml, as in _find
+            for file in roslib.packages.find_resource(package, executable):
+                what = f', but a file of that name, which is not executable: chmod +x {file}'
+        raise UnknownNodeError(f'the ROS package {package} has no program {executable!r}{what}')
     return paths
 
 
