@@ -94,7 +94,18 @@ def test_its_tests_pass_in_the_clone_with_nothing_built(made):
     package, _ = made
     status, printed = run(sys.executable, '-m', 'pytest', '-q', 'test', cwd=package)
     assert status == 0, printed
-    assert '2 passed' in printed
+    assert re.search('^2 passed in ', printed, re.MULTILINE), printed  # and no warnings
+
+
+def test_a_test_may_be_added_to_its_own_that_is_written_as_that_of_the_readme(made, tmp_path):
+    package = shutil.copytree(made[0], tmp_path / 'my_robot')
+    (block,) = re.findall(
+        '```python\n(def test_.*?)```', (ROOT / 'README.md').read_text(), re.DOTALL
+    )
+    test = package / 'test' / 'test_readme.py'
+    test.write_text(f'from pharos import BlockNode\n\n\n{block}')
+    status, printed = run(sys.executable, '-m', 'pytest', '-q', test, cwd=package)
+    assert status == 0, printed
 
 
 def test_its_node_follows_its_parameter(made, master, monkeypatch):
@@ -168,6 +179,7 @@ def test_help_says_what_it_is_for_and_how_it_is_called(tmp_path):
     status, printed = run(SCRIPT, '--help', cwd=tmp_path)
     assert status == 0
     assert 'rosrun pharos create_package my_robot --node camera controller' in printed
+    assert 'two letters or more' in ' '.join(printed.split())
 
 
 # -- who maintains it

@@ -261,6 +261,11 @@ def expect_failures() -> None:
     _factories[-1].expect_failures()
 
 
+def pytest_configure(config: 'pytest.Config') -> None:
+    """Have pytest say nothing of a name of Python 2's by which rospy itself calls ``threading``."""
+    config.addinivalue_line('filterwarnings', 'ignore:notifyAll:DeprecationWarning')
+
+
 @pytest.fixture
 def create_node(master: Master) -> Iterator[NodeFactory]:
     """``create_node(node_class, name=None, **kwargs)`` makes and starts a node, which is stopped

@@ -152,7 +152,13 @@ import sys
 # the tests run in a clone where nothing is built, too
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parent.parent / 'src'))
 
-from pharos.testing import create_node, expect_failures, master  # noqa: E402, F401
+from pharos.testing import (  # noqa: E402, F401
+    create_node,
+    expect_failures,
+    mailbox,
+    master,
+    pytest_configure,
+)
 '''
 
 TEST = '''\
