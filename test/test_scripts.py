@@ -47,6 +47,14 @@ def test_a_scripts_messages_arrive(master):
         assert mailbox.next().data == 'hello from /greeter'
 
 
+def test_a_script_shows_how_many_topics_it_has_for_it_has_no_channels(master, mailbox):
+    create(master, '/hearer').interested_in('/chatter', 'std_msgs/String', mailbox)
+    with master.load(TALKER, name='greeter') as script:
+        mailbox.next()
+        assert '/greeter running, 1 topic: ' in repr(script)
+    assert repr(script) == '<ScriptNode /greeter stopped>'
+
+
 def test_a_script_without_a_name_given_has_its_own(master):
     with master.load(WORKER, None, 'spin') as node:
         assert node.name == '/worker'

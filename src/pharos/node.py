@@ -272,10 +272,10 @@ class Node(NodeWithTopics, is_base=True):
 
     def __repr__(self) -> str:
         health = f': {health_of(self, ask=False)}' if self.is_running else ''
-        return (
-            f'<{type(self).__name__} {self.name} {self.lifecycle.value},'
-            f' {counted(len(self.channels), "channel")}{health}>'
-        )
+        return f'<{type(self).__name__} {self.name} {self.lifecycle.value}{self._size()}{health}>'
+
+    def _size(self) -> str:
+        return f', {counted(len(self.channels), "channel")}'
 
 
 class BlockNode(Node):

@@ -25,7 +25,9 @@ def read_arguments(words: List[str]) -> argparse.Namespace:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument('name', metavar='NAME', help='the package: two letters or more; small letters, digits and _')
+    parser.add_argument(
+        'name', metavar='NAME', help='the package: two letters or more; small letters, digits and _'
+    )
     parser.add_argument(
         '--node',
         nargs='+',

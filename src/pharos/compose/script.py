@@ -11,6 +11,7 @@ from pharos import node_registry, signals, working_directory
 from pharos.blocks import attempt
 from pharos.compose.output import redirect
 from pharos.compose.programs import check_source, find_program, source_of
+from pharos.counts import counted
 from pharos.errors import NodeStoppedError, PharosError
 from pharos.lifecycle import Lifecycle
 from pharos.node import Node
@@ -111,6 +112,14 @@ class ScriptNode(Node):
             if not node_registry.wait_until(has_ended, timeout):
                 raise TimeoutError(f'{self.name} has not ended within {timeout:g} s: stop() it')
         return self.exit_code
+
+    def _size(self) -> str:
+        if not self.is_running:
+            return ''
+        rospys = self.latest_run.rospy.topics
+        topics = {name for name, _ in rospys.get_publications() + rospys.get_subscriptions()}
+        topics -= {'/rosout'}  # each program has it
+        return f', {counted(len(topics), "topic")}'
 
 
 class ScriptRun(Run):
