@@ -1,6 +1,7 @@
 """What those who know rospy, or read no manual, try first: it works, or the error says what to write."""
 import dataclasses
 import re
+import sys
 
 import pytest
 
@@ -142,6 +143,25 @@ def test_a_stop_that_does_not_call_super_stops_the_node(master):
     node.stop()
     assert not master.is_node_alive('/silent')
     assert node.lifecycle is pharos.Lifecycle.STOPPED
+
+
+@pytest.mark.parametrize(
+    'use, said',
+    [
+        (lambda node: node.interested_in('/t', spam=1), 'Node.interested_in'),
+        (lambda node: node.send_to(), 'Node.send_to'),
+        (lambda node: node.fork(spam=1), 'Node.fork'),
+        (lambda node: node.renew(1), 'Node.renew'),
+        (lambda node: node.log(), 'Node.log'),
+        (lambda node: node.parameter(), 'Node.parameter'),
+        (lambda node: node.master.lookup_service(), 'Master.lookup_service'),
+        (lambda node: node.master.topic_types(1), 'Master.topic_types'),
+    ],
+)
+@pytest.mark.skipif(sys.version_info < (3, 10), reason='Python names no class before')
+def test_what_python_complains_of_a_method_names_the_class_that_users_know(master, use, said):
+    with pytest.raises(TypeError, match=fr'^{said}\(\) '):
+        use(create(master))
 
 
 # -- names that rospy has, and ROS 2

@@ -30,7 +30,7 @@ from pharos.ros_process import RosProcess
 from pharos.seconds import check_limit
 from pharos.topic import Topic
 from pharos.watcher import watcher_of
-from pharos.wrong_guesses import tells_keywords
+from pharos.wrong_guesses import names_its_methods, tells_keywords
 
 if TYPE_CHECKING:
     from typing_extensions import ParamSpec  # part of typing since Python 3.10
@@ -43,6 +43,7 @@ NodeType = TypeVar('NodeType', bound=Node)
 AnyNode = Union[Node, ExternalNode]
 
 
+@names_its_methods
 class Master(MasterServices):
     """The proxy of a ROS master: creates nodes, and finds others.
 

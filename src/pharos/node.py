@@ -13,12 +13,13 @@ from pharos.run import Run
 from pharos.seconds import check_seconds
 from pharos.service import Service
 from pharos.starts import of_one_run
-from pharos.wrong_guesses import tells_keywords
+from pharos.wrong_guesses import names_its_methods, tells_keywords
 
 
 Self = TypeVar('Self', bound='Node')
 
 
+@names_its_methods
 class Node(NodeWithTopics, is_base=True):
     """A ROS node of this process: made by :meth:`Master.create`, subclassed to override
     :meth:`start` and :meth:`stop`.

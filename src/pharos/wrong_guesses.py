@@ -85,7 +85,17 @@ _KEYWORDS: Dict[str, List[str]] = {
     'from_': ['sender', 'node'],
     'seconds': ['period', 'duration', *_RATES],
 }
+Class = TypeVar('Class', bound=type)
 Function = TypeVar('Function', bound=Callable[..., Any])
+
+
+def names_its_methods(cls: Class) -> Class:
+    """Class decorator: what Python complains of a call of a method, it says of this class, which
+    users know, and not of that among its bases which has the method."""
+    for name, method in inspect.getmembers(cls, inspect.isfunction):
+        for function in method, inspect.unwrap(method):
+            function.__qualname__ = f'{cls.__name__}.{name}'
+    return cls
 
 
 def tells_keywords(function: Function) -> Function:
