@@ -75,10 +75,10 @@ def parameter_arguments(path: str, parameters: Dict[str, Any]) -> List[str]:
     :param path: the program's
     :raises ValueError: if a value would become another one
     """
-    texts = {}
+    texts, is_python = {}, _is_python(path)
     for name, value in parameters.items():
-        texts[name] = text = _as_yaml(value) if _is_python(path) else str(value)
-        if not (_is_python(path) or _survives_roscpp(value)) or rosgraph.names.REMAP in text:
+        texts[name] = text = _as_yaml(value) if is_python else str(value)
+        if not (is_python or _survives_roscpp(value)) or rosgraph.names.REMAP in text:
             raise ValueError(
                 f'the parameter {name} of {path} cannot be given as {value!r}: on a command line it'
                 ' would become something else. Give the program a name=, and it is set on the'

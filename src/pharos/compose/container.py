@@ -14,8 +14,6 @@ from pharos.node import Node
 if TYPE_CHECKING:
     from pharos.compose.composition import Composition
 
-SERVICES = 'load_nodelet', 'unload_nodelet', 'list'
-
 
 class Container(Node):
     """Loads programs into a composition, as nodelet's manager does nodelets: ``nodelet load

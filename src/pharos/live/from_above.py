@@ -29,7 +29,7 @@ class ViewFromAbove:
         low, high = points.min(axis=0), points.max(axis=0)
         extent = max(*(high - low), 0.1)
         self._scale = (SIZE - 2 * BORDER) / extent  # pixels a metre
-        self._low, self._high = low, high
+        self._low = low
         width, height = (int(side * self._scale) + 2 * BORDER for side in high - low)
         self.image = Image.new('RGB', (max(width, SIZE // 3), max(height, SIZE // 4)), 'white')
         self.draw = ImageDraw.Draw(self.image)

@@ -21,6 +21,8 @@ from pharos.probe import Look
 from pharos.seconds import check_seconds
 
 TIMEOUT = 1.0  # seconds that all nodes have to answer
+# what a process does, as its nodes do it
+_SUMMED = 'received', 'sent', 'bytes_received', 'bytes_sent', 'dropped', 'failures'
 
 
 @dataclasses.dataclass(frozen=True)
@@ -194,13 +196,7 @@ class Meter:
                     host=host.name,
                     nodes=[row.name for row in own],
                     **self._usage(process.pid if host.is_here else None),
-                    **{
-                        field: _sum(getattr(row, field) for row in own)
-                        for field in (
-                            *('received', 'sent', 'bytes_received', 'bytes_sent'),
-                            *('dropped', 'failures'),
-                        )
-                    },
+                    **{field: _sum(getattr(row, field) for row in own) for field in _SUMMED},
                 )
         self._processes = {pid: each for pid, each in self._processes.items() if pid in here}
 
