@@ -81,6 +81,21 @@ def test_it_tells_how_far_it_has_come_and_what_has_become_of_each(compose):
     assert printed[-4:] == ['/talker: stopped', *(f'{name}: did not start' for name in failed)]
 
 
+def test_it_says_which_nodes_run_apart_and_why(master, compose):
+    chosen = '--only', 'talker', 'relay', 'shell', 'prefixed', 'own_nodes', 'again'
+    program = compose('composed_robot', 'robot.launch', 'robot:=r2', *chosen, '--apart', 'again')
+    program.wait_for('starting 1 of 1: /r2/talker')
+    lines = [line for line in program.printed if line.startswith('run apart: ')]
+    assert lines == [
+        'run apart: /r2/relay, /shell (not written in Python, or for another one than this)\n',
+        'run apart: /prefixed (with a launch-prefix)\n',
+        'run apart: /own_nodes (programs that use pharos make their nodes themselves; for one process'
+        ' with all of them, write a program that makes these beside master.compose(), as'
+        ' doc/compose.md says)\n',
+        'run apart: /again (as asked for)\n',
+    ]
+
+
 def test_it_ends_when_all_nodes_have_ended(master, compose):
     program = compose('--script', 'composed_robot/talker', 'composed_robot/no_such_program')
     program.wait_for("composed_robot has no program 'no_such_program'")
@@ -111,7 +126,7 @@ def test_a_program_that_is_no_node_is_told_as_such(compose, tmp_path):
 def test_a_script_that_makes_its_nodes_itself_is_a_process_of_its_own(master, compose):
     own = 'composed_robot/own_nodes'
     program = compose('--script', own, 'composed_robot/talker')
-    program.wait_for(f'{own} makes its nodes itself, with pharos: it runs apart')
+    program.wait_for(f'run apart: {own} (programs that use pharos make their nodes themselves;')
     program.wait_for('started /talker')
     pid = master.wait_for_node('/own_node', TIMEOUT).pid
     assert pid != program.process.pid

@@ -15,6 +15,7 @@ from pharos.compose.apart import Apart, ApartNodes
 from pharos.compose.kept_node import KeptNode
 from pharos.compose.launch_file import LaunchedNode, LaunchFile, Problem
 from pharos.compose.output import SCREEN
+from pharos.compose.programs import MAKES_NODES
 from pharos.compose.progress import Progress
 from pharos.compose.script import ScriptNode
 from pharos.counts import counted
@@ -79,6 +80,7 @@ class Composition:
             if problem.ends_all:
                 return self.end_because(f'{problem.name}, which is required, cannot be started')
         if file.apart:
+            self.progress.apart(file.reasons)
             self._apart.append(ApartNodes(self, file.config_apart()))
         logs = os.path.join(rospkg.get_log_dir(env=os.environ), run_id)
         for folder in logs, rospkg.get_ros_home():  # roslaunch makes them, too
@@ -111,7 +113,7 @@ class Composition:
 
     def run_apart(self, launched: LaunchedNode) -> None:
         """Run a program that makes its nodes itself in a process of its own."""
-        self.progress.tell(f'{launched.program} makes its nodes itself, with pharos: it runs apart')
+        self.progress.apart({MAKES_NODES: [launched.program]})
         command = [sys.executable, launched.path, *launched.args]
         self._apart.append(Apart(self, [launched.program], command))
 

@@ -30,7 +30,7 @@ import rospkg
 from roslaunch.substitution_args import SubstitutionException
 
 from pharos import working_directory
-from pharos.compose.programs import uses_pharos
+from pharos.compose.programs import MAKES_NODES, uses_pharos
 from pharos.errors import PharosError, UnknownNodeError, suggest
 from pharos.parameters import as_stored
 from pharos.program_files import AnyPath, find_launch_file
@@ -156,6 +156,8 @@ class LaunchFile:
         self.here: List[LaunchedNode] = []
         #: roslaunch's nodes, for processes of their own
         self.apart: List[Any] = []
+        #: why they are to have these, with the names of those for which it is so
+        self.reasons: Dict[str, List[str]] = {}
         #: those that nobody can start
         self.problems: List[Problem] = []
         for name, node in named.items():
@@ -216,7 +218,7 @@ class LaunchFile:
     def _sort(self, name: str, node: Any, is_kept_apart: bool) -> None:
         is_local = roslaunch.core.is_machine_local(node.machine)
         if not is_local:
-            self.apart.append(node)
+            self._put_apart(name, node, 'on another machine')
             return
         try:
             command = _command(node)
@@ -231,14 +233,13 @@ class LaunchFile:
                 )
             self.problems.append(Problem(name, node.filename, why))
             return
-        needs_own_folder = node.cwd is not None and not working_directory.is_possible()
-        is_kept_apart = is_kept_apart or bool(node.launch_prefix) or needs_own_folder
-        if is_kept_apart or not _runs_here(command[0]):
+        reason = 'as asked for' if is_kept_apart else _reason(command[0], node)
+        if reason:
             why = _lacks(command[0], node)
             if why:
                 self.problems.append(Problem(name, node.filename, why, bool(node.required)))
             else:
-                self.apart.append(node)
+                self._put_apart(name, node, reason)
             return
         self.here.append(
             LaunchedNode(
@@ -254,6 +255,10 @@ class LaunchFile:
                 file=node.filename,
             )
         )
+
+    def _put_apart(self, name: str, node: Any, reason: str) -> None:
+        self.apart.append(node)
+        self.reasons.setdefault(reason, []).append(name)
 
     def set_parameters(self, run_id: str) -> None:
         """Run what is to run before (rosparam's delete and dump), clear and set the parameters.
@@ -335,9 +340,15 @@ def _lacks(path: str, node: Any) -> str:
     return f'the first line of {path} names {named[0]}, which is not there'
 
 
-def _runs_here(path: str) -> bool:
-    """Whether a program is Python's, for this interpreter, as its first line says."""
-    return any(map(_is_python, _interpreter(path))) and not uses_pharos(path)
+def _reason(path: str, node: Any) -> str:
+    """Why a node of this host cannot be one of this process; empty where it can."""
+    if node.launch_prefix:
+        return 'with a launch-prefix'
+    if node.cwd is not None and not working_directory.is_possible():
+        return 'with a cwd, which all nodes of a process share on this system'
+    if not any(map(_is_python, _interpreter(path))):
+        return 'not written in Python, or for another one than this'
+    return MAKES_NODES if uses_pharos(path) else ''
 
 
 def _is_python(word: str) -> bool:

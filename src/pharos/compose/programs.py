@@ -15,6 +15,11 @@ _WRAPPER = re.compile(
 )
 #: a program of ours makes its nodes itself: within another one they would not end with it
 _USES_PHAROS = re.compile(rb'^\s*(from|import) pharos\b', re.MULTILINE)
+#: why it runs apart, and what to do
+MAKES_NODES = (
+    'programs that use pharos make their nodes themselves; for one process with all of them, write'
+    ' a program that makes these beside master.compose(), as doc/compose.md says'
+)
 _ELF = b'\x7fELF'  # how compiled programs begin
 
 

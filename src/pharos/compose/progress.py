@@ -1,6 +1,6 @@
 """What a composition tells of itself while it starts, runs and ends."""
 import threading
-from typing import TYPE_CHECKING, List, Optional, TextIO
+from typing import TYPE_CHECKING, List, Mapping, Optional, TextIO
 
 from pharos.transcript import Transcript
 
@@ -12,6 +12,9 @@ _CLEAR = '\r\033[K'  # what takes the line away that a terminal shows
 
 class Progress:
     """Tells what goes wrong, by the :data:`Transcript`."""
+
+    def apart(self, reasons: Mapping[str, List[str]]) -> None:
+        """Nodes or programs, by the reason for it, start as processes of their own."""
 
     def starts(self, name: str, number: int, count: int) -> None:
         """A node, the so-manieth of so many, starts."""
@@ -55,6 +58,11 @@ class PrintedProgress(Progress):
         self._lock = threading.Lock()
         self._line: Optional[str] = None  # that the terminal shows, to be drawn over
         self._place = ''
+
+    def apart(self, reasons: Mapping[str, List[str]]) -> None:
+        """See :class:`Progress`."""
+        for reason, names in reasons.items():
+            self.tell(f"run apart: {', '.join(names)} ({reason})")
 
     def starts(self, name: str, number: int, count: int) -> None:
         """See :class:`Progress`."""
