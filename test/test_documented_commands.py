@@ -144,6 +144,13 @@ def file_name(block):
     return named[1] if named else ''
 
 
+def write_files(page, folder):
+    """Put the files of a page there."""
+    for block in blocks():
+        if block.page == page and file_name(block):
+            (folder / file_name(block)).write_text(block.text)
+
+
 def python_of(page):
     return [block for block in blocks() if block.page == ROOT / page and block.kind == 'python']
 
@@ -295,9 +302,7 @@ def test_a_command_runs(block, line, master, robot, tmp_path):
     log = tmp_path / 'log'
     folder = tmp_path / 'folder'
     folder.mkdir()
-    for each in blocks():
-        if each.page == block.page and file_name(each):
-            (folder / file_name(each)).write_text(each.text)
+    write_files(block.page, folder)
     variables = {'ROS_HOME': str(tmp_path), 'PATH': DEBIANS}
     if 'create_package' in line:
         variables['ROS_PACKAGE_PATH'] = str(ROOT)  # there is no package of that name yet
@@ -379,8 +384,9 @@ def test_three_lines_run(block, master, monkeypatch, tmp_path):
     ids=identify,
 )
 def test_a_program_prints_something_until_it_is_told_to_end(block, master, tmp_path):
+    write_files(block.page, tmp_path)
     (tmp_path / 'program.py').write_text(block.text)
-    with Program(master.url, '/usr/bin/python3', str(tmp_path / 'program.py')) as program:
+    with Program(master.url, '/usr/bin/python3', 'program.py', cwd=tmp_path) as program:
         program.wait_for('')
         assert program.end() == 0
     assert 'Traceback' not in program.read_to_the_end()
