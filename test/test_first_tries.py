@@ -7,7 +7,7 @@ import pytest
 
 from helpers import create
 import pharos
-from pharos import BlockNode, Node, wrong_guesses
+from pharos import BlockNode, Node, PharosError, program, wrong_guesses
 from pharos.testing import Mailbox, until
 from std_msgs.msg import String
 from std_srvs.srv import Empty
@@ -293,6 +293,11 @@ def test_a_field_that_a_block_reads_in_vain_is_told_by_those_that_there_are(mast
         ),
         (lambda node: node.interested_in('/t', STRING, inline='no'), "inline is True .* not 'no'"),
         (lambda node: node.interested_in('/t', STRING, shared=5), 'shared is True .* not 5'),
+        (lambda node: node.interested_in('/t', STRING, Mailbox), 'not the class .*give Mailbox'),
+        (lambda node: setattr(node, 'soul', BlockNode), 'a soul is a function.* not the class'),
+        (lambda node: node.master.load('/x/y.py', 'z'), "'/x/y.py' is a path, and no ROS package"),
+        (lambda node: node.master.run('/bin/ls', '-l'), "'/bin/ls' is a path, and no ROS package"),
+        (lambda node: program.run('arm', None), "program.run.'name', main. .* None is none"),
         (lambda node: node.master.uri_of(None), 'a node name is a string, not None'),
         (
             lambda node: node.ros_import('tf2_ros/Buffer'),
@@ -302,7 +307,7 @@ def test_a_field_that_a_block_reads_in_vain_is_told_by_those_that_there_are(mast
     ],
 )
 def test_a_value_in_another_one_s_place_is_told(master, use, said):
-    with pytest.raises((ValueError, TypeError, AttributeError), match=said):
+    with pytest.raises((ValueError, TypeError, AttributeError, PharosError), match=said):
         use(create(master))
 
 

@@ -1,5 +1,6 @@
 """master.load: rospy programs, unmodified, as nodes of this process."""
 import json
+import os
 import pathlib
 import re
 import shutil
@@ -518,6 +519,17 @@ def test_a_script_that_closes_what_it_prints_to_closes_it_for_nobody_else(how, m
 def test_what_a_script_prints_is_as_it_is_unless_asked_for(master, capsys):
     master.load(WORKER, None, 'speak').wait(30)
     assert 'two\nlines\none more\n' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    'output, error', [('', pharos.PharosError), ('/', pharos.PharosError), (1, TypeError)]
+)
+def test_an_output_that_can_be_none_is_refused(master, output, error):
+    """A number was taken for the open file of that number, which was closed at the end."""
+    with pytest.raises(error, match="output.* 'screen'|output='screen'"):
+        master.load(WORKER, None, 'speak', output=output)
+    os.fstat(1)
+    assert master.local_nodes() == []
 
 
 def test_what_a_script_prints_goes_to_a_file(master, capsys, tmp_path):

@@ -68,6 +68,21 @@ def test_a_mailbox_in_which_nothing_comes_names_its_channels(master):
         Mailbox().next(0)
 
 
+@pytest.mark.parametrize(
+    'use, said',
+    [
+        (lambda create_node: create_node('/arm'), "made of a subclass of Node.* not '/arm'"),
+        (lambda create_node: create_node(None), 'made of a subclass of Node.* not None'),
+        (lambda create_node: create_node(pharos.BlockNode, named='/a'), "name='/a', not as named="),
+        (lambda create_node: Mailbox('/topic'), "node that hears, before the topic, not '/topic'"),
+        (lambda create_node: Mailbox(pharos.BlockNode, '/topic'), 'given the node that hears'),
+    ],
+)
+def test_what_is_given_in_another_order_is_told(master, use, said):
+    with pytest.raises(TypeError, match=said):
+        use(NodeFactory(master))
+
+
 @pytest.mark.parametrize('timeout', ['5', float('nan'), [5]], ids=repr)
 def test_a_limit_that_is_no_number_of_seconds_is_refused(timeout):
     for wait in (

@@ -79,13 +79,23 @@ def check_filler(
     check_block(block, 'block', (what,))
 
 
+def _check_no_class(block: Any, what: str) -> None:
+    if isinstance(block, type):
+        raise TypeError(
+            f'a {what} is a function, or another thing that can be called, and not the class'
+            f' {block!r}, of which each call makes another object: give {block.__name__}(...)'
+        )
+
+
 def check_delegate(block: Any) -> Any:
     """``block`` if it can be a delegate (or is None), else TypeError."""
+    _check_no_class(block, 'delegate')
     return check_block(block, 'delegate', ('message', 'channel'))
 
 
 def check_soul(block: Any) -> Any:
     """``block`` if it can be a soul (or is None), else TypeError."""
+    _check_no_class(block, 'soul')
     try:
         return check_block(block, 'soul', ('node',))
     except TypeError as error:

@@ -19,6 +19,8 @@ def run(name: str, main: Callable[[], Optional[int]], about: Optional[str] = Non
     :param about: what is printed instead where the program was called with ``--help``; None: that
         is left to ``main``
     """
+    if not callable(main):
+        raise TypeError(f"program.run('name', main) runs a function, and {main!r} is none")
     output: Any = sys.stdout  # None where the program was started without one
     try:
         if output is not None:

@@ -86,6 +86,11 @@ def _known(package: object, file: object) -> Iterator[None]:
             f'a ROS package and a program or file in it are given by their names, not {package!r}'
             f' and {file!r}'
         )
+    if os.sep in str(package):
+        raise UnknownNodeError(
+            f'{package!r} is a path, and no ROS package, in which to look for {file!r}: give the name'
+            ' of a package, or None for the second, before what the program is told'
+        )
     try:
         yield
     except rospkg.ResourceNotFound:

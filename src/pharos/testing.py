@@ -68,6 +68,10 @@ class Mailbox:
     def __init__(self, node: Optional[Node] = None, topic: str = '', typed_as: Any = None) -> None:
         self._came: List[Any] = []
         self._waiting: 'queue.SimpleQueue[Tuple[Any, InputChannel]]' = queue.SimpleQueue()
+        if not (node is None or node_registry.is_node(node)):
+            raise TypeError(
+                f'a Mailbox is given the node that hears, before the topic, not {node!r}'
+            )
         self.channel = node.interested_in(topic, typed_as, delegate=self) if node else None
 
     def __call__(self, message: Any, channel: InputChannel) -> None:
@@ -222,16 +226,20 @@ class NodeFactory:
         :param node_class: as in :meth:`~pharos.Master.create`, like ``domain`` and ``kwargs``
         :param name: None: made of that of the class, and unique among the nodes of the test
         """
+        if 'named' in kwargs:
+            raise TypeError(
+                f"create_node() takes a name as name={kwargs['named']!r}, not as named="
+            )
         if name is None:
-            name = self._free_name(node_class)
+            name = self._free_name(getattr(node_class, '__name__', 'node'))
         else:
             check_not_taken(node_class, ['name'], 'create_node()')
         node = self.master.create(node_class, named=name, domain=domain, **kwargs)
         self.nodes.append(node)
         return node
 
-    def _free_name(self, node_class: Callable[..., Node]) -> str:
-        base = '/' + re.sub(r'(?<=[a-z0-9])(?=[A-Z])', '_', node_class.__name__).lower()
+    def _free_name(self, class_name: str) -> str:
+        base = '/' + re.sub(r'(?<=[a-z0-9])(?=[A-Z])', '_', class_name).lower()
         taken = {node.name for node in self.nodes}
         numbers = range(2, len(taken) + 3)
         names = [base, *(f'{base}_{number}' for number in numbers)]

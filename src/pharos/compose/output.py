@@ -5,6 +5,8 @@ import sys
 import threading
 from typing import IO, Any, Callable, Optional
 
+from pharos.errors import PharosError
+
 SCREEN = 'screen'  # as launch files say it
 
 
@@ -98,7 +100,14 @@ def redirect(
             stdout = _named(lambda: sys.stdout, name)
         else:
             mode = 'a' if is_again else 'w'
-            stdout = file = open(output, mode, 1, encoding='utf-8', errors='backslashreplace')
+            try:
+                file = open(output, mode, 1, encoding='utf-8', errors='backslashreplace')
+            except OSError as error:
+                raise PharosError(
+                    f'the output of {name()} cannot be written to {output!r} ({error}): give'
+                    f" output='{SCREEN}', or the path of a file"
+                ) from error
+            stdout = file
     # under both names, as in a process: what nobody has any more closes itself
     system.stdout = system.__stdout__ = stdout
     system.stderr = system.__stderr__ = stderr

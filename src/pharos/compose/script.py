@@ -75,6 +75,8 @@ class ScriptNode(Node):
         if cwd is not None and not os.path.isdir(cwd):
             raise ValueError(f'{found} cannot run in {cwd!r}: there is no such folder')
         self.cwd = cwd
+        if not isinstance(output, (str, os.PathLike, type(None))):  # a number is an open file
+            raise TypeError(f"output is 'screen', the path of a file, or None, not {output!r}")
         self.output = output
 
     def start(self) -> None:
