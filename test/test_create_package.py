@@ -234,8 +234,9 @@ def test_an_address_that_catkin_refuses_is_not_written_and_that_is_said(source, 
         ('../robot', r"did you mean 'robot'\?"),
         ('x', 'two letters or more'),
         ('class', 'a word of Python'),
-        ('json', r'would hide .*json.*__init__\.py'),
-        ('sys', 'would hide'),
+        ('json', 'would hide that module of Python|would hide .*json'),
+        ('os', 'would hide that module of Python|would hide .*os'),
+        ('sys', 'would hide that module of Python'),
         ('pharos', r'would hide .*pharos.*__init__\.py'),
         ('rospy', r'would hide .*rospy.*__init__\.py'),
     ],
@@ -303,6 +304,12 @@ def test_a_package_is_not_made_where_catkin_would_not_find_it(source):
 def test_a_folder_that_is_missing_is_not_made(source):
     with pytest.raises(PharosError, match='there is no folder .*/stack: make it, by mkdir -p'):
         create_package('rover', [], source / 'stack', LICENSE)
+
+
+def test_a_file_in_the_place_of_a_folder_is_told(source):
+    (source / 'notes').write_text('mine')
+    with pytest.raises(PharosError, match='/notes is a file: give a folder as --directory'):
+        create_package('rover', [], source / 'notes', LICENSE)
 
 
 def test_what_cannot_be_written_leaves_nothing(source):

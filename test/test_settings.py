@@ -33,6 +33,12 @@ def test_the_name_of_a_node(master, monkeypatch, named, argv, namespace, name):
     assert name in {other.name for other in master.nodes()}
 
 
+def test_a_namespace_of_the_environment_that_can_be_none_is_named(master, monkeypatch):
+    monkeypatch.setenv('ROS_NAMESPACE', 'robot 2')
+    with pytest.raises(ValueError, match="'robot 2' cannot be a ROS_NAMESPACE name"):
+        create(master, 'driver')
+
+
 def test_topics_are_resolved_and_remapped_for_each_node(master):
     plain = create(master, '/robot1/plain')
     remapped = create(master, '/robot1/remapped', argv=['pose:=/elsewhere/pose', '~state:=/state'])

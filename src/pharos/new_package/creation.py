@@ -9,6 +9,7 @@ import pathlib
 import re
 import shutil
 import subprocess
+import sys
 from typing import Iterator, List, NamedTuple, Optional, Sequence
 
 import rospkg
@@ -70,6 +71,11 @@ def _check_package_name(name: str, directory: pathlib.Path) -> None:
     if len(name) < 2:
         raise ValueError(f'{name!r} cannot be the name of a package: it has two letters or more')
     workspace = workspace_of(directory)
+    if name in sys.builtin_module_names or name in getattr(sys, 'stdlib_module_names', ()):
+        raise ValueError(
+            f'{name!r} cannot be the name of the package, which would hide that module of Python:'
+            ' choose another name'
+        )
     for other in _namesakes(name):
         # what catkin has built of a package that was here and was removed is no other one
         if workspace is None or workspace not in other.parents:
@@ -122,6 +128,8 @@ def _check_name(name: str, what: str) -> None:
 def _check_folder(path: pathlib.Path) -> None:
     if path.exists() or path.is_symlink():
         raise PharosError(f'{path} is there already: choose another name, or another --directory')
+    if path.parent.exists() and not path.parent.is_dir():
+        raise PharosError(f'{path.parent} is a file: give a folder as --directory')
     if not path.parent.is_dir():
         raise PharosError(f'there is no folder {path.parent}: make it, by mkdir -p {path.parent}')
     for parent in path.parents:

@@ -143,7 +143,8 @@ def _namespace(name, given):
     if given is None:
         given = '/' if name.startswith('/') else os.environ.get(ROS_NAMESPACE, '/')
     if given.strip('/'):
-        check_name(given, 'namespace')
+        is_of_environment = given == os.environ.get(ROS_NAMESPACE)
+        check_name(given, ROS_NAMESPACE if is_of_environment else 'namespace')
     else:
         given = '/'
     inner = name.lstrip('/').rpartition('/')[0]
