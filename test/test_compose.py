@@ -184,9 +184,11 @@ def test_it_ends_with_its_block(master, compose):
     assert not composed.nodes[0].is_running
 
 
-def test_to_wait_has_a_limit(compose):
-    with pytest.raises(TimeoutError, match='/talker have not ended within 0.1 s'):
-        compose('chat.launch', only=['talker']).wait(0.1)
+@pytest.mark.parametrize('names', [['/talker'], ['/relay'], ['/talker', '/relay']])
+def test_to_wait_has_a_limit(compose, names):
+    says = f"not ended within 0.1 s: {', '.join(names)}; stop"
+    with pytest.raises(TimeoutError, match=says):
+        compose('chat.launch', only=names).wait(0.1)
 
 
 def test_a_required_node_that_ends_here_ends_all(master, compose, transcript):

@@ -153,8 +153,11 @@ class Composition:
         """
         with signals.interruptible_wait():
             if not node_registry.wait_until(lambda: self.is_over or self.is_ending, timeout):
-                left = ', '.join(kept.name for kept in self.kept if not kept.is_over)
-                raise TimeoutError(f'{left} have not ended within {timeout:g} s: stop() them')
+                names = [kept.name for kept in self.kept if not kept.is_over]
+                for apart in self._apart:
+                    names += [] if apart.is_over else apart.names
+                left = ', '.join(names)
+                raise TimeoutError(f'not ended within {timeout:g} s: {left}; stop() ends all')
         self.stop()
         has_failed = [kept.problem is not None for kept in self.kept]
         is_nothing_started = all(has_failed) and not self._apart

@@ -106,10 +106,10 @@ class KeptNode:
                 ScriptNode,
                 self._composition.master,
                 launched.name,
-                None,
-                None,
-                (),
-                {name: getattr(launched, name) for name in _OF_SCRIPT},
+                soul=None,
+                delegate=None,
+                args=(),
+                kwargs={name: getattr(launched, name) for name in _OF_SCRIPT},
             )
         start_made(self.node)
 
