@@ -614,10 +614,14 @@ def test_a_plot_names_fields_as_text(turns):
 
 
 def test_a_plot_of_what_nobody_sends_says_so(turns):
-    with pytest.raises(TimeoutError, match=r'/plotted_turns within 0.1 s, which /plotted_one pub'):
+    with pytest.raises(
+        TimeoutError, match='/plotted_turns within 0.1 s: it is published by /plotted_one'
+    ):
         turns.plot('linear.x', seconds=0.1)
     silent = turns.node.interested_in('/plotted_silence', 'std_msgs/Float64')
-    with pytest.raises(TimeoutError, match='/plotted_silence within 0.1 s, which nobody publishes'):
+    with pytest.raises(
+        TimeoutError, match='/plotted_silence within 0.1 s: it is published by nobody'
+    ):
         silent.plot('data', seconds=0.1)
 
 

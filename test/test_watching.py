@@ -142,7 +142,7 @@ def test_a_topic_that_nobody_publishes_is_told_at_once(master, look):
         with pytest.raises(UnknownTopicError, match='^nobody publishes on /watched at http'):
             look(master.topic('/watched'))
         node.interested_in('/watched', 'std_msgs/String')
-        with pytest.raises(UnknownTopicError, match='/watched, which /node hears: start a node'):
+        with pytest.raises(UnknownTopicError, match='/watched, heard by /node: start a node'):
             look(master.topic('/watched'))
         node.output_channel('/watcher', 'std_msgs/String')
         with pytest.raises(UnknownTopicError, match="did you mean '/watcher'"):
@@ -185,7 +185,9 @@ def test_last_is_else_the_next_message(master, publishing):
 def test_last_waits_for_so_long_only(master):
     with create(master) as node:
         node.output_channel('/watched', 'std_msgs/String')
-        with pytest.raises(TimeoutError, match='on /watched within 0.1 s, which /node publishes'):
+        with pytest.raises(
+            TimeoutError, match='on /watched within 0.1 s: it is published by /node'
+        ):
             watching.last(master.topic('/watched'), 0.1)
 
 

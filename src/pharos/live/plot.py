@@ -15,7 +15,7 @@ from pharos.counts import counted
 from pharos.errors import NodeStoppedError, PharosError, missing
 from pharos.live import graphviz
 from pharos.live.colors import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION
-from pharos.live.watching import create_looker
+from pharos.live.watching import create_looker, nothing_came
 from pharos.messages.numeric_field import numeric_field
 from pharos.node import BlockNode
 from pharos.probe import Look, wait_for_publishers
@@ -210,11 +210,7 @@ def plot(channel: InputChannel, fields: Tuple[str, ...], seconds: Optional[float
     with made:
         made.wait(seconds)
     if not made.times:
-        publishers = channel.node.master.topic(channel.topic).publishers
-        raise TimeoutError(
-            f'no message came on {channel.topic} within {seconds:g} s, which'
-            f' {", ".join(publishers) or "nobody"} publishes'
-        )
+        raise nothing_came(channel.node.master.topic(channel.topic), seconds)
     return made
 
 

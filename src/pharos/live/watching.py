@@ -123,9 +123,14 @@ def last(topic: Topic, timeout: float = LAST_TIMEOUT) -> genpy.Message:
     """
     for message in messages_of(topic, 1, check_seconds('timeout', timeout)):
         return message
-    raise TimeoutError(
-        f'no message came on {topic.name} within {timeout:g} s, which'
-        f" {', '.join(topic.publishers) or 'nobody'} publishes"
+    raise nothing_came(topic, timeout)
+
+
+def nothing_came(topic: Topic, seconds: float) -> TimeoutError:
+    """The error of who has looked at a topic for so many seconds in vain."""
+    return TimeoutError(
+        f'no message came on {topic.name} within {seconds:g} s: it is published by'
+        f" {', '.join(topic.publishers) or 'nobody'}"
     )
 
 
@@ -198,7 +203,7 @@ def _check_published(topic: Topic) -> None:
     hint = suggest(topic.name, publishers) or ': start a node that does first'
     raise UnknownTopicError(
         f'nobody publishes on {topic.name}'
-        + (f", which {', '.join(heard)} hears" if heard else f' at {topic.master.url}')
+        + (f", heard by {', '.join(heard)}" if heard else f' at {topic.master.url}')
         + hint
     )
 
