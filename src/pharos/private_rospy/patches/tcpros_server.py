@@ -9,6 +9,7 @@ import time
 from pharos.intraprocess.sharing import numbered
 from pharos.private_rospy.acceptor import BACKLOG, Acceptor, brief
 from pharos.private_rospy.deadlines import seconds_left
+from pharos.private_rospy.large_messages import LargeMessages
 from pharos.private_rospy.lifetime import shutdown_socket
 from pharos.private_rospy.names import NAME_LIMIT
 from pharos.private_rospy.patches.table import patch, substitute
@@ -133,14 +134,33 @@ def rospyerr(*, module):
 @patch(
     'rospy.impl.tcpros_base',
     'TCPROSTransportProtocol.read_messages',
-    'believes an announcement of 4 GiB',
+    'believes an announcement of 4 GiB, and copies a large message three times, into memory that it'
+    ' asks the system for each time',
 )
 def read_messages(self, b, msg_queue, sock, *, module, original):
-    """Refuse a message beyond the limit."""
+    """Refuse a message beyond the limit, and read one that the buffer does not hold past it."""
     (size,) = struct.unpack_from('<I', b.getbuffer())
     if size > MESSAGE_LIMIT:
         raise module.TransportException(f'a message of {size} bytes; the limit is {MESSAGE_LIMIT}')
-    original(self, b, msg_queue, sock)
+    if self.direction != rospy.impl.transport.INBOUND:  # a service's, which its clients share
+        original(self, b, msg_queue, sock)
+        return
+    large = getattr(self, 'large', None)
+    if large is None:
+        self.large = large = LargeMessages(self.buff_size)
+    is_large = size > large.buff_size and b.tell() < 4 + size
+    # the next is likely to be as large: read its length first, and all of it comes in one piece
+    self.buff_size = 4 if is_large else large.buff_size
+    if not is_large:
+        original(self, b, msg_queue, sock)
+        return
+    data = large.read(b, size, sock)
+    try:
+        # AnyMsg keeps what it is given, all others slices of it
+        kept = data[:] if self.recv_data_class._md5sum == '*' else data
+        msg_queue.append(self.recv_data_class().deserialize(kept))
+    except Exception as error:  # as rospy's deserialize_messages
+        raise module.DeserializationError(f'cannot deserialize: {error}') from error
 
 
 @patch(
@@ -162,6 +182,9 @@ def receive_once(self, *, node, module, original):
         if we_are_the_client and not self.done and not module.is_shutdown():
             node.warn(f'connection with {self.endpoint_id} for {self.name} closed: {brief(error)}')
         raise Unreadable(str(error)) from None
+    large = getattr(self.protocol, 'large', None)  # it is None where it was closed meanwhile
+    if large is not None:
+        self.stat_bytes += large.counted()
     if not messages and module.is_shutdown():
         raise module.TransportTerminated('the node stops')
     return messages
