@@ -13,8 +13,8 @@ import xml.etree.ElementTree
 import pytest
 
 from helpers import create, ended
-from pharos import Graph, Master, MasterUnreachableError, NodeStoppedError, PharosError
-from pharos.live import graphviz
+from pharos import Graph, Master, MasterUnreachableError, NodeStoppedError, PharosError, probe
+from pharos.live import graphviz, snapshot
 from pharos.live.snapshot import (
     ALIVE,
     DEAD,
@@ -195,12 +195,28 @@ def test_rates_are_counted_where_they_are_asked_for(master, small):
     assert master.graph().rates == {}
 
 
-def test_counting_ends_with_the_node_whose_soul_counts(master):
+# while it asks other nodes, or waits
+@pytest.mark.parametrize('is_asking', [True, False])
+def test_counting_ends_with_the_node_whose_soul_counts(master, monkeypatch, is_asking):
     node = create(master, '/picture_one')
     ends, began = [], threading.Event()
+    take, pause = snapshot.take, probe.Look.pause
+
+    def take_when_it_stops(*args, **options):
+        seen = take(*args, **options)
+        if is_asking:
+            began.set()
+            assert node.latest_run.rospy.ended.wait(TIMEOUT)
+        return seen
+
+    def pause_when_it_began(look, seconds):
+        began.set()
+        pause(look, seconds)
+
+    monkeypatch.setattr(snapshot, 'take', take_when_it_stops)
+    monkeypatch.setattr(probe.Look, 'pause', pause_when_it_began)
 
     def count(me):
-        began.set()
         try:
             me.master.graph(seconds=1000)
         except NodeStoppedError as error:
@@ -209,7 +225,6 @@ def test_counting_ends_with_the_node_whose_soul_counts(master):
 
     thread = node.fork(count)
     assert began.wait(TIMEOUT)
-    until(lambda: node.latest_run.rospy.lifetime.interruptions)  # it waits
     node.stop()
     assert ended(thread) and ends
 

@@ -4,15 +4,16 @@ import io
 import struct
 import subprocess
 import sys
+import threading
 
 import genpy
 import numpy
 import pytest
 from PIL import Image as Pillow
 
-from helpers import create
+from helpers import create, ended
 from pharos import MessageTypeError, NodeStoppedError, PharosError, message_class, spin
-from pharos.live import pictures, top
+from pharos.live import pictures, plot as plot_module, top
 from pharos.live.pictures import picture
 from pharos.messages import class_from_definition
 from pharos.messages.numeric_field import numeric_field, numeric_paths
@@ -505,6 +506,28 @@ def test_a_plot_ends_with_the_node_of_its_channel_but_not_by_a_restart(turns):
     with pytest.raises(NodeStoppedError, match='the plot of /plotted_turns is closed'):
         plot.wait(TIMEOUT)
     assert 'closed' in repr(plot)
+
+
+def test_a_soul_that_plots_ends_though_its_node_stopped_before_it_waits(turns, monkeypatch):
+    soul = create(turns.node.master, '/plots')
+    began, ends = threading.Event(), []
+
+    def wait_until_it_stops(looker, topic, timeout):
+        began.set()
+        assert soul.latest_run.rospy.ended.wait(TIMEOUT)
+
+    monkeypatch.setattr(plot_module, 'wait_for_publishers', wait_until_it_stops)
+
+    def draw(me):
+        try:
+            turns.plot('linear.x', seconds=1000)
+        except NodeStoppedError as error:
+            ends.append(error)
+
+    thread = soul.fork(draw)
+    assert began.wait(TIMEOUT)
+    soul.stop()
+    assert ended(thread) and ends
 
 
 def test_spin_waits_for_no_plot(turns):

@@ -230,9 +230,10 @@ def graph_of(master: Master, seconds: float = 0, **options: Any) -> Graph:
     seconds = check_seconds('seconds', seconds, least=0)
     if not seconds:
         return Graph(snapshot.take(master), **options)
+    look = Look()  # from here on: a node that stops while others are asked ends the wait, too
     before = snapshot.take(master, counts=True)
     Graph(before, **options)  # complains of an option before all the time is spent
-    Look().pause(seconds)
+    look.pause(seconds)
     after = snapshot.take(master, counts=True)
     return Graph(after, Traffic(before.connections, after.connections).of_topic, **options)
 

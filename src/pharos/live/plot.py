@@ -85,13 +85,13 @@ class Plot:
         :raises NodeStoppedError: if it is closed, also meanwhile, or the node stops whose thread
             this is
         """
-        seconds = check_seconds('seconds', seconds, above=0)
+        seconds, look = check_seconds('seconds', seconds, above=0), Look()
         if not self._looker.is_running:
             raise NodeStoppedError(
                 f'the plot of {self.topic} is closed, and collects no more: plot() begins another'
             )
         wait_for_publishers(self._looker, self.topic, self._looker.connect_timeout)
-        Look().wait_out(self._looker, seconds)
+        look.wait_out(self._looker, seconds)
         return self
 
     def close(self) -> None:
