@@ -17,6 +17,7 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 
 from helpers import create
 from pharos import PharosError
+from pharos.new_package import creation
 from pharos.new_package.creation import NAME, create_package
 from pharos.new_package.files import Package, files_of
 from pharos.testing import TIMEOUT, until
@@ -316,6 +317,31 @@ def test_what_cannot_be_written_leaves_nothing(source):
     with pytest.raises(PharosError, match='cannot be written to .*/rover: .*File name too long'):
         create_package('rover', ['n' * 300], source, LICENSE)
     assert list(source.iterdir()) == []
+
+
+def test_what_ctrl_c_cuts_off_leaves_nothing(source, monkeypatch):
+    write = creation._write
+
+    def write_some(path, text, is_program):
+        write(path, text, is_program)
+        if path.name == 'package.xml':
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(creation, '_write', write_some)
+    with pytest.raises(KeyboardInterrupt):
+        create_package('rover', [], source, LICENSE)
+    assert list(source.iterdir()) == []
+
+
+def test_what_another_program_makes_meanwhile_stays(source, monkeypatch):
+    def check_before_it_is_made(path):
+        path.mkdir()
+        (path / 'theirs').touch()
+
+    monkeypatch.setattr(creation, '_check_folder', check_before_it_is_made)
+    with pytest.raises(PharosError, match='cannot be written to .*/rover: .*File exists'):
+        create_package('rover', [], source, LICENSE)
+    assert [each.name for each in (source / 'rover').iterdir()] == ['theirs']
 
 
 # -- any names

@@ -10,7 +10,7 @@ import re
 import shutil
 import subprocess
 import sys
-from typing import Iterator, List, NamedTuple, Optional, Sequence
+from typing import Dict, Iterator, List, NamedTuple, Optional, Sequence
 
 import rospkg
 
@@ -54,11 +54,9 @@ def create_package(
     author = _author(path.parent)
     texts = files_of(Package(name, nodes, author.name, author.email, license_name))
     try:
-        path.mkdir()
-        for file, text in texts.items():
-            _write(path / file, text, is_program=file.startswith('scripts/'))
+        path.mkdir()  # before what removes it: another program may have made it meanwhile
+        _write_all(path, texts)
     except OSError as error:
-        shutil.rmtree(path, ignore_errors=True)
         raise PharosError(f'the package cannot be written to {path}: {error}') from error
     return _advice(path, list(texts), author)
 
@@ -177,6 +175,16 @@ def _user() -> str:
     except (KeyError, OSError):  # a user of whom the system knows only the number
         user = ''
     return re.sub(r'[^a-zA-Z0-9_]+', '_', user) or 'user'
+
+
+def _write_all(path: pathlib.Path, texts: Dict[str, str]) -> None:
+    """Write all files, or leave nothing, also where Ctrl-C comes meanwhile."""
+    try:
+        for file, text in texts.items():
+            _write(path / file, text, is_program=file.startswith('scripts/'))
+    except BaseException:
+        shutil.rmtree(path, ignore_errors=True)
+        raise
 
 
 def _write(path: pathlib.Path, text: str, is_program: bool) -> None:
