@@ -1,11 +1,13 @@
 """Waiting for the next message on a topic, in whatever thread."""
 import subprocess
 import threading
+from unittest import mock
 
 import pytest
 import std_msgs.msg
 
 from helpers import create, ended, in_thread, speak_tcpros_only
+from pharos.intraprocess.inbox import Inbox
 from pharos.testing import TIMEOUT
 import pharos
 
@@ -84,6 +86,23 @@ def test_a_latched_message_comes_at_once_also_beside_a_channel(master, mailbox):
     assert mailbox.next().data == 7
     assert node.wait_for_message('/waited', timeout=TIMEOUT).data == 7
     assert len(node.channels) == 1
+
+
+def test_a_message_that_is_dropped_while_it_is_taken_is_none(master, pair):
+    waiting, sending, channel = pair
+    is_dropped = threading.Event()
+    run_next = Inbox.run_next
+
+    def run_when_it_is_dropped(inbox):
+        if not is_dropped.is_set():  # as where the next one is too large for both
+            inbox._queue.clear()
+            is_dropped.set()
+        return run_next(inbox)
+
+    with mock.patch.object(Inbox, 'run_next', run_when_it_is_dropped):
+        send_when_heard(channel, 1)
+        in_thread(lambda: is_dropped.wait(TIMEOUT) and channel.send(data=2))
+        assert waiting.wait_for_message('/waited', timeout=TIMEOUT).data == 2
 
 
 def test_a_channel_of_the_node_gets_the_message_too(master, pair, mailbox):

@@ -89,22 +89,32 @@ class NextMessages(InputChannel):
 
         :raises NodeStoppedError: if the node stops, or the one on whose behalf this thread runs
         """
-        run = self._run
-        timeout = None if deadline is None else deadline - time.monotonic()
-        scheduled = self._waiting.scheduled
-        with signals.interruptible_wait(), Interruption(self.notify, run.rospy.lifetime) as stop:
-            is_in_time = wait_for(
-                self._changed,
-                lambda: bool(scheduled) or stop.came or run.rospy.ended.is_set(),
-                timeout,
-            )
-        if scheduled:
-            scheduled.popleft().run_next()
-            return self._taken.popleft()
-        if not is_in_time:
-            return None
-        name = self.node.name if run.rospy.ended.is_set() else 'the node in whose block this is'
-        raise NodeStoppedError(f'{name} stops, and the wait for a message on {self.topic} with it')
+        run, scheduled = self._run, self._waiting.scheduled
+        while not self._taken:
+            timeout = None if deadline is None else deadline - time.monotonic()
+            with signals.interruptible_wait(), Interruption(
+                self.notify, run.rospy.lifetime
+            ) as stop:
+                is_in_time = wait_for(
+                    self._changed,
+                    lambda: bool(scheduled) or stop.came or run.rospy.ended.is_set(),
+                    timeout,
+                )
+            if scheduled:
+                # takes nothing where the publisher has just dropped it for a newer one
+                scheduled.popleft().run_next()
+            elif is_in_time:
+                who = (
+                    self.node.name
+                    if run.rospy.ended.is_set()
+                    else 'the node in whose block this is'
+                )
+                raise NodeStoppedError(
+                    f'{who} stops, and the wait for a message on {self.topic} with it'
+                )
+            else:
+                return None
+        return self._taken.popleft()
 
     def notify(self) -> None:
         """Have the thread that waits look again."""
