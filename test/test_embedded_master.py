@@ -2,6 +2,7 @@
 import os
 import signal
 import socket
+import struct
 import subprocess
 import sys
 
@@ -50,6 +51,17 @@ def test_nodes_of_this_process_and_others_meet_there(embedded):
     )
     with Program(embedded.url, 'rostopic', 'pub', '/t', 'std_msgs/String', 'data: from outside'):
         assert mailbox.next().data == 'from outside'
+
+
+def test_a_connection_that_is_cut_off_is_not_told_of_on_the_screen(capfd):
+    with Master.embedded() as master:
+        host, port = master.url[len('http://') :].rstrip('/').split(':')
+        with socket.create_connection((host, int(port))) as client:
+            client.sendall(b'POST /RPC2 HTTP/1.0')
+            reset = struct.pack('ii', 1, 0)
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, reset)
+        assert master.is_reachable()
+    assert capfd.readouterr().err == ''
 
 
 def test_rosout_agg_gets_each_line_once(embedded):

@@ -22,8 +22,9 @@ POLL = 1.0  # seconds between two looks whether the parent is there
 def main(port: int, parent: int) -> None:
     """Run rosmaster, with a /rosout that passes the log lines on to /rosout_agg as ROS's does."""
     answers, sys.stdout = sys.stdout, sys.stderr  # rospy prints log lines on standard output
-    # it tells of every node that just stopped
-    logging.getLogger('rosmaster').addHandler(logging.NullHandler())
+    # they tell of every node that just stopped, and of each connection that was cut off
+    for name in 'rosmaster', 'xmlrpc':
+        logging.getLogger(name).addHandler(logging.NullHandler())
     try:
         family = socket.AF_INET6 if rosgraph.network.use_ipv6() else socket.AF_INET
         # rosmaster waits for ever where its port is taken
