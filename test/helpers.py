@@ -28,10 +28,15 @@ class InProcessMaster:
             ready.wait(0.001)  # rosmaster has no event for it
         self.url = f'http://127.0.0.1:{self._master.master_node.port}/'
 
+    @property
+    def handler(self):
+        """What answers its calls."""
+        return self._master.handler
+
     def forget_types(self):
         """Forget the type of each topic that no node has, which rosmaster itself never does: the next
         test may use the name for another."""
-        handler = self._master.handler
+        handler = self.handler
         with handler.ps_lock:
             kept = set(handler.publishers.map) | set(handler.subscribers.map)
             for topic in set(handler.topics_types) - kept:

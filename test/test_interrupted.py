@@ -133,6 +133,25 @@ def test_what_is_closed_while_the_master_hangs_is_unregistered_when_it_goes_on(a
     until(lambda: registrations(away, '/node') == before)
 
 
+@pytest.mark.parametrize('how', ['end', 'hang'])
+def test_a_first_line_of_the_log_is_told_while_the_master_is_away(away, how):
+    speaker, listener, lines = create(away, '/speaker'), create(away, '/listener'), Mailbox()
+    listener.interested_in('/rosout', 'rosgraph_msgs/Log', lines, from_=speaker)
+    getattr(away, how)()
+    speaker.log('all alone')
+    assert lines.next().msg == 'all alone'
+
+
+def test_a_line_that_comes_too_late_for_rosout_shows_no_traceback(away, capfd):
+    node = create(away, '/node')
+    rosout = node.ros.impl.rosout
+    node.stop()
+    away.end()
+    rosout._rosout(8, 'was under way', 'file.py', 1, 'function')
+    node.latest_run.rospy.module.logwarn('the last word')
+    assert capfd.readouterr().err == 'the last word\n'
+
+
 @pytest.mark.parametrize('stops', [False, True])
 @pytest.mark.parametrize('opener', ['interested_in', 'output_channel', 'serve'])
 def test_what_could_not_be_opened_while_the_master_hung_is_not_there_when_it_goes_on(

@@ -12,6 +12,7 @@ import rosgraph
 from helpers import InProcessMaster, create, ended, in_thread
 from pharos.testing import Mailbox, TIMEOUT, until
 from pharos import Master, MasterUnreachableError, NodeStoppedError, node_registry
+from pharos.blocks import attempt
 from pharos.private_rospy.instance import PrivateRospy
 from programs import run
 
@@ -103,6 +104,49 @@ def test_what_rosparam_sets_to_another_type_is_reported_and_the_block_not_run(ma
         rate.value
     master.parameters[PRIVATE] = 3.0
     assert changes.get() == rate.value == 3.0
+
+
+# -- stops, and a master that does not answer
+
+
+@pytest.mark.parametrize(
+    'how',
+    [
+        lambda node, parameter: parameter.value,
+        lambda node, parameter: parameter.on_change(print),
+        lambda node, parameter: node.log('a line, of which rospy asks where it may go'),
+        lambda node, parameter: node.ros.get_param_cached(parameter.name, 0),
+    ],
+)
+def test_a_node_that_stops_while_it_subscribes_to_a_parameter_leaves_nothing(
+    master, ros_master, monkeypatch, how
+):
+    node = create(master, '/stopping')
+    began, handler, ended_event = threading.Event(), ros_master.handler, node.latest_run.rospy.ended
+    subscribe = handler.subscribeParam
+
+    def subscribe_when_it_stops(*args):
+        began.set()
+        ended_event.wait(TIMEOUT)
+        return subscribe(*args)
+
+    monkeypatch.setattr(handler, 'subscribeParam', subscribe_when_it_stops)
+    parameter = node.parameter('/stopping/speed')
+    thread = in_thread(attempt, lambda: how(node, parameter))
+    assert began.wait(TIMEOUT)
+    node.stop()
+    assert ended(thread)
+    with pytest.raises(rosgraph.MasterError, match='unknown node'):
+        master.api().lookupNode('/stopping')
+
+
+def test_who_reads_a_parameter_waits_no_longer_for_others_that_do(master, monkeypatch):
+    monkeypatch.setattr('pharos.private_rospy.parameters.TIMEOUT', 0.1)
+    node = create(master, '/reading')
+    with node.latest_run.rospy.parameters._turn():  # another thread asks, and gets no answer
+        with pytest.raises(MasterUnreachableError, match='timed out'):
+            node.parameter('/speed').value
+    assert node.parameter('/speed').value is None
 
 
 # -- names

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, List
 import rosgraph
 
 from pharos.blocks import Block, BlockOf, check_block
-from pharos.private_rospy.parameters import as_stored, changing
+from pharos.private_rospy.parameters import UNKNOWN, as_stored, changing
 
 if TYPE_CHECKING:
     from pharos.node import Node
@@ -50,9 +50,8 @@ class Parameter:
         :raises MasterUnreachableError: if it is not known yet, and there is no answer
         """
         parameters = self.node.current_run.rospy.parameters  # raises where it is stopped
-        try:
-            value = parameters.kept(self.name)
-        except KeyError:
+        value = parameters.kept(self.name)
+        if value is UNKNOWN:
             with self.node.master.reached():
                 value = parameters.read(self.name, self._get)
         return self._checked(value)

@@ -60,6 +60,9 @@ def close_handlers(module):
             logger.removeHandler(handler)
             with contextlib.suppress(OSError):
                 handler.close()
+    # Else logging would show what rospy itself logs later, meant for the file. What the node's code
+    # says to the last is shown.
+    module.root.manager.getLogger('rospy').addHandler(logging.NullHandler())
 
 
 class _LogFile(logging.handlers.RotatingFileHandler):

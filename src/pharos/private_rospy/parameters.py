@@ -2,6 +2,7 @@
 import contextlib
 import copy
 import reprlib
+import socket
 import threading
 import weakref
 import xmlrpc.client
@@ -10,8 +11,11 @@ from typing import Any
 import rosgraph
 
 from pharos.private_rospy import registration
+from pharos.private_rospy.deadlines import deadline_in, seconds_left, time_limit
 from pharos.private_rospy.proxies import master_api
 
+TIMEOUT = 5.0  # seconds that all may take for which a parameter is read, watched or initialized
+UNKNOWN: Any = object()  # the value of a parameter that is not kept
 
 _of_all_nodes: Any = weakref.WeakSet()  # the WatchedParameters of this process
 _adding = threading.Lock()  # guards it
@@ -32,9 +36,11 @@ class WatchedParameters:
         self._initialized = {}  # global name -> its first value
         # of those watched, the outermost: of what is in them, the master tells for each
         self._subscribed = set()
+        # names of which the master was ever asked to tell, also where its answer did not come
+        self._asked = set()
         self.cached = set()  # global names of which rospy itself has the master tell
         self._lock = threading.Lock()  # held to add to _watched
-        self._subscribing = threading.Lock()  # guards _subscribed
+        self._subscribing = threading.Lock()  # guards _subscribed and _asked
         self._kept = {}  # global name -> value, None where it has none
         self._changes = 0  # how often something changed
         self._keeping = threading.Lock()  # held to change these two
@@ -47,7 +53,8 @@ class WatchedParameters:
 
     def initialize(self, name, value):
         """Set the parameter where it has no value, also after a restart of the master."""
-        self._set_where_missing(name, value)
+        with time_limit(TIMEOUT):
+            self._set_where_missing(name, value)
         self._initialized[name] = value
 
     def restore_from_previous_run(self, former):
@@ -78,11 +85,9 @@ class WatchedParameters:
             raise
 
     def kept(self, name):
-        """The value of a parameter that was read before, None where it has none.
-
-        :raises KeyError: if it was not, or has changed since
-        """
-        return _own(self._kept[name])
+        """The value of a parameter that was read before, None where it has none; UNKNOWN if it was
+        not, or has changed since."""
+        return _own(self._kept.get(name, UNKNOWN))
 
     def read(self, name, ask):
         """The value of a parameter, which is kept from now on.
@@ -90,8 +95,9 @@ class WatchedParameters:
         :param ask: ``ask()`` asks the master for it
         """
         before = self._changes
-        is_told = self._subscribe(name)
-        value = ask()
+        with time_limit(TIMEOUT):
+            is_told = self._subscribe(name)
+            value = ask()
         with self._keeping:
             if is_told and before == self._changes:  # else what came may be older
                 self._kept[name] = value
@@ -112,20 +118,42 @@ class WatchedParameters:
 
     def _subscribe(self, name):
         """Have the master tell of the parameter; returns whether it does."""
-        master, uri = self._master(), self._node.uri
-        with self._subscribing:
+        with time_limit(TIMEOUT), self._turn():
             if not self.may_subscribe():
                 return False
             if any(_contains(other, name) for other in self._subscribed):
                 return True
             if not registration.keeps_name(self._node):
                 return False
+            master, uri = self._master(), self._node.uri
+            self._asked.add(name)
             master.subscribeParam(uri, name)
             within = {other for other in self._subscribed if _contains(name, other)}
             self._subscribed = self._subscribed - within | {name}
             for other in within - self.cached:
                 master.unsubscribeParam(uri, other)
             return True
+
+    def subscribe_for_rospy(self, name, subscribe):
+        """What ``subscribe()`` returns, by which rospy itself has the master tell of a parameter."""
+        with self._turn():
+            if not self.may_subscribe():
+                raise KeyError(name)
+            self._asked.add(name)
+            return subscribe()
+
+    @contextlib.contextmanager
+    def _turn(self):
+        """Within this, no other thread of the node subscribes, nor does its stop unsubscribe.
+
+        :raises socket.timeout: if another one takes too long, for the master does not answer
+        """
+        if not self._subscribing.acquire(timeout=seconds_left(deadline_in(TIMEOUT))):
+            raise socket.timeout('timed out')
+        try:
+            yield
+        finally:
+            self._subscribing.release()
 
     def _set_where_missing(self, name, value):
         master = self._master()
@@ -177,8 +205,14 @@ class WatchedParameters:
 
     def unsubscribe(self, calls):
         """Add to the calls those that end the watch: a master keeps the name of a node that does
-        not."""
-        for name in self._subscribed | self.cached:
+        not.
+
+        What another thread was just subscribing to is, and nothing more will be.
+        """
+        with time_limit(registration.UNREGISTER_TIMEOUT), contextlib.suppress(socket.timeout):
+            with self._turn():
+                pass
+        for name in tuple(self._asked):
             calls.unsubscribeParam(self._node.name, self._node.uri, name)
 
     def _value(self, name):

@@ -1,6 +1,11 @@
 """Parameters: subscriptions that rospy makes for itself are known, and none is made late."""
+from pharos.private_rospy.deadlines import time_limit
 from pharos.private_rospy.parameters import changing
 from pharos.private_rospy.patches.table import patch
+from pharos.private_rospy.registration import COMMUNICATION_ERRORS
+
+ASKED_BY_LOG = '/rosout_disable_topics_generation'  # by each line, until it is known
+LOG_TIMEOUT = 1.0  # seconds that the master may hold up a line of the log
 
 
 @patch('rospy.impl.paramserver', 'ParamServerCache.set', 'never lets go what it subscribed to')
@@ -17,11 +22,20 @@ def set_cached(self, key, value, *, node, original):
     ' name to a newer one',
 )
 def get_param_cached(self, key, *, node, original, module):
-    """Subscribe once, and only while the node runs."""
-    name = module.rospy.names.resolve_name(key)
-    if name in node.parameters.cached:
+    """Subscribe once, and only while the node runs; no line of the log is lost, or waits for long,
+    for want of the master."""
+    name, parameters = module.rospy.names.resolve_name(key), node.parameters
+    if name in parameters.cached:
         return module.rospy.impl.paramserver.get_param_server_cache().get(name)
-    return original(self, key) if node.parameters.may_subscribe() else self[key]
+    if name == ASKED_BY_LOG:
+        try:
+            with time_limit(LOG_TIMEOUT):
+                return parameters.subscribe_for_rospy(name, lambda: original(self, key))
+        except COMMUNICATION_ERRORS:
+            raise KeyError(key) from None
+    if parameters.may_subscribe():
+        return parameters.subscribe_for_rospy(name, lambda: original(self, key))
+    return self[key]
 
 
 @patch(
