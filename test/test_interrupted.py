@@ -133,6 +133,24 @@ def test_what_is_closed_while_the_master_hangs_is_unregistered_when_it_goes_on(a
     until(lambda: registrations(away, '/node') == before)
 
 
+def test_a_repair_that_failed_is_made_again_in_full(away, monkeypatch):
+    create(away, '/node')
+    repair, made = registration.repair, []
+
+    def repair_at_the_second_attempt(node, state, was_away):
+        made.append(was_away)
+        if len(made) == 1:
+            raise ConnectionResetError
+        repair(node, state, was_away)
+
+    away.end()
+    until(lambda: watcher.watcher_of(away).reachable_since is None)
+    monkeypatch.setattr(registration, 'repair', repair_at_the_second_attempt)
+    away.come_back()
+    until(lambda: len(made) > 2)
+    assert made[:3] == [True, True, False]
+
+
 @pytest.mark.parametrize('how', ['end', 'hang'])
 def test_a_first_line_of_the_log_is_told_while_the_master_is_away(away, how):
     speaker, listener, lines = create(away, '/speaker'), create(away, '/listener'), Mailbox()

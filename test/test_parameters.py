@@ -14,6 +14,7 @@ from pharos.testing import Mailbox, TIMEOUT, until
 from pharos import Master, MasterUnreachableError, NodeStoppedError, node_registry
 from pharos.blocks import attempt
 from pharos.private_rospy.instance import PrivateRospy
+from pharos.private_rospy.parameters import WatchedParameters
 from programs import run
 
 PRIVATE = '/robot1/driver/rate'
@@ -147,6 +148,29 @@ def test_who_reads_a_parameter_waits_no_longer_for_others_that_do(master, monkey
         with pytest.raises(MasterUnreachableError, match='timed out'):
             node.parameter('/speed').value
     assert node.parameter('/speed').value is None
+
+
+def test_first_values_are_set_and_watched_though_a_restarted_master_goes_once_more(
+    mortal_master, monkeypatch
+):
+    node = create(Master(mortal_master.url), '/repaired')
+    speed, changes = node.parameter('~speed', initialized=2.0), Mailbox()
+    speed.on_change(lambda value: changes(value, None))
+    failures, renew = [], WatchedParameters.renew
+
+    def renew_at_the_second_attempt(watched):
+        if not failures:
+            failures.append(ConnectionResetError())
+            raise failures[0]
+        renew(watched)
+
+    mortal_master.end()
+    monkeypatch.setattr(WatchedParameters, 'renew', renew_at_the_second_attempt)
+    mortal_master.come_back()
+    until(lambda: '/repaired/speed' in node.master.parameters)
+    until(lambda: speed in node.latest_run.parameters and not node.latest_run.rospy.was_forgotten)
+    assert run(mortal_master.url, 'rosparam', 'set', '/repaired/speed', '3.0').returncode == 0
+    assert changes.next() == 3.0 and failures
 
 
 # -- names

@@ -40,6 +40,8 @@ class PrivateRospy:
 
     #: whether its log lines on the screen begin with its name; what a program prints may have it
     names_log_lines = True
+    #: whether the master has forgotten it, or was away, and not all is repaired yet
+    was_forgotten = _was_away = False
     #: called where another process asks for the node's health; returns what XML-RPC has
     tell_health: Any = dict
 
@@ -318,14 +320,17 @@ class PrivateRospy:
         if not self.is_registered:
             return
         self._close_idle_proxies()
+        self._was_away = self._was_away or was_away
         try:
-            if registration.repair(self, state, was_away):
+            registration.repair(self, state, self._was_away)
+            if self.was_forgotten:
+                self.parameters.restore_after_master_restart()
                 self.module.logwarn(
                     'the master %s had forgotten %s: registered again',
                     self.settings.master_url,
                     self.name,
                 )
-                self.parameters.restore_after_master_restart()
+            self.was_forgotten = self._was_away = False
         except (rosgraph.MasterException, *registration.COMMUNICATION_ERRORS) as error:
             self.module.logdebug(
                 'cannot register with the master %s: %s', self.settings.master_url, error

@@ -198,7 +198,8 @@ def repair(node, state, was_away):
         names]}``
     :param was_away: whether the master was out of reach: what it had to say of publishers then is
         asked for again, and what the node closed then is unregistered
-    :returns: whether it had forgotten the node altogether
+
+    Where the master had forgotten the node altogether, its ``was_forgotten`` is set.
     """
     master = master_api(node.settings.master_url, node.name)
     publishers, subscribers, services = state
@@ -230,7 +231,7 @@ def repair(node, state, was_away):
     # master already
     is_forgotten = node.name not in services.get(node.module.resolve_name('~get_loggers'), ())
     if any(kind.lost(node) for kind in kinds) and not keeps_name(node):
-        return False
+        return
+    node.was_forgotten = node.was_forgotten or is_forgotten
     for kind in kinds:
         kind.repair(node, was_away)
-    return is_forgotten
