@@ -1,10 +1,14 @@
 """One connection to a publisher elsewhere for the nodes of this process: what each of them gets is
 what its own connection would bring."""
+import threading
+
 import pytest
 from std_msgs.msg import Int32, String
 
-from helpers import create, in_thread, speak_tcpros_only
+from helpers import create, ended, in_thread, speak_tcpros_only
 from pharos import Master
+from pharos.private_rospy import shared_connections
+from pharos.private_rospy.tcpros_connection import TcprosConnection
 from pharos.testing import Mailbox, TIMEOUT, until
 import programs
 
@@ -123,6 +127,57 @@ def test_when_the_last_has_stopped_the_connection_is_closed(master, sharing):
     wait_until_heard(channel, third)
     channel.send(data=1)
     assert three.next().data == 1
+
+
+@pytest.fixture
+def connecting(monkeypatch):
+    """A list of who has made a connection, and an event: they may go on."""
+    makers, go_on = [], threading.Event()
+
+    def make(address, header, *args):
+        made = TcprosConnection(address, header, *args)
+        makers.append(header['callerid'])
+        go_on.wait(TIMEOUT)
+        return made
+
+    monkeypatch.setattr(shared_connections, 'TcprosConnection', make)
+    yield makers, go_on
+    go_on.set()
+
+
+def test_a_connection_whose_maker_is_not_interested_any_more_is_closed(master, sharing, connecting):
+    makers, go_on = connecting
+    ((first, one),) = listen(sharing, '/first')
+    sender = create(master, '/sender')
+    opening = in_thread(sender.output_channel, '/shared', Int32)
+    until(lambda: makers)
+    first.channels[0].close()
+    go_on.set()
+    assert ended(opening)
+    (channel,) = sender.channels
+    until(lambda: not channel.connections)
+    channel.send(data=1)
+    ((second, two),) = listen(sharing, '/second')
+    wait_until_heard(channel, second)
+    channel.send(data=2)
+    assert two.next().data == 2
+
+
+def test_a_node_stops_while_another_one_makes_the_connection(
+    master, sharing, connecting, transcript
+):
+    makers, go_on = connecting
+    (first, one), (second, two) = listen(sharing, '/first', '/second')
+    sender = create(master, '/sender')
+    opening = in_thread(sender.output_channel, '/shared', Int32)
+    until(lambda: makers)
+    maker, other = (first, second) if makers == ['/first'] else (second, first)
+    until(lambda: other.latest_run.rospy.connections._connecting)
+    other.stop()
+    assert not [line for line in transcript if 'left behind' in line]
+    go_on.set()
+    assert ended(opening)
+    wait_until_heard(sender.channels[0], maker)
 
 
 def test_a_publisher_that_comes_back_is_heard_by_all(master, sharing):

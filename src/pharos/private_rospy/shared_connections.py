@@ -4,6 +4,7 @@ Each node is connected by a link, as to a publisher of this process, whose messa
 one socket: they are read and deserialized once. The publisher has a single subscriber, the node
 that connected first, also after that has left the connection to the others.
 """
+import contextlib
 import os
 import threading
 import weakref
@@ -13,6 +14,7 @@ from pharos.intraprocess.copier import copier_for
 from pharos.intraprocess.fanout import ClosedError, Fanout, Latch
 from pharos.private_rospy import changes, registration
 from pharos.private_rospy.deadlines import deadline_in
+from pharos.private_rospy.lifetime import SIGNAL_LATENCY
 from pharos.private_rospy.local_link import End, LocalLink
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.refusals import ask, suits
@@ -93,7 +95,12 @@ class SharedConnection:
         with self._publock:
             left = [each for each in self.fanout.connections if each is not end]
             self.fanout.set_connections(left)
-            if not left:
+        self.close_where_unheard()
+
+    def close_where_unheard(self):
+        """Close it if no link is there: what came would wait for who connects next."""
+        with self._publock:
+            if not self.fanout.connections:
                 self._close()
 
     # -- the socket
@@ -129,6 +136,8 @@ class SharedConnection:
         if _shared.get(self._key) is self:
             del _shared[self._key]
         self._connection.shut_down()
+        if self._thread is None:  # which closes it
+            self._connection.close()
         for end in ends:
             end.close()
 
@@ -186,7 +195,9 @@ def connect(node, topic, uri, address):
         return 0, refusal[0], 0
     node.refusals.publisher_connected(topic, uri)
     link = SharedLink(shared, subscriber, node, shared)
-    if link.open():
+    is_open = link.open()
+    shared.close_where_unheard()
+    if is_open:
         changes.notify()
         return 1, f'connected to {shared.name}', 0
     link.receiving.close()
@@ -197,11 +208,11 @@ def _connection_for(node, subscriber, uri, address):
     """``(the SharedConnection, None)``; or where the publisher refuses, ``(None, (what it said, a
     function that returns its connection header))``.
 
-    :raises OSError: if it does not answer
+    :raises OSError: if it does not answer, or the node stops while another one makes the connection
     """
     topic, data_class = subscriber.resolved_name, subscriber.data_class
     key = topic, uri, data_class._md5sum
-    with _turns.setdefault(key, threading.Lock()):
+    with _turn(node, key):
         shared = _shared.get(key)
         if shared is not None:
             return shared, None
@@ -220,6 +231,19 @@ def _connection_for(node, subscriber, uri, address):
             return None, (refusal, lambda: header if 'md5sum' in header else ask(address, topic))
         _shared[key] = shared = SharedConnection(key, data_class, connection)
         return shared, None
+
+
+@contextlib.contextmanager
+def _turn(node, key):
+    """Within this, no other node makes the connection."""
+    lock = _turns.setdefault(key, threading.Lock())
+    while not lock.acquire(timeout=SIGNAL_LATENCY):
+        if node.ended.is_set():
+            raise ConnectionAbortedError(f'{node.name} stops')
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 # a process that was forked has none of the threads that read
