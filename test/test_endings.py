@@ -444,6 +444,8 @@ WAITS = {
     'wait_for_node': lambda me: me.master.wait_for_node('/nobody'),
     'Master.wait': lambda me: Master(refused_url()).wait(),
     'Master.wait for one that says nothing': lambda me: Master(silent()).wait(),
+    'an offer, of one that says nothing': lambda me: Master(silent()).wait_for_service('/s'),
+    'wait_for_node, of one that says nothing': lambda me: Master(silent()).wait_for_node('/n'),
     'a subscriber that says nothing': lambda me: me.output_channel('/mute', 'std_msgs/Empty'),
     'the type of a topic': lambda me: me.interested_in('/untold', wait=TIMEOUT),
     'a publisher that does not connect': lambda me: me.interested_in('/slow', 'std_msgs/Empty'),

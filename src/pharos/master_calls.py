@@ -23,7 +23,7 @@ import rosgraph
 from pharos import on_demand
 from pharos.errors import MasterUnreachableError, NodeStoppedError
 from pharos.private_rospy.addresses import is_same_master
-from pharos.private_rospy.lifetime import Interruption
+from pharos.private_rospy.lifetime import Interruption, is_waiting
 from pharos.private_rospy.deadlines import MARGIN, time_limit
 from pharos.private_rospy.names import check_name
 from pharos.private_rospy.proxies import ServerProxy, interruption, master_api
@@ -60,8 +60,9 @@ class MasterCalls:
     ) -> Any:
         """Call a method of :meth:`api`.
 
-        A question about all that there is ends with the node on whose behalf this thread runs.
-        A call about one name does not: a node that stops may still finish what it is about.
+        A question about all that there is ends with the node on whose behalf this thread runs, as
+        does whatever is part of a wait. Any other call about one name does not: a node that stops
+        may still finish what it is about.
 
         :raises MasterUnreachableError: if the master does not answer
         :raises NodeStoppedError: if the node that asks stops meanwhile
@@ -69,7 +70,7 @@ class MasterCalls:
         """
         api = self.api(caller_id, timeout)
         with self.reached():
-            if args:
+            if args and not is_waiting():
                 return getattr(api, method)(*args)
             with interruption(api.handle) as stop:
                 try:
@@ -157,8 +158,8 @@ class MasterCalls:
         :raises COMMUNICATION_ERRORS: if it does not, in time
         """
         try:
-            node = ServerProxy(self.api().lookupNode(name), PING_TIMEOUT)
-        except (rosgraph.MasterException, *COMMUNICATION_ERRORS):
+            node = ServerProxy(self.call('lookupNode', name), PING_TIMEOUT)
+        except (rosgraph.MasterException, MasterUnreachableError):
             return None
         with interruption(node):
             return getattr(node, method)('/pharos')

@@ -356,6 +356,11 @@ class Interruption:
             lifetime.interruptions.discard(self)
 
 
+def is_waiting() -> bool:
+    """Whether this thread is within an :class:`Interruption`."""
+    return getattr(_thread, 'interruption', None) is not None
+
+
 def keep_alive(sock: socket.socket, while_sending: bool = False) -> None:
     """Have the connection break when its peer has silently gone, as with a cable pulled out.
 
