@@ -11,23 +11,34 @@ terminals:
 import random
 import sys
 
-from pharos import BlockNode, Master, program, spin
+from pharos import BlockNode, Master, MasterUnreachableError, Node, program, spin
 
 
-def work(worker):
-    for step in worker.every(0.1):
-        worker.send_to('/steps', typed_as='std_msgs/UInt32', data=step)
-        if random.random() < 0.02:
-            raise RuntimeError(f'the wheel is stuck after {step} steps')
+class Worker(Node):
+    def start(self):
+        super().start()
+        self.fork(Worker.work)
+
+    def work(self):
+        for step in self.every(0.1):
+            self.send_to('/steps', typed_as='std_msgs/UInt32', data=step)
+            if random.random() < 0.02:
+                raise RuntimeError(f'the wheel is stuck after {step} steps')
 
 
 def supervise(supervisor, workers):
+    due = {}  # worker -> why it is to be restarted
     for _ in supervisor.every(1):
         for worker in workers:
             if worker.errors or not worker.is_running:
-                why = worker.errors.pop() if worker.errors else 'it was stopped'
-                supervisor.log(f'restarts {worker.name}: {why}', level='warn')
-                worker.restart()
+                due[worker] = worker.errors.pop() if worker.errors else 'it was stopped'
+            if worker in due:
+                supervisor.log(f'restarts {worker.name}: {due[worker]}', level='warn')
+                try:
+                    worker.restart()
+                    del due[worker]
+                except MasterUnreachableError as error:
+                    supervisor.log(f'will try again: {error}', level='warn')
         health = [{'name': worker.name, 'message': str(worker.health())} for worker in workers]
         supervisor.send_to(
             '/diagnostics', typed_as='diagnostic_msgs/DiagnosticArray', status=health
@@ -36,9 +47,7 @@ def supervise(supervisor, workers):
 
 def main():
     master = Master()
-    workers = [master.create(BlockNode, named=name, soul=work) for name in ('left', 'right')]
-    for worker in workers:
-        worker.fork()
+    workers = [master.create(Worker, named=name) for name in ('left', 'right')]
     supervisor = master.create(BlockNode, named='supervisor')
     supervisor.fork(lambda me: supervise(me, workers))
     spin()

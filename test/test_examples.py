@@ -110,6 +110,18 @@ def test_what_has_failed_or_stopped_is_restarted(master):
         assert 'registered' in echo(master, '/diagnostics')
 
 
+def test_the_supervisor_goes_on_when_the_master_comes_back(mortal_master):
+    with examples.started('supervisor', mortal_master.url) as program:
+        program.wait_for(examples.READY['supervisor'])
+        mortal_master.end()
+        program.wait_for('will try again: no ROS master answers')
+        mortal_master.come_back()
+        program.wait_for('had forgotten')
+        for _ in range(3):  # one of the two has failed, and was restarted, more than once
+            program.wait_for(': the wheel is stuck')
+        assert program.end(signal.SIGINT) == 0
+
+
 # -- all of them
 
 
