@@ -419,6 +419,20 @@ def test_a_stop_ends_a_start_at_a_master_that_says_nothing():
         assert node_registry.nodes() == []
 
 
+def test_what_a_block_starts_while_all_nodes_are_stopped_is_stopped_too(master):
+    worker, supervisor = create(master, '/worker'), create(master, '/supervisor')
+    supervisor.stop_timeout = TIMEOUT
+
+    def supervise(me):
+        until(lambda: not worker.is_running)
+        worker.restart()
+
+    soul = supervisor.fork(supervise)
+    node_registry.stop_all()
+    assert ended(soul)
+    assert node_registry.nodes() == [] and not supervisor.errors
+
+
 # -- what waits ends with the node
 
 

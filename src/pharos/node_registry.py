@@ -7,17 +7,7 @@ import os
 import sys
 import threading
 import time
-from typing import (
-    TYPE_CHECKING,
-    Any,
-    Callable,
-    Dict,
-    Iterator,
-    List,
-    Optional,
-    Set,
-    Tuple,
-)
+from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, List, Optional, Set, Tuple
 
 from pharos import signals
 from pharos.blocks import name_of
@@ -32,6 +22,8 @@ if TYPE_CHECKING:
 
 #: seconds from its beginning on that anybody waits for a stop() that another thread runs
 STOP_LIMIT = 30.0
+#: how many times all that run are stopped, where others start some in answer to that
+STOP_ROUNDS = 5
 
 changed = threading.Condition()  # guards the life cycles of all nodes, and what follows
 # (master, name) -> those that the master may know, in the order of their starts
@@ -310,20 +302,26 @@ def _not_stopped_here() -> 'Set[Node]':
 
 
 def stop_all() -> None:
-    """Stop all nodes of the process, side by side.
+    """Stop all nodes of the process, side by side, and those that their blocks start meanwhile.
 
     Returns when each has ended its ``stop()``, or after STOP_LIMIT seconds.
     """
-    for function in list(_starters):
-        function()
-    with changed:
+    deadline = time.monotonic() + STOP_LIMIT
+    known: 'Set[Tuple[Node, Run]]' = set()
+    for _ in range(STOP_ROUNDS):
+        for function in list(_starters):
+            function()
+        with changed:
+            runs = {(node, node.latest_run) for node in _not_stopped_here()} - known
+        known |= runs
         threads = [
             threading.Thread(target=stop, args=(node,), name=node.name + ' stop', daemon=True)
-            for node in _not_stopped_here()
+            for node, _ in runs
         ]
-    for thread in threads:
-        thread.start()
-    join(threads, STOP_LIMIT)
+        for thread in threads:
+            thread.start()
+        if not threads or join(threads, deadline - time.monotonic()):
+            return
 
 
 def before_stop_all(function: Callable[[], Any]) -> None:
