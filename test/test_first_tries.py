@@ -198,6 +198,21 @@ def test_what_the_table_of_guesses_says_is_there(master):
         assert not all(hasattr(thing, guess) for thing in names.values()), guess
 
 
+@pytest.mark.parametrize(
+    'name, meant', [('delgate', 'delegate'), ('send', 'send_to'), ('sped', 'speed')]
+)
+def test_a_name_with_a_slip_is_told_once_by_what_may_be_meant(master, capsys, name, meant):
+    node = create(master, '/driver', Driver)
+    with pytest.raises(AttributeError) as raised:
+        getattr(node, name)
+    capsys.readouterr()
+    sys.__excepthook__(
+        raised.type, raised.value, raised.tb
+    )  # which may have a suggestion of Python's
+    told = f"AttributeError: 'Driver' object has no attribute '{name}' (did you mean '{meant}'?)"
+    assert capsys.readouterr().err.splitlines()[-1] == told
+
+
 def test_any_other_name_and_what_a_property_raises_are_as_python_has_it(master):
     class Arm(Node):
         @property
@@ -360,6 +375,8 @@ def test_a_type_or_field_of_something_else_is_told(master, use, said):
         (lambda master: create(master).sleep(duration=5), "'seconds='"),
         (lambda master: master.lookup_service('/s', callerid='/x'), "'caller_id='"),
         (lambda master: master.run('pharos', 'graph', nam='x'), "'name='"),
+        (lambda master: master.load('pharos', 'talker', argv=['_a:=1']), r"mean '\*args'\?\)$"),
+        (lambda master: master.run('pharos', 'graph', args=['x']), r"mean '\*args'\?\)$"),
         (lambda master: master.compose('pharos', 'turtle.launch', 'linear:=1'), 'takes .* given$'),
     ],
 )

@@ -223,6 +223,9 @@ def test_a_mistake_is_told_by_the_line_and_one_sentence(master, told):
     assert 'MessageTypeError: geometry_msgs/Twist.linear = 3 does not fit' in text
     assert text.count('\n') < 12, text
     assert 'src/pharos' not in text
+    text = told('me.delgate')
+    assert "no attribute 'delgate' (did you mean 'delegate'?)" in text
+    assert 'src/pharos' not in text
     text = told("me.send_to('/tw', linear=3)", '%tb')  # and that shows all
     assert 'src/pharos' in text
 

@@ -83,6 +83,7 @@ _KEYWORDS: Dict[str, List[str]] = {
     'block': ['callback', 'cb', 'handler', 'delegate'],
     'initialized': ['default', 'value', 'default_value'],
     'from_': ['sender', 'node'],
+    '*args': ['args', 'argv', 'arguments'],
     'seconds': ['period', 'duration', *_RATES],
 }
 Class = TypeVar('Class', bound=type)
@@ -109,7 +110,10 @@ def tells_keywords(function: Function) -> Function:
         except TypeError as error:
             frames = error.__traceback__
             if frames is not None and frames.tb_next is None:  # the function has not begun
-                known = list(inspect.signature(function).parameters)
+                known = [
+                    '*' + each.name if each.kind is each.VAR_POSITIONAL else each.name
+                    for each in inspect.signature(function).parameters.values()
+                ]
                 error.args = (f'{error}{keyword_hint(known, kwargs)}',)
             raise
 
@@ -120,13 +124,14 @@ def keyword_hint(known: List[str], given: Dict[str, Any]) -> str:
     """The end of the complaint that a keyword is not known, or one is missing; empty where nothing
     is near.
 
-    :param known: the keywords that there are
+    :param known: the keywords that there are, and '*args'
     :param given: those of the call
     """
+    shown = {name: name if name.startswith('*') else f'{name}=' for name in known}
     for wrong in given:
         if wrong not in known:
-            meant = [f'{name}=' for name in known if wrong in _KEYWORDS.get(name, ())]
-            found = suggest(f'{wrong}=', [f'{name}=' for name in known], meant)
+            meant = [shown[name] for name in known if wrong in _KEYWORDS.get(name, ())]
+            found = suggest(f'{wrong}=', shown.values(), meant)
             return found + (f', which is 1 / {wrong}' if meant and wrong in _RATES else '')
     return ''
 
@@ -149,14 +154,18 @@ def getattr_with_hint(thing: Any, name: str) -> Any:
     try:
         return object.__getattribute__(thing, name)
     except AttributeError as error:
-        if not hasattr(type(thing), name):
-            error.args = (f'{error}{hint(name) or _spelt_otherwise(thing, name)}',)
+        told = '' if hasattr(type(thing), name) else hint(name) or _spelt_otherwise(thing, name)
+        if told:
+            error.args = (f'{error}{told}',)
+            setattr(error, 'obj', None)  # else Python adds its own suggestion when it prints it
         raise
 
 
 def _spelt_otherwise(thing: Any, name: str) -> str:
     """The hint at a name that is spelt so but for capitals and underscores, as in the report's
-    Smalltalk: ``sendTo``."""
+    Smalltalk: ``sendTo``; or else but for a slip."""
+    if name.startswith('_'):
+        return ''  # whether it is there ask Python and IPython, of whatever there is
     plain = name.replace('_', '').lower()
-    names = [own for own in dir(type(thing)) if not own.startswith('_')]
-    return suggest(name, (), [own for own in names if own.replace('_', '') == plain])
+    names = [own for own in dir(thing) if not own.startswith('_')]
+    return suggest(name, names, [own for own in names if own.replace('_', '') == plain])

@@ -12,7 +12,7 @@ from pharos.blocks import attempt
 from pharos.errors import PharosError
 
 #: what is raised here for what users do
-KINDS = PharosError, ValueError, TypeError, LookupError, TimeoutError
+KINDS = PharosError, ValueError, TypeError, LookupError, AttributeError, TimeoutError
 #: packages whose lines are none of the user's
 _BELOW = 'IPython', 'pharos', 'rospy'
 
