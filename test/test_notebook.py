@@ -87,7 +87,7 @@ def kernel(master, tmp_path):
 
 
 def test_one_line_makes_a_notebook_a_workspace(master, kernel):
-    assert f'nodes are at the ROS master {master.url}' in kernel.printed
+    assert f'1 node is at the ROS master {master.url}' in kernel.printed
     assert kernel.run('me.name, master.url')['text/plain'] == f"('/workspace', '{master.url}')"
     assert '/workspace' in {node.name for node in master.nodes()}
 

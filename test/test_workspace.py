@@ -83,7 +83,7 @@ def test_a_session_has_a_master_a_node_of_its_own_and_all_of_pharos(master, open
         " <class 'pharos.compose.script.ScriptNode'> "
     )
     assert '/workspace' in names(master)
-    assert f'nodes are at the ROS master {master.url}' in terminal.text
+    assert f': 1 node is at the ROS master {master.url}' in terminal.text
 
 
 def test_a_second_session_has_another_name(master, open_session):
