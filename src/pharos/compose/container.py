@@ -1,4 +1,5 @@
 """The node that a composition is for others: it loads and unloads programs by nodelet's services."""
+import threading
 from typing import TYPE_CHECKING, Any, Dict, List
 
 import rosgraph.names
@@ -27,6 +28,8 @@ class Container(Node):
         super().__init__()
         self.composition = composition
         self._only_nearby = not allow_remote_load
+        # guards the two below, so that what is unloaded while it is being bound leaves no bond behind
+        self._changing = threading.RLock()
         self._loaded: Dict[str, KeptNode] = {}
         self._bonds: Dict[str, Any] = {}
 
@@ -76,13 +79,14 @@ class Container(Node):
         kept.settled.wait()
         if kept.problem is not None:
             raise kept.problem
-        self._loaded[full_name] = kept
-        if request.bond_id:
-            try:
-                self._bind(full_name, request.bond_id)
-            except BaseException:
-                self._drop(full_name)
-                raise
+        with self._changing:
+            self._loaded[full_name] = kept
+            if request.bond_id:
+                try:
+                    self._bind(full_name, request.bond_id)
+                except BaseException:
+                    self._drop(full_name)
+                    raise
         return True
 
     def _full_name(self, name: str) -> str:
@@ -96,16 +100,19 @@ class Container(Node):
             f'{self.name}/bond', bond_id, on_broken=lambda: self._drop(name)
         )
         bond.start()
-        self.fork(lambda me: self._drop_at_its_end(name), name=f'bond of {name}')
-
-    def _drop_at_its_end(self, name: str) -> None:
         kept = self._loaded[name]
+        self.fork(lambda me: self._drop_at_its_end(name, kept), name=f'bond of {name}')
+
+    def _drop_at_its_end(self, name: str, kept: KeptNode) -> None:
         node_registry.wait_until(lambda: kept.is_over)
-        if kept.is_over:  # else this node stops
+        if (
+            kept.is_over and self._loaded.get(name) is kept
+        ):  # else this node stops, or it was dropped
             self._drop(name)
 
     def _drop(self, name: str) -> None:
-        kept, bond = self._loaded.pop(name, None), self._bonds.pop(name, None)
+        with self._changing:
+            kept, bond = self._loaded.pop(name, None), self._bonds.pop(name, None)
         if kept is not None:
             kept.stop()
         if bond is not None:
