@@ -350,7 +350,7 @@ def test_ctrl_c_at_the_prompt_ends_no_node(master, open_session):
 
 def test_ctrl_c_ends_a_script_that_spins_and_the_session_goes_on(master, open_session):
     terminal = open_session(script('turtle_driver'), prompt='PhaROS')
-    master.wait_for_node('/my_turtle_driver', TIMEOUT)
+    terminal.wait_for('waits for a turtle')  # it is past its start, which Ctrl-C would end
     terminal.press('C-c')
     terminal.wait_for(r'^In \[1\]:')
     terminal.enter('master.node("/my_turtle_driver").is_running')
