@@ -47,6 +47,8 @@ class Kind:
             message.width, message.height = IMAGES[self._name]
             message.encoding = 'rgb8'
             message.data = bytes(3 * message.width * message.height)
+        elif self._name.startswith('bytes'):  # as benchmark/scale asks for them
+            message.data = bytes(int(self._name[len('bytes') :]))
         return message
 
     def mark(self):

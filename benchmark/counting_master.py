@@ -1,0 +1,40 @@
+"""A ROS master that counts what it is asked, and tells it by a call of ``counts(caller_id)``. See
+benchmark/scale.
+
+usage: counting_master.py PORT
+"""
+import sys
+import time
+import xmlrpc.server
+
+import rosmaster.master
+import rosmaster.master_api
+
+counts = {'requests': 0, 'bytes': 0}
+
+
+def count_dispatches():
+    """Have the servers of this process count the requests that they answer, and the bytes of both."""
+    dispatcher = xmlrpc.server.SimpleXMLRPCDispatcher
+    dispatch = dispatcher._marshaled_dispatch
+
+    def counted(self, data, *options):
+        answer = dispatch(self, data, *options)
+        if b'<methodName>counts<' not in data:
+            counts['requests'] += 1
+            counts['bytes'] += len(data) + len(answer)
+        return answer
+
+    dispatcher._marshaled_dispatch = counted
+
+
+def tell(handler, caller_id):
+    """The counts so far, and the seconds of a processor."""
+    return 1, 'counts', {**counts, 'cpu': time.process_time()}
+
+
+if __name__ == '__main__':
+    count_dispatches()
+    rosmaster.master_api.ROSMasterHandler.counts = tell
+    rosmaster.master.Master(port=int(sys.argv[1])).start()
+    sys.stdin.read()  # until the parent ends

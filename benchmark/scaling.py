@@ -1,0 +1,336 @@
+"""What many nodes, topics and receivers cost, and where they end, measured in a fresh process;
+prints its findings as JSON. benchmark/scale starts it, at a counting_master.py.
+
+usage: scaling.py nodes pharos|rospy COUNT SECONDS
+       scaling.py topics pharos|rospy COUNT SECONDS
+       scaling.py limit WHAT LIMIT COUNT
+       scaling.py receivers RATE COUNT
+       scaling.py size BYTES
+"""
+import collections
+import ctypes
+import json
+import os
+import pathlib
+import re
+import resource
+import signal
+import subprocess
+import sys
+import threading
+import time
+import xmlrpc.client
+
+from std_msgs.msg import Int32
+
+clock = time.perf_counter
+PATIENCE = 60.0  # seconds for all to be there
+TICKS = os.sysconf('SC_CLK_TCK')
+NOBODY = 65534  # who has limits, where this runs as root
+PR_SET_DUMPABLE = 4
+QUEUE = 10  # messages that wait for a receiver
+
+
+def wait_until(holds, what):
+    """Look a hundred times a second."""
+    deadline = clock() + PATIENCE
+    while not holds():
+        if clock() > deadline:
+            raise SystemExit(f'not in time: {what}')
+        time.sleep(0.01)
+
+
+def master_counts():
+    """What the master has been asked so far."""
+    return xmlrpc.client.ServerProxy(os.environ['ROS_MASTER_URI']).counts('/scale')[2]
+
+
+def registered(names):
+    """How many of these nodes the master knows."""
+    state = xmlrpc.client.ServerProxy(os.environ['ROS_MASTER_URI']).getSystemState('/scale')[2]
+    return len(set(names) & {name for kind in state for _, nodes in kind for name in nodes})
+
+
+class Use:
+    """What processes use, as /proc tells: MB of memory (what they share is divided), threads,
+    descriptors, seconds of a processor."""
+
+    def __init__(self, pids):
+        self.memory = self.threads = self.descriptors = self.cpu = 0
+        for pid in pids:
+            folder = pathlib.Path('/proc', str(pid))
+            share = re.search(r'^Pss: *(\d+) kB', (folder / 'smaps_rollup').read_text(), re.M)
+            self.memory += int(share[1]) / 1e3
+            self.threads += len(os.listdir(folder / 'task'))
+            self.descriptors += len(os.listdir(folder / 'fd'))
+            fields = (folder / 'stat').read_text().rpartition(')')[2].split()
+            self.cpu += (int(fields[11]) + int(fields[12])) / TICKS
+
+
+def measure(pids, begun, before, asked, seconds):
+    """What there is of processes that have just come to rest, and what they do while idle.
+
+    :param begun: when they began to start
+    :param before: the Use of what was there before
+    :param asked: the counts of the master then
+    """
+    started, now = clock() - begun, master_counts()
+    time.sleep(2.5)  # connections to the master are given back
+    use, counts, since = Use(pids), master_counts(), clock()
+    time.sleep(seconds)
+    later, idle, lasted = Use(pids), master_counts(), clock() - since
+    return {
+        'start': started,
+        'asked to start': now['requests'] - asked['requests'],
+        'memory': use.memory - before.memory,
+        'threads': use.threads - before.threads,
+        'descriptors': use.descriptors,  # all, for there is a limit on them
+        'cpu': 100 * (later.cpu - use.cpu) / lasted,
+        'requests': (idle['requests'] - counts['requests']) / lasted,
+        'bytes': (idle['bytes'] - counts['bytes']) / lasted / 1e3,
+        'master': 100 * (idle['cpu'] - counts['cpu']) / lasted,
+    }
+
+
+# -- nodes: a chain, in which each hears its predecessor
+
+
+def link_of_chain(master, number, heard=None):
+    """One more node of pharos."""
+    import pharos
+
+    node = master.create(pharos.BlockNode, named=f'/scale/n{number}', domain='127.0.0.1')
+    node.output_channel(f'/scale/t{number + 1}', Int32)
+    node.interested_in(f'/scale/t{number}', Int32, heard or (lambda message, channel: None))
+    return node
+
+
+def nodes_of_pharos(count, seconds):
+    """That many nodes of this process."""
+    import pharos
+
+    master = pharos.Master()
+    link_of_chain(master, 0).stop()  # what is loaded once per process
+    before, asked, begun = Use([os.getpid()]), master_counts(), clock()
+    nodes = [link_of_chain(master, number + 1) for number in range(count)]
+    found = measure([os.getpid()], begun, before, asked, seconds)
+    kinds, begun = kinds_of_threads(), clock()
+    for node in nodes:
+        node.stop()
+    return {**found, 'stop': clock() - begun, 'kinds': kinds}
+
+
+def kinds_of_threads():
+    """``{what the threads do: how many}``."""
+    names = (re.sub(r'^/\S* |[-\d]*\d', '', thread.name) for thread in threading.enumerate())
+    return dict(collections.Counter(names))
+
+
+def nodes_of_rospy(count, seconds):
+    """That many processes, each with a node; they start a few at a time."""
+    asked, begun, processes = master_counts(), clock(), []
+    names = [f'/scale_n{number}' for number in range(count)]
+    try:
+        for number in range(count):
+            processes.append(
+                subprocess.Popen(
+                    [sys.executable, __file__, 'node', str(number)], stdout=subprocess.DEVNULL
+                )
+            )
+        wait_until(lambda: registered(names) == count, f'{count} nodes of rospy')
+        found = measure([process.pid for process in processes], begun, Use([]), asked, seconds)
+    finally:
+        begun = clock()
+        for process in processes:
+            process.send_signal(signal.SIGINT)
+        for process in processes:
+            process.wait()
+    return {**found, 'stop': clock() - begun}
+
+
+def node_of_rospy(number):
+    """One of them, until Ctrl-C."""
+    import rospy
+
+    rospy.init_node(f'scale_n{number}')
+    publisher = rospy.Publisher(f'/scale/t{number + 1}', Int32, queue_size=QUEUE)
+    rospy.Subscriber(f'/scale/t{number}', Int32, lambda message: None)
+    rospy.spin()
+    publisher.unregister()
+
+
+# -- topics: one node publishes on each of them, and hears it
+
+
+def topics(way, count, seconds):
+    """Open so many topics of a node, send a message on each, and see what they cost."""
+    heard = collections.Counter()
+    opened, stop = {'pharos': topics_of_pharos, 'rospy': topics_of_rospy}[way]()
+    opened(count, lambda *_: None)  # what is loaded once per process
+    before, asked, begun = Use([os.getpid()]), master_counts(), clock()
+    publishers = [
+        opened(number, lambda message, *_: heard.update([message.data])) for number in range(count)
+    ]
+    wait_until(lambda: all(map(connections, publishers)), 'connections')
+    found = measure([os.getpid()], begun, before, asked, seconds)
+    begun = clock()
+    for number, publisher in enumerate(publishers):
+        publisher.publish(Int32(number))
+    wait_until(lambda: len(heard) == count, 'a message on each topic')
+    found['round'] = clock() - begun
+    begun = clock()
+    stop()
+    return {**found, 'stop': clock() - begun}
+
+
+def connections(publisher):
+    """How many a channel of pharos, or a Publisher of rospy, has."""
+    try:
+        return len(publisher.connections)
+    except AttributeError:
+        return publisher.get_num_connections()
+
+
+def topics_of_pharos():
+    """``opened(number, heard)``, which returns a Publisher or channel that is heard, and ``stop()``."""
+    import pharos
+
+    node = pharos.Master().create(pharos.BlockNode, named='/scale/topics', domain='127.0.0.1')
+
+    def opened(number, heard):
+        node.interested_in(f'/scale/t{number}', Int32, heard)
+        return node.output_channel(f'/scale/t{number}', Int32)
+
+    return opened, node.stop
+
+
+def topics_of_rospy():
+    """The same."""
+    import rospy
+
+    rospy.init_node('scale_topics', disable_signals=True)
+
+    def opened(number, heard):
+        rospy.Subscriber(f'/scale/t{number}', Int32, heard)
+        return rospy.Publisher(f'/scale/t{number}', Int32, queue_size=QUEUE)
+
+    return opened, lambda: rospy.signal_shutdown('measured')
+
+
+# -- limits: what happens where there is no more
+
+
+def limit(what, value, count):
+    """Start nodes of pharos until one cannot; what was said, and whether the others go on."""
+    import pharos
+
+    what, value, heard = getattr(resource, f'RLIMIT_{what}'), int(value), threading.Event()
+    master = pharos.Master()
+    nodes = [link_of_chain(master, 0)]
+    if what == resource.RLIMIT_NPROC and os.geteuid() == 0:
+        os.setuid(NOBODY)  # root has no such limit
+        ctypes.CDLL(None).prctl(PR_SET_DUMPABLE, 1)  # what /proc tells of it stays its own
+    resource.setrlimit(what, (value, value))
+    said = None
+    try:
+        for number in range(count):
+            nodes.append(link_of_chain(master, number + 1, lambda *_: heard.set()))
+    except Exception as error:
+        said = f'{type(error).__name__}: {error}'
+    own = Use([os.getpid()])
+    nodes[0].send_to('/scale/t1', data=1)
+    goes_on = heard.wait(PATIENCE)
+    for node in nodes:
+        node.stop()
+    return {
+        'nodes': len(nodes),
+        'said': said,
+        'goes on': goes_on,
+        'threads': own.threads,
+        'descriptors': own.descriptors,
+    }
+
+
+# -- receivers: as many as keep up
+
+
+def receivers(rate, count):
+    """Send to so many nodes for two seconds, and see what is dropped, and who says so."""
+    import pharos
+
+    master = pharos.Master()
+    sender = master.create(pharos.BlockNode, named='/scale/sender', domain='127.0.0.1')
+    channels = [
+        master.create(
+            pharos.BlockNode, named=f'/scale/r{number}', domain='127.0.0.1'
+        ).interested_in('/scale/crowd', Int32, lambda message, channel: None, queue_size=QUEUE)
+        for number in range(count)
+    ]
+    publish = sender.output_channel('/scale/crowd', Int32).publish
+    began = due = clock()
+    for number in range(2 * rate):
+        publish(Int32(number))
+        due += 1 / rate
+        time.sleep(max(0.0, due - clock()))
+    took = clock() - began
+    time.sleep(0.5)  # for what waits in the queues
+    received, dropped = (
+        sum(getattr(each, name) for each in channels) for name in ('received', 'dropped')
+    )
+    worst = max(channels, key=lambda each: each.dropped)
+    said = f'{worst.node.name}: {worst.node.health(ask=False)}'
+    return {'took': took, 'received': received, 'dropped': dropped, 'said': said}
+
+
+# -- sizes: what is too large
+
+
+def size(count):
+    """Send an image of so many bytes in process and to another one; what is said of it."""
+    from sensor_msgs.msg import Image
+
+    import pharos
+
+    master, arrived = pharos.Master(), threading.Event()
+    sender = master.create(pharos.BlockNode, named='/scale/sender', domain='127.0.0.1')
+    heard = master.create(pharos.BlockNode, named='/scale/receiver', domain='127.0.0.1')
+    heard.interested_in('/scale/large', Image, lambda *_: arrived.set())
+    channel = sender.output_channel('/scale/large', Image)
+    said = []
+    for number in count, 2**32:
+        arrived.clear()
+        try:
+            channel.publish(Image(data=bytes(number)))
+            what = 'arrived' if arrived.wait(PATIENCE) else 'did not arrive'
+        except pharos.PharosError as error:
+            what = f'{type(error).__name__}: {error}'
+        said.append(f'{number} bytes in process: {what}')
+    return said
+
+
+def main():
+    """Do as the arguments say."""
+    if sys.argv[1] == 'node':
+        node_of_rospy(int(sys.argv[2]))
+        return
+    answers = os.fdopen(os.dup(1), 'w')
+    os.dup2(2, 1)  # what ROS prints is no answer
+    what, *words = sys.argv[1:]
+    if what == 'nodes':
+        found = {'pharos': nodes_of_pharos, 'rospy': nodes_of_rospy}[words[0]](
+            int(words[1]), float(words[2])
+        )
+    elif what == 'topics':
+        found = topics(words[0], int(words[1]), float(words[2]))
+    elif what == 'limit':
+        found = limit(words[0], int(words[1]), int(words[2]))
+    elif what == 'size':
+        found = size(int(words[0]))
+    else:
+        found = receivers(int(words[0]), int(words[1]))
+    print(json.dumps(found), file=answers, flush=True)
+    os._exit(0)  # all that is measured is over
+
+
+if __name__ == '__main__':
+    main()
