@@ -6,6 +6,7 @@ nodes alone; the master and the peers are elsewhere.
 import gc
 import json
 import os
+import re
 import resource
 import subprocess
 import sys
@@ -154,6 +155,15 @@ def test_a_node_for_which_there_are_no_descriptors_says_so(master):
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, before)
     assert create(master, '/one_more').is_running
+
+
+def test_a_node_for_which_there_is_no_thread_says_so_and_leaves_nothing(master):
+    found = run(master, 'limited.py')
+    assert re.match(
+        r"no thread for /limited/n\d+: can't start new thread, beside \d+ .* ulimit -v \(",
+        found['said'],
+    )
+    assert found['goes on'] and not found['is left']
 
 
 def test_questions_to_the_master_and_to_nodes_hold_no_descriptor(master):

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Callable, Dict, FrozenSet, List, Optional
 from pharos.blocks import name_of
 from pharos.errors import MasterUnreachableError
 from pharos.failures import Failures
+from pharos.private_rospy import threads
 from pharos.transcript import Transcript
 
 if TYPE_CHECKING:
@@ -55,10 +56,10 @@ class Watcher:
             elif self._thread is None:
                 if self._master.local_nodes():
                     self.reachable_since = time.time()  # one has just registered
-                self._thread = threading.Thread(
-                    target=self._run, name=f'watcher of {self._master.url}', daemon=True
-                )
-                self._thread.start()
+                name = f'watcher of {self._master.url}'
+                thread = threading.Thread(target=self._run, name=name, daemon=True)
+                threads.start(thread.start, f'the {name}')
+                self._thread = thread
 
     def listen(self, block: Callable[[str, str, bool], Any]) -> Callable[[], None]:
         """Have ``block(kind, name, is_there)`` called for each node, topic and service that comes

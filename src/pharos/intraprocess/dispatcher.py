@@ -184,7 +184,11 @@ class Dispatcher:
     def need_thread(self) -> None:
         """Have the dispatcher thread, from the first channel on that is not inline."""
         if self._thread_claim.acquire(blocking=False):
-            self._start_thread(self._run_thread, name=self._name)
+            try:
+                self._start_thread(self._run_thread, name=self._name)
+            except BaseException:  # the next one may have it
+                self._thread_claim.release()
+                raise
 
     def schedule(self, inbox: Runnable) -> None:
         """Have the dispatcher thread run an inbox."""

@@ -13,7 +13,7 @@ import genpy
 from genmsg.msgs import bare_msg_type, is_builtin, parse_type
 from genpy.base import SIMPLE_TYPES_DICT
 
-from pharos.errors import MessageTypeError, suggest
+from pharos.errors import MessageTypeError, PharosError, suggest
 
 MessageClass = Type[genpy.Message]
 
@@ -175,6 +175,11 @@ def check_fits(message: genpy.Message) -> None:
     Slow."""
     try:
         message.serialize(io.BytesIO())
+    except MemoryError as error:
+        raise PharosError(
+            f'no memory to serialize {type(message)._type} for subscribers elsewhere: send less at'
+            ' once, or raise ulimit -v, or what a container may have'
+        ) from error
     except Exception as error:
         # genpy lets AttributeError, OverflowError and UnicodeEncodeError escape too
         cls = type(message)

@@ -276,7 +276,8 @@ class PrivateRospy:
         core.signal_shutdown('stop')
         with core._shutdown_lock:
             pass  # where the node's own code called that, it returned at once
-        self.start_thread(self._process.run_exit_handlers, name='atexit')
+        if self._process.has_exit_handlers():
+            self.start_thread(self._process.run_exit_handlers, name='atexit')
         for proxy in list(core._xmlrpc_cache.values()):  # a thread that is left may add one
             proxy('close')()
         left = self.lifetime.finish_shutdown(abandoned)
@@ -386,7 +387,8 @@ def _ports_checked(what, port):
     try:
         yield
     except OSError as error:
-        if error.errno not in (errno.EADDRINUSE, errno.EACCES):
+        # with the name of a file, it is the log that cannot be written
+        if error.errno not in (errno.EADDRINUSE, errno.EACCES) or error.filename:
             raise
         raise PortInUseError(
             f'{what} {port} cannot be bound ({error.strerror}): choose another port, or 0 for any'

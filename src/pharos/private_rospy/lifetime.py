@@ -11,6 +11,7 @@ import weakref
 from typing import Any, Callable, Iterable, List, Optional
 
 from pharos import working_directory
+from pharos.private_rospy import threads
 from pharos.private_rospy.module_proxy import ModuleProxy
 from pharos.signals import main_thread
 
@@ -100,7 +101,7 @@ class Lifetime:
                 # one that a thread of the node starts has the working directory of that
                 self.is_from_elsewhere = getattr(_thread, 'lifetime', None) is not lifetime
                 lifetime.threads.add(self)
-                super().start()
+                threads.start(super().start, lifetime.name)
 
         class Timer(Thread, threading.Timer):
             """``threading.Timer`` of the node, whose stop cancels it, at the end of its program."""

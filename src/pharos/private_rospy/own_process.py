@@ -110,6 +110,12 @@ class OwnProcess:
         while waiting:
             self._attempt(waiting.pop())
 
+    def has_exit_handlers(self):
+        """Whether :meth:`run_exit_handlers` has anything to do, for which a thread may not be
+        there."""
+        lifetime = self._lifetime
+        return bool(lifetime.raised or self.exit_handlers or lifetime.before_threads_end)
+
     def run_exit_handlers(self):
         """Run the handlers of atexit, the last first, each once."""
         self._attempt(self._lifetime.raise_pending)  # where it could not, report it
