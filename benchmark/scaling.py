@@ -278,7 +278,7 @@ def receivers(rate, count):
         sum(getattr(each, name) for each in channels) for name in ('received', 'dropped')
     )
     worst = max(channels, key=lambda each: each.dropped)
-    said = f'{worst.node.name}: {worst.node.health(ask=False)}'
+    said = f'{worst.node.name}: {worst.node.health()}'
     return {'took': took, 'received': received, 'dropped': dropped, 'said': said}
 
 

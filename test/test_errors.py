@@ -5,10 +5,12 @@ import threading
 
 import genpy
 import pytest
+from std_msgs.msg import Int32
 
 from helpers import create
 import pharos
 from pharos import BlockNode, Master
+from pharos.messages.fields import check_fits
 from pharos.private_rospy.process_rospy import rospy
 
 
@@ -418,3 +420,12 @@ def test_all_errors_are_ros_exceptions():
     errors = [getattr(pharos, name) for name in pharos.__all__ if name.endswith('Error')]
     assert len(errors) == 12
     assert all(issubclass(error, (pharos.PharosError, rospy.ROSException)) for error in errors)
+
+
+def test_a_message_for_which_there_is_no_memory_is_told_as_that():
+    class Huge(Int32):
+        def serialize(self, buffer):
+            raise MemoryError
+
+    with pytest.raises(pharos.PharosError, match='no memory to serialize std_msgs/Int32'):
+        check_fits(Huge())

@@ -13,7 +13,9 @@ import sys
 import weakref
 
 import pytest
+from std_msgs.msg import String
 
+import load
 from helpers import create
 from pharos.testing import Mailbox, until
 import pharos
@@ -125,6 +127,26 @@ def test_a_node_holds_a_descriptor_for_each_port_and_one_for_rosout(monkeypatch)
         nodes[0].send_to('/frugal', data='to all')
         # their connections to the master are closed in a while, and its to them
         until(lambda: len(os.listdir('/proc/self/fd')) < before + 4 * 10)
+
+
+def test_a_node_has_a_thread_for_each_port_and_one_for_its_delegates(monkeypatch):
+    monkeypatch.setenv('ROS_HOSTNAME', '127.0.0.1')
+    with pharos.Master.embedded() as master:
+        node = create(master, '/of_few_threads')
+        node.interested_in('/few', 'std_msgs/String')
+        node.send_to('/few', data='to itself')
+        # those that registered and connected it end by themselves
+        until(lambda: node.health().threads == 3)
+
+
+def test_a_subscriber_that_left_is_noticed_without_a_message_to_it(master):
+    with create(master, '/left_alone') as node:
+        channel = node.output_channel('/left', 'std_msgs/String')
+        client = load.subscribe(node, '/left', String)
+        until(lambda: channel.connections)
+        impl = node.latest_run.rospy.publisher('/left')
+        client.close()
+        until(lambda: not impl.connections)
 
 
 def test_a_thread_that_waits_for_clients_holds_no_number_of_a_descriptor(monkeypatch):

@@ -193,3 +193,10 @@ def test_a_failure_is_told_where_the_log_shows_nothing_on_the_screen(master, tmp
     printed, _ = told(master, ROS_PYTHON_LOG_CONFIG_FILE=str(configuration))
     assert printed.count('raised ValueError') == 2
     assert 'hello' not in printed
+
+
+def test_a_log_that_cannot_be_opened_is_told_as_that(master, tmp_path, monkeypatch):
+    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path))
+    (tmp_path / 'without_log.log').mkdir()
+    with pytest.raises(pharos.PharosError, match='without_log.log cannot be opened .* ROS_LOG_DIR'):
+        create(master, '/without_log')

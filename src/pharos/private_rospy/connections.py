@@ -8,7 +8,7 @@ from typing import Any, Dict
 from pharos.errors import NodeStoppedError
 from pharos.private_rospy.addresses import is_same_master
 from pharos.private_rospy.names import Resolved
-from pharos.private_rospy import changes, registration, shared_connections
+from pharos.private_rospy import changes, departures, registration, shared_connections
 from pharos.private_rospy.deadlines import time_limit
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.proxies import ServerProxy
@@ -45,9 +45,11 @@ class Connections:
     def announce(self):
         """The node runs: its neighbours may connect to it."""
         _running[self._node.uri] = self._node
+        departures.watch(self._node)
 
     def withdraw(self):
         """The node stops."""
+        departures.ignore(self._node)
         if _running.get(self._node.uri) is self._node:
             del _running[self._node.uri]
 

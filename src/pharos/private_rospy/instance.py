@@ -8,7 +8,12 @@ from typing import Any
 
 import rosgraph.network
 
-from pharos.errors import MasterUnreachableError, NodeStoppedError, PortInUseError
+from pharos.errors import (
+    MasterUnreachableError,
+    NodeStoppedError,
+    PharosError,
+    PortInUseError,
+)
 from pharos.private_rospy import (
     changes,
     logs,
@@ -387,8 +392,12 @@ def _ports_checked(what, port):
     try:
         yield
     except OSError as error:
-        # with the name of a file, it is the log that cannot be written
-        if error.errno not in (errno.EADDRINUSE, errno.EACCES) or error.filename:
+        if error.filename:
+            raise PharosError(
+                f'the log {error.filename} cannot be opened ({error.strerror}): set ROS_LOG_DIR to a'
+                ' folder in which it can'
+            ) from error
+        if error.errno not in (errno.EADDRINUSE, errno.EACCES):
             raise
         raise PortInUseError(
             f'{what} {port} cannot be bound ({error.strerror}): choose another port, or 0 for any'

@@ -70,14 +70,24 @@ def reg_removed(self, resolved_name, data_type_or_uri, reg_type, *, original):
 
 
 @patch('rospy.impl.registration', 'RegManager.publisher_update', 'forgets who publishes')
-def publisher_update(self, resolved_name, uris, *, node, original):
-    """Note whom the master named."""
+def publisher_update(self, resolved_name, uris, *, node):
+    """Note whom the master named, and connect to each in a thread of its own."""
     subscriber = node.subscriber(resolved_name)
     if subscriber is not None:
         subscriber.publishers = uris
         subscriber.out_of_reach.intersection_update(uris)
         node.refusals.publishers_changed(subscriber)
-    original(self, resolved_name, uris)
+    for uri in () if node.ended.is_set() else uris:  # each by itself: one may not answer
+        node.start_thread(self._connect_topic_thread, (resolved_name, uri), 'connecting')
+
+
+@patch(
+    'rospy.impl.registration',
+    'RegManager.run',
+    'is a thread of each node that looks twice a second, and ends where it cannot start another',
+)
+def run(self):
+    """Leave it to publisher_update, and to the departures of all nodes."""
 
 
 @patch(

@@ -125,6 +125,8 @@ class _Poller:
 
     def error_iter(self):
         """The descriptors of those sockets."""
+        if not self._watched:
+            return
         poll = select.poll()
         for descriptor in tuple(self._watched):
             poll.register(descriptor, LEFT)
