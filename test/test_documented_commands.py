@@ -219,7 +219,9 @@ def test_a_long_command_has_the_options_that_it_is_given(line):
     )
 
 
-@pytest.mark.parametrize('name', ['nodes', 'channels', 'services', 'compose', 'scale', 'middleware'])
+@pytest.mark.parametrize(
+    'name', ['nodes', 'channels', 'services', 'compose', 'scale', 'middleware']
+)
 def test_each_benchmark_can_be_seen_to_work_quickly(name):
     assert '--quick' in help_of(['/usr/bin/python3', f'benchmark/{name}'])
 
