@@ -93,7 +93,7 @@ def test_the_pictures_of_the_benchmarks_show_the_figures_of_their_tables(tmp_pat
     pytest.importorskip('matplotlib')
     command = [sys.executable, ROOT / 'benchmark' / 'picture', '--output', tmp_path]
     drawn = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.split()
-    assert len(drawn) == 4
+    assert len(drawn) == 6
     for path in map(pathlib.Path, drawn):
         assert texts(path) == texts(ROOT / 'doc' / path.name), 'benchmark/picture --output doc'
 
@@ -101,7 +101,7 @@ def test_the_pictures_of_the_benchmarks_show_the_figures_of_their_tables(tmp_pat
 def texts(picture):
     """What is written in a picture, but for the marks of its axes, which depend on matplotlib."""
     found = re.findall(r'<text [^>]*>([^<]+)</text>', picture.read_text())
-    assert {'direct call', 'six processes', 'zenoh'} & set(found)
+    assert {'direct call', 'six processes', 'zenoh', 'pharos', 'pharos default'} & set(found)
     return [text for text in found if not re.fullmatch(r'[\d.]+', text) or '.' in text]
 
 
