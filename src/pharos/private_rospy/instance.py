@@ -8,20 +8,8 @@ from typing import Any
 
 import rosgraph.network
 
-from pharos.errors import (
-    MasterUnreachableError,
-    NodeStoppedError,
-    PharosError,
-    PortInUseError,
-)
-from pharos.private_rospy import (
-    changes,
-    logs,
-    patches,
-    process_rospy,
-    refusals,
-    registration,
-)
+from pharos.errors import MasterUnreachableError, NodeStoppedError, PharosError, PortInUseError
+from pharos.private_rospy import changes, logs, patches, process_rospy, refusals, registration
 from pharos.private_rospy.acceptor import Acceptor, Limits
 from pharos.private_rospy.lifetime import Lifetime
 from pharos.private_rospy.loader import PrivateImports
