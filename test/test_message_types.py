@@ -555,6 +555,8 @@ def test_fill_names_type_and_field_that_does_not_exist_and_the_one_meant():
         match=r"geometry_msgs/Twist.linear has no field 'w'.* x: float64, y: float64",
     ):
         fill(geometry_msgs.msg.Twist(), {'linear': {'w': 1}})
+    with pytest.raises(MessageTypeError, match="no field 'data'; it has no fields at all"):
+        fill(std_msgs.msg.Empty(), {'data': 1})
 
 
 @pytest.mark.parametrize(
@@ -574,10 +576,11 @@ def test_fill_names_type_and_field_that_does_not_exist_and_the_one_meant():
         ('string[2] x', ['a'], 'give a list of 2 string'),
         ('string[] x', ['a', 1], 'zoo/T.x[1] = 1 does not fit string'),
         ('int32[] x', 5, 'zoo/T.x = 5 does not fit int32[]'),
-        ('geometry_msgs/Point x', 5, 'give a Point (x: float64, y: float64, z: float64)'),
+        ('geometry_msgs/Point x', 5, 'give a Point or a dict of its fields (x: float64, y: '),
         ('geometry_msgs/Point[] x', [{'y': 'q'}], "zoo/T.x[0].y = 'q' does not fit float64"),
         ('geometry_msgs/Point[] x', [5], 'zoo/T.x[0] = 5 does not fit geometry_msgs/Point'),
-        ('time x', 5, 'give a Time (secs: uint32, nsecs: uint32)'),
+        ('time x', 5, 'give a rospy.Time, such as node.ros.Time.now()'),
+        ('duration x', 1.5, 'give a rospy.Duration, such as node.ros.Duration(1.5)'),
         ('time x', {'secs': -1}, 'zoo/T.x.secs = -1 does not fit uint32'),
     ],
 )

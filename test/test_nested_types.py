@@ -125,7 +125,7 @@ def test_nested_fields_are_filled_by_dicts(made):
         ),
         (
             {'header': 5},
-            'bag_msgs/Stamped.header = 5 does not fit std_msgs/Header: give a Header (seq: uint32',
+            'bag_msgs/Stamped.header = 5 does not fit std_msgs/Header: give a Header or a dict of its fields (seq: ',
         ),
     ],
 )

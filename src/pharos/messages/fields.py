@@ -28,6 +28,8 @@ _WHAT_FITS = {
     'string': 'a str',
     'float32': 'a number up to 3.4e38',
     'float64': 'a number',
+    'time': 'a rospy.Time, such as node.ros.Time.now()',
+    'duration': 'a rospy.Duration, such as node.ros.Duration(1.5)',
 }
 
 
@@ -219,10 +221,8 @@ def add_fields(error: BaseException, message: Any) -> None:
 
 def _no_field(cls: MessageClass, path: str, name: str) -> MessageTypeError:
     names = [field for field, _ in fields_of(cls)]
-    return MessageTypeError(
-        f'{path} has no field {name!r}{suggest(str(name), names)}; '
-        f'its fields are {describe_fields(cls)}'
-    )
+    known = f'its fields are {describe_fields(cls)}' if names else 'it has no fields at all'
+    return MessageTypeError(f'{path} has no field {name!r}{suggest(str(name), names)}; {known}')
 
 
 def _fill(message: genpy.Message, fields: Dict[str, Any], path: str) -> genpy.Message:
@@ -320,4 +320,4 @@ def _what_fits(cls: MessageClass, base: str, is_array: bool, length: Optional[in
     if nested is None:  # of a class written by hand
         return f'a {base}'
     name = getattr(nested, '_type', nested.__name__).rpartition('/')[2]
-    return f'a {name} ({describe_fields(nested)})'
+    return f'a {name} or a dict of its fields ({describe_fields(nested)})'
