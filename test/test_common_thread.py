@@ -2,6 +2,7 @@
 and no node holds another one up by that."""
 import itertools
 import os
+import sys
 import threading
 import types
 import warnings
@@ -234,6 +235,48 @@ def test_a_node_that_another_thread_runs_is_left_to_its_own(nodes_with):
     assert got.empty()
     release.set()
     assert got.next() == (1, 7)
+
+
+def interrupted_at(step, block):
+    """Have ``block()`` end with a KeyboardInterrupt, as by a handler of signals, at a step of what
+    tells the threads; returns whether it came so far."""
+    steps = itertools.count()
+
+    def look(frame, event, argument):
+        tells = frame.f_code.co_filename in (common_thread.__file__, dispatcher.__file__)
+        if tells and event in ('call', 'c_return') and next(steps) == step:
+            sys.setprofile(None)
+            raise KeyboardInterrupt
+
+    sys.setprofile(look)
+    try:
+        block()
+    except KeyboardInterrupt:
+        return True
+    finally:
+        sys.setprofile(None)
+    return False
+
+
+@pytest.mark.parametrize('fast', [True, False])
+def test_a_signal_that_interrupts_a_publisher_anywhere_leaves_no_node_deaf(nodes_with, fast):
+    goes_on, got = threading.Event(), Mailbox()
+
+    def block(number):
+        goes_on.wait(TIMEOUT)
+        got(number, None)
+
+    nodes = nodes_with([block] * 3)
+    for step in itertools.count():
+        goes_on.clear()
+        is_interrupted = interrupted_at(step, lambda: nodes.publish(-1, fast))
+        goes_on.set()
+        nodes.publish(step)
+        assert sorted(got.take(6)) == [-1] * 3 + [step] * 3
+        if not is_interrupted:
+            break
+        until(lambda: nodes.are_idle() and common_is_idle())
+    assert step > 5
 
 
 ACTS = st.sampled_from(['return', 'let go', 'wait for all', 'publish'])

@@ -7,6 +7,7 @@ anyway. When it has got it, the thread is through; or a delegate waits for somet
 long: then the publisher takes back what has not begun, and wakes the threads of those nodes. So no
 node waits longer for another than it does where each runs in its own thread.
 """
+import contextlib
 import os
 import threading
 from typing import Any, Callable, Iterable, Optional
@@ -35,16 +36,23 @@ class CommonThread(Dispatcher):
         run by the nodes' own threads."""
         try:
             super().yield_gil()
-        finally:  # a handler of signals may raise
             self._take_back()
+        except BaseException:  # a handler of signals has raised it
+            self._take_back()
+            raise
 
     def _take_back(self) -> None:
-        while self.scheduled:
-            try:
-                dispatcher: Any = self.scheduled.popleft()
-            except IndexError:
-                return  # the thread has come to it
-            dispatcher.wake()
+        dispatcher: Any = None
+        try:
+            while self.scheduled:
+                with contextlib.suppress(IndexError, ValueError):  # the thread has come to it
+                    dispatcher = self.scheduled[0]
+                    self.scheduled.remove(dispatcher)
+                    dispatcher.wake()
+        except BaseException:  # a handler of signals has raised it, perhaps just before the waking
+            if dispatcher is not None:
+                dispatcher.wake()
+            raise
 
 
 def take(dispatchers: Iterable[Dispatcher]) -> Optional[CommonThread]:
@@ -60,10 +68,15 @@ def take(dispatchers: Iterable[Dispatcher]) -> Optional[CommonThread]:
     common = _common or _begin()
     if common is None or not common.idle:
         return None
-    for dispatcher in fast:
-        dispatcher.idle = False
-        common.scheduled.append(dispatcher)
-    common.wake()
+    try:
+        for dispatcher in fast:
+            dispatcher.idle = False
+            common.scheduled.append(dispatcher)
+        common.wake()
+    except BaseException:  # a handler of signals has raised it, and nobody else would wake them
+        for dispatcher in fast:
+            dispatcher.wake()
+        raise
     return common
 
 

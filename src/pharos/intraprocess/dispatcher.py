@@ -199,8 +199,13 @@ class Dispatcher:
     def wake(self) -> None:
         """Wake the dispatcher thread, which is idle."""
         self.idle = False
-        self._awake_signal.acquire(False)  # takes back what was said of an earlier waking
-        _release(self._wake_signal)
+        try:
+            self._awake_signal.acquire(False)  # takes back what was said of an earlier waking
+        finally:  # a handler of signals may raise, also at the call of a function of ours
+            try:
+                self._wake_signal.release()
+            except RuntimeError:
+                pass  # it was free already: two had the same to say
 
     def yield_gil(self) -> None:
         """Let the woken dispatcher thread have the interpreter: it would get it 5 ms later from a
