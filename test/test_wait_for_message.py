@@ -7,6 +7,7 @@ import pytest
 import std_msgs.msg
 
 from helpers import create, ended, in_thread, speak_tcpros_only
+from pharos import next_message
 from pharos.intraprocess.inbox import Inbox
 from pharos.testing import TIMEOUT
 import pharos
@@ -197,6 +198,22 @@ def test_the_block_of_another_node_stops_to_wait_when_that_stops(master, pair):
     assert never.wait_for_subscribers(timeout=TIMEOUT)
     other.stop()
     assert ended(thread)
+    assert waiting.channels == []
+
+
+def test_a_node_that_stops_before_the_first_message_is_waited_for_ends_the_wait(
+    master, pair, monkeypatch
+):
+    waiting, sending, channel = pair
+    take, other = next_message.NextMessages.take, create(master, '/other')
+
+    def stop_and_take(*args):
+        in_thread(other.stop)
+        assert other.latest_run.rospy.ended.wait(TIMEOUT)
+        return take(*args)
+
+    monkeypatch.setattr(next_message.NextMessages, 'take', stop_and_take)
+    assert ended(other.fork(lambda me: waiting.wait_for_message('/waited/never', INT)))
     assert waiting.channels == []
 
 

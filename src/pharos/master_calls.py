@@ -247,13 +247,15 @@ class MasterCalls:
         deadline = None if timeout is None else time.monotonic() + timeout
         woken = threading.Event()
         with Interruption(woken.set) as stop:
-            while True:
-                found = look()
+            while not stop.came:
+                try:
+                    found = look()
+                except NodeStoppedError:
+                    break  # it stopped while the master was asked
                 if found is not None or deadline is not None and time.monotonic() >= deadline:
                     return found
                 woken.wait(POLL)
-                if stop.came:
-                    raise NodeStoppedError(f'the node that waited for {what} stops')
+        raise NodeStoppedError(f'the node that waited for {what} stops')
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, MasterCalls) and is_same_master(self.url, other.url)

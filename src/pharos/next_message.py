@@ -33,21 +33,23 @@ def next_message(
     timeout = check_limit('timeout', timeout)
     deadline = None if timeout is None else time.monotonic() + timeout
     wait = 0.0 if timeout is None else max(0.0, timeout)
-    if node.current_run.rospy.connections.is_read_here(topic.name):
+    rospy = node.current_run.rospy
+    if rospy.connections.is_read_here(topic.name):
         raise PharosError(
             f'this delegate runs in the thread that brings what comes on {topic.name}, and no other'
             ' message would: have a soul wait for it, or fork() what waits'
         )
-    channel = topic.open_input(NextMessages, node, typed_as, wait)
-    try:
-        while True:
-            message = channel.take(deadline)
-            if message is None:
-                _tell_late(channel, topic, timeout)
-            if where is None or where(message):
-                return message
-    finally:
-        channel.close()
+    with Interruption(lifetime=rospy.lifetime):  # it begins here, and not with the first message
+        channel = topic.open_input(NextMessages, node, typed_as, wait)
+        try:
+            while True:
+                message = channel.take(deadline)
+                if message is None:
+                    _tell_late(channel, topic, timeout)
+                if where is None or where(message):
+                    return message
+        finally:
+            channel.close()
 
 
 def _tell_late(channel: 'NextMessages', topic: Topic, timeout: Optional[float]) -> NoReturn:

@@ -331,7 +331,7 @@ class Interruption:
     def __init__(
         self, wake: Optional[Callable[[], Any]] = None, lifetime: Optional[Lifetime] = None
     ) -> None:
-        self.wake = wake
+        self.wake = wake or (lambda: None)
         self._outer = getattr(_thread, 'interruption', None)
         given = lifetime, getattr(_thread, 'lifetime', None)
         self.lifetimes = {each for each in given if each is not None and not each.ended.is_set()}
@@ -347,7 +347,7 @@ class Interruption:
         _thread.interruption = self
         for lifetime in self.lifetimes:
             lifetime.interruptions.add(self)
-        if self.came and self.wake is not None:
+        if self.came:
             self.wake()
         return self
 
