@@ -3,11 +3,17 @@ import sys
 
 import pharos
 
+
+def say(line):
+    """Print a line in one piece: the program that is loaded may print just now, too."""
+    print(f'{line}\n', end='', flush=True)
+
+
 how, program, *arguments = sys.argv[1:]
 node = pharos.Master().load(program, None, *arguments)
-print('loaded', node.name, flush=True)
+say(f'loaded {node.name}')
 if how == 'spin':
     pharos.spin()
 elif how == 'wait':
-    print('exit code', node.wait(), flush=True)
-print('ends', flush=True)
+    say(f'exit code {node.wait()}')
+say('ends')

@@ -230,7 +230,8 @@ class ScriptRun(Run):
         if code is None or isinstance(code, int):
             status = int(code or 0)
             return status & 0xFF if type(wanted) is SystemExit else status
-        attempt(lambda: print(code, file=self.rospy.system.stderr))
+        # in one piece: others of this process may print just now, too
+        attempt(lambda: print(f'{code}\n', end='', file=self.rospy.system.stderr))
         return 1
 
     def _init_node(self, name: str, register: Any, xmlrpc_port: int, tcpros_port: int) -> None:
