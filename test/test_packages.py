@@ -12,7 +12,7 @@ import pytest
 from pharos import PharosError
 from pharos.testing import Mailbox, TIMEOUT, until
 from helpers import create
-from programs import ROOT, Program, environment
+from programs import ROOT, Program, environment, forget_parameters
 
 PATROL = ROOT / 'test' / 'packages' / 'patrol'
 NODES = 'camera', 'controller'
@@ -102,6 +102,14 @@ def workspace(tmp_path_factory):
         return built[command]
 
     return of
+
+
+@pytest.fixture(autouse=True)
+def own_parameters(ros_master):
+    """Those that roslaunch or a node sets outlive it on the master, which other files have, too."""
+    forget_parameters(ros_master.url)
+    yield
+    forget_parameters(ros_master.url)
 
 
 def pid_of(master, name):
@@ -245,6 +253,8 @@ def test_the_page_about_packages_names_both_nodes_of_a_process(master, workspace
         said.wait_for(has_heard_three)
         for name in '/robot1/camera', '/robot1/controller', '/robot2/camera', '/robot2/pilot':
             master.wait_for_node(name, TIMEOUT)
+        # rospy sets what is in args after it has registered the node
+        until(lambda: '/robot2/pilot/period' in master.parameters)
     periods = {name: value for name, value in master.parameters.items() if 'period' in name}
     assert periods == {
         '/robot1/camera/period': 0.1,
