@@ -495,11 +495,11 @@ def test_a_publisher_is_tried_no_longer_than_the_master_knows_it(master, impatie
     for found in gone, not_wanted:
         for _ in range(5):
             assert found.asked.acquire(timeout=TIMEOUT)
-    assert len(threads('_connect_topic_thread')) == 2
+    assert len(threads('/listener connecting')) == 2
     gone.unregister()
-    until(lambda: len(threads('_connect_topic_thread')) == 1)
+    until(lambda: len(threads('/listener connecting')) == 1)
     channels[1].close()
-    until(lambda: not threads('_connect_topic_thread'))
+    until(lambda: not threads('/listener connecting'))
 
 
 def threads(name):
