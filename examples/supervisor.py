@@ -11,7 +11,7 @@ terminals:
 import random
 import sys
 
-from pharos import BlockNode, Master, MasterUnreachableError, Node, program, spin
+from pharos import BlockNode, Master, MasterUnreachableError, Node, NodeStoppedError, program, spin
 
 
 class Worker(Node):
@@ -37,7 +37,7 @@ def supervise(supervisor, workers):
                 try:
                     worker.restart()
                     del due[worker]
-                except MasterUnreachableError as error:
+                except (MasterUnreachableError, NodeStoppedError) as error:  # stopped half way
                     supervisor.log(f'will try again: {error}', level='warn')
         health = [{'name': worker.name, 'message': str(worker.health())} for worker in workers]
         supervisor.send_to(
