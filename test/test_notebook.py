@@ -43,7 +43,10 @@ class Kernel:
             elif message['msg_type'] in ('execute_result', 'display_data'):
                 shown.update(content['data'])
 
-        reply = self.client.execute_interactive(code, timeout=TIMEOUT, output_hook=note)
+        # after an error, a kernel that stops on errors refuses also the next cell, for a moment
+        reply = self.client.execute_interactive(
+            code, timeout=TIMEOUT, output_hook=note, stop_on_error=False
+        )
         content = reply['content']
         if content['status'] == 'error':
             shown['error'] = f"{content['ename']}: {content['evalue']}"
