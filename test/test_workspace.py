@@ -314,6 +314,14 @@ def test_a_question_mark_tells_of_a_topic_and_two_what_it_is_beside(master, open
     terminal.wait_for('class Topic:')
 
 
+def test_what_is_long_is_shown_where_there_is_no_pager(open_session, tmp_path, monkeypatch):
+    monkeypatch.delenv('PAGER', raising=False)
+    (tmp_path / 'sh').symlink_to('/bin/sh')
+    terminal = open_session(PATH=str(tmp_path))
+    terminal.enter('lines = "as always\\n" * 7000 + "the last"', '%page -r lines')
+    terminal.wait_for('^the last$')
+
+
 # -- Ctrl-C, the ends
 
 LINES = [

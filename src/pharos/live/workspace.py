@@ -7,6 +7,7 @@
 """
 import itertools
 import os
+import shutil
 import signal
 import sys
 from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple
@@ -223,6 +224,10 @@ class _Session:
             self._shell.confirm_exit = False
             self._shell.events.register('post_run_cell', self._note)
         equip(self._shell, workspace)
+        if 'PAGER' not in os.environ and shutil.which('less') is None:
+            # writing to a pager that is not there, IPython takes it for one that has been left
+            page = ipython().core.page
+            self._shell.set_hook('show_in_pager', page.as_hook(page.display_page))
         node_registry.before_stop_all(self._end)  # which a signal asks for
 
     def run_script(self, path: str, args: Sequence[str]) -> None:
