@@ -195,7 +195,8 @@ def check_fits(message: genpy.Message) -> None:
 def explain(error: AttributeError, message: genpy.Message) -> None:
     """Raise `MessageTypeError` if an `AttributeError` names a field that the message, or one nested
     in it, has not."""
-    wrong = re.fullmatch(r"'(\w+)' object has no attribute '(\w+)'", str(error))
+    no_dict = '( and no __dict__ for setting new attributes)?'  # since Python 3.13
+    wrong = re.fullmatch(r"'(\w+)' object has no attribute '(\w+)'" + no_dict, str(error))
     pending = [type(message), *_TIMES.values()]
     while wrong and pending:
         cls = pending.pop(0)
