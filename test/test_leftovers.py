@@ -10,6 +10,7 @@ import re
 import resource
 import subprocess
 import sys
+import threading
 import weakref
 
 import pytest
@@ -137,6 +138,13 @@ def test_a_node_has_a_thread_for_each_port_and_one_more_at_the_most(master):
         heard.next()
         # those that registered and connected it end by themselves
         until(lambda: 2 <= node.health().threads <= 3)
+
+
+def test_a_node_whose_port_is_known_only_after_its_end_leaves_no_thread(master):
+    node = create(master, '/ends_at_once')
+    node.stop()
+    node.latest_run.rospy.connections.announce()
+    until(lambda: not any(thread.name == 'departures' for thread in threading.enumerate()))
 
 
 def test_a_subscriber_that_left_is_noticed_without_a_message_to_it(master):

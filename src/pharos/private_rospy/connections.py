@@ -46,6 +46,8 @@ class Connections:
         """The node runs: its neighbours may connect to it."""
         _running[self._node.uri] = self._node
         departures.watch(self._node)
+        if self._node.ended.is_set():  # a node that ends at once may have been withdrawn before
+            self.withdraw()
 
     def withdraw(self):
         """The node stops."""
