@@ -149,6 +149,43 @@ except KeyboardInterrupt:
     assert running.process.wait(TIMEOUT) == 0
 
 
+def test_ctrl_c_at_the_prompt_ends_each_line_though_what_was_said_of_the_last_one_comes_late(
+    program,
+):
+    """What ends a line is said to the main thread again and again, and may be said for the last time
+    as the line ends, after which IPython ignores Ctrl-C until the next one: that of the next line was
+    lost."""
+    running = program(
+        """
+sys.ps1 = '>>> '
+me = node()
+kill, asked, next_line, killed = signal.pthread_kill, *(threading.Event() for _ in range(3))
+def kill_late(*arguments):
+    asked.set()
+    next_line.wait()
+    kill(*arguments)
+    killed.set()
+signal.pthread_kill = kill_late
+def line(wait):
+    try:
+        with pharos.signals.held():
+            signal.raise_signal(signal.SIGINT)
+            wait()
+    except KeyboardInterrupt:
+        print('interrupted', flush=True)
+line(asked.wait)
+handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+next_line.set()
+killed.wait()
+signal.signal(signal.SIGINT, handler)
+line(lambda: None)
+""",
+        wait_for=None,
+    )
+    assert running.read_to_the_end().split() == ['interrupted'] * 2
+    assert running.process.wait(TIMEOUT) == 0
+
+
 def test_sigterm_at_the_prompt_ends_spin_and_the_nodes(program):
     running = program(
         """

@@ -32,6 +32,9 @@ _MARK = '_pharos_signal'
 HOLD_LIMIT = 30.0  # seconds after which a signal cuts off even a start or a stop
 PATIENCE = 1.0  # seconds, likewise, for other calls of ours, from the end of the nodes on
 REMINDER = 0.01  # seconds between two looks at whether the main thread can be cut off
+#: has it look. It is none of those that come, so that none of these is taken for it, and does
+#: nothing where it comes late.
+_REMINDER_SIGNAL = signal.SIGURG
 #: where code is that may hold a lock just now which the nodes need to stop, and Python to end
 _OURS = tuple(
     os.path.join(os.path.dirname(file), '')
@@ -51,7 +54,6 @@ _waits = 0  # how deep the main thread is in waits of ours, which end with the n
 _is_cut_off = False  # whether the innermost of them is cut off by what the signal raises instead
 _holds = 0  # how many starts and stops, within one another, the main thread runs
 _coming: 'Optional[_Signal]' = None  # has come, and not yet ended what the main thread does
-_is_reminded = False  # whether the next signal is a reminder of that one
 
 
 class _Signal:
@@ -74,14 +76,12 @@ class _Signal:
 
     def remind(self) -> None:
         """Have the main thread's handler look again and again, until it has raised an exception."""
-        global _is_reminded
         identifier = main_thread().ident
         while signal.getsignal(self.number) is _on_signal:
             time.sleep(REMINDER)  # first: mostly it is cut off at once, and needs none
             if _coming is not self:
                 return
-            _is_reminded = True
-            signal.pthread_kill(identifier, self.number)  # type: ignore[arg-type]
+            signal.pthread_kill(identifier, _REMINDER_SIGNAL)  # type: ignore[arg-type]
 
     def may_cut_off(self, frame: Optional[FrameType]) -> bool:
         """Whether the main thread, which is at that frame, can be cut off there."""
@@ -226,11 +226,8 @@ def held(is_end: bool = False) -> Iterator[None]:
 
 
 def _on_signal(number: int, frame: Optional[FrameType]) -> None:
-    global _coming, _is_reminded
-    is_reminder, _is_reminded = _is_reminded, False
+    global _coming
     if _coming is None:
-        if is_reminder:
-            return
         if not (_holds or _is_needed()):
             _do_default(number, frame)
             return
@@ -242,8 +239,15 @@ def _on_signal(number: int, frame: Optional[FrameType]) -> None:
             if _waits and not (_holds or _is_cut_off):
                 return  # the wait ends with the nodes
         _coming = coming
+        signal.signal(_REMINDER_SIGNAL, _look_again)
         _thread.start_new_thread(coming.remind, ())
-    if _coming.may_cut_off(frame):
+    _look_again(number, frame)
+
+
+def _look_again(_: int, frame: Optional[FrameType]) -> None:
+    """Cut the main thread off, if it can be."""
+    global _coming
+    if _coming is not None and _coming.may_cut_off(frame):
         number, _coming = _coming.number, None
         raise _exception(number)
 
@@ -266,9 +270,9 @@ def _do_default(number: int, frame: Any) -> None:
 
 def _forget() -> None:
     """In a process that was forked: it begins anew."""
-    global _waits, _is_cut_off, _holds, _coming, _is_reminded
+    global _waits, _is_cut_off, _holds, _coming
     _waits = _holds = 0
-    _is_cut_off, _coming, _is_reminded = False, None, False
+    _is_cut_off, _coming = False, None
 
 
 os.register_at_fork(after_in_child=_forget)
