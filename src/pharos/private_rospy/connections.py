@@ -16,8 +16,6 @@ from pharos.private_rospy.registration import UNREGISTER_TIMEOUT, registered
 from pharos.private_rospy.socket_callback import SocketCallback
 
 TCPROS = 'TCPROS'  # as ROS calls it
-# bytes read from a socket at once; rospy's 64 KiB let subscribers of images fall behind
-BUFFER_SIZE = 1 << 20
 
 _running: Dict[str, Any] = {}  # URI -> the PrivateRospy that runs there, in this process
 
@@ -80,7 +78,6 @@ class Connections:
                     receiver.message_class,
                     callback,
                     tcp_nodelay=True,
-                    buff_size=BUFFER_SIZE,
                 ),
                 _unregister,
                 timeout,

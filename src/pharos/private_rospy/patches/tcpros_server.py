@@ -156,9 +156,7 @@ def read_messages(self, b, msg_queue, sock, *, module, original):
         return
     data = large.read(b, size, sock)
     try:
-        # AnyMsg keeps what it is given, all others slices of it
-        kept = data[:] if self.recv_data_class._md5sum == '*' else data
-        msg_queue.append(self.recv_data_class().deserialize(kept))
+        msg_queue.append(self.recv_data_class().deserialize(data))
     except Exception as error:  # as rospy's deserialize_messages
         raise module.DeserializationError(f'cannot deserialize: {error}') from error
 
