@@ -191,6 +191,27 @@ def test_what_could_not_be_opened_while_the_master_hung_is_not_there_when_it_goe
     until(lambda: registrations(away, '/node') == before)
 
 
+def test_what_the_master_registers_later_than_it_was_to_be_taken_back_is_taken_back(
+    ros_master, master, monkeypatch
+):
+    """A master that goes on answers what waits in any order."""
+    node, handler = create(master, '/node'), ros_master.handler
+    unregister = handler.unregisterPublisher
+
+    def register_late(caller_id, topic, uri):
+        answer = unregister(caller_id, topic, uri)
+        if topic == '/interrupted/late':
+            monkeypatch.setattr(handler, 'unregisterPublisher', unregister)
+            handler.registerPublisher(caller_id, topic, STRING, uri)
+        return answer
+
+    monkeypatch.setattr(handler, 'unregisterPublisher', register_late)
+    node.latest_run.rospy.unsure.add(('unregisterPublisher', '/interrupted/late', node.uri))
+    node.stop()
+    assert handler.unregisterPublisher == unregister
+    assert registrations(master, '/node') == [[], [], []]
+
+
 # -- the start is interrupted
 
 

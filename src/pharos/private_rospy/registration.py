@@ -14,6 +14,7 @@ from pharos.private_rospy.proxies import ServerProxy, master_api
 PING_TIMEOUT = 1.0  # seconds in which a running node answers getPid
 REGISTER_TIMEOUT = 1.0  # seconds that the master has at least, to register what is opened
 UNREGISTER_TIMEOUT = 2.0  # seconds that it has, to unregister what is closed or stops
+LATE = 0.5  # seconds after which it is not expected to come to a call that timed out before
 # seconds between attempts to reach a publisher, for as long as the master knows it
 RETRY_DELAY = 2.0
 # the last where something answers that does not speak XML-RPC

@@ -1,9 +1,11 @@
 """Registering with the master: once, within a time limit, and not while it holds a lock for
 ever."""
 import contextlib
+import time
 import xmlrpc.client
 
 from pharos.private_rospy import registration
+from pharos.private_rospy.deadlines import deadline_in
 from pharos.private_rospy.patches.table import addition, patch
 from pharos.private_rospy.proxies import ServerProxy
 
@@ -100,7 +102,8 @@ def cleanup(self, reason, *, node, module):
     if not self.master_uri:
         return
     topics, services = module.get_topic_manager(), module.get_service_manager()
-    calls = xmlrpc.client.MultiCall(ServerProxy(self.master_uri, registration.UNREGISTER_TIMEOUT))
+    master = ServerProxy(self.master_uri, registration.UNREGISTER_TIMEOUT)
+    calls = xmlrpc.client.MultiCall(master)
     with contextlib.ExitStack() as locks:
         # what another thread was just registering, or unregistering, is, and nothing more will be
         for manager in topics, services:
@@ -113,12 +116,22 @@ def cleanup(self, reason, *, node, module):
             calls.unregisterPublisher(node.name, name, self.uri)
         for name, uri in services.get_services():
             calls.unregisterService(node.name, name, uri)
-    for unregister, name, uri in tuple(node.unsure):
-        getattr(calls, unregister)(node.name, name, uri)
     node.parameters.unsubscribe(calls)
     try:
         calls()
+        _take_back(node, master)
     except registration.COMMUNICATION_ERRORS as error:
         self.logger.warning('cannot unregister from the master %s: %s', self.master_uri, error)
     topics.close_all()
     services.unregister_all()
+
+
+def _take_back(node, master):
+    """Unregister what could not be registered in time: a master that goes on may come to that call
+    after those that were made later."""
+    deadline = deadline_in(registration.LATE)
+    for unregister, name, uri in tuple(node.unsure):
+        while not getattr(master, unregister)(node.name, name, uri)[2]:
+            if time.monotonic() > deadline:
+                return
+            time.sleep(registration.LATE / 20)
