@@ -12,7 +12,7 @@ from hypothesis import given, settings, strategies as st
 from std_msgs.msg import Int32
 
 from helpers import create, ended, in_thread
-from pharos.intraprocess import common_thread, dispatcher, fanout
+from pharos.intraprocess import common_thread, dispatcher, fanout, inbox
 from pharos.intraprocess.dispatcher import Dispatcher
 from pharos.intraprocess.fanout import Fanout
 from pharos.intraprocess.inbox import Inbox
@@ -39,10 +39,10 @@ class Receiver:
     """Runs ``block(number)`` for what comes."""
 
     topic, message_class, from_ = '/t', Int32, None
-    queue_size, queue_bytes, inline, shared = 1000, 1 << 20, False, False
+    queue_size, queue_bytes, shared = 1000, 1 << 20, False
 
-    def __init__(self, block):
-        self.block = block
+    def __init__(self, block, inline):
+        self.block, self.inline = block, inline
 
     def deliver(self, message, header):
         self.block(message.data)
@@ -51,15 +51,13 @@ class Receiver:
 class Nodes:
     """Dispatchers with threads, each with a receiver of what is published."""
 
-    def __init__(self, blocks):
+    def __init__(self, blocks, on_behalf=lambda run, name: run(), inline=False):
         self.threads = []
-        self.dispatchers = [
-            Dispatcher(self.start_thread, on_behalf=lambda run, name: run()) for _ in blocks
-        ]
+        self.dispatchers = [Dispatcher(self.start_thread, on_behalf=on_behalf) for _ in blocks]
         self.fanout = Fanout(Int32, threading.RLock(), None)
         connections = []
         for each, block in zip(self.dispatchers, blocks):
-            receiver = Receiver(block)
+            receiver = Receiver(block, inline)
             inbox = Inbox(receiver, each, self.fanout._thaw, {})
             link = types.SimpleNamespace(inboxes={receiver: inbox}, header={})
             connections.append(types.SimpleNamespace(endpoint_id='', link=link))
@@ -88,8 +86,8 @@ def nodes_with():
     """Makes dispatchers with receivers."""
     made = []
 
-    def make(blocks):
-        made.append(Nodes(blocks))
+    def make(blocks, **options):
+        made.append(Nodes(blocks, **options))
         until(lambda: made[-1].are_idle() and common_is_idle())
         return made[-1]
 
@@ -153,6 +151,21 @@ def test_the_common_thread_ends_with_the_last_node(master, mailbox):
     assert not thread.is_alive()
 
 
+def test_a_publisher_that_comes_too_late_begins_none_again(nodes_with, monkeypatch):
+    nodes = nodes_with([lambda number: None] * 2)
+    begin = common_thread._begin
+
+    def begin_late():
+        nodes.close()
+        common_thread.end()
+        return begin()
+
+    common_thread.end()
+    monkeypatch.setattr(common_thread, '_begin', begin_late)
+    nodes.publish(1)
+    assert common_thread._common is None
+
+
 def test_a_node_is_run_by_it_once_it_has_been_fast_for_some_time(monkeypatch, nodes_with):
     monkeypatch.undo()
     monkeypatch.setattr(dispatcher, 'FAST_TURN', TIMEOUT)
@@ -173,12 +186,11 @@ def test_a_node_is_run_by_it_once_it_has_been_fast_for_some_time(monkeypatch, no
 
 def test_a_node_that_keeps_to_its_thread_is_run_by_no_other(nodes_with):
     ran = Mailbox()
-    nodes = nodes_with([lambda number: ran(threading.get_ident(), None)] * 3)
-    for each in nodes.dispatchers[1:]:
-        each.keep_to_thread()
-        each.is_fast = False
-    nodes.fanout.publish(Int32(1))
-    assert len(set(ran.take(3))) == 3
+    nodes = nodes_with([lambda number: ran(threading.get_ident(), None)] * 3, on_behalf=None)
+    for number in range(3):
+        nodes.fanout.publish(Int32(number))
+        assert len(set(ran.take(3))) == 3
+        until(lambda: nodes.are_idle() and common_is_idle())
 
 
 # -- no node holds another one up
@@ -237,14 +249,15 @@ def test_a_node_that_another_thread_runs_is_left_to_its_own(nodes_with):
     assert got.next() == (1, 7)
 
 
-def interrupted_at(step, block):
-    """Have ``block()`` end with a KeyboardInterrupt, as by a handler of signals, at a step of what
-    tells the threads; returns whether it came so far."""
+def interrupted_at(step, block, modules=(common_thread, dispatcher)):
+    """Have ``block()`` end with a KeyboardInterrupt, as by a handler of signals, at a step of what is
+    in these modules; returns whether it came so far."""
+    files = [module.__file__ for module in modules]
     steps = itertools.count()
 
     def look(frame, event, argument):
-        tells = frame.f_code.co_filename in (common_thread.__file__, dispatcher.__file__)
-        if tells and event in ('call', 'c_return') and next(steps) == step:
+        is_step = frame.f_code.co_filename in files and event in ('call', 'c_return')
+        if is_step and next(steps) == step:
             sys.setprofile(None)
             raise KeyboardInterrupt
 
@@ -277,6 +290,26 @@ def test_a_signal_that_interrupts_a_publisher_anywhere_leaves_no_node_deaf(nodes
             break
         until(lambda: nodes.are_idle() and common_is_idle())
     assert step > 5
+
+
+@pytest.mark.parametrize('what', ['publish', 'run in turn', 'wait'])
+def test_a_signal_that_interrupts_who_runs_a_node_leaves_it_to_others(nodes_with, what):
+    got = Mailbox()
+    nodes = nodes_with([lambda number: got(number, None)] * 2, inline=True)
+    one, _ = nodes.dispatchers
+    act = {
+        'publish': lambda: nodes.publish(-1),
+        'run in turn': lambda: one.run_in_turn(bool),
+        'wait': lambda: one.wait_for_delegate(TIMEOUT),
+    }[what]
+    for step in itertools.count():
+        is_interrupted = interrupted_at(step, act, (dispatcher, inbox))
+        assert ended(in_thread(one.run_in_turn, bool))
+        nodes.publish(step)
+        until(lambda: got.all().count(step) == 2)
+        if not is_interrupted:
+            break
+    assert step > 3
 
 
 ACTS = st.sampled_from(['return', 'let go', 'wait for all', 'publish'])
@@ -365,7 +398,11 @@ def send_until(predicate, sent):
         sent.send(data=number)
         until(
             lambda: predicate()
-            or all(node.latest_run.dispatcher.idle for node in sent.node.master.local_nodes())
+            or all(
+                node.latest_run.dispatcher.idle
+                for node in sent.node.master.local_nodes()
+                if node is not sent.node  # which has no thread that could be
+            )
         )
 
 
@@ -442,6 +479,26 @@ def test_a_program_runs_its_delegates_in_a_thread_of_its_own(master, mailbox, tm
         sent.send(data=number)
         assert len({thread for thread, _, _ in mailbox.take(3)}) == 3
         until(lambda: all(node.latest_run.dispatcher.idle for node in nodes))
+
+
+def test_a_forked_process_does_not_wait_for_who_looks_for_a_delegate():
+    has_turn, forked = threading.Event(), threading.Event()
+
+    def look():
+        with dispatcher._looking:
+            has_turn.set()
+            forked.wait(TIMEOUT)
+
+    looking = in_thread(look)
+    assert has_turn.wait(TIMEOUT)
+    with warnings.catch_warnings():  # as below
+        warnings.simplefilter('ignore', DeprecationWarning)
+        child = os.fork()
+    if not child:
+        os._exit(not dispatcher._looking.acquire(False))
+    forked.set()
+    assert os.waitpid(child, 0)[1] == 0
+    assert ended(looking)
 
 
 def test_a_forked_process_has_a_common_thread_of_its_own(master, mailbox):

@@ -18,6 +18,7 @@ from pharos.lifecycle import Lifecycle
 from pharos.output_channel import OutputChannel
 from pharos.private_rospy import changes, descriptors
 from pharos.private_rospy.instance import PrivateRospy
+from pharos.private_rospy.lifetime import JOIN_TIMEOUT
 from pharos.private_rospy.names import Resolved, check_name
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.settings import Settings
@@ -43,6 +44,9 @@ class Run:
     #: what to say of souls that are left behind
     left_behind = 'A soul ends by itself if it waits with node.sleep() or loops over node.every()'
 
+    #: whether a thread that runs other nodes, too, may run its delegates
+    may_run_elsewhere = True
+
     def __init__(self, node: 'Node', settings: Settings) -> None:
         self.node = node
         self.lifecycle = Lifecycle.STARTING
@@ -67,9 +71,8 @@ class Run:
         self.restart: Optional[Restart] = None
         descriptors.check_left(settings.name)
         self.rospy = PrivateRospy(settings, self._stop_for_ros, lambda: node.allow_remote_shutdown)
-        self.dispatcher = Dispatcher(
-            self.rospy.start_thread, on_behalf=self.rospy.lifetime.run_on_behalf
-        )
+        on_behalf = self.rospy.lifetime.run_on_behalf if self.may_run_elsewhere else None
+        self.dispatcher = Dispatcher(self.rospy.start_thread, on_behalf=on_behalf)
         self.rospy.on_received = self.dispatcher.run
         self.rospy.on_failure = self._hook_failed
         self.rospy.refusals.on_refused = self._report_refusal
@@ -185,6 +188,8 @@ class Run:
             Transcript.show(
                 f"{self.node.name} left behind threads that did not end: {', '.join(left)}"
             )
+        else:  # a delegate may run inline, in another node's thread
+            self.dispatcher.wait_for_delegate(JOIN_TIMEOUT)
 
     def _close_opened(self) -> None:
         for opened in self.opened:
@@ -226,7 +231,7 @@ class Run:
         if self.is_starting:
             return self._starter == threading.get_ident()
         is_nodes = threading.current_thread() in self.rospy.lifetime.threads
-        return is_nodes or self.dispatcher.is_run_elsewhere_here()
+        return is_nodes or self.dispatcher.is_run_here()
 
     def _stop_for_ros(self, reason: str) -> None:
         attempt(lambda: self.node.log(f'stops: {reason}'))

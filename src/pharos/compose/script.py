@@ -128,6 +128,7 @@ class ScriptRun(Run):
     """One run of a program."""
 
     node: ScriptNode
+    may_run_elsewhere = False
     left_behind = (
         'A script ends by itself if it spins, sleeps, or loops while not rospy.is_shutdown(); one'
         ' that cannot is better a process of its own: master.run()'
@@ -135,7 +136,6 @@ class ScriptRun(Run):
 
     def __init__(self, node: ScriptNode, settings: Any) -> None:
         super().__init__(node, settings)
-        self.dispatcher.keep_to_thread()
         self.exit_code: Optional[int] = None
         self._process = os.getpid()
         self.is_registered = False

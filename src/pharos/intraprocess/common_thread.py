@@ -65,7 +65,11 @@ def take(dispatchers: Iterable[Dispatcher]) -> Optional[CommonThread]:
     ]
     if len(fast) < 2:
         return None
-    common = _common or _begin()
+    common = _common
+    if common is None:
+        common = _begin()
+        if not any(dispatcher.is_fast for dispatcher in fast):
+            end()  # their nodes have ended meanwhile, perhaps as the last ones
     if common is None or not common.idle:
         return None
     try:

@@ -9,6 +9,7 @@ wait for the delegate that runs.) Nor does a thread run a node for long because 
 messages: those it leaves to the dispatcher thread.
 """
 import collections
+import os
 import threading
 import time
 from _thread import allocate_lock, get_ident
@@ -66,8 +67,9 @@ class Dispatcher:
         self._on_behalf = on_behalf
         self._credit = 0  # for turns that were fast
         self._is_elsewhere = False  # whether such a thread runs it, for whose delegate a stop waits
-        self._running = threading.Lock()  # held by the thread that runs delegates,
-        self._runner: Optional[int] = None  # which is this one, by its identifier
+        # held by the thread that runs delegates; an RLock, which knows by whom
+        self._running = threading.RLock()
+        self._runner: Optional[int] = None  # that thread, by its identifier
         self._start_thread, self._name = start_thread, name
         self._thread_claim = threading.Lock()  # taken for good by who starts the thread
         self._closed = self._finishing = False
@@ -85,31 +87,45 @@ class Dispatcher:
         rest is left to the dispatcher thread: others that bring messages all the time would never
         let this thread go.
         """
+        if self._runner is not None and self.is_run_here():
+            return  # it looks again itself
         inline, running = self.inline, self._running
         owed = len(inline)  # runs that are due in any case: those of the inboxes that wait now
         deadline = 0.0  # of what comes meanwhile; 0.0 until all that was owed has run
-        while inline and running.acquire(False):
-            self._runner = get_ident()
-            try:
-                while inline:
-                    if self._closed:
-                        return
-                    if owed <= 0:
-                        now = time.perf_counter()
-                        deadline = deadline or now + COURTESY
-                        if now > deadline:
-                            break
-                    owed -= 1
-                    inline.popleft().run_next()
-            except IndexError:
-                pass  # close() cleared it
-            finally:
-                self._runner = None
-                running.release()
-            # looked at again: what was scheduled just before the release found the node busy
-            if deadline and inline:
-                self._leave_to_thread()
-                return
+        try:
+            while inline and running.acquire(False):
+                self._runner = get_ident()
+                try:
+                    while inline:
+                        if self._closed:
+                            return
+                        if owed <= 0:
+                            now = time.perf_counter()
+                            deadline = deadline or now + COURTESY
+                            if now > deadline:
+                                break
+                        owed -= 1
+                        inline[0].run_next()
+                        inline.popleft()  # not before: a handler of signals may raise at any call
+                except IndexError:
+                    pass  # close() cleared it
+                finally:
+                    self._runner = None
+                    running.release()
+                # looked at again: what was scheduled just before the release found the node busy
+                if deadline and inline:
+                    self._leave_to_thread()
+                    return
+        except BaseException:
+            self._let_go()
+            raise
+
+    def _let_go(self) -> None:
+        """Release the lock, where this thread holds it: a handler of signals may have raised what
+        ends the taking of it when it was taken already."""
+        if self.is_run_here():
+            self._runner = None
+        _release(self._running)
 
     def _leave_to_thread(self) -> None:
         """Have the dispatcher thread run the inline inboxes that have messages."""
@@ -117,10 +133,15 @@ class Dispatcher:
             return
         self.need_thread()
         try:
-            for _ in range(len(self.inline)):
-                self.scheduled.append(self.inline.popleft())
-        except IndexError:
-            pass  # another thread runs them
+            while self.inline and self._running.acquire(False):  # else who runs them looks again
+                while self.inline:
+                    self.scheduled.append(self.inline[0])
+                    self.inline.popleft()
+                self._running.release()
+        except BaseException as error:
+            self._let_go()
+            if not isinstance(error, IndexError):  # close() cleared it
+                raise
         if self.idle:
             self.wake()
 
@@ -131,10 +152,17 @@ class Dispatcher:
     def wait_for_delegate(self, timeout: float) -> None:
         """Wait until the delegate that another thread runs just now has ended, for up to
         ``timeout`` seconds."""
-        if not self.is_run_here() and self._running.acquire(True, timeout):
-            self._running.release()
-            if self.inline:  # scheduled meanwhile by a thread that found the node busy
-                self._leave_to_thread()
+        if self.is_run_here():
+            return
+        try:
+            is_free = self._running.acquire(True, timeout)
+            if is_free:
+                self._running.release()
+        except BaseException:
+            self._let_go()
+            raise
+        if is_free and self.inline:  # scheduled meanwhile by a thread that found the node busy
+            self._leave_to_thread()
 
     def run_in_turn(self, job: Callable[[], Any]) -> bool:
         """Run ``job()`` in this thread when no delegate runs; at once in one that it runs.
@@ -148,22 +176,24 @@ class Dispatcher:
             return True
         me = get_ident()
         try:
-            while not self._running.acquire(True, CLOSED_INTERVAL):
-                if self._closed:
-                    return False
-                with _looking:
-                    _awaited[me] = self
-                    self._check_not_for_each_other(me)
-        finally:
-            _awaited.pop(me, None)
-        is_open = not self._closed
-        try:
-            self._runner = get_ident()
+            try:
+                while not self._running.acquire(True, CLOSED_INTERVAL):
+                    if self._closed:
+                        return False
+                    with _looking:
+                        _awaited[me] = self
+                        self._check_not_for_each_other(me)
+            finally:
+                _awaited.pop(me, None)
+            self._runner = me
+            is_open = not self._closed
             if is_open:
                 job()
-        finally:
             self._runner = None
             self._running.release()
+        except BaseException:
+            self._let_go()
+            raise
         if self.inline:  # as in wait_for_delegate
             self._leave_to_thread()
         return is_open
@@ -212,10 +242,6 @@ class Dispatcher:
         busy publisher."""
         self._awake_signal.acquire(True, YIELD_LIMIT)
 
-    def keep_to_thread(self) -> None:
-        """Have no thread that runs other nodes, too, run this one."""
-        self._on_behalf = None
-
     def run_next(self) -> bool:
         """Run what is scheduled, in the thread of another dispatcher; raises nothing."""
         begun = time.perf_counter()
@@ -246,10 +272,6 @@ class Dispatcher:
         finally:
             self._runner, self._is_elsewhere = None, False
             self._running.release()
-
-    def is_run_elsewhere_here(self) -> bool:
-        """Whether this thread runs a delegate in the place of the node's own thread."""
-        return self._is_elsewhere and self.is_run_here()
 
     def _run_thread(self) -> None:
         self._loop()
@@ -294,7 +316,9 @@ class Dispatcher:
             self._credit = min(self._credit + 1, MAX_CREDIT)
         else:
             self._credit = max(self._credit - SLOW_COST, 0)
-        self.is_fast = self._credit >= FAST_CREDIT and not self._closed
+        self.is_fast = self._credit >= FAST_CREDIT
+        if self._closed:  # perhaps since just now
+            self.is_fast = False
 
     def finish(self) -> None:
         """End the thread when all that is scheduled has run."""
@@ -311,8 +335,18 @@ class Dispatcher:
         self.wake()
 
 
+def _forget() -> None:
+    """In a process that was forked, when another thread may have held the lock."""
+    global _looking
+    _looking = threading.Lock()
+    _awaited.clear()
+
+
+os.register_at_fork(after_in_child=_forget)
+
+
 def _release(lock: Any) -> None:
     try:
         lock.release()
     except RuntimeError:
-        pass  # it was free already: two had the same to say
+        pass  # it is free already, for two had the same to say, or another thread's
