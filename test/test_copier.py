@@ -424,6 +424,28 @@ def test_other_buffers_are_refused_in_a_uint8_array(data):
         copier_for(UInt8MultiArray).freeze(UInt8MultiArray(data=data))
 
 
+class Late(Vector3):
+    """Meets the time limit of a handler of signals, once."""
+
+    __slots__ = ['is_over']
+
+    @property
+    def x(self):
+        if not hasattr(self, 'is_over'):
+            self.is_over = True
+            raise TimeoutError
+        return 1.0
+
+    @x.setter
+    def x(self, value):
+        pass
+
+
+def test_what_a_handler_of_signals_raises_within_the_copying_is_raised():
+    with pytest.raises(TimeoutError):
+        copier_for(Twist).freeze(Twist(linear=Late()))
+
+
 @pytest.mark.parametrize(
     'message, error',
     [

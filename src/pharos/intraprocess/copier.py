@@ -54,6 +54,12 @@ from pharos.messages import fields_of, nested_class
 Frozen = Union[Tuple[Any, ...], bytes]
 SMALL = 64  # bytes that a message is taken to have beside its texts and arrays
 FEW = 1024  # bytes; messages that all have one size, of so many, are not worth counting
+# What a value raises that is not copied as it should be. Others are of a handler of signals, which may
+# run at any moment, and of what a value runs that is an object of the user's own.
+UNFIT = (
+    *(NeedsSerializer, struct.error, AttributeError, TypeError, ValueError),
+    *(ArithmeticError, LookupError),
+)
 
 
 class Copier(NamedTuple):
@@ -148,7 +154,7 @@ def _generate(cls: Any) -> Copier:
             '    if type(message) is cls:',
             '        try:',
             *_indented(_indented(_indented(freeze))),
-            '        except Exception:',
+            '        except unfit:',
             '            pass',
             '    return serialized(message)',
             '',
@@ -159,7 +165,7 @@ def _generate(cls: Any) -> Copier:
             '',
         ]
     )
-    scope = {**writer.scope, 'cls': cls, 'serialized': serialized}
+    scope = {**writer.scope, 'cls': cls, 'serialized': serialized, 'unfit': UNFIT}
     exec(compile(source, f'<copier of {cls.__name__}>', 'exec'), scope)
     return Copier(
         scope['freeze'],
