@@ -4,8 +4,9 @@ import threading
 
 import pytest
 
-from helpers import create, ended, in_thread
-from pharos.testing import Mailbox, TIMEOUT
+from helpers import create, ended, in_thread, speak_tcpros_only
+from pharos.testing import Mailbox, TIMEOUT, until
+from pharos import Master
 import pharos
 from pharos.messages import define_service
 
@@ -211,3 +212,77 @@ def test_a_channel_that_is_opened_while_its_node_stops_says_so(master, monkeypat
     ):
         node.interested_in('/closing/late', 'std_msgs/String')
     assert not node.channels
+
+
+@pytest.mark.parametrize('is_shared', [False, True])
+def test_a_channel_closed_while_it_is_connected_leaves_no_connection(
+    master, monkeypatch, is_shared
+):
+    receiver = create(Master(master.url, share_connections=is_shared), '/receiver')
+    if is_shared:
+        speak_tcpros_only(receiver)
+    channel = receiver.interested_in('/connected', STRING)
+    subscription = receiver.latest_run.rospy.subscriber('/connected')
+    add_connection = subscription.add_connection
+
+    def add_and_close(connection):
+        is_added = add_connection(connection)
+        channel.close()
+        until(lambda: connection.link.sending.done)
+        return is_added
+
+    monkeypatch.setattr(subscription, 'add_connection', add_and_close)
+    sent = create(master, '/sender').output_channel('/connected', STRING)
+    assert channel.closed
+    until(lambda: sent._endpoint.get_num_connections() == 0)
+
+
+def stopped_while_inline(master, then):
+    """Another thread stops a node whose delegate runs inline, and calls ``then(node, thread)``
+    meanwhile; returns whether that thread was still stopping it afterwards."""
+    entered, stopping, waited = threading.Event(), [], []
+
+    def run(message, channel):
+        entered.set()
+        until(lambda: stopping and not channel.node.is_running)
+        then(channel.node, stopping[0])
+        waited.append(stopping[0].is_alive())
+
+    receiver = create(master, '/receiver')
+    receiver.interested_in('/inline', STRING, delegate=run, inline=True)
+    sender = create(master, '/sender')
+    sending = in_thread(lambda: sender.send_to('/inline', typed_as=STRING, data='runs'))
+    assert entered.wait(TIMEOUT)
+    stopping.append(in_thread(receiver.stop))
+    assert ended(stopping[0]) and ended(sending)
+    return waited == [True]
+
+
+def test_the_stop_of_a_node_waits_for_its_delegate_in_the_thread_of_a_publisher(master):
+    # well within JOIN_TIMEOUT
+    assert stopped_while_inline(master, lambda node, stopping: stopping.join(0.3))
+
+
+def test_a_delegate_inline_may_stop_its_node_while_another_thread_does(master):
+    """Each would wait for the other."""
+    assert stopped_while_inline(master, lambda node, stopping: node.stop())
+
+
+def test_who_closes_a_channel_and_opens_it_again_is_not_taken_for_connected(master, monkeypatch):
+    """The publisher's end of the connection is closed somewhat later."""
+    receiver, sender = create(master, '/receiver'), create(master, '/sender')
+    sent = sender.output_channel('/again', STRING)
+    channel = receiver.interested_in('/again', STRING)
+    assert sent.wait_for_subscribers(1, TIMEOUT)
+    run, closing = sender.latest_run.rospy, []
+    start_thread = run.start_thread
+
+    def start_but_close(target, args=(), name=None):
+        return closing.append(target) if name == 'closing' else start_thread(target, args, name)
+
+    monkeypatch.setattr(run, 'start_thread', start_but_close)
+    channel.close()
+    assert not run.connections.sends_to('/receiver', '/again')
+    assert sent.connections == []
+    for close in closing:
+        close()

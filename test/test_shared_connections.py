@@ -1,6 +1,11 @@
 """One connection to a publisher elsewhere for the nodes of this process: what each of them gets is
 what its own connection would bring."""
+import os
+import struct
 import threading
+import types
+import warnings
+import weakref
 
 import pytest
 from std_msgs.msg import Int32, String
@@ -40,9 +45,11 @@ def sender_of(master, *heard_by, topic='/shared', typed_as=Int32, **options):
 
 
 def wait_until_heard(channel, *nodes):
+    """A publisher has a connection somewhat later than who hears it, whom it has answered before."""
     name = channel.node.name
     for node in nodes:
         until(lambda: (name, 'TCPROS') in node.channels[0].connections)
+    until(lambda: channel.connections)
 
 
 def data(box, count):
@@ -178,6 +185,97 @@ def test_a_node_stops_while_another_one_makes_the_connection(
     go_on.set()
     assert ended(opening)
     wait_until_heard(sender.channels[0], maker)
+
+
+def test_two_threads_do_not_make_a_connection_at_once(monkeypatch):
+    """Which both look for it while neither has found one."""
+    node, both, second = types.SimpleNamespace(ended=threading.Event()), threading.Barrier(2), []
+    reference = weakref.KeyedRef
+
+    def take_turn():
+        with shared_connections._turn(node, 'key'):
+            try:
+                both.wait(0.2)
+            except threading.BrokenBarrierError:
+                return
+            second.append('at once')
+
+    def refer(*arguments):
+        monkeypatch.undo()
+        other.append(in_thread(take_turn))
+        other[0].join(0.1)  # it has looked, too, or waits for its turn to
+        return reference(*arguments)
+
+    other = []
+    monkeypatch.setattr(weakref, 'KeyedRef', refer)
+    take_turn()
+    assert ended(other[0])
+    assert not second
+
+
+def test_a_process_forked_while_a_connection_is_made_makes_its_own():
+    node = types.SimpleNamespace(ended=threading.Event())
+    has_turn, forked = threading.Event(), threading.Event()
+
+    def connect():
+        with shared_connections._turn(node, 'key'):
+            has_turn.set()
+            forked.wait(TIMEOUT)
+
+    connecting = in_thread(connect)
+    assert has_turn.wait(TIMEOUT)
+    with warnings.catch_warnings():  # Python 3.12 and later do not like what is tried here
+        warnings.simplefilter('ignore', DeprecationWarning)
+        child = os.fork()
+    if not child:
+        node.ended.set()  # so that a turn that does not come is an error
+        try:
+            with shared_connections._turn(node, 'key'):
+                os._exit(0)
+        finally:
+            os._exit(1)
+    forked.set()
+    assert os.waitpid(child, 0)[1] == 0
+    assert ended(connecting)
+
+
+def test_nodes_for_which_there_was_no_thread_hear_the_publisher_once_there_is_one(
+    master, sharing, monkeypatch
+):
+    sender = create(master, '/sender').output_channel('/shared', Int32)
+    start, refused = threading.Thread.start, threading.Event()
+
+    def refuse(self):
+        if self.name == '/shared of /sender':
+            monkeypatch.undo()
+            refused.set()
+            raise RuntimeError("can't start new thread")
+        start(self)
+
+    monkeypatch.setattr(threading.Thread, 'start', refuse)
+    ((first, one),) = listen(sharing, '/first')
+    assert refused.wait(TIMEOUT)
+    ((second, two),) = listen(sharing, '/second')
+    wait_until_heard(sender, first, second)
+    sender.send(data=1)
+    assert one.next().data == two.next().data == 1
+
+
+def test_what_is_no_message_ends_the_connection_and_is_told(master, sharing, monkeypatch):
+    ((first, one),) = listen(sharing, '/first')
+    told = Mailbox()
+    monkeypatch.setattr(first.latest_run.rospy, 'warn', lambda line: told(line, None))
+    channel = sender_of(master, first)
+    (connection,) = channel.node.latest_run.rospy.publisher('/shared').fanout.connections
+    connection.write_data(struct.pack('<I', 0xFFFFFFFF))
+    assert told.next() == (
+        'connection with /sender for /shared closed: 4294967295 bytes were announced; the limit is'
+        ' 1073741824'
+    )
+    until(lambda: connection.done)
+    wait_until_heard(channel, first)
+    channel.send(data=1)
+    assert one.next().data == 1
 
 
 def test_a_publisher_that_comes_back_is_heard_by_all(master, sharing):

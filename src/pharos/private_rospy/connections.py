@@ -284,7 +284,8 @@ class Connections:
         that name."""
         publisher = self._node.publisher(topic)
         return publisher is None or any(
-            connection.endpoint_id == name for connection in publisher.fanout.connections
+            connection.endpoint_id == name and not _has_left(connection)
+            for connection in publisher.fanout.connections
         )
 
     def hears(self, topic):
@@ -344,8 +345,8 @@ def _unregister(endpoint):
 
 def _has_left(connection):
     """Whether the subscriber at the other end of a publisher's connection has closed it."""
-    if connection.transport_type != 'TCPROS':
-        return False
+    if hasattr(connection, 'link'):  # whose end here is closed somewhat later
+        return connection.link.is_closed
     poll = select.poll()
     try:
         poll.register(connection.socket, select.POLLRDHUP)

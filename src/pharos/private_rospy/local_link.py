@@ -87,6 +87,9 @@ class LocalLink(Link):
         is_open = self.subscriber.add_connection(self.receiving) and self.publisher.add_connection(
             self.sending
         )
+        if is_open and self.sending.done:  # closed before it was added, and so not removed by that
+            self.publisher.remove_connection(self.sending)
+            is_open = False
         # actionlib goes by the name: who has one hears what is published from now on
         self.receiving.callerid_pub = self._other.name
         return is_open

@@ -12,13 +12,14 @@ from typing import Any, Dict
 
 from pharos.intraprocess.copier import copier_for
 from pharos.intraprocess.fanout import ClosedError, Fanout, Latch
-from pharos.private_rospy import changes, registration
+from pharos.private_rospy import changes, registration, threads
+from pharos.private_rospy.acceptor import brief
 from pharos.private_rospy.deadlines import deadline_in
 from pharos.private_rospy.lifetime import SIGNAL_LATENCY
 from pharos.private_rospy.local_link import End, LocalLink
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.refusals import ask, suits
-from pharos.private_rospy.tcpros_connection import TcprosConnection
+from pharos.private_rospy.tcpros_connection import NoMessageError, TcprosConnection
 
 CONNECT_TIMEOUT = 10.0  # seconds that one attempt may take, as for connections of one's own
 # in what getBusInfo tells of such a connection
@@ -28,6 +29,7 @@ QUEUE_BYTES = 64 << 20  # bytes that wait for the callbacks of plain rospy in on
 _shared: Dict[Any, Any] = {}  # (topic, URI of the publisher, md5sum) -> the SharedConnection
 # by the same, the lock that is held by who makes the connection, which others then share
 _turns: Any = weakref.WeakValueDictionary()
+_looking = threading.Lock()  # held to look for one there, for two threads would each find none
 
 
 class SharedConnection:
@@ -68,15 +70,15 @@ class SharedConnection:
         with self._publock:
             is_open = not self.fanout.is_closed
             if is_open:
-                end.set_cleanup_callback(self._remove_connection)
+                end.set_cleanup_callback(self.remove_connection)
                 end.link.match_receivers()
                 self.fanout.set_connections((*self.fanout.connections, end))
                 self.fanout.send_latched(end)
                 if self._thread is None:  # nothing is read before somebody hears it
-                    self._thread = threading.Thread(
-                        target=self._read, name=f'{self.resolved_name} of {self.name}', daemon=True
-                    )
-                    self._thread.start()
+                    name = f'{self.resolved_name} of {self.name}'
+                    thread = threading.Thread(target=self._read, name=name, daemon=True)
+                    threads.start(thread.start, name)
+                    self._thread = thread  # where there is none, the next who connects may have it
         if not is_open:
             end.close()
         self.fanout.run()
@@ -91,7 +93,8 @@ class SharedConnection:
                 self.fanout.send_latched(link.sending, new)
         self.fanout.run()
 
-    def _remove_connection(self, end):
+    def remove_connection(self, end):
+        """Send through a link no more."""
         with self._publock:
             left = [each for each in self.fanout.connections if each is not end]
             self.fanout.set_connections(left)
@@ -112,14 +115,21 @@ class SharedConnection:
                 self._data = data = self._connection.read_message()
                 self.bytes += 4 + len(data)
                 self.fanout.publish(self.data_class().deserialize(data), self._latch)
-        except (OSError, ClosedError):
-            pass  # each node tries to connect again
+        except ClosedError:
+            pass
         except BaseException as error:
-            for end in self.fanout.connections:
-                end.link.warn(f'the connection to {self.name} is closed: {error!r}')
+            # that it has gone is told nowhere, for each node tries to connect again
+            if isinstance(error, NoMessageError) or not isinstance(error, OSError):
+                self._warn(error)
         finally:
             self._close()
             self._connection.close()
+
+    def _warn(self, error):
+        said = brief(str(error) or repr(error))
+        text = f'connection with {self.name} for {self.resolved_name} closed: {said}'
+        for end in self.fanout.connections:
+            end.link.warn(text)
 
     def _freeze(self, message):
         """What is kept of it; where it could not be sent on, for deserializing has put seconds of a
@@ -236,7 +246,8 @@ def _connection_for(node, subscriber, uri, address):
 @contextlib.contextmanager
 def _turn(node, key):
     """Within this, no other node makes the connection."""
-    lock = _turns.setdefault(key, threading.Lock())
+    with _looking:
+        lock = _turns.setdefault(key, threading.Lock())
     while not lock.acquire(timeout=SIGNAL_LATENCY):
         if node.ended.is_set():
             raise ConnectionAbortedError(f'{node.name} stops')
@@ -246,5 +257,13 @@ def _turn(node, key):
         lock.release()
 
 
-# a process that was forked has none of the threads that read
-os.register_at_fork(after_in_child=_shared.clear)
+def _forget():
+    """In a process that was forked, which has none of the threads that read, or make a
+    connection."""
+    global _looking
+    _looking = threading.Lock()
+    _shared.clear()
+    _turns.clear()
+
+
+os.register_at_fork(after_in_child=_forget)

@@ -22,6 +22,10 @@ _HEADER_LIMIT = 1 << 22  # bytes of a connection header; it holds a message defi
 _LIMIT = 1 << 30  # bytes of a response; a length beyond is a broken stream
 
 
+class NoMessageError(ConnectionError):
+    """What comes is none, so that nothing after it can be read."""
+
+
 class TcprosConnection:
     """A connection that is shaken hands on: :attr:`header` is the peer's answer, with 'error' where
     it refuses.
@@ -71,7 +75,7 @@ class TcprosConnection:
     def _read_sized(self, size, limit):
         (size,) = struct.unpack('<I', size)
         if size > limit:
-            raise ConnectionError('%d bytes were announced' % size)
+            raise NoMessageError(f'{size} bytes were announced; the limit is {limit}')
         return self._read(size)
 
     def _read(self, size):
