@@ -196,6 +196,28 @@ def test_a_node_for_which_there_is_no_thread_says_so_and_leaves_nothing(master):
     assert found['goes on'] and not found['is left']
 
 
+@pytest.mark.parametrize('is_sender_first', [True, False])
+def test_two_nodes_that_get_no_thread_to_connect_say_so(master, monkeypatch, is_sender_first):
+    sender, receiver = create(master, '/sender'), create(master, '/receiver')
+    first, second = sender.output_channel, receiver.interested_in
+    if not is_sender_first:
+        first, second = second, first
+    topic = '/threadless', 'std_msgs/String'
+    first(*topic)
+    start = threading.Thread.start
+
+    def start_others(thread):
+        if re.search('^/sender| connecting$| check$', thread.name):
+            raise RuntimeError("can't start new thread")
+        start(thread)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, 'start', start_others)
+        with pytest.raises(pharos.PharosError, match='no thread for /receiver to connect to'):
+            second(*topic)
+    assert second(*topic).connections
+
+
 def test_questions_to_the_master_and_to_nodes_hold_no_descriptor(master):
     with master.create(BlockNode, named='/questioner', domain='127.0.0.1') as node:
         gc.collect()

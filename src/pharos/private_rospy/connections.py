@@ -8,7 +8,7 @@ from typing import Any, Dict
 from pharos.errors import NodeStoppedError
 from pharos.private_rospy.addresses import is_same_master
 from pharos.private_rospy.names import Resolved
-from pharos.private_rospy import changes, departures, registration, shared_connections
+from pharos.private_rospy import changes, departures, registration, shared_connections, threads
 from pharos.private_rospy.deadlines import time_limit
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.proxies import ServerProxy
@@ -98,7 +98,7 @@ class Connections:
     def _connect_to_neighbours(self, topic, timeout):
         publishers = [other for other in self._neighbours() if other.publisher(topic)]
         for other in publishers:
-            self.connect(topic, other.uri)
+            self.connect(topic, other.uri, is_local=True)
         name, refuses = self._node.name, self._node.refusals.refuses
         self._node.wait_until(
             lambda: all(
@@ -147,9 +147,13 @@ class Connections:
         if latch is not None:
             fanout.resume(latch)
             fanout.run()
-        for other in self._neighbours():
-            if other.subscriber(topic):
-                other.connections.connect(topic, self._node.uri)
+        try:
+            for other in self._neighbours():
+                if other.subscriber(topic):
+                    other.connections.connect(topic, self._node.uri, is_local=True)
+        except BaseException:
+            self.unadvertise(endpoint, latch)
+            raise
         return endpoint, fanout
 
     def known_subscribers(self, topic):
@@ -203,13 +207,15 @@ class Connections:
         """The receivers that :meth:`subscribe` has connected to the topic."""
         return self._receivers.get(topic, ())
 
-    def connect(self, topic, uri):
+    def connect(self, topic, uri, is_local=False):
         """Connect the subscription to the publisher at that URI, unless it is connected.
 
         Who asks while that is under way need not wait: where it fails, it is tried once more, for
         what was no publisher a moment ago may be one now.
 
+        :param is_local: that is a node of this process, and the caller waits for the connection
         :returns: as all calls of ROS's slave API: a code (1: done), a text, 0
+        :raises NoThreadError: if it is local, and the system gives no thread that would answer
         """
         key = topic, uri
         with self._lock:
@@ -219,7 +225,7 @@ class Connections:
             self._connecting[key] = False
         while True:
             try:
-                answer = self._negotiate(topic, uri)
+                answer = self._negotiate(topic, uri, is_local)
             except BaseException:  # else nobody would ever connect to it again
                 with self._lock:
                     del self._connecting[key]
@@ -247,7 +253,7 @@ class Connections:
         if not self._node.ended.wait(delay) and not subscriber.closed:
             self.connect(subscriber.resolved_name, uri)
 
-    def _negotiate(self, topic, uri):
+    def _negotiate(self, topic, uri, is_local):
         """What rospy's ROSHandler._connect_topic does, for as long as the node is interested."""
         while True:
             handler, subscriber = self._node.handler, self._node.subscriber(topic)
@@ -263,6 +269,8 @@ class Connections:
             except ConnectionRefusedError as error:
                 return 0, str(error), 0
             except Exception:  # whatever it answered
+                if is_local:  # else this goes on for as long as there is no thread to answer
+                    threads.check(f'{self._node.name} to connect to {topic}')
                 self._node.ended.wait(registration.RETRY_DELAY)
             if uri not in subscriber.publishers:
                 return 0, f'the master knows no publisher of {topic} at {uri}', 0

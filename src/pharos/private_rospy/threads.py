@@ -31,6 +31,14 @@ def start(starting: Callable[[], Any], whose: str) -> None:
         ) from error
 
 
+def check(whose: str) -> None:
+    """Start a thread that ends at once.
+
+    :raises NoThreadError: if the system gives no more of them
+    """
+    start(threading.Thread(target=lambda: None, name=f'{whose} check', daemon=True).start, whose)
+
+
 def _limits() -> Iterator[str]:
     """What may be the limit, as it is set."""
     of_user, _ = resource.getrlimit(resource.RLIMIT_NPROC)
