@@ -5,10 +5,12 @@ import glob
 import importlib
 import io
 import os
+import signal
 import struct
 import subprocess
 import sys
 import threading
+import warnings
 
 import genmsg
 import genpy
@@ -19,7 +21,9 @@ import std_msgs.msg
 import std_srvs.srv
 from hypothesis import given, settings, strategies as st
 
+from helpers import ended, in_thread
 from programs import PROGRAMS
+from pharos.testing import TIMEOUT
 from pharos.messages import classes, definition, lookup
 from pharos.errors import MessageTypeError, UnknownTypeError
 from pharos.messages import (
@@ -167,6 +171,30 @@ def test_a_definition_given_comes_before_the_one_shipped():
     )
     define_message('turtlesim/Velocity', 'float64 speed\n')
     assert describe_fields(message_class('turtlesim/Velocity')) == 'speed: float64'
+
+
+def test_a_process_forked_while_a_class_is_made_makes_its_own(monkeypatch):
+    making, forked, find = threading.Event(), threading.Event(), lookup.find
+
+    def find_slowly(*key):
+        making.set()
+        forked.wait(TIMEOUT)
+        return find(*key)
+
+    monkeypatch.setattr(lookup, 'find', find_slowly)
+    thread = in_thread(message_class, 'std_msgs/Int32')
+    assert making.wait(TIMEOUT)
+    monkeypatch.undo()
+    with warnings.catch_warnings():  # Python 3.12 and later do not like what is tried here
+        warnings.simplefilter('ignore', DeprecationWarning)
+        child = os.fork()
+    if not child:
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)  # which ends one that waits
+        signal.alarm(int(TIMEOUT))
+        os._exit(message_class('std_msgs/Int32') is not std_msgs.msg.Int32)
+    forked.set()
+    assert os.waitpid(child, 0)[1] == 0
+    assert ended(thread)
 
 
 def test_two_threads_that_ask_get_the_same_class():

@@ -3,6 +3,7 @@
 A class made here works with rospy's topics and services like an installed one. Every function may
 be called from any thread.
 """
+import os
 import threading
 from typing import Any, Dict, List, Optional, Union
 
@@ -137,3 +138,12 @@ def _define(kind: str, type_: str, text: str) -> Any:
                 _given['msg', nested] = lookup.found['msg', nested] = classes[nested]
                 lookup.provisional.add(('msg', nested))
         return cls
+
+
+def _forget() -> None:
+    """In a process that was forked, perhaps while another thread made a class."""
+    global _lock
+    _lock = threading.RLock()
+
+
+os.register_at_fork(after_in_child=_forget)
