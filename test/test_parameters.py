@@ -6,6 +6,7 @@ import threading
 import types
 import xmlrpc.server
 
+import numpy
 import pytest
 import rosgraph
 
@@ -333,6 +334,12 @@ def test_a_value_that_the_server_cannot_hold_is_refused_by_name(master, value):
     if value is not None:
         with pytest.raises(ValueError, match='/robot1/driver/any cannot be'):
             parameter.node.parameter('~any', initialized=value)
+
+
+@pytest.mark.parametrize('value', [numpy.float64(1.5), [numpy.int64(3)], numpy.zeros(2)])
+def test_what_is_numpys_is_told_with_what_makes_it_pythons(master, value):
+    with pytest.raises(ValueError, match='but what its tolist'):
+        master.parameters['/numpys'] = value
 
 
 # -- namespaces

@@ -257,9 +257,10 @@ def as_stored(name, value):
     try:
         return xmlrpc.client.loads(_Marshaller('utf-8').dumps((value,)))[0][0]
     except Exception as error:  # of several kinds; text with characters that XML has not, for one
+        hint = ', but what its tolist() returns' if "'numpy." in str(error) else ''
         raise ValueError(
             f'{name} cannot be {reprlib.repr(value)}: the parameter server holds booleans, numbers '
-            f'(integers of 32 bits), strings, and lists and dicts of them ({error})'
+            f'(integers of 32 bits), strings, and lists and dicts of them ({error}{hint})'
         ) from error
 
 
