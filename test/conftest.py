@@ -50,7 +50,7 @@ def master(request, ros_master, monkeypatch):
         yield master
         node_registry.stop_all()
     if isinstance(ros_master, InProcessMaster):  # not a process of its own
-        ros_master.forget_types()
+        ros_master.forget()
 
 
 @pytest.fixture

@@ -33,10 +33,12 @@ class InProcessMaster:
         """What answers its calls."""
         return self._master.handler
 
-    def forget_types(self):
-        """Forget the type of each topic that no node has, which rosmaster itself never does: the next
-        test may use the name for another."""
+    def forget(self):
+        """Forget the parameters, and the type of each topic that no node has, which rosmaster itself
+        never does: the next test may use the names for others."""
         handler = self.handler
+        with handler.param_server.lock:
+            handler.param_server.parameters.clear()
         with handler.ps_lock:
             kept = set(handler.publishers.map) | set(handler.subscribers.map)
             for topic in set(handler.topics_types) - kept:

@@ -8,6 +8,7 @@ import struct
 from rosgraph.network import encode_ros_handshake_header
 
 LISTEN = '0A'  # the state, in /proc/net/tcp
+_refusing = []  # sockets that have a port and do not listen
 
 
 def listening(pid='self'):
@@ -37,14 +38,29 @@ def silent_peer():
     with socket.socket() as listener:
         listener.bind(('127.0.0.1', 0))
         listener.listen()
-        yield 'http://127.0.0.1:%d/' % listener.getsockname()[1]
+        yield _url(listener)
 
 
 def refused_url():
-    """A URL at which nobody listens."""
-    with socket.socket() as free:
-        free.bind(('127.0.0.1', 0))
-        return 'http://127.0.0.1:%d/' % free.getsockname()[1]
+    """A URL at which nobody listens, as long as this process runs."""
+    _refusing.append(_bound())
+    return _url(_refusing[-1])
+
+
+def unused_url():
+    """A URL at which nobody listens yet."""
+    with _bound() as free:
+        return _url(free)
+
+
+def _bound():
+    bound = socket.socket()
+    bound.bind(('127.0.0.1', 0))
+    return bound
+
+
+def _url(bound):
+    return 'http://127.0.0.1:%d/' % bound.getsockname()[1]
 
 
 def wait_for_end(pid, timeout):

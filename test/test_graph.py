@@ -16,7 +16,7 @@ import pharos
 from pharos import ExternalNode, Master, UnknownNodeError, UnknownTopicError, watcher
 from pharos.errors import MasterUnreachableError, UnknownServiceError
 from programs import PROGRAMS, Program
-from sockets import refused_url, silent_peer
+from sockets import refused_url, silent_peer, unused_url
 
 STRING = 'std_msgs/String'
 
@@ -235,7 +235,7 @@ def test_what_answers_but_is_no_master_is_not_reachable():
 
 
 def test_wait_returns_once_the_master_answers():
-    url = refused_url()
+    url = unused_url()
     master = Master(url)
     assert not master.is_reachable()
     with concurrent.futures.ThreadPoolExecutor() as pool:
@@ -430,7 +430,7 @@ def test_a_listener_that_raises_stops_nothing(bare, transcript):
 
 
 def test_a_listener_hears_of_a_master_that_comes_later():
-    url = refused_url()
+    url = unused_url()
     changes = Changes()
     end = Master(url).on_change(changes)
     ros_master = InProcessMaster(int(url.rstrip('/').rpartition(':')[2]))

@@ -325,11 +325,11 @@ def wait_for_each(program, *texts):
 
 @contextlib.contextmanager
 def cut(host):
-    """Its link is down, for CUT seconds beyond what happens within."""
+    """Its link is down, for CUT seconds before what happens within."""
     host.link('down')
     try:
-        yield
         threading.Event().wait(CUT)
+        yield
     finally:
         host.link('up')
 
