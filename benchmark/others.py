@@ -19,6 +19,7 @@ import subprocess
 import sys
 import threading
 import time
+import traceback
 from multiprocessing.shared_memory import SharedMemory
 
 import player
@@ -112,7 +113,7 @@ def own(self):
 
 def _written(kind):
     """What becomes of it, in a child, for that may end there."""
-    answers = ['seen by no other', 'seen by the others', 'refused']
+    answers = {0: 'seen by no other', 1: 'seen by the others', 2: 'refused'}
     child = os.fork()
     if child == 0:
         try:
@@ -120,12 +121,13 @@ def _written(kind):
             os._exit(any(kind.read(each) == -1 for kept in kind.held[1:] for _, each in kept))
         except (TypeError, BufferError):
             os._exit(2)
-        finally:
+        except BaseException:
+            traceback.print_exc()
             os._exit(3)
     _, status = os.waitpid(child, 0)
     if os.WIFSIGNALED(status):
         return f'{signal.Signals(os.WTERMSIG(status)).name}, process dies'
-    return answers[os.WEXITSTATUS(status)]
+    return answers.get(os.WEXITSTATUS(status), 'failed')
 
 
 class Other(player.Player):

@@ -6,9 +6,10 @@ It reads commands from standard input, one a line, and answers each with a line 
 
     open MESSAGE RECEIVERS QUEUE        be ready for these slices; a player may have several open
     begin MESSAGE RECEIVERS QUEUE       forget what was received, and count CPU time from here
-    send RATE SECONDS BUSY              send on what was begun, RATE a second (0: flat out), in
-    between computing (BUSY 1) result EXPECTED                     wait until so many have arrived,
-    or no more come, and tell
+    send RATE SECONDS BUSY              send on what was begun, RATE a second (0: flat out), and
+                                        compute in between (BUSY 1)
+    result EXPECTED SILENCE             wait until so many have arrived, or none for so many
+                                        seconds, and tell
 
 Stamps are kept beside the messages, which carry an index into them: reading a clock is not part of
 what is serialized.
@@ -18,6 +19,7 @@ import json
 import mmap
 import os
 import queue
+import random
 import sys
 import threading
 import time
@@ -29,7 +31,6 @@ from std_msgs.msg import String
 clock = time.perf_counter  # CLOCK_MONOTONIC, the same in all processes
 STAMPS = 1 << 21  # messages of a slice at the most
 SAMPLES = 4000  # latencies told of a slice at the most
-SILENCE = 0.4  # seconds without a message after which the rest is lost
 PATIENCE = 10.0  # seconds that connecting may take
 IMAGES = {'image0.9': (640, 480), 'image6.2': (1920, 1080)}
 
@@ -127,7 +128,9 @@ class Player:
         count = (
             self._flat_out(publish, message, mark, begun + seconds)
             if not rate
-            else self._paced(publish, message, mark, int(rate * seconds), 1 / rate, busy == '1')
+            else self._paced(
+                publish, message, mark, max(1, int(rate * seconds)), 1 / rate, busy == '1'
+            )
         )
         self._begun = begun
         return {'sent': count, 'begun': begun, 'took': clock() - begun}
@@ -156,14 +159,16 @@ class Player:
                 time.sleep(max(0.0, due - clock()))
         return count
 
-    def result(self, expected):
-        expected, arrived, last = int(expected), -1, clock()
+    def result(self, expected, silence):
+        expected, silence, arrived, last = int(expected), float(silence), -1, clock()
         cpu = time.process_time()
-        while arrived < expected and clock() - last < SILENCE:
+        while arrived < expected and clock() - last < silence:
             if len(self.took) > arrived:
                 arrived, last, cpu = len(self.took), clock(), time.process_time()
             time.sleep(0.002)
-        took = self.took[:: len(self.took) // SAMPLES + 1]
+        took = self.took
+        if len(took) > SAMPLES:  # at random, for receivers note in turn
+            took = random.sample(took, SAMPLES)
         return {'received': max(arrived, 0), 'last': last, 'cpu': cpu - self._cpu, 'took': took}
 
     def serve(self, commands, answers):

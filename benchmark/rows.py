@@ -45,6 +45,13 @@ PYTHON_ROWS = {
     'rospy, 2 proc., tuned': ['rospy', '--tuned', '--two'],
 }
 CPP_ROWS = {'C++ nodelets': 'nodelets', 'roscpp, 1 process': 'roscpp'}
+# seconds without a message after which the rest is lost; at a rate, where nothing is to be lost, as
+# long as the largest message may be under way: what came later would count in the next slice
+SILENCE, SILENCE_AT_A_RATE = 0.4, 2.0
+
+
+class Ended(Exception):
+    """A process that was to measure has ended."""
 
 
 class Slice(NamedTuple):
@@ -88,8 +95,10 @@ class Row:
             player.ask('begin', *what)
         sent = self._players[-1].ask('send', rate, seconds, int(busy))
         expected = sent['sent'] * what[1]
-        receiver = self._players[0].ask('result', expected)
-        cpu = receiver['cpu'] + sum(player.ask('result', 0)['cpu'] for player in self._players[1:])
+        silence = SILENCE_AT_A_RATE if rate else SILENCE
+        receiver = self._players[0].ask('result', expected, silence)
+        others = [player.ask('result', 0, silence) for player in self._players[1:]]
+        cpu = sum(each['cpu'] for each in (receiver, *others))
         duration = max(receiver['last'] - sent['begun'], sent['took'])
         return Slice(receiver['took'], expected, receiver['received'], duration, cpu)
 
@@ -111,7 +120,7 @@ class Row:
 
 class _Player:
     def __init__(self, command, environment, errors):
-        self._command, self._errors = command, errors
+        self._errors = errors
         self._process = subprocess.Popen(
             command,
             stdin=subprocess.PIPE,
@@ -129,10 +138,10 @@ class _Player:
         except BrokenPipeError:
             answer = ''
         if not answer:
-            self._errors.seek(0)
-            raise RuntimeError(
-                f"{' '.join(self._command)} ended at {words}:\n{self._errors.read()[-2000:]}"
-            )
+            status = self._process.wait()
+            how = signal.Signals(-status).name if status < 0 else f'status {status}'
+            what = f"a process ended by {how} at {' '.join(map(str, words))}"
+            raise Ended(f'{what}: {what_was_raised(self._errors)}')
         return json.loads(answer)
 
     def signal(self, number):
@@ -141,6 +150,13 @@ class _Player:
     def end(self):
         self._process.kill()
         self._process.wait()
+
+
+def what_was_raised(errors):
+    """The last error in a file, without the frames of its traceback."""
+    errors.seek(0)
+    last = errors.read().rpartition('Traceback (most recent call last):')[2].splitlines()
+    return ' '.join(line for line in last if line and not line.startswith(' '))[:1000]
 
 
 def end_with_parent():
@@ -156,14 +172,12 @@ def make(names, environment, folder, beside=()):
     :param beside: other ``src`` folders of pharos: their rows are there too, marked with ', '' and
         so on
     """
-    errors = open(folder / 'errors', 'w+')
     rows = []
     for name in names:
         label = f'row{len(rows)}'
         if name in CPP_ROWS:
-            rows.append(
-                Row(name, [[str(BUILD / 'player'), CPP_ROWS[name], label]], environment, errors)
-            )
+            command = [str(BUILD / 'player'), CPP_ROWS[name], label]
+            rows.append(Row(name, [command], environment, open_errors(folder, label)))
             continue
         words = PYTHON_ROWS[name]
         for number, source in enumerate((SOURCE, *beside) if 'pharos' in name else (SOURCE,)):
@@ -173,10 +187,15 @@ def make(names, environment, folder, beside=()):
                     name + "'" * number,
                     commands(words, label, folder),
                     {**environment, 'PYTHONPATH': str(source)},
-                    errors,
+                    open_errors(folder, label),
                 )
             )
     return rows
+
+
+def open_errors(folder, label):
+    """Where the processes of a row write what is wrong."""
+    return open(folder / f'{label}.errors', 'w+')
 
 
 def commands(words, label, folder, program=('/usr/bin/python3', str(HERE / 'player.py'))):
@@ -225,8 +244,11 @@ def build_cpp():
 
 
 @contextlib.contextmanager
-def ros_master(folder):
-    """A ROS master as a child process; gives the environment for nodes of it."""
+def ros_master(folder, program=('/usr/bin/rosmaster', '--core', '-p')):
+    """A ROS master as a child process; gives the environment for nodes of it.
+
+    :param program: what is started, with its port as one more argument
+    """
     port = free_port()
     environment = {
         **os.environ,
@@ -235,11 +257,14 @@ def ros_master(folder):
         'ROS_LOG_DIR': str(folder),
         'ROS_HOME': str(folder),
     }
+    environment.pop('ROS_NAMESPACE', None)
     process = subprocess.Popen(
-        ['/usr/bin/rosmaster', '--core', '-p', str(port)],
+        [*program, str(port)],
         env=environment,
+        stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
+        preexec_fn=end_with_parent,
     )
     try:
         deadline = time.monotonic() + 20
@@ -248,8 +273,8 @@ def ros_master(folder):
                 xmlrpc.client.ServerProxy(environment['ROS_MASTER_URI']).getPid('/benchmark')
                 break
             except OSError:
-                if time.monotonic() > deadline:
-                    raise
+                if time.monotonic() > deadline or process.poll() is not None:
+                    raise Ended(f"no ROS master by {' '.join(map(str, program))}") from None
                 time.sleep(0.05)
         yield environment
     finally:
@@ -262,3 +287,28 @@ def free_port():
     with socket.socket() as free:
         free.bind(('127.0.0.1', 0))
         return free.getsockname()[1]
+
+
+def tell(text=''):
+    """Show what is measured now, at a terminal, in a line that the next one overwrites."""
+    if sys.stderr.isatty():
+        print(f'\r{text:<78.78}', end='' if text else '\r', file=sys.stderr, flush=True)
+
+
+def run_program(main):
+    """Run it to its end; by Ctrl-C or another signal it ends as by an exception, so that all that it
+    has begun ends, too."""
+
+    def end(number, frame):
+        sys.exit(128 + number)
+
+    for number in signal.SIGTERM, signal.SIGHUP:
+        if signal.getsignal(number) is signal.SIG_DFL:  # nohup has it ignored
+            signal.signal(number, end)
+    try:
+        main()
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except Ended as error:
+        tell()
+        sys.exit(f'{os.path.basename(sys.argv[0])}: {error}')

@@ -8,6 +8,7 @@ usage: scaling.py nodes pharos|rospy COUNT SECONDS
        scaling.py size BYTES
 """
 import collections
+import contextlib
 import ctypes
 import json
 import os
@@ -43,12 +44,6 @@ def wait_until(holds, what):
 def master_counts():
     """What the master has been asked so far."""
     return xmlrpc.client.ServerProxy(os.environ['ROS_MASTER_URI']).counts('/scale')[2]
-
-
-def registered(names):
-    """How many of these nodes the master knows."""
-    state = xmlrpc.client.ServerProxy(os.environ['ROS_MASTER_URI']).getSystemState('/scale')[2]
-    return len(set(names) & {name for kind in state for _, nodes in kind for name in nodes})
 
 
 class Use:
@@ -111,13 +106,14 @@ def nodes_of_pharos(count, seconds):
 
     master = pharos.Master()
     link_of_chain(master, 0).stop()  # what is loaded once per process
-    before, asked, begun = Use([os.getpid()]), master_counts(), clock()
+    alone, asked, begun = Use([os.getpid()]), master_counts(), clock()
     nodes = [link_of_chain(master, number + 1) for number in range(count)]
-    found = measure([os.getpid()], begun, before, asked, seconds)
+    found = measure([os.getpid()], begun, Use([]), asked, seconds)
+    added = found['memory'] - alone.memory
     kinds, begun = kinds_of_threads(), clock()
     for node in nodes:
         node.stop()
-    return {**found, 'stop': clock() - begun, 'kinds': kinds}
+    return {**found, 'stop': clock() - begun, 'kinds': kinds, 'added': added}
 
 
 def kinds_of_threads():
@@ -127,18 +123,23 @@ def kinds_of_threads():
 
 
 def nodes_of_rospy(count, seconds):
-    """That many processes, each with a node; they start a few at a time."""
+    """That many processes, each with a node; all start at once."""
+    from rows import end_with_parent
+
     asked, begun, processes = master_counts(), clock(), []
-    names = [f'/scale_n{number}' for number in range(count)]
     try:
         for number in range(count):
+            command = [sys.executable, __file__, 'node', str(number)]
             processes.append(
-                subprocess.Popen(
-                    [sys.executable, __file__, 'node', str(number)], stdout=subprocess.DEVNULL
-                )
+                subprocess.Popen(command, stdout=subprocess.PIPE, preexec_fn=end_with_parent)
             )
-        wait_until(lambda: registered(names) == count, f'{count} nodes of rospy')
-        found = measure([process.pid for process in processes], begun, Use([]), asked, seconds)
+        for process in processes:
+            # it is registered; all but the last are heard, too
+            for _ in range(1 if process is processes[-1] else 2):
+                if not process.stdout.readline():
+                    raise SystemExit('a node of rospy has ended')
+        pids = [process.pid for process in processes]
+        found = measure(pids, begun, Use([]), asked, seconds)
     finally:
         begun = clock()
         for process in processes:
@@ -149,12 +150,19 @@ def nodes_of_rospy(count, seconds):
 
 
 def node_of_rospy(number):
-    """One of them, until Ctrl-C."""
+    """One of them, until Ctrl-C; prints a line when it is registered, and one when it is heard."""
     import rospy
 
+    class Heard(rospy.SubscribeListener):
+        def peer_subscribe(self, *_):
+            print('heard', flush=True)
+
     rospy.init_node(f'scale_n{number}')
-    publisher = rospy.Publisher(f'/scale/t{number + 1}', Int32, queue_size=QUEUE)
+    publisher = rospy.Publisher(
+        f'/scale/t{number + 1}', Int32, queue_size=QUEUE, subscriber_listener=Heard()
+    )
     rospy.Subscriber(f'/scale/t{number}', Int32, lambda message: None)
+    print('registered', flush=True)
     rospy.spin()
     publisher.unregister()
 
@@ -164,19 +172,24 @@ def node_of_rospy(number):
 
 def topics(way, count, seconds):
     """Open so many topics of a node, send a message on each, and see what they cost."""
-    heard = collections.Counter()
+    heard, all_heard = set(), threading.Event()
+
+    def hear(message, *_):
+        heard.add(message.data)
+        if len(heard) == count:
+            all_heard.set()
+
     opened, stop = {'pharos': topics_of_pharos, 'rospy': topics_of_rospy}[way]()
     opened(count, lambda *_: None)  # what is loaded once per process
     before, asked, begun = Use([os.getpid()]), master_counts(), clock()
-    publishers = [
-        opened(number, lambda message, *_: heard.update([message.data])) for number in range(count)
-    ]
+    publishers = [opened(number, hear) for number in range(count)]
     wait_until(lambda: all(map(connections, publishers)), 'connections')
     found = measure([os.getpid()], begun, before, asked, seconds)
     begun = clock()
     for number, publisher in enumerate(publishers):
         publisher.publish(Int32(number))
-    wait_until(lambda: len(heard) == count, 'a message on each topic')
+    if not all_heard.wait(PATIENCE):
+        raise SystemExit('not in time: a message on each topic')
     found['round'] = clock() - begun
     begun = clock()
     stop()
@@ -227,9 +240,11 @@ def limit(what, value, count):
     what, value, heard = getattr(resource, f'RLIMIT_{what}'), int(value), threading.Event()
     master = pharos.Master()
     nodes = [link_of_chain(master, 0)]
-    if what == resource.RLIMIT_NPROC and os.geteuid() == 0:
-        os.setuid(NOBODY)  # root has no such limit
-        ctypes.CDLL(None).prctl(PR_SET_DUMPABLE, 1)  # what /proc tells of it stays its own
+    if what == resource.RLIMIT_NPROC:
+        if os.geteuid() == 0:
+            os.setuid(NOBODY)  # root has no such limit
+            ctypes.CDLL(None).prctl(PR_SET_DUMPABLE, 1)  # what /proc tells of it stays its own
+        value += threads_of_user()
     resource.setrlimit(what, (value, value))
     said = None
     try:
@@ -237,6 +252,8 @@ def limit(what, value, count):
             nodes.append(link_of_chain(master, number + 1, lambda *_: heard.set()))
     except Exception as error:
         said = f'{type(error).__name__}: {error}'
+    if len(nodes) == 1:
+        raise SystemExit(f'not one node: {said}')
     own = Use([os.getpid()])
     nodes[0].send_to('/scale/t1', data=1)
     goes_on = heard.wait(PATIENCE)
@@ -249,6 +266,16 @@ def limit(what, value, count):
         'threads': own.threads,
         'descriptors': own.descriptors,
     }
+
+
+def threads_of_user():
+    """How many threads this user's processes have, to all of which a limit of them is set."""
+    count = 0
+    for folder in pathlib.Path('/proc').glob('[0-9]*'):
+        with contextlib.suppress(OSError):  # it has ended
+            if folder.stat().st_uid == os.getuid():
+                count += len(os.listdir(folder / 'task'))
+    return count
 
 
 # -- receivers: as many as keep up
@@ -286,7 +313,7 @@ def receivers(rate, count):
 
 
 def size(count):
-    """Send an image of so many bytes in process and to another one; what is said of it."""
+    """Send images of so many bytes, and of 4 GiB, in process; what is said of them."""
     from sensor_msgs.msg import Image
 
     import pharos

@@ -1,6 +1,7 @@
 """Prints what benchmark/channels measured: ``slices`` is ``{(key, row name): [Slice of each
 round]}``."""
 import statistics
+import textwrap
 
 
 class Figures:
@@ -23,14 +24,20 @@ def _ratio(value, first):
     return '' if first is None else '%.3g' % float('%.2g' % (value / first)) if first else '-'
 
 
-def _time(value):
+def time_text(value):
+    """Microseconds, in few digits."""
     return '%.*f' % (2 if value < 10 else 1 if value < 100 else 0, value)
+
+
+def indented(text):
+    """In lines of their own."""
+    return '\n' + textwrap.fill(text, 110, initial_indent=' ' * 4, subsequent_indent=' ' * 5)
 
 
 def print_ways(names, messages, receivers, slices):
     """The table."""
     print(
-        '%-24s | %-31s | %-33s | %-27s'
+        '%-25s | %-29s | %-23s | %s'
         % ('', 'latency at 100 Hz, us', 'latency flat out, us', 'flat out')
     )
     heads = (
@@ -39,12 +46,12 @@ def print_ways(names, messages, receivers, slices):
         ('received/s', 'ratio', 'lost', 'CPU us'),
     )
     print(
-        '%-24s | %8s %6s %8s %6s | %10s %9s %12s | %10s %6s %6s %8s'
+        '%-25s | %7s %7s %6s %6s | %7s %7s %7s | %10s %7s %6s %6s'
         % ('', *heads[0], *heads[1], *heads[2])
     )
     for message in messages:
         for count in receivers:
-            print('-' * 130)
+            print('-' * 118)
             print('%s, %d receiver%s' % (message, count, 's' * (count > 1)))
             first = None
             for name in names:
@@ -54,23 +61,24 @@ def print_ways(names, messages, receivers, slices):
                 paced, flat = map(Figures, found)
                 first = first or (paced, flat)
                 print(
-                    '  %-22s | %8s %6s %8s %6s | %10s %9s %12s | %10s %6s %5.1f%% %8s'
+                    '  %-23s | %7s %7s %6s %6s | %7s %7s %7s | %10s %7s %5.1f%% %6s'
                     % (
                         name,
-                        _time(paced.p50),
+                        time_text(paced.p50),
                         _ratio(paced.p50, first[0].p50),
-                        _time(paced.p99),
-                        _time(paced.cpu),
-                        _time(flat.p50),
+                        time_text(paced.p99),
+                        time_text(paced.cpu),
+                        time_text(flat.p50),
                         _ratio(flat.p50, first[1].p50),
-                        _time(flat.p99),
+                        time_text(flat.p99),
                         '%d' % flat.rate,
                         _ratio(flat.rate, first[1].rate),
                         flat.lost,
-                        _time(flat.cpu),
+                        time_text(flat.cpu),
                     )
-                    + ('' if paced.lost == 0 else f'   (100 Hz: {paced.lost:.0f}% lost)')
                 )
+                if paced.lost:
+                    print(f"  {'':23} | {paced.lost:.2g}% lost")
 
 
 def print_special(names, slices):
@@ -98,7 +106,14 @@ def _print_small(title, names, slices, key):
         for name, each in figures.items():
             print(
                 '  %-56s %8s %8s %8s %10d %5.1f%%'
-                % (name, _time(each.p50), _time(each.p95), _time(each.p99), each.rate, each.lost)
+                % (
+                    name,
+                    time_text(each.p50),
+                    time_text(each.p95),
+                    time_text(each.p99),
+                    each.rate,
+                    each.lost,
+                )
             )
 
 
@@ -165,7 +180,7 @@ def print_aims(slices):
         ours = of('pharos, 2 processes', message, 1, 'paced')
         if ours and of('rospy, 2 proc., tuned', message, 1, 'paced'):
             aim(
-                f'{message} over TCPROS, 100 Hz: rospy, same options, +5 %',
+                f'{message} over TCPROS, 100 Hz: rospy, tuned, +5 %',
                 ours.p50,
                 1.05 * of('rospy, 2 proc., tuned', message, 1, 'paced').p50,
             )

@@ -26,7 +26,6 @@ namespace {
 
 constexpr std::size_t STAMPS = 1 << 21;    // messages of a slice at the most
 constexpr std::size_t SAMPLES = 4000;      // latencies told of a slice at the most
-constexpr double SILENCE = 0.4;            // seconds without a message after which the rest is lost
 constexpr double PATIENCE = 10.0;          // seconds that connecting may take
 
 double seconds_of(clockid_t which) {
@@ -240,9 +239,10 @@ class Player {
 
   void result(std::istream& words, std::ostream& answer) {
     std::size_t expected, arrived = 0;
-    words >> expected;
+    double silence;    // seconds without a message after which the rest is lost
+    words >> expected >> silence;
     double last = now(), used = cpu();
-    for (bool first = true; arrived < expected && now() - last < SILENCE; first = false) {
+    for (bool first = true; arrived < expected && now() - last < silence; first = false) {
       std::size_t sum = 0;
       for (auto& notes : way_->notes) sum += notes->count;
       if (first || sum > arrived) arrived = sum, last = now(), used = cpu();
