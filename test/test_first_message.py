@@ -8,9 +8,9 @@ import xmlrpc.server
 import pytest
 import rosgraph
 
-from helpers import create, in_thread
+from helpers import create, ended, in_thread
 from pharos.testing import Mailbox, TIMEOUT, until
-from pharos import BlockNode
+from pharos import BlockNode, NodeStoppedError, OutputChannel
 from pharos.intraprocess.link import Link
 from sockets import subscribe
 
@@ -135,6 +135,24 @@ def test_a_send_that_waits_for_another_threads_channel_ends_with_the_node(master
         for thread in threads:
             thread.join(TIMEOUT)
             assert not thread.is_alive()
+
+
+def test_a_send_that_comes_to_its_wait_right_after_the_stop_ends(master, monkeypatch):
+    node = create(master, '/sender')
+    node.connect_timeout = 10 * TIMEOUT
+    wait = OutputChannel.wait_until_connected
+
+    def stop_and_wait(*arguments):
+        node.stop()
+        wait(*arguments)
+
+    monkeypatch.setattr(OutputChannel, 'wait_until_connected', stop_and_wait)
+
+    def send():
+        with pytest.raises(NodeStoppedError):
+            node.send_to('/first/ended', typed_as=STRING, data='text')
+
+    assert ended(in_thread(send))
 
 
 def test_a_first_message_may_wait_without_limit_for_its_type(master):

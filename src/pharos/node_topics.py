@@ -157,7 +157,7 @@ class NodeWithTopics(NodeWithSouls, is_base=True):
         if typed_as not in (None, channel.message_class, channel.type):
             self._topic(topic).message_class(self._node, typed_as)  # refuses another type
         # another thread may be opening it just now
-        channel.wait_until_connected(connect_timeout)
+        channel.wait_until_connected(run, connect_timeout)
         return channel.send(block, to=to, **fields)
 
     def _class_finder(self, topic: str, typed_as: TypedAs) -> Callable[[], Any]:

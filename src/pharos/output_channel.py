@@ -18,6 +18,7 @@ from pharos.signals import is_from_signal
 
 if TYPE_CHECKING:
     from pharos.node import Node
+    from pharos.run import Run
 
 
 class OutputChannel(Channel):
@@ -73,11 +74,15 @@ class OutputChannel(Channel):
         finally:
             self._connected.set()
 
-    def wait_until_connected(self, timeout: float) -> None:
+    def wait_until_connected(self, run: 'Run', timeout: float) -> None:
         """Wait for up to ``timeout`` seconds while another thread opens the channel and connects it
-        to the subscribers that the master knows."""
-        if self._opener is not threading.current_thread():
-            self._connected.wait(timeout)
+        to the subscribers that the master knows.
+
+        :param run: that of the node with whose stop the wait ends
+        """
+        connected = self._connected  # another one from the stop on, which the next start sets
+        if self._opener is not threading.current_thread() and not run.is_ending:
+            connected.wait(timeout)
 
     def publish(self, message: genpy.Message, to: Any = None) -> None:
         """Send ``message`` to all who are interested, or to the node ``to`` alone.
