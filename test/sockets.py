@@ -13,23 +13,39 @@ _refusing = []  # sockets that have a port and do not listen
 
 def listening(pid='self'):
     """``{(address, port)}`` of the TCP sockets on which the process listens."""
+    return {local for state, local, _ in _tcp_sockets(pid) if state == LISTEN}
+
+
+def connections_to_port(port):
+    """How many connections to that port this process has open."""
+    return sum(remote[1] == port for _, _, remote in _tcp_sockets('self'))
+
+
+def _tcp_sockets(pid):
+    """``[(state, local, remote)]`` of those that the process has open: the system's table has those
+    of others, too, among which a port may come again."""
     inodes = set()
     for descriptor in os.listdir(f'/proc/{pid}/fd'):
         with contextlib.suppress(OSError):
             link = os.readlink(f'/proc/{pid}/fd/{descriptor}')
             if link.startswith('socket:'):
                 inodes.add(link[len('socket:[') : -1])
-    found = set()
+    found = {}
     for table, family in ('tcp', socket.AF_INET), ('tcp6', socket.AF_INET6):
         with open(f'/proc/{pid}/net/{table}') as file:
             for line in list(file)[1:]:
-                _, local, _, state, *rest = line.split()
-                if state == LISTEN and rest[5] in inodes:
-                    address, port = local.split(':')
-                    words = struct.iter_unpack('=I', bytes.fromhex(address))
-                    packed = b''.join(struct.pack('>I', word) for word, in words)
-                    found.add((socket.inet_ntop(family, packed), int(port, 16)))
-    return found
+                _, local, remote, state, *rest = line.split()
+                if rest[5] in inodes:
+                    found[rest[5]] = state, _address(local, family), _address(remote, family)
+    return list(found.values())
+
+
+def _address(text, family):
+    """``(address, port)`` as the system's table has it."""
+    address, port = text.split(':')
+    words = struct.iter_unpack('=I', bytes.fromhex(address))
+    packed = b''.join(struct.pack('>I', word) for word, in words)
+    return socket.inet_ntop(family, packed), int(port, 16)
 
 
 @contextlib.contextmanager

@@ -21,7 +21,7 @@ from pharos.testing import TIMEOUT, until
 import pharos
 from pharos import messages
 from programs import PROGRAMS, Program, environment, forget_parameters, run, script
-from sockets import wait_for_end
+from sockets import connections_to_port, wait_for_end
 
 ECHO = 'diagnostic_msgs/AddDiagnostics'  # load_namespace -> success, message
 ECHO_FIELDS = 'request: load_namespace: string; response: success: bool, message: string'
@@ -147,13 +147,8 @@ def together(count, job):
 
 
 def connections_to(service):
-    """How many connections to the service's provider are open in this process, from which alone it
-    is called."""
-    port = f":{int(service.uri.rpartition(':')[2]):04X}"
-    with open('/proc/self/net/tcp') as table:
-        rows = [line.split() for line in table][1:]
-    # 0: closed, and the kernel's by now
-    return sum(row[2].endswith(port) and row[9] != '0' for row in rows)
+    """How many connections to the service's provider, another process, are open in this one."""
+    return connections_to_port(int(service.uri.rpartition(':')[2]))
 
 
 @contextlib.contextmanager
