@@ -12,7 +12,8 @@ from std_msgs.msg import Int32, String
 
 from helpers import create, ended, in_thread, speak_tcpros_only
 from pharos import Master
-from pharos.private_rospy import shared_connections
+from pharos.private_rospy import registration, shared_connections
+from pharos.private_rospy.patches import subscribers
 from pharos.private_rospy.tcpros_connection import TcprosConnection
 from pharos.testing import Mailbox, TIMEOUT, until
 import programs
@@ -276,6 +277,33 @@ def test_what_is_no_message_ends_the_connection_and_is_told(master, sharing, mon
     wait_until_heard(channel, first)
     channel.send(data=1)
     assert one.next().data == 1
+
+
+@pytest.mark.parametrize('is_shared', [False, True], ids=['own', 'shared'])
+def test_a_publisher_that_sends_nothing_but_nonsense_is_not_stormed(master, monkeypatch, is_shared):
+    """One that was understood before is connected to again at once, so that little is lost."""
+    master = Master(master.url, share_connections=is_shared)
+    ((node, heard),) = listen(master, '/node')
+    channel = sender_of(master, node)
+    connections, delays = node.latest_run.rospy.connections, Mailbox()
+    connect_later = connections.connect_later
+
+    def connect_at_once(subscriber, uri, delay):
+        delays(delay, None)
+        connect_later(subscriber, uri, 0)
+
+    monkeypatch.setattr(connections, 'connect_later', connect_at_once)
+    publisher = channel.node.latest_run.rospy.publisher('/shared')
+    for is_understood in False, True, False:
+        if is_understood:
+            channel.send(data=1)
+            assert heard.next().data == 1
+        (connection,) = publisher.fanout.connections
+        connection.write_data(struct.pack('<I', 0xFFFFFFFF))
+        delay = delays.next()
+        assert delay == (subscribers.RECONNECT_DELAY if is_understood else registration.RETRY_DELAY)
+        until(lambda: connection.done)
+        wait_until_heard(channel, node)
 
 
 def test_a_publisher_that_comes_back_is_heard_by_all(master, sharing):

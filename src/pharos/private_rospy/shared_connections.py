@@ -120,15 +120,16 @@ class SharedConnection:
         except BaseException as error:
             # that it has gone is told nowhere, for each node tries to connect again
             if isinstance(error, NoMessageError) or not isinstance(error, OSError):
-                self._warn(error)
+                self._tell_unreadable(error)
         finally:
             self._close()
             self._connection.close()
 
-    def _warn(self, error):
+    def _tell_unreadable(self, error):
         said = brief(str(error) or repr(error))
         text = f'connection with {self.name} for {self.resolved_name} closed: {said}'
         for end in self.fanout.connections:
+            end.link.receiving.is_unreadable = True
             end.link.warn(text)
 
     def _freeze(self, message):

@@ -61,14 +61,18 @@ def _invoke_callback(self, msg, cb, cb_args, *, node, original):
     'lets a link that broke go, though its publisher is there, or there again (ros_comm #851)',
 )
 def remove_connection(self, c, *, node, original):
-    """Connect again soon, but to one who refused, or may not be talked to."""
+    """Connect again soon, but to one who refused, or may not be talked to; later to one who has sent
+    nothing that can be read."""
     original(self, c)
     if self.closed:
         return
-    if c.header:
-        delay = None if 'error' in c.header else RECONNECT_DELAY
-    else:
+    if not c.header:
         delay = registration.RETRY_DELAY if c.dest_address else None
+    elif 'error' in c.header:
+        delay = None
+    else:
+        is_senseless = getattr(c, 'is_unreadable', False) and not c.stat_num_msg
+        delay = registration.RETRY_DELAY if is_senseless else RECONNECT_DELAY
     if delay is not None:
         node.connections.connect_later(self, c.endpoint_id, delay)
 

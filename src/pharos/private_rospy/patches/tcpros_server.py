@@ -176,6 +176,7 @@ def receive_once(self, *, node, module, original):
     except module.TransportTerminated:
         raise
     except module.TransportException as error:
+        self.is_unreadable = True
         we_are_the_client = self.dest_address
         if we_are_the_client and not self.done and not module.is_shutdown():
             node.warn(f'connection with {self.endpoint_id} for {self.name} closed: {brief(error)}')
