@@ -161,5 +161,5 @@ def test_nodes_that_come_and_go_leave_nothing(master):
     seed = int(os.environ.get('PHAROS_LOAD_SEED', 0)) or random.randrange(1, 1 << 32)
     counts = run(master, 'load.come_and_go(master, %d, turns=60)' % seed)
     assert counts['starts'] > 20
-    assert counts['calls'] > 20
+    assert counts['calls'] > 5
     assert counts['delivered'] > 50
