@@ -3,7 +3,7 @@ prints its findings as JSON. benchmark/scale starts it, at a counting_master.py.
 
 usage: scaling.py nodes pharos|rospy COUNT SECONDS
        scaling.py topics pharos|rospy COUNT SECONDS
-       scaling.py limit WHAT LIMIT COUNT
+       scaling.py limit nodes|topics WHAT LIMIT COUNT
        scaling.py receivers RATE COUNT
        scaling.py size BYTES
 """
@@ -204,14 +204,15 @@ def connections(publisher):
         return publisher.get_num_connections()
 
 
-def topics_of_pharos():
+def topics_of_pharos(name='/scale/topics'):
     """``opened(number, heard)``, which returns a Publisher or channel that is heard, and ``stop()``."""
     import pharos
 
-    node = pharos.Master().create(pharos.BlockNode, named='/scale/topics', domain='127.0.0.1')
+    node = pharos.Master().create(pharos.BlockNode, named=name, domain='127.0.0.1')
 
-    def opened(number, heard):
-        node.interested_in(f'/scale/t{number}', Int32, heard)
+    def opened(number, heard=None):
+        if heard is not None:
+            node.interested_in(f'/scale/t{number}', Int32, heard)
         return node.output_channel(f'/scale/t{number}', Int32)
 
     return opened, node.stop
@@ -233,39 +234,96 @@ def topics_of_rospy():
 # -- limits: what happens where there is no more
 
 
-def limit(what, value, count):
-    """Start nodes of pharos until one cannot; what was said, and whether the others go on."""
-    import pharos
-
+def limit(kind, what, value, count):
+    """Have one more node, or topic of another process, until that cannot be; what was said, and
+    whether the others go on."""
     what, value, heard = getattr(resource, f'RLIMIT_{what}'), int(value), threading.Event()
-    master = pharos.Master()
-    nodes = [link_of_chain(master, 0)]
+    one_more, send, stop = {'nodes': chain, 'topics': topics_elsewhere}[kind](count, heard)
     if what == resource.RLIMIT_NPROC:
         if os.geteuid() == 0:
             os.setuid(NOBODY)  # root has no such limit
             ctypes.CDLL(None).prctl(PR_SET_DUMPABLE, 1)  # what /proc tells of it stays its own
         value += threads_of_user()
     resource.setrlimit(what, (value, value))
-    said = None
+    reached, said = 0, None
     try:
-        for number in range(count):
-            nodes.append(link_of_chain(master, number + 1, lambda *_: heard.set()))
+        while reached < count:
+            one_more(reached)
+            reached += 1
     except Exception as error:
         said = f'{type(error).__name__}: {error}'
-    if len(nodes) == 1:
-        raise SystemExit(f'not one node: {said}')
+    if not reached:
+        raise SystemExit(f'not one: {said}')
     own = Use([os.getpid()])
-    nodes[0].send_to('/scale/t1', data=1)
+    send()
     goes_on = heard.wait(PATIENCE)
-    for node in nodes:
-        node.stop()
+    stop()
     return {
-        'nodes': len(nodes),
+        'reached': reached,
         'said': said,
         'goes on': goes_on,
         'threads': own.threads,
         'descriptors': own.descriptors,
     }
+
+
+def chain(count, heard):
+    """``one_more(number)`` adds a node, ``send()`` has the first be heard, ``stop()`` ends all."""
+    import pharos
+
+    master, nodes = pharos.Master(), []
+
+    def one_more(number):
+        nodes.append(link_of_chain(master, number, lambda *_: heard.set()))
+
+    def stop():
+        for node in nodes:
+            node.stop()
+
+    return one_more, lambda: nodes[0].send_to('/scale/t1', data=1), stop
+
+
+def topics_elsewhere(count, heard):
+    """The same of topics that another process publishes, and one node hears."""
+    import pharos
+
+    from rows import end_with_parent
+
+    publisher = subprocess.Popen(
+        [sys.executable, __file__, 'publisher', str(count)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        preexec_fn=end_with_parent,
+    )
+    publisher.stdout.readline()
+    node = pharos.Master().create(pharos.BlockNode, named='/scale/hearer', domain='127.0.0.1')
+
+    def one_more(number):
+        node.interested_in(f'/scale/t{number}', Int32, lambda *_: heard.set())
+        wait_until(lambda: node.channels[-1].connections, f'connection {number}')
+
+    def stop():
+        node.stop()
+        publisher.stdin.close()
+        publisher.wait()
+
+    def send():
+        publisher.stdin.write(b'\n')
+        publisher.stdin.flush()
+
+    return one_more, send, stop
+
+
+def publish_topics(count):
+    """Publish on so many topics; on the first one for each line that comes."""
+    _, descriptors = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (descriptors, descriptors))
+    opened, stop = topics_of_pharos('/scale/publisher')
+    first, *_ = [opened(number) for number in range(count)]
+    print('ready', flush=True)
+    for _ in sys.stdin:
+        first.publish(Int32(1))
+    stop()
 
 
 def threads_of_user():
@@ -340,6 +398,9 @@ def main():
     if sys.argv[1] == 'node':
         node_of_rospy(int(sys.argv[2]))
         return
+    if sys.argv[1] == 'publisher':
+        publish_topics(int(sys.argv[2]))
+        return
     answers = os.fdopen(os.dup(1), 'w')
     os.dup2(2, 1)  # what ROS prints is no answer
     what, *words = sys.argv[1:]
@@ -350,7 +411,7 @@ def main():
     elif what == 'topics':
         found = topics(words[0], int(words[1]), float(words[2]))
     elif what == 'limit':
-        found = limit(words[0], int(words[1]), int(words[2]))
+        found = limit(words[0], words[1], int(words[2]), int(words[3]))
     elif what == 'size':
         found = size(int(words[0]))
     else:

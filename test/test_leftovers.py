@@ -3,6 +3,7 @@
 The counting is done in a process of its own, whose threads, descriptors and memory are those of its
 nodes alone; the master and the peers are elsewhere.
 """
+import errno
 import gc
 import json
 import os
@@ -11,14 +12,16 @@ import resource
 import subprocess
 import sys
 import threading
+import types
 import weakref
 
 import pytest
 from std_msgs.msg import String
 
 import load
-from helpers import create
-from pharos.testing import Mailbox, until
+from helpers import create, ended, in_thread, speak_tcpros_only
+from pharos.private_rospy import connections, descriptors, registration
+from pharos.testing import Mailbox, TIMEOUT, until
 import pharos
 from pharos import BlockNode
 from programs import PROGRAMS, environment
@@ -185,6 +188,66 @@ def test_a_node_for_which_there_are_no_descriptors_says_so(master):
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, before)
     assert create(master, '/one_more').is_running
+
+
+def test_a_channel_for_which_there_are_no_descriptors_says_so(master, monkeypatch, mailbox):
+    """It would count as open, and hear nobody."""
+    sender, receiver = create(master, '/sender'), create(master, '/receiver', delegate=mailbox)
+    refuse_descriptors(monkeypatch)
+    with pytest.raises(pharos.PharosError, match='/receiver cannot connect to /lacking: .* -n'):
+        receiver.interested_in('/lacking', 'std_msgs/String')
+    assert not receiver.channels
+    monkeypatch.undo()
+    receiver.interested_in('/lacking', 'std_msgs/String')
+    sender.send_to('/lacking', data='heard')
+    assert mailbox.next().data == 'heard'
+
+
+def test_a_publisher_that_comes_when_there_are_no_descriptors_is_told_once_and_heard_later(
+    master, monkeypatch, mailbox
+):
+    sender, receiver = create(master, '/sender'), create(master, '/receiver', delegate=mailbox)
+    speak_tcpros_only(receiver)
+    receiver.interested_in('/lacking', 'std_msgs/String')
+    told = Mailbox()
+    monkeypatch.setattr(receiver.latest_run.rospy, 'warn', lambda line: told(line, None))
+    monkeypatch.setattr(registration, 'RETRY_DELAY', 0.01)
+    monkeypatch.setattr(
+        connections.Connections, '_neighbours', lambda self: []
+    )  # all are elsewhere
+    refused = refuse_descriptors(monkeypatch)
+    opening = in_thread(sender.output_channel, '/lacking', 'std_msgs/String')
+    assert all(refused.acquire(timeout=TIMEOUT) for _ in range(3))
+    monkeypatch.undo()
+    assert ended(opening)
+    assert re.match('/receiver cannot connect to /lacking: .* ulimit -n', told.next())
+    assert told.empty()
+    sender.send_to('/lacking', data='heard')
+    assert mailbox.next().data == 'heard'
+
+
+def test_two_nodes_that_have_no_descriptors_to_connect_say_so(master, monkeypatch):
+    sender, receiver = create(master, '/sender'), create(master, '/receiver')
+    receiver.interested_in('/lacking', 'std_msgs/String')
+    refuse_descriptors(monkeypatch)
+    with pytest.raises(pharos.PharosError, match='/receiver cannot connect to /lacking: .* -n'):
+        sender.output_channel('/lacking', 'std_msgs/String')
+    monkeypatch.undo()
+    assert sender.output_channel('/lacking', 'std_msgs/String').connections
+
+
+def refuse_descriptors(monkeypatch):
+    """Have the process seem to have none for connections between nodes; returns a semaphore, which
+    is released for each that is refused."""
+    refused = threading.Semaphore(0)
+
+    def refuse(*arguments):
+        refused.release()
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    monkeypatch.setattr(descriptors, 'os', types.SimpleNamespace(**{**vars(os), 'open': refuse}))
+    monkeypatch.setattr(connections, 'ServerProxy', refuse)
+    return refused
 
 
 def test_a_node_for_which_there_is_no_thread_says_so_and_leaves_nothing(master):

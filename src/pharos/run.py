@@ -69,7 +69,7 @@ class Run:
         self.successor: Optional[Run] = None
         #: the restart that ends this one
         self.restart: Optional[Restart] = None
-        descriptors.check_left(settings.name)
+        descriptors.check_left(descriptors.STARTING, f'{settings.name} cannot start')
         self.rospy = PrivateRospy(settings, self._stop_for_ros, lambda: node.allow_remote_shutdown)
         on_behalf = self.rospy.lifetime.run_on_behalf if self.may_run_elsewhere else None
         self.dispatcher = Dispatcher(self.rospy.start_thread, on_behalf=on_behalf)

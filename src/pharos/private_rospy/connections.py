@@ -10,6 +10,7 @@ from pharos.private_rospy.addresses import is_same_master
 from pharos.private_rospy.names import Resolved
 from pharos.private_rospy import changes, departures, registration, shared_connections, threads
 from pharos.private_rospy.deadlines import time_limit
+from pharos.private_rospy.descriptors import ForConnections
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.proxies import ServerProxy
 from pharos.private_rospy.registration import UNREGISTER_TIMEOUT, registered
@@ -36,6 +37,7 @@ class Connections:
         self.subscribers_at_registration = {}
         # topics of which the log says that subscribers did not connect in time
         self.told_late = set()
+        self._descriptors = ForConnections(node)
         self._reading = {}  # identifier of a thread -> the topic whose socket it reads
         # (topic, URI) of each publisher just being connected to -> whether somebody asked again
         self._connecting = {}
@@ -65,8 +67,10 @@ class Connections:
         :param timeout: seconds that all may take
         :raises MasterUnreachableError: if it cannot be registered
         :raises NodeStoppedError: if the node stops meanwhile
+        :raises PharosError: if there are no descriptors for a connection to a publisher
         """
         topic, callback = receiver.topic, SocketCallback(receiver, inbox, self._node)
+        self._descriptors.check(topic)
         with self._lock:
             self._receivers[topic] = (*self.receivers_on(topic), receiver)
         endpoint = None
@@ -216,6 +220,7 @@ class Connections:
         :param is_local: that is a node of this process, and the caller waits for the connection
         :returns: as all calls of ROS's slave API: a code (1: done), a text, 0
         :raises NoThreadError: if it is local, and the system gives no thread that would answer
+        :raises PharosError: if it is local, and there are no descriptors to connect
         """
         key = topic, uri
         with self._lock:
@@ -247,6 +252,7 @@ class Connections:
     def connect_later(self, subscriber, uri, delay):
         """Connect a subscription to the publisher at that URI in so many seconds, unless it, or the
         node, ends before."""
+        self._descriptors.tell_lack(subscriber.resolved_name)
         self._node.start_thread(self._connect_later, (subscriber, uri, delay), 'reconnect')
 
     def _connect_later(self, subscriber, uri, delay):
@@ -269,8 +275,11 @@ class Connections:
             except ConnectionRefusedError as error:
                 return 0, str(error), 0
             except Exception:  # whatever it answered
-                if is_local:  # else this goes on for as long as there is no thread to answer
+                if is_local:  # else this goes on for as long as there is nothing to answer with
                     threads.check(f'{self._node.name} to connect to {topic}')
+                    self._descriptors.check(topic)
+                else:
+                    self._descriptors.tell_lack(topic)
                 self._node.ended.wait(registration.RETRY_DELAY)
             if uri not in subscriber.publishers:
                 return 0, f'the master knows no publisher of {topic} at {uri}', 0
