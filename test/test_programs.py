@@ -20,6 +20,7 @@ import numpy
 import pytest
 
 import pharos
+import programs
 from helpers import create, ended, in_thread
 from pharos.private_rospy import ownership
 from pharos.testing import TIMEOUT, until
@@ -277,12 +278,8 @@ def test_a_program_may_interrupt_itself_alone(how, code, node, master):
 
 @pytest.mark.skipif(sys.version_info < (3, 11), reason='asyncio does not handle SIGINT itself')
 def test_the_stop_interrupts_what_asyncio_runs(master):
-    node = master.load(str(PROGRAMS / 'own' / 'runs_a_coroutine.py'))
-    main = node.ros_import('__main__')
-    assert main.begun.wait(TIMEOUT)
-    node.stop()
-    assert main.ended == ['in order']
-    assert node.exit_code == -signal.SIGINT
+    done = programs.run(master.url, sys.executable, PROGRAMS / 'stops_a_coroutine.py')
+    assert done.stdout == f'in order {-signal.SIGINT}\n', done.stderr
 
 
 def test_an_alarm_tells_how_much_was_left_of_the_one_before(master):
