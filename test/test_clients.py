@@ -472,15 +472,13 @@ def test_a_publisher_that_announces_4_gib_is_left_and_found_again(master, mailbo
         'cannot deserialize',
     ):
         assert sent.wait_for_subscribers(1, TIMEOUT)
-        (connection,) = other.latest_run.rospy.publisher('/clients/in').connections
+        fanout = other.latest_run.rospy.publisher('/clients/in').fanout
+        (connection,) = fanout.connections
         connection.write_data(said)
         line = warnings.next()
         assert logged in line
         assert line.startswith(f'connection with {other.uri} for /clients/in closed: ')
-        until(
-            lambda: connection not in other.latest_run.rospy.publisher('/clients/in').connections
-            and sent.connections
-        )
+        until(lambda: connection not in fanout.connections and sent.connections)
     sent.send(data='understood')
     assert mailbox.next().data == 'understood'
 

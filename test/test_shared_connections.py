@@ -302,7 +302,7 @@ def test_a_publisher_that_sends_nothing_but_nonsense_is_not_stormed(master, monk
         connection.write_data(struct.pack('<I', 0xFFFFFFFF))
         delay = delays.next()
         assert delay == (subscribers.RECONNECT_DELAY if is_understood else registration.RETRY_DELAY)
-        until(lambda: connection.done)
+        until(lambda: connection not in publisher.fanout.connections)
         wait_until_heard(channel, node)
 
 
