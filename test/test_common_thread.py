@@ -193,7 +193,37 @@ def test_a_node_that_keeps_to_its_thread_is_run_by_no_other(nodes_with):
         until(lambda: nodes.are_idle() and common_is_idle())
 
 
-# -- no node holds another one up
+# -- no node holds another one, or a publisher, up
+
+
+def test_a_publisher_waits_for_a_delegate_only_while_that_is_fast(nodes_with, monkeypatch):
+    monkeypatch.undo()
+    monkeypatch.setattr(dispatcher, 'FAST_TURN', 0.0)
+    goes_on, ran = threading.Semaphore(0), threading.Semaphore(0)
+
+    def wait(number):
+        assert goes_on.acquire(timeout=TIMEOUT)
+        ran.release()
+
+    nodes = nodes_with([wait])
+    (one,) = nodes.dispatchers
+    one.is_fast, one._credit = True, dispatcher.MAX_CREDIT
+    count = 0
+    while one.is_fast:
+        nodes.fanout._last_wake = 0.0  # no burst
+        nodes.fanout.publish(Int32(count))  # returns, though the delegate waits for what follows
+        goes_on.release()
+        assert ran.acquire(timeout=TIMEOUT)
+        until(nodes.are_idle)
+        count += 1
+    assert 1 < count < 5
+
+
+def test_a_publisher_does_not_wait_for_who_was_woken_in_vain(nodes_with):
+    (one,) = nodes_with([lambda number: None]).dispatchers
+    one.is_fast = True
+    one.wake()
+    assert one._awake_signal.acquire(True, TIMEOUT)
 
 
 def test_delegates_of_a_hundred_nodes_that_all_wait_hold_none_of_them_up(nodes_with):

@@ -239,8 +239,13 @@ class Dispatcher:
 
     def yield_gil(self) -> None:
         """Let the woken dispatcher thread have the interpreter: it would get it 5 ms later from a
-        busy publisher."""
-        self._awake_signal.acquire(True, YIELD_LIMIT)
+        busy publisher.
+
+        Until a fast delegate has run: the publisher would not get the interpreter back before, and
+        waking it, too, takes as long as such a delegate does.
+        """
+        if not self._awake_signal.acquire(True, YIELD_LIMIT):
+            self._note_turn(YIELD_LIMIT)
 
     def run_next(self) -> bool:
         """Run what is scheduled, in the thread of another dispatcher; raises nothing."""
@@ -284,10 +289,14 @@ class Dispatcher:
         acquire, release = self._running.acquire, self._running.release  # ``with`` costs more
         me = get_ident()
         begun: Optional[float] = None  # when the turn began, where its length matters
+        is_awaited = False  # whether a publisher may wait for the first delegate
         while True:
             try:
                 inbox = scheduled.popleft()
             except IndexError:
+                if is_awaited:
+                    is_awaited = False
+                    _release(self._awake_signal)
                 if self._closed or self._finishing:
                     return
                 if begun is not None:
@@ -295,7 +304,9 @@ class Dispatcher:
                 self.idle = True
                 if not (scheduled or self._closed or self._finishing):
                     self._wake_signal.acquire()
-                    _release(self._awake_signal)
+                    is_awaited = self.is_fast
+                    if not is_awaited:
+                        _release(self._awake_signal)
                 self.idle = False
                 begun = None if self.is_fast or not self._on_behalf else time.perf_counter()
                 continue
@@ -308,6 +319,9 @@ class Dispatcher:
             finally:
                 self._runner = None
                 release()
+            if is_awaited:
+                is_awaited = False
+                _release(self._awake_signal)
             if inline:
                 self.run()
 
