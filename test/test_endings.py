@@ -7,7 +7,7 @@ import time
 import pytest
 
 from helpers import create, ended
-from pharos.testing import TIMEOUT, until
+from pharos.testing import TIMEOUT, Mailbox, until
 from pharos import (
     BlockNode,
     ExternalNode,
@@ -550,6 +550,36 @@ def test_what_waits_ends_with_the_node(master, waiting, monkeypatch, where, name
     assert time.monotonic() - begin < TIMEOUT / 2
     assert not [thread for thread in threading.enumerate() if thread.name.startswith('/waiter ')]
     assert not node.errors
+
+
+@pytest.mark.parametrize(
+    'wait',
+    [
+        lambda me: me.master.wait_for_service('/nobodys'),
+        lambda me: me.master.wait_for_node('/nobody'),
+        lambda me: Master(refused_url()).wait(),
+        lambda me: me.wait_for_message('/nobodys', 'std_msgs/Empty'),
+    ],
+    ids=['service', 'node', 'master', 'message'],
+)
+def test_a_wait_without_limit_that_begins_after_the_stop_has_begun_ends(master, wait):
+    """The last words of a soul may wait for something, but not for ever."""
+    node = create(master, '/late')
+    stops = node.latest_run.rospy.ended
+    ended_by = Mailbox()
+
+    def soul(me):
+        assert stops.wait(TIMEOUT)
+        try:
+            wait(me)
+        except NodeStoppedError as error:
+            ended_by(error, None)
+
+    node.stop_timeout = TIMEOUT
+    soul_thread = node.fork(soul)
+    node.stop()
+    assert ended(soul_thread)
+    assert ended_by.next()
 
 
 class StartsSlowly(threading.Event):

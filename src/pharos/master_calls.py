@@ -23,7 +23,7 @@ import rosgraph
 from pharos import on_demand
 from pharos.errors import MasterUnreachableError, NodeStoppedError
 from pharos.private_rospy.addresses import is_same_master
-from pharos.private_rospy.lifetime import Interruption, is_waiting
+from pharos.private_rospy.lifetime import Interruption, is_after_stop, is_waiting
 from pharos.private_rospy.deadlines import MARGIN, time_limit
 from pharos.private_rospy.names import check_name
 from pharos.private_rospy.proxies import ServerProxy, interruption, master_api
@@ -242,7 +242,8 @@ class MasterCalls:
         where it has not in time.
 
         :param timeout: seconds, None: without limit
-        :raises NodeStoppedError: if the node on whose behalf this thread waits stops meanwhile
+        :raises NodeStoppedError: if the node on whose behalf this thread waits stops meanwhile, or,
+            without a limit, stops already
         """
         deadline = None if timeout is None else time.monotonic() + timeout
         woken = threading.Event()
@@ -254,6 +255,8 @@ class MasterCalls:
                     break  # it stopped while the master was asked
                 if found is not None or deadline is not None and time.monotonic() >= deadline:
                     return found
+                if deadline is None and is_after_stop():
+                    break
                 woken.wait(POLL)
         raise NodeStoppedError(f'the node that waited for {what} stops')
 

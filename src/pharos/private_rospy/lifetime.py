@@ -357,6 +357,12 @@ class Interruption:
             lifetime.interruptions.discard(self)
 
 
+def is_after_stop() -> bool:
+    """Whether the stop of the node on whose behalf this thread runs has begun."""
+    lifetime = getattr(_thread, 'lifetime', None)
+    return lifetime is not None and lifetime.ended.is_set()
+
+
 def is_waiting() -> bool:
     """Whether this thread is within an :class:`Interruption`."""
     return getattr(_thread, 'interruption', None) is not None
