@@ -364,7 +364,13 @@ def receivers(rate, count):
     )
     worst = max(channels, key=lambda each: each.dropped)
     said = f'{worst.node.name}: {worst.node.health()}'
-    return {'took': took, 'received': received, 'dropped': dropped, 'said': said}
+    return {
+        'sent': 2 * rate,
+        'took': took,
+        'received': received,
+        'dropped': dropped,
+        'said': said,
+    }
 
 
 # -- sizes: what is too large

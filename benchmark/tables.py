@@ -71,7 +71,7 @@ def print_ways(names, messages, receivers, slices):
                         time_text(flat.p50),
                         _ratio(flat.p50, first[1].p50),
                         time_text(flat.p99),
-                        '%d' % flat.rate,
+                        '%.0f' % flat.rate,
                         _ratio(flat.rate, first[1].rate),
                         flat.lost,
                         time_text(flat.cpu),
@@ -105,7 +105,7 @@ def _print_small(title, names, slices, key):
         print('\n%-58s %8s %8s %8s %10s %6s' % (title, 'p50', 'p95', 'p99', 'received/s', 'lost'))
         for name, each in figures.items():
             print(
-                '  %-56s %8s %8s %8s %10d %5.1f%%'
+                '  %-56s %8s %8s %8s %10.0f %5.1f%%'
                 % (
                     name,
                     time_text(each.p50),

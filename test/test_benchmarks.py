@@ -45,6 +45,8 @@ def module(monkeypatch):
         ('middleware --seconds 0', "'0' is not a number of seconds above 0"),
         ('scale --sizes 6MB', "'6MB' is not a list as 1,10 of whole numbers above 0"),
         ('scale --nodes 10,many', "'10,many' is not a list as 1,10 of whole numbers above 0"),
+        ('services --seconds -1', "'-1' is not a number of seconds above 0"),
+        ('nodes --rounds -1', "'-1' is not a list as 1,10 of whole numbers above 0"),
         ('scale threads', 'no section threads: of nodes, topics'),
         ('picture no_such_file', 'cannot read no_such_file'),
         ('picture /bin/true', 'cannot read /bin/true'),
