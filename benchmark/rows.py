@@ -5,6 +5,7 @@ import ctypes
 import json
 import os
 import pathlib
+import random
 import signal
 import socket
 import subprocess
@@ -163,6 +164,12 @@ def end_with_parent():
     """Has a child process end with the thread that starts it."""
     # PR_SET_PDEATHSIG: a stopped player would stay for ever
     ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+
+
+def shuffled(all_rows):
+    """The rows in another order each time, so that none always finds the processor's caches as the
+    same other one has left them."""
+    return random.sample(all_rows, len(all_rows))
 
 
 def make(names, environment, folder, beside=()):
