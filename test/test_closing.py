@@ -286,3 +286,28 @@ def test_who_closes_a_channel_and_opens_it_again_is_not_taken_for_connected(mast
     assert sent.connections == []
     for close in closing:
         close()
+
+
+@pytest.mark.parametrize('of', ['publisher', 'subscriber'])
+def test_a_connection_that_is_removed_late_takes_none_with_it_that_has_its_descriptor_by_now(
+    master, mailbox, of
+):
+    """Two threads may close one, as that which sends and that which looks for who has left."""
+    receiver, sender = create(master, '/receiver'), create(master, '/sender')
+    speak_tcpros_only(receiver)
+    sent = sender.output_channel('/again', STRING)
+    channel = receiver.interested_in('/again', STRING, delegate=mailbox)
+    assert sent.wait_for_subscribers(1, TIMEOUT)
+    end = {'publisher': sent, 'subscriber': channel}[of]
+    topic = getattr(end.node.latest_run.rospy, of)('/again')
+    until(lambda: topic.connections)
+    (first,) = topic.connections
+    first = getattr(first, '_connection', first)
+    first.close()
+    until(lambda: topic.connections and sent.connections)
+    (second,) = topic.connections
+    first._fileno = second.fileno()
+    topic.remove_connection(first)
+    assert topic.connections == [second]
+    sent.send(data='heard')
+    assert mailbox.next().data == 'heard'

@@ -20,7 +20,7 @@ from std_msgs.msg import String
 
 import load
 from helpers import create, ended, in_thread, speak_tcpros_only
-from pharos.private_rospy import connections, descriptors, registration
+from pharos.private_rospy import connections, descriptors, lifetime, registration
 from pharos.testing import Mailbox, TIMEOUT, until
 import pharos
 from pharos import BlockNode
@@ -177,16 +177,19 @@ def held_numbers():
         return len(set(range(lowest.fileno())) - listed)
 
 
-def test_a_node_for_which_there_are_no_descriptors_says_so(master):
+def test_a_node_for_which_there_are_no_descriptors_says_so(master, monkeypatch):
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     create(master, '/one')
     used = len(os.listdir('/proc/self/fd'))
-    resource.setrlimit(resource.RLIMIT_NOFILE, (used + 5, before[1]))
+    # many more than others of this process may take, or give back, meanwhile
+    monkeypatch.setattr(descriptors, 'STARTING', 500)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (used + 250, before[1]))
     try:
         with pytest.raises(pharos.PharosError, match='/one_more cannot start: .* ulimit -n'):
             create(master, '/one_more')
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, before)
+    monkeypatch.undo()
     assert create(master, '/one_more').is_running
 
 
@@ -224,6 +227,27 @@ def test_a_publisher_that_comes_when_there_are_no_descriptors_is_told_once_and_h
     assert told.empty()
     sender.send_to('/lacking', data='heard')
     assert mailbox.next().data == 'heard'
+
+
+def test_a_stop_lists_threads_while_others_begin():
+    """The iteration of a WeakSet raises where something is added to it."""
+
+    class Kept:
+        """What a WeakSet can hold."""
+
+    class Growing(weakref.WeakSet):
+        """One that another thread adds to as it is iterated for the first time."""
+
+        def __iter__(self):
+            for each in super().__iter__():
+                if len(kept) < 3:
+                    kept.append(Kept())
+                    self.add(kept[-1])
+                yield each
+
+    kept = [Kept(), Kept()]
+    assert set(lifetime.listed(Growing(kept))) == set(kept)
+    assert len(kept) == 3
 
 
 def test_two_nodes_that_have_no_descriptors_to_connect_say_so(master, monkeypatch):

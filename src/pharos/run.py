@@ -18,7 +18,7 @@ from pharos.lifecycle import Lifecycle
 from pharos.output_channel import OutputChannel
 from pharos.private_rospy import changes, descriptors
 from pharos.private_rospy.instance import PrivateRospy
-from pharos.private_rospy.lifetime import JOIN_TIMEOUT
+from pharos.private_rospy.lifetime import JOIN_TIMEOUT, listed
 from pharos.private_rospy.names import Resolved, check_name
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.settings import Settings
@@ -172,7 +172,9 @@ class Run:
 
     def _end_souls(self, timeout: float) -> None:
         """Wait for the souls, but this thread's."""
-        threads = [thread for thread in self._forked if thread is not threading.current_thread()]
+        threads = [
+            thread for thread in listed(self._forked) if thread is not threading.current_thread()
+        ]
         self.rospy.lifetime.await_end(threads, timeout)
         self._ignoring = [thread for thread in threads if thread.is_alive()]
         if self._ignoring:

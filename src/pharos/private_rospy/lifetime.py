@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 import weakref
-from typing import Any, Callable, Iterable, List, Optional
+from typing import Any, Callable, Iterable, List, Optional, TypeVar
 
 from pharos import working_directory
 from pharos.private_rospy import threads
@@ -29,6 +29,7 @@ KEEPALIVE_COUNT = 4  # of them without an answer, and the connection is broken
 # .lifetime: of the node on whose behalf the thread runs; .interruption: the innermost it is within;
 # .was_cut_off: whether a ProgramCutOff was raised in it
 _thread = threading.local()
+T = TypeVar('T')
 
 
 class ProgramCutOff(SystemExit):
@@ -120,7 +121,7 @@ class Lifetime:
 
     def rename(self, name):
         """Have the threads be named after the node, which is called so from now on."""
-        for thread in list(self.threads):
+        for thread in listed(self.threads):
             thread.name = thread.name.replace(self.name, name, 1)
         self.name = name
 
@@ -180,7 +181,7 @@ class Lifetime:
             self._cancel_timers()
 
     def _cancel_timers(self):
-        for thread in list(self.threads):
+        for thread in listed(self.threads):
             if isinstance(thread, self.Timer):
                 thread.cancel()
 
@@ -196,7 +197,7 @@ class Lifetime:
     def wait_for_threads(self):
         """Wait until those threads of the program have ended for which Python waits at its end, or
         the time is up."""
-        for thread in list(self.threads):
+        for thread in listed(self.threads):
             if thread.is_waited_for and thread is not threading.current_thread():
                 while thread.is_alive() and not self.overdue.is_set():
                     thread.join(SIGNAL_LATENCY)
@@ -271,11 +272,18 @@ class Lifetime:
         :returns: the threads that did not end in time
         """
         self.begin_shutdown()
-        for sock in list(self._sockets):
+        for sock in listed(self._sockets):
             shutdown_socket(sock)
-        others = set(self.threads) - {threading.current_thread(), *abandoned}
+        others = set(listed(self.threads)) - {threading.current_thread(), *abandoned}
         # One that is not alive has ended, or is just being started, and will see that all has.
         return join(others, JOIN_TIMEOUT)
+
+
+def listed(weak: 'weakref.WeakSet[T]') -> List[T]:
+    """What is in a set; others may add to it meanwhile, at which its iteration raises."""
+    while True:
+        with contextlib.suppress(RuntimeError):
+            return list(weak)
 
 
 def _is_rospys(frame: Any) -> bool:

@@ -126,6 +126,24 @@ def receivers_changed(self, link):
 
 
 @patch(
+    'rospy.topics',
+    '_TopicImpl._remove_connection',
+    'goes by the number of a descriptor, which another connection may have by then: that one is'
+    ' removed',
+)
+def remove_from_connections(self, connections, c):
+    """Go by the connection, or the one that a Sender is in front of."""
+    with contextlib.suppress(Exception):
+        c.close()
+    for each in tuple(connections):
+        if each is c or getattr(each, '_connection', None) is c:
+            connections.remove(each)
+            number = each.fileno()
+            if all(other.fileno() != number for other in connections):
+                self.connection_poll.remove_fd(number)
+
+
+@patch(
     'rospy.topics', '_PublisherImpl.remove_connection', 'trips over listeners that are gone by then'
 )
 def remove_connection(self, c, *, node, module):
