@@ -9,6 +9,7 @@ from pharos.testing import Mailbox, TIMEOUT, until
 from pharos import Master
 import pharos
 from pharos.messages import define_service
+from pharos.private_rospy.connections import Connections
 
 STRING = 'std_msgs/String'
 
@@ -311,3 +312,36 @@ def test_a_connection_that_is_removed_late_takes_none_with_it_that_has_its_descr
     assert topic.connections == [second]
     sent.send(data='heard')
     assert mailbox.next().data == 'heard'
+
+
+@pytest.mark.parametrize(
+    'opens, way', [('interested_in', 'subscribe'), ('output_channel', 'advertise')]
+)
+def test_a_channel_that_is_opened_while_another_thread_restarts_the_node_says_so(
+    master, monkeypatch, opens, way
+):
+    """It would count as open, and be that of the run before."""
+    node, errors = create(master, '/node'), Mailbox()
+    opened, restarted, really = threading.Event(), threading.Event(), getattr(Connections, way)
+
+    def open_slowly(*arguments):
+        endpoint = really(*arguments)
+        opened.set()
+        restarted.wait(TIMEOUT)
+        return endpoint
+
+    def open_channel():
+        try:
+            getattr(node, opens)('/restarted', STRING)
+        except pharos.NodeStoppedError as error:
+            errors(error, None)
+
+    monkeypatch.setattr(Connections, way, open_slowly)
+    opening = in_thread(open_channel)
+    assert opened.wait(TIMEOUT)
+    node.restart()
+    restarted.set()
+    assert ended(opening)
+    assert '/node stopped while it opened /restarted' in str(errors.next())
+    assert not node.channels
+    assert getattr(node, opens)('/restarted', STRING).is_open

@@ -103,12 +103,20 @@ class Channel:
         if endpoint is not None:
             self._unregister(endpoint)
 
-    def _opened(self, endpoint: Any) -> None:
-        """The channel is open, unless a delegate or another thread has closed it meanwhile."""
+    def _opened(self, run: 'Run', endpoint: Any) -> None:
+        """The channel is open, unless a delegate or another thread has closed it meanwhile.
+
+        :param run: the node's, when the opening began
+        :raises NodeStoppedError: if that has ended
+        """
         self._endpoint = endpoint
-        self._run.remember(self)
+        run.remember(self)
         if self.closed:
             self.close()
+        elif run.is_over:
+            raise NodeStoppedError(
+                f'{self.node.name} stopped while it opened {self.topic}: open it again'
+            )
 
     def node_stopped(self) -> None:
         """The node stops, and its rospy closes all endpoints."""
@@ -165,11 +173,13 @@ class InputChannel(Channel):
         self._begin()
 
     def open(self) -> None:
-        dispatcher = self._run.dispatcher
+        run = self._run
+        dispatcher = run.dispatcher
         if not self.inline:
             dispatcher.need_thread()
         inbox = Inbox(self, dispatcher) if self.inline else SocketInbox(self, dispatcher)
-        self._opened(self._rospy.connections.subscribe(self, inbox, self.node.connect_timeout))
+        subscribe = run.rospy.connections.subscribe
+        self._opened(run, subscribe(self, inbox, self.node.connect_timeout))
         dispatcher.run()  # the inline inboxes that latched messages have filled
 
     def _unregister(self, endpoint: Any) -> None:

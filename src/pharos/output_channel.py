@@ -59,9 +59,9 @@ class OutputChannel(Channel):
     def open(self, connect_timeout: Optional[float] = None) -> None:
         timeout = self.node.connect_timeout if connect_timeout is None else connect_timeout
         deadline = time.monotonic() + timeout
-        self._opener = threading.current_thread()
+        run, self._opener = self._run, threading.current_thread()
         try:
-            endpoint, self._fanout = self._rospy.connections.advertise(
+            endpoint, self._fanout = run.rospy.connections.advertise(
                 self.topic,
                 self.message_class,
                 self.latched,
@@ -69,7 +69,7 @@ class OutputChannel(Channel):
                 self.queue_size,
                 self.queue_bytes,
             )
-            self._opened(endpoint)
+            self._opened(run, endpoint)
             first_message.wait_for_known_subscribers(self, timeout, deadline)
         finally:
             self._connected.set()

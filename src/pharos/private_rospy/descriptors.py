@@ -26,7 +26,7 @@ def check_left(count: int, what: str) -> None:
         limit, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
         raise PharosError(
             f'{what}: {error.strerror} ({limit} is the limit of this process). Raise it before the'
-            ' program starts, by ulimit -n, or stop other nodes'
+            ' program starts, by ulimit -n, or have fewer nodes and channels'
         ) from error
     finally:
         for each in opened:
