@@ -1,4 +1,6 @@
 """What the tests of several files need: nodes, threads, a master in this process."""
+import itertools
+import sys
 import threading
 
 import numpy
@@ -86,3 +88,25 @@ def registrations(master, name):
         sorted(topic for topic, nodes in kind.items() if name in nodes)
         for kind in master.system_state()
     ]
+
+
+def interrupted_at(step, block, modules):
+    """Have ``block()`` end with a KeyboardInterrupt, as by a handler of signals, at a step of what is
+    in these modules; returns whether it came so far."""
+    files = [module.__file__ for module in modules]
+    steps = itertools.count()
+
+    def look(frame, event, argument):
+        is_step = frame.f_code.co_filename in files and event in ('call', 'c_return')
+        if is_step and next(steps) == step:
+            sys.setprofile(None)
+            raise KeyboardInterrupt
+
+    sys.setprofile(look)
+    try:
+        block()
+    except KeyboardInterrupt:
+        return True
+    finally:
+        sys.setprofile(None)
+    return False

@@ -2,7 +2,6 @@
 and no node holds another one up by that."""
 import itertools
 import os
-import sys
 import threading
 import types
 import warnings
@@ -11,7 +10,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from std_msgs.msg import Int32
 
-from helpers import create, ended, in_thread
+from helpers import create, ended, in_thread, interrupted_at
 from pharos.intraprocess import common_thread, dispatcher, fanout, inbox
 from pharos.intraprocess.dispatcher import Dispatcher
 from pharos.intraprocess.fanout import Fanout
@@ -279,28 +278,6 @@ def test_a_node_that_another_thread_runs_is_left_to_its_own(nodes_with):
     assert got.next() == (1, 7)
 
 
-def interrupted_at(step, block, modules=(common_thread, dispatcher)):
-    """Have ``block()`` end with a KeyboardInterrupt, as by a handler of signals, at a step of what is
-    in these modules; returns whether it came so far."""
-    files = [module.__file__ for module in modules]
-    steps = itertools.count()
-
-    def look(frame, event, argument):
-        is_step = frame.f_code.co_filename in files and event in ('call', 'c_return')
-        if is_step and next(steps) == step:
-            sys.setprofile(None)
-            raise KeyboardInterrupt
-
-    sys.setprofile(look)
-    try:
-        block()
-    except KeyboardInterrupt:
-        return True
-    finally:
-        sys.setprofile(None)
-    return False
-
-
 @pytest.mark.parametrize('fast', [True, False])
 def test_a_signal_that_interrupts_a_publisher_anywhere_leaves_no_node_deaf(nodes_with, fast):
     goes_on, got = threading.Event(), Mailbox()
@@ -312,7 +289,9 @@ def test_a_signal_that_interrupts_a_publisher_anywhere_leaves_no_node_deaf(nodes
     nodes = nodes_with([block] * 3)
     for step in itertools.count():
         goes_on.clear()
-        is_interrupted = interrupted_at(step, lambda: nodes.publish(-1, fast))
+        is_interrupted = interrupted_at(
+            step, lambda: nodes.publish(-1, fast), (common_thread, dispatcher)
+        )
         goes_on.set()
         nodes.publish(step)
         assert sorted(got.take(6)) == [-1] * 3 + [step] * 3

@@ -1,5 +1,7 @@
 """What cannot be done because the master is away, or the start ends early, leaves nothing behind
 and loses nothing."""
+import contextlib
+import itertools
 import os
 import signal
 import socket
@@ -9,11 +11,12 @@ import pytest
 import std_msgs.msg
 import std_srvs.srv
 
-from helpers import create, registrations
+from helpers import create, ended, in_thread, interrupted_at, registrations, speak_tcpros_only
 from pharos.testing import Mailbox, TIMEOUT, until
 import pharos
 from pharos import Master, node_registry, watcher
-from pharos.private_rospy import proxies, registration
+from pharos.private_rospy import proxies, registration, sender
+from pharos.private_rospy.connections import Connections
 
 STRING = 'std_msgs/String'
 
@@ -330,3 +333,61 @@ def test_a_channel_closed_while_its_node_is_stopped_does_not_come_back(away, sto
     stopped.start()
     assert stopped.channels == []
     assert '/interrupted/in' not in registrations(away, '/node')[1]
+
+
+def test_a_start_that_ends_as_its_node_is_started_again_takes_nothing_with_it(master, monkeypatch):
+    node, really = create(master, '/node'), Connections.advertise
+    channel = node.output_channel('/interrupted/again', STRING)
+    node.stop()
+    opened, started, raised = threading.Event(), threading.Event(), Mailbox()
+
+    def open_slowly(*arguments):
+        endpoint = really(*arguments)
+        if not opened.is_set():
+            opened.set()
+            started.wait(TIMEOUT)
+        return endpoint
+
+    def start():
+        try:
+            node.start()
+        except pharos.NodeStoppedError as error:
+            raised(error, None)
+
+    monkeypatch.setattr(Connections, 'advertise', open_slowly)
+    starting = in_thread(start)
+    assert opened.wait(TIMEOUT)
+    node.stop()
+    node.start()
+    started.set()
+    assert ended(starting)
+    assert raised.next()
+    assert node.channels == [channel]
+    channel.send(data='sent')
+
+
+# -- a send is interrupted
+
+
+def test_a_signal_that_interrupts_a_send_over_tcpros_anywhere_leaves_it_to_others(master, mailbox):
+    """Neither a lock is taken for good, nor a message cut short."""
+    receiver = speak_tcpros_only(create(master, '/receiver', delegate=mailbox))
+    receiver.interested_in('/interrupted/sent', STRING)
+    sent = create(master, '/sender').output_channel('/interrupted/sent', STRING)
+    for step in itertools.count():
+        until(lambda: sent.connections)
+        is_interrupted = interrupted_at(
+            step, lambda: sent.send(data='interrupted'), (sender, threading)
+        )
+
+        def send_until_heard():
+            while True:
+                sent.send(data=str(step))
+                with contextlib.suppress(TimeoutError):  # the connection was closed, for safety
+                    return mailbox.wait_for(lambda message: message.data == str(step), 0.2)
+
+        assert ended(in_thread(send_until_heard))
+        if not is_interrupted:
+            break
+    assert step > 3
+    assert ended(in_thread(sent.node.stop))

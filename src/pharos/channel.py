@@ -107,16 +107,16 @@ class Channel:
         """The channel is open, unless a delegate or another thread has closed it meanwhile.
 
         :param run: the node's, when the opening began
-        :raises NodeStoppedError: if that has ended
         """
         self._endpoint = endpoint
         run.remember(self)
         if self.closed:
             self.close()
-        elif run.is_over:
-            raise NodeStoppedError(
-                f'{self.node.name} stopped while it opened {self.topic}: open it again'
-            )
+
+    def _stopped_meanwhile(self) -> NodeStoppedError:
+        return NodeStoppedError(
+            f'{self.node.name} stopped while it opened {self.topic}: open it again'
+        )
 
     def node_stopped(self) -> None:
         """The node stops, and its rospy closes all endpoints."""
@@ -178,8 +178,11 @@ class InputChannel(Channel):
         if not self.inline:
             dispatcher.need_thread()
         inbox = Inbox(self, dispatcher) if self.inline else SocketInbox(self, dispatcher)
-        subscribe = run.rospy.connections.subscribe
-        self._opened(run, subscribe(self, inbox, self.node.connect_timeout))
+        endpoint = run.rospy.connections.subscribe(self, inbox, self.node.connect_timeout)
+        if run.is_over:  # perhaps another one is there by now, which has opened it
+            run.rospy.connections.unsubscribe(self, endpoint)
+            raise self._stopped_meanwhile()
+        self._opened(run, endpoint)
         dispatcher.run()  # the inline inboxes that latched messages have filled
 
     def _unregister(self, endpoint: Any) -> None:

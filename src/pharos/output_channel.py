@@ -61,7 +61,7 @@ class OutputChannel(Channel):
         deadline = time.monotonic() + timeout
         run, self._opener = self._run, threading.current_thread()
         try:
-            endpoint, self._fanout = run.rospy.connections.advertise(
+            endpoint, fanout = run.rospy.connections.advertise(
                 self.topic,
                 self.message_class,
                 self.latched,
@@ -69,6 +69,10 @@ class OutputChannel(Channel):
                 self.queue_size,
                 self.queue_bytes,
             )
+            if run.is_over:  # perhaps another one is there by now, which has opened it
+                run.rospy.connections.unadvertise(endpoint, self.latched)
+                raise self._stopped_meanwhile()
+            self._fanout = fanout
             self._opened(run, endpoint)
             first_message.wait_for_known_subscribers(self, timeout, deadline)
         finally:

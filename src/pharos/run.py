@@ -121,7 +121,8 @@ class Run:
                 self.node.latest_run = former  # type: ignore[assignment]
                 self._become(Lifecycle.STOPPED)
             self.end()
-            self._close_opened()  # what was opened after another thread had stopped the node
+            if self.node.latest_run is self:  # else those of the next one
+                self._close_opened()  # what was opened after another thread had stopped the node
             if is_stopped and isinstance(error, Exception):
                 raise NodeStoppedError(f'{self.node.name} was stopped while it started') from error
             raise

@@ -14,6 +14,7 @@ from genmsg.msgs import bare_msg_type, is_builtin, parse_type
 from genpy.base import SIMPLE_TYPES_DICT
 
 from pharos.errors import MessageTypeError, PharosError, suggest
+from pharos.signals import is_from_signal
 
 MessageClass = Type[genpy.Message]
 
@@ -237,8 +238,9 @@ def _fill(message: genpy.Message, fields: Dict[str, Any], path: str) -> genpy.Me
         try:
             _WRITERS[field_type](value)
             fits = True
-        except Exception:  # it is no single number or string, or does not fit
-            pass
+        except Exception as error:  # it is no single number or string, or does not fit
+            if is_from_signal(error):
+                raise
         if not fits:
             field_path = f'{path}.{name}'
             value = _from_dicts(cls, field_type, value, field_path, getattr(message, name))

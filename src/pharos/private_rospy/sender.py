@@ -6,6 +6,8 @@ import socket
 import threading
 import time
 
+from pharos.signals import is_from_signal
+
 # bytes; copying more into the socket would hold the publisher up longer than waking a thread
 AT_ONCE = 1 << 16
 
@@ -34,16 +36,21 @@ class Sockets:
             buffer.truncate()
 
     def write(self, data, connections):
-        """Write it to each subscriber; one whose connection broke is left."""
+        """Write it to each subscriber; one whose connection broke is left, as is one to which a
+        handler of signals has perhaps cut it short."""
         self._publisher.message_data_sent += len(data)
         for connection in connections:
             try:
                 connection.write_data(data)
-            except Exception as error:
+            except BaseException as error:
+                is_interrupted = not isinstance(error, Exception) or is_from_signal(error)
+                if not is_interrupted or getattr(connection, 'is_unsure', True):
+                    connection.close()
+                if is_interrupted:
+                    raise
                 self._module.logdebug(
                     f'publisher connection to [{connection.endpoint_id}] terminated: {error}'
                 )
-                connection.close()
 
 
 class Sender:
@@ -65,7 +72,11 @@ class Sender:
         self._begun = b''  # the rest of a message whose beginning the socket has
         self._is_idle = True  # nothing is on its way but what the socket has
         self._error = None  # of the thread, for the next who publishes, as in rospy
-        self._changed = threading.Condition(threading.Lock())
+        self.is_unsure = False  # whether who is interrupted leaves a part of a message, or disorder
+        # Taken by itself, and not by the condition, whose __enter__ is Python: a handler of signals
+        # may raise there, when it is taken already, and nobody would release it.
+        self._lock = threading.Lock()
+        self._changed = threading.Condition(self._lock)
         self._cleanup = connection.cleanup_cb  # where it has been in use without a queue
         connection.set_cleanup_callback(self._closed)
         start_thread(self._run, name='sender')
@@ -79,20 +90,23 @@ class Sender:
 
     def write_data(self, data):
         """Send ``data``, a message with its length; never waits for the subscriber."""
-        with self._changed:
+        with self._lock:
             if self._error is not None:
                 error, self._error = self._error, None
                 raise error
+            self.is_unsure = True
             if self._is_idle and len(data) <= AT_ONCE:
                 sent = self._send(data)
                 if sent == len(data):
                     self._connection.stat_num_msg += 1
+                    self.is_unsure = False
                     return
                 self._begun = data[sent:]
             else:
                 self._enqueue(data)
             self._is_idle = False
             self._changed.notify_all()
+            self.is_unsure = False
         time.sleep(0)  # else the thread gets the interpreter 5 ms later from a busy publisher
 
     def _enqueue(self, data):
@@ -116,7 +130,7 @@ class Sender:
     def _run(self):
         connection = self._connection
         while True:
-            with self._changed:
+            with self._lock:
                 self._is_idle = not self._begun and not self._queue
                 if self._is_idle:
                     self._changed.notify_all()
@@ -130,18 +144,18 @@ class Sender:
             try:
                 connection.write_data(data)
             except Exception as error:
-                with self._changed:
+                with self._lock:
                     self._error = error
 
     def _closed(self, connection):
         if self._cleanup:
             self._cleanup(connection)
-        with self._changed:
+        with self._lock:
             self._changed.notify_all()
 
     def flush(self, timeout):
         """Wait until everything published is with the socket, up to ``timeout`` seconds."""
-        with self._changed:
+        with self._lock:
             self._changed.wait_for(
                 lambda: self._is_idle or self._connection.done, max(0.0, timeout)
             )
