@@ -178,12 +178,19 @@ class InputChannel(Channel):
         if not self.inline:
             dispatcher.need_thread()
         inbox = Inbox(self, dispatcher) if self.inline else SocketInbox(self, dispatcher)
+        self._subscribe(run, inbox)
+        dispatcher.run()  # the inline inboxes that latched messages have filled
+
+    def _subscribe(self, run: 'Run', inbox: Inbox) -> None:
+        """Be open, with an inbox for what comes through sockets.
+
+        :raises NodeStoppedError: if the run ends meanwhile
+        """
         endpoint = run.rospy.connections.subscribe(self, inbox, self.node.connect_timeout)
         if run.is_over:  # perhaps another one is there by now, which has opened it
             run.rospy.connections.unsubscribe(self, endpoint)
             raise self._stopped_meanwhile()
         self._opened(run, endpoint)
-        dispatcher.run()  # the inline inboxes that latched messages have filled
 
     def _unregister(self, endpoint: Any) -> None:
         self._rospy.connections.unsubscribe(self, endpoint)

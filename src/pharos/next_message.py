@@ -78,9 +78,7 @@ class NextMessages(InputChannel):
 
     def open(self) -> None:
         inbox = _WaitingInbox(self, self._waiting)
-        self._opened(
-            self._run, self._rospy.connections.subscribe(self, inbox, self.node.connect_timeout)
-        )
+        self._subscribe(self._run, inbox)
 
     def _unregister(self, endpoint: Any) -> None:
         self._rospy.connections.unsubscribe(self, endpoint)

@@ -111,9 +111,7 @@ class Probe(InputChannel):
         if self.weighs:
             dispatcher.need_thread()
         inbox = _SocketTally(self, dispatcher)
-        self._opened(
-            self._run, self._rospy.connections.subscribe(self, inbox, self.node.connect_timeout)
-        )
+        self._subscribe(self._run, inbox)
 
     def restart(self) -> None:
         """Forget what came so far, such as latched messages."""
