@@ -222,15 +222,19 @@ def test_more_than_2_gib_through_a_connection_are_counted_on(master, sender):
     with create(master, '/late') as late:
         late.interested_in('/traffic')
         impl = sender.latest_run.rospy.publisher('/traffic')
-        socket = next(each for each in impl.connections if each.transport_type == 'TCPROS')
-        socket._connection.stat_bytes = impl.message_data_sent = 2**31 - 10
-        _, _, (published, _, _) = node_api(sender.uri).getBusStats('/test')
+        socket = until(
+            lambda: next((each for each in impl.connections if each.transport_type == 'TCPROS'), None)
+        )
+        with impl.c_lock, socket._lock:  # nothing is counted meanwhile
+            socket._connection.stat_bytes = impl.message_data_sent = 2**31 - 10
+        node_api(sender.uri).getBusStats('/test')
         until(lambda: socket.stat_bytes > 2**31)
         _, _, (published, _, _) = node_api(sender.uri).getBusStats('/test')
         topic, _, connections = next(each for each in published if each[0] == '/traffic')
         assert min(count for _, count, *_ in connections) < 0  # as roscpp counts
         found = top.measure(master, 1, names=['/late'])
-    assert is_about(rows(found.nodes)['/late'].bytes_received, RATE * SIZE)
+    # neither below 0, nor by 4 GiB too much
+    assert 0 < rows(found.nodes)['/late'].bytes_received < 100 * RATE * SIZE
 
 
 def test_nodes_are_asked_for_their_health_by_top_and_no_other_look(master, sender):

@@ -245,7 +245,7 @@ class Dispatcher:
         waking it, too, takes as long as such a delegate does.
         """
         if not self._awake_signal.acquire(True, YIELD_LIMIT):
-            self._note_turn(YIELD_LIMIT)
+            self._note_turn(FAST_TURN)  # too long, whatever the turn takes by itself
 
     def run_next(self) -> bool:
         """Run what is scheduled, in the thread of another dispatcher; raises nothing."""
