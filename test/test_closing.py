@@ -9,6 +9,7 @@ from pharos.testing import Mailbox, TIMEOUT, until
 from pharos import Master
 import pharos
 from pharos.messages import define_service
+from pharos.private_rospy import local_services
 from pharos.private_rospy.connections import Connections
 
 STRING = 'std_msgs/String'
@@ -315,33 +316,44 @@ def test_a_connection_that_is_removed_late_takes_none_with_it_that_has_its_descr
 
 
 @pytest.mark.parametrize(
-    'opens, way', [('interested_in', 'subscribe'), ('output_channel', 'advertise')]
+    'opens, owner, way',
+    [
+        (lambda node: node.interested_in('/restarted', STRING), Connections, 'subscribe'),
+        (lambda node: node.output_channel('/restarted', STRING), Connections, 'advertise'),
+        (
+            lambda node: node.serve('/restarted', 'std_srvs/Empty', lambda _: None),
+            local_services,
+            'offer',
+        ),
+    ],
+    ids=['input', 'output', 'service'],
 )
-def test_a_channel_that_is_opened_while_another_thread_restarts_the_node_says_so(
-    master, monkeypatch, opens, way
+def test_what_is_opened_while_another_thread_restarts_the_node_says_so(
+    master, monkeypatch, opens, owner, way
 ):
     """It would count as open, and be that of the run before."""
     node, errors = create(master, '/node'), Mailbox()
-    opened, restarted, really = threading.Event(), threading.Event(), getattr(Connections, way)
+    opened, restarted, really = threading.Event(), threading.Event(), getattr(owner, way)
 
     def open_slowly(*arguments):
-        endpoint = really(*arguments)
+        made = really(*arguments)
         opened.set()
         restarted.wait(TIMEOUT)
-        return endpoint
+        return made
 
-    def open_channel():
+    def open_it():
         try:
-            getattr(node, opens)('/restarted', STRING)
+            opens(node)
         except pharos.NodeStoppedError as error:
             errors(error, None)
 
-    monkeypatch.setattr(Connections, way, open_slowly)
-    opening = in_thread(open_channel)
+    monkeypatch.setattr(owner, way, open_slowly)
+    opening = in_thread(open_it)
     assert opened.wait(TIMEOUT)
     node.restart()
     restarted.set()
     assert ended(opening)
     assert '/node stopped while it opened /restarted' in str(errors.next())
-    assert not node.channels
-    assert getattr(node, opens)('/restarted', STRING).is_open
+    assert not node.latest_run.opened
+    opens(node)
+    assert node.latest_run.opened

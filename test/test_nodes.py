@@ -125,6 +125,19 @@ def test_a_node_starts_again_under_the_same_name_and_ports(master, mailbox):
         assert mailbox.next().data == str(turn)
 
 
+def test_a_node_that_waits_for_no_subscriber_waits_for_the_master(master, mailbox):
+    node = create(master, '/node')
+    create(master, '/receiver').interested_in('/t', 'std_msgs/Int32', delegate=mailbox)
+    node.connect_timeout = 0
+    node.send_to('/t', data=1)
+    node.restart()
+    node.send_to('/t', to='/receiver', data=2)
+    until(lambda: node.channels[0].connections)
+    node.send_to('/t', to='/receiver', data=3)
+    while mailbox.next().data != 3:
+        pass
+
+
 def test_a_subclass_makes_its_channels_in_start(master, mailbox):
     class Logger(Node):
         def start(self):

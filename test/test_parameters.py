@@ -535,6 +535,21 @@ def test_a_parameter_needs_a_running_node_and_goes_on_with_the_next_run(master):
     assert rate.value == 1
 
 
+def test_a_block_goes_on_with_the_next_run_that_came_as_the_node_was_restarted(master, monkeypatch):
+    node, changes = create(master, '/node'), Mailbox()
+    really = WatchedParameters.watch
+
+    def restart_and_watch(*arguments):
+        monkeypatch.undo()
+        node.restart()
+        really(*arguments)
+
+    monkeypatch.setattr(WatchedParameters, 'watch', restart_and_watch)
+    node.parameter('/rate').on_change(lambda value: changes(value, None))
+    master.parameters['/rate'] = 5
+    assert changes.next() == 5
+
+
 @pytest.mark.parametrize('known_again', [False, True], ids=['unknown', 'known_again'])
 def test_values_and_watches_are_back_after_a_restart_of_the_master(
     mortal_master, monkeypatch, known_again

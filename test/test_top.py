@@ -223,7 +223,9 @@ def test_more_than_2_gib_through_a_connection_are_counted_on(master, sender):
         late.interested_in('/traffic')
         impl = sender.latest_run.rospy.publisher('/traffic')
         socket = until(
-            lambda: next((each for each in impl.connections if each.transport_type == 'TCPROS'), None)
+            lambda: next(
+                (each for each in impl.connections if each.transport_type == 'TCPROS'), None
+            )
         )
         with impl.c_lock, socket._lock:  # nothing is counted meanwhile
             socket._connection.stat_bytes = impl.message_data_sent = 2**31 - 10

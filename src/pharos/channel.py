@@ -113,11 +113,6 @@ class Channel:
         if self.closed:
             self.close()
 
-    def _stopped_meanwhile(self) -> NodeStoppedError:
-        return NodeStoppedError(
-            f'{self.node.name} stopped while it opened {self.topic}: open it again'
-        )
-
     def node_stopped(self) -> None:
         """The node stops, and its rospy closes all endpoints."""
         self._endpoint = None
@@ -187,9 +182,7 @@ class InputChannel(Channel):
         :raises NodeStoppedError: if the run ends meanwhile
         """
         endpoint = run.rospy.connections.subscribe(self, inbox, self.node.connect_timeout)
-        if run.is_over:  # perhaps another one is there by now, which has opened it
-            run.rospy.connections.unsubscribe(self, endpoint)
-            raise self._stopped_meanwhile()
+        run.check_not_over(self.topic, lambda: run.rospy.connections.unsubscribe(self, endpoint))
         self._opened(run, endpoint)
 
     def _unregister(self, endpoint: Any) -> None:

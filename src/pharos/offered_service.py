@@ -50,9 +50,10 @@ class OfferedService:
 
     def open(self) -> None:
         """Register with the master, also after a restart of the node."""
+        run = self.node.current_run
         try:
-            self._service = local_services.offer(
-                self.node.current_run.rospy,
+            service = local_services.offer(
+                run.rospy,
                 self.name,
                 self.service_class,
                 self._answer,
@@ -60,7 +61,9 @@ class OfferedService:
             )
         except rospy.ServiceException as error:  # a plain rospy Service has the name
             raise self._is_offered() from error
-        self.node.latest_run.remember(self)
+        run.check_not_over(self.name, lambda: service.shutdown('its node stopped'))
+        self._service = service
+        run.remember(self)
         if self.closed:  # meanwhile
             self.close()
 

@@ -13,6 +13,7 @@ from pharos.errors import MessageTypeError, NodeStoppedError
 from pharos.intraprocess.copier import copier_for
 from pharos.intraprocess.fanout import ClosedFanout
 from pharos.private_rospy.deadlines import time_limit
+from pharos.private_rospy.registration import REGISTER_TIMEOUT
 from pharos.seconds import check_limit
 from pharos.signals import is_from_signal
 
@@ -69,9 +70,9 @@ class OutputChannel(Channel):
                 self.queue_size,
                 self.queue_bytes,
             )
-            if run.is_over:  # perhaps another one is there by now, which has opened it
-                run.rospy.connections.unadvertise(endpoint, self.latched)
-                raise self._stopped_meanwhile()
+            run.check_not_over(
+                self.topic, lambda: run.rospy.connections.unadvertise(endpoint, self.latched)
+            )
             self._fanout = fanout
             self._opened(run, endpoint)
             first_message.wait_for_known_subscribers(self, timeout, deadline)
@@ -114,7 +115,7 @@ class OutputChannel(Channel):
         endpoint = self._endpoint
         if endpoint is None or self._rospy.connections.reaches(endpoint, name):
             return
-        with time_limit(self.node.connect_timeout):
+        with time_limit(max(REGISTER_TIMEOUT, self.node.connect_timeout)):
             self.node.master.uri_of(name)
         if name not in self._uninterested and not self.latch:
             self._uninterested.add(name)

@@ -96,12 +96,15 @@ class Parameter:
                 f'{self.name} needs a block to run when it changes, called as block(value)'
             )
         check_block(block, 'parameter block', ('value',))
-        watched = self.node.current_run.rospy.parameters
+        run = self.node.current_run  # raises where it is stopped
         given = BlockOf(self.node, block)
         self.blocks.append(given)
         try:
             with self.node.master.reached():
-                watched.watch(self.name, self._changed)
+                run.rospy.parameters.watch(self.name, self._changed)
+                while run.is_over:  # the node was restarted meanwhile, or stopped
+                    run = self.node.current_run
+                    run.rospy.parameters.watch(self.name, self._changed)
         except BaseException:
             self.blocks.remove(given)
             raise

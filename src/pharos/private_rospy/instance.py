@@ -146,13 +146,13 @@ class PrivateRospy:
     def start(self, timeout, register=None):
         """Open the ports, claim the name, register. On an error, nothing is left behind.
 
-        :param timeout: seconds that the master may take
+        :param timeout: seconds that the master may take, if it is more than REGISTER_TIMEOUT
         :param register: called as ``register(xmlrpc_port=, tcpros_port=)`` instead of rospy's
             init_node
         :raises MasterUnreachableError, NodeNameInUseError, PortInUseError:
         :raises NodeStoppedError: if :meth:`begin_stop` was called meanwhile
         """
-        settings = self.settings
+        settings, timeout = self.settings, max(registration.REGISTER_TIMEOUT, timeout)
         register = register or functools.partial(
             self.module.init_node, settings.base_name, argv=settings.argv, disable_signals=True
         )
