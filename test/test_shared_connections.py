@@ -12,6 +12,7 @@ from std_msgs.msg import Int32, String
 
 from helpers import create, ended, in_thread, speak_tcpros_only
 from pharos import Master
+from pharos import first_message
 from pharos.private_rospy import registration, shared_connections
 from pharos.private_rospy.patches import subscribers
 from pharos.private_rospy.tcpros_connection import TcprosConnection
@@ -396,6 +397,39 @@ def test_nodes_of_other_masters_objects_have_connections_of_their_own(master, sh
     assert len(channel.connections) == 2
     channel.send(data=1)
     assert one.next().data == two.next().data == three.next().data == 1
+
+
+def test_the_first_message_waits_no_longer_than_for_one_who_shares_the_connection_late(
+    master, sharing, monkeypatch, transcript
+):
+    (first, one), (second, two) = listen(sharing, '/first', '/second')
+    really, connect, asked = first_message._may_connect, shared_connections.connect, []
+    looked, get_ident = threading.Event(), threading.get_ident
+
+    def ask(channel, name):
+        asked.append(name)
+        answer = really(channel, name)
+        looked.set()
+        return answer
+
+    def connect_late(node, *arguments):
+        if node is second.latest_run.rospy:
+            if get_ident() == sender.ident:
+                return 0, 'the word of the master is to come first', 0
+            looked.wait(TIMEOUT)
+        return connect(node, *arguments)
+
+    def send():
+        sender.ident = get_ident()
+        sender.send_to('/shared', typed_as=Int32, data=1)
+
+    monkeypatch.setattr(first_message, '_may_connect', ask)
+    monkeypatch.setattr(shared_connections, 'connect', connect_late)
+    sender = create(master, '/sender')
+    sender.connect_timeout = 10 * TIMEOUT
+    assert ended(in_thread(send))
+    assert set(asked) == {'/second'}
+    assert one.next().data == two.next().data == 1
 
 
 def test_rosnode_shows_it_at_each_node(master, sharing):

@@ -4,13 +4,15 @@ from typing import TYPE_CHECKING, Set
 
 from pharos.errors import MasterUnreachableError
 from pharos.private_rospy.deadlines import time_limit
+from pharos.private_rospy.lifetime import Interruption
 from pharos.private_rospy.registration import REGISTER_TIMEOUT
 from pharos.private_rospy.shared_connections import SHARED
 
 if TYPE_CHECKING:
     from pharos.output_channel import OutputChannel
 
-# seconds in which the master has told a live subscriber; then it is asked whether it lives
+# seconds in which the master has told a live subscriber; then, and every so many, it is asked whether
+# it lives
 ANSWER_TIMEOUT = 0.5
 
 
@@ -40,15 +42,20 @@ def wait_for_known_subscribers(channel: 'OutputChannel', timeout: float, deadlin
         missing.difference_update(rospy.refusals.subscribers(channel.topic))
         return not missing or not channel.is_open
 
-    rospy.wait_until(connected, min(deadline - time.monotonic(), ANSWER_TIMEOUT))
-    if not connected() and node.is_running:
-        with time_limit(deadline - time.monotonic()):
-            missing.intersection_update(
-                name for name in tuple(missing) if _may_connect(channel, name)
-            )
-        rospy.wait_until(connected, deadline - time.monotonic())
-        if timeout and not connected() and node.is_running:
-            _tell_who_is_late(channel, missing, timeout)
+    with Interruption(lifetime=rospy.lifetime) as stop:
+        while True:
+            left = deadline - time.monotonic()
+            rospy.wait_until(connected, min(left, ANSWER_TIMEOUT))
+            if connected() or stop.came or not node.is_running:
+                return
+            if left <= ANSWER_TIMEOUT:
+                break
+            with time_limit(deadline - time.monotonic()):
+                missing.intersection_update(
+                    name for name in tuple(missing) if _may_connect(channel, name)
+                )
+    if timeout:
+        _tell_who_is_late(channel, missing, timeout)
 
 
 def _may_connect(channel: 'OutputChannel', name: str) -> bool:
