@@ -11,8 +11,7 @@ import pytest
 from std_msgs.msg import Int32, String
 
 from helpers import create, ended, in_thread, speak_tcpros_only
-from pharos import Master
-from pharos import first_message
+from pharos import Master, NodeStoppedError, first_message
 from pharos.private_rospy import registration, shared_connections
 from pharos.private_rospy.patches import subscribers
 from pharos.private_rospy.tcpros_connection import TcprosConnection
@@ -404,7 +403,7 @@ def test_the_first_message_waits_no_longer_than_for_one_who_shares_the_connectio
 ):
     (first, one), (second, two) = listen(sharing, '/first', '/second')
     really, connect, asked = first_message._may_connect, shared_connections.connect, []
-    looked, get_ident = threading.Event(), threading.get_ident
+    looked = threading.Event()
 
     def ask(channel, name):
         asked.append(name)
@@ -414,22 +413,45 @@ def test_the_first_message_waits_no_longer_than_for_one_who_shares_the_connectio
 
     def connect_late(node, *arguments):
         if node is second.latest_run.rospy:
-            if get_ident() == sender.ident:
-                return 0, 'the word of the master is to come first', 0
             looked.wait(TIMEOUT)
         return connect(node, *arguments)
-
-    def send():
-        sender.ident = get_ident()
-        sender.send_to('/shared', typed_as=Int32, data=1)
 
     monkeypatch.setattr(first_message, '_may_connect', ask)
     monkeypatch.setattr(shared_connections, 'connect', connect_late)
     sender = create(master, '/sender')
     sender.connect_timeout = 10 * TIMEOUT
-    assert ended(in_thread(send))
+    sender.latest_run.rospy.connections._neighbours = list  # as if they were of another process
+    assert ended(in_thread(lambda: sender.send_to('/shared', typed_as=Int32, data=1)))
     assert set(asked) == {'/second'}
     assert one.next().data == two.next().data == 1
+
+
+def test_what_an_inline_delegate_waits_for_ends_with_its_node_and_is_not_its_own_topic(
+    master, sharing, mailbox
+):
+    """As where the node has a connection of its own."""
+
+    def wait(message, channel):
+        try:
+            if message.data == 1:
+                channel.node.wait_for_message('/shared', Int32)
+            else:
+                mailbox(threading.current_thread().name, None)
+                channel.node.wait_for_message('/never', Int32)
+        except BaseException as error:
+            mailbox(error, None)
+
+    ((waiting, _), (other, box)) = listen(sharing, '/waiting', '/other', inline=True)
+    waiting.channels[0].delegate = wait
+    channel = sender_of(master, waiting, other)
+    channel.send(data=1)
+    assert 'this delegate runs in the thread that brings' in str(mailbox.next())
+    channel.send(data=2)
+    assert mailbox.next() == '/waiting /shared'
+    waiting.stop()
+    assert isinstance(mailbox.next(), NodeStoppedError)
+    channel.send(data=3)
+    assert data(box, 3) == [1, 2, 3]
 
 
 def test_rosnode_shows_it_at_each_node(master, sharing):

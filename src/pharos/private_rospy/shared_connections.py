@@ -114,7 +114,10 @@ class SharedConnection:
             while not self.fanout.is_closed:
                 self._data = data = self._connection.read_message()
                 self.bytes += 4 + len(data)
-                self.fanout.publish(self.data_class().deserialize(data), self._latch)
+                message = self.data_class().deserialize(data)
+                self.fanout.publish(message, self._latch, runs_inline=False)
+                for end in self.fanout.connections:
+                    end.link.run_inline()
         except ClosedError:
             pass
         except BaseException as error:
@@ -174,6 +177,13 @@ class SharedLink(LocalLink):
     """A link from a connection that is shared to rospy's _SubscriberImpl of one node."""
 
     end_class = _End
+
+    def run_inline(self):
+        """Run the node's delegates that are inline, as the thread of a connection of its own would."""
+        if any(inbox.inline for inbox in self.inboxes.values()):
+            topic, node = self.subscriber.resolved_name, self._node
+            with node.connections.reading(topic):
+                node.lifetime.run_on_behalf(node.on_received, topic)
 
     def close(self, end):
         """One end was closed: the other goes too; but that of the connection has no lock that
