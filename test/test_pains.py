@@ -111,9 +111,12 @@ def bare(ros_master):
         yield run
 
 
-def fails(issue):
-    """The mark of a twin: what it asserts is never so with bare rospy, for this is known there."""
-    return pytest.mark.xfail(strict=True, raises=AssertionError, reason='ros_comm ' + issue)
+def fails(issue, is_always=True):
+    """The mark of a twin: what it asserts is not so with bare rospy, for this is known there.
+
+    :param is_always: whether it never is, also on a machine that is busy
+    """
+    return pytest.mark.xfail(strict=is_always, raises=AssertionError, reason='ros_comm ' + issue)
 
 
 @fails('#185')
@@ -166,7 +169,7 @@ except RuntimeError:
     )
 
 
-@fails('(no issue)')
+@fails('(no issue)', is_always=False)
 def test_bare_rospy_frees_its_port_at_its_shutdown(bare):
     assert (
         bare(

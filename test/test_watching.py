@@ -53,10 +53,10 @@ def publishing_apart(master, topic, rate=RATE):
 def test_hz_tells_how_often_messages_come(master, publishing):
     with publishing(master, '/watched'):
         rate = master.topic('/watched').hz(1)
-    assert RATE / 3 < float(rate) < RATE * 2
-    assert rate.window >= 5
-    assert 0 <= rate.min <= 1 / rate.rate <= rate.max <= 1
-    assert 0 <= rate.std_dev < 1
+    assert RATE / 10 < float(rate) < RATE * 2
+    assert rate.window >= 2
+    assert 0 <= rate.min <= 1 / rate.rate <= rate.max < TIMEOUT
+    assert 0 <= rate.std_dev < TIMEOUT
     assert re.fullmatch(
         r'\S+ Hz \(\S+ to \S+ s apart, std dev \S+ s\), \d+ messages in 1 s', repr(rate)
     )
