@@ -9,6 +9,7 @@ from pharos import on_demand
 from pharos.blocks import Block, attempt, check_delegate
 from pharos.errors import NodeStoppedError, PharosError
 from pharos.intraprocess.inbox import Inbox, SocketInbox
+from pharos.restarts import check_not_over
 
 if TYPE_CHECKING:
     from pharos.live.plot import Plot
@@ -182,7 +183,7 @@ class InputChannel(Channel):
         :raises NodeStoppedError: if the run ends meanwhile
         """
         endpoint = run.rospy.connections.subscribe(self, inbox, self.node.connect_timeout)
-        run.check_not_over(self.topic, lambda: run.rospy.connections.unsubscribe(self, endpoint))
+        check_not_over(run, self.topic, lambda: run.rospy.connections.unsubscribe(self, endpoint))
         self._opened(run, endpoint)
 
     def _unregister(self, endpoint: Any) -> None:

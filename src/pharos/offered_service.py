@@ -14,6 +14,7 @@ from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.deadlines import time_limit
 from pharos.private_rospy.registration import UNREGISTER_TIMEOUT
 from pharos.private_rospy.xmlrpc_server import is_call_from_nearby
+from pharos.restarts import check_not_over
 
 if TYPE_CHECKING:
     from pharos.node import Node
@@ -61,7 +62,7 @@ class OfferedService:
             )
         except rospy.ServiceException as error:  # a plain rospy Service has the name
             raise self._is_offered() from error
-        run.check_not_over(self.name, lambda: service.shutdown('its node stopped'))
+        check_not_over(run, self.name, lambda: service.shutdown('its node stopped'))
         self._service = service
         run.remember(self)
         if self.closed:  # meanwhile

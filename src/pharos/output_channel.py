@@ -14,6 +14,7 @@ from pharos.intraprocess.copier import copier_for
 from pharos.intraprocess.fanout import ClosedFanout
 from pharos.private_rospy.deadlines import time_limit
 from pharos.private_rospy.registration import REGISTER_TIMEOUT
+from pharos.restarts import check_not_over
 from pharos.seconds import check_limit
 from pharos.signals import is_from_signal
 
@@ -70,8 +71,8 @@ class OutputChannel(Channel):
                 self.queue_size,
                 self.queue_bytes,
             )
-            run.check_not_over(
-                self.topic, lambda: run.rospy.connections.unadvertise(endpoint, self.latched)
+            check_not_over(
+                run, self.topic, lambda: run.rospy.connections.unadvertise(endpoint, self.latched)
             )
             self._fanout = fanout
             self._opened(run, endpoint)

@@ -249,15 +249,6 @@ class Run:
                 # replaced, so that others may iterate meanwhile
                 self.opened = [*self.opened, opened]
 
-    def check_not_over(self, topic: str, give_back: Callable[[], Any]) -> None:
-        """Raise NodeStoppedError, after ``give_back()``, if the run has ended while something was
-        opened in it: perhaps another one is there by now, which has opened it."""
-        if self.is_over:
-            give_back()
-            raise NodeStoppedError(
-                f'{self.node.name} stopped while it opened {topic}: open it again'
-            )
-
     def forget(self, opened: Any) -> None:
         """It was closed for good."""
         with node_registry.changed:

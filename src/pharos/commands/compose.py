@@ -52,7 +52,8 @@ def read_arguments(
     parser.add_argument(
         '--share-connections',
         action='store_true',
-        help='have the nodes share one connection to each publisher elsewhere',
+        help='have the nodes share one connection to each publisher elsewhere, which then has one'
+        ' subscriber (see doc/compose.md)',
     )
     parser.add_argument(
         '--allow-remote-load',

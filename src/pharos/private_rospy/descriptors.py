@@ -4,6 +4,7 @@ import resource
 from typing import Any, Set
 
 from pharos.errors import PharosError
+from pharos.private_rospy.registration import RETRY_DELAY
 
 STARTING = 8  # while a node starts; later it has three, and one for each connection
 CONNECTING = 2  # for a connection to a publisher, and while that is asked for one
@@ -54,4 +55,4 @@ class ForConnections:
                 self.check(topic)
             except PharosError as error:
                 self._told.add(topic)
-                self._node.warn(str(error))
+                self._node.warn(f'{error}; meanwhile it is tried every {RETRY_DELAY:g} s')
