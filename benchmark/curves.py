@@ -8,8 +8,8 @@ from scale_columns import COLUMNS
 TITLES = {
     'nodes': 'nodes, in one process',
     'topics': 'topics of one node',
-    'twist': 'receivers of a twist',
-    'image6.2': 'receivers of a image6.2',
+    'twist': 'receivers of twist',
+    'image6.2': 'receivers of image6.2',
     'sizes': 'bytes of an image',
 }
 COUNTED = re.compile(r' *(pharos|rospy) +(\d+) +([-\d. ]+)')
