@@ -17,9 +17,10 @@ counts = {'requests': 0, 'bytes': 0}
 
 
 def count_dispatches():
-    """Have the servers of this process count the requests that they answer, and the bytes of both."""
+    """Have the servers of this process count the requests that they answer, and the bytes of both,
+    of long answers those that go over the wire."""
     dispatcher = xmlrpc.server.SimpleXMLRPCDispatcher
-    dispatch = dispatcher._marshaled_dispatch
+    dispatch, compress = dispatcher._marshaled_dispatch, xmlrpc.server.gzip_encode
 
     def counted(self, data, *options):
         answer = dispatch(self, data, *options)
@@ -28,7 +29,13 @@ def count_dispatches():
             counts['bytes'] += len(data) + len(answer)
         return answer
 
+    def compressed(answer):
+        sent = compress(answer)
+        counts['bytes'] -= len(answer) - len(sent)
+        return sent
+
     dispatcher._marshaled_dispatch = counted
+    xmlrpc.server.gzip_encode = compressed
 
 
 def tell(handler, caller_id):

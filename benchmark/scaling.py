@@ -26,7 +26,9 @@ from std_msgs.msg import Int32
 
 clock = time.perf_counter
 PATIENCE = 60.0  # seconds for all to be there
-TICKS = os.sysconf('SC_CLK_TCK')
+CPU_CLOCK = (
+    2  # of the clocks of a process, that of what it computes; /proc has it in ticks of 10 ms
+)
 # Who has limits, where this runs as root: a user of no other process, also of none in other containers,
 # which the kernel counts and /proc does not show.
 NOBODY = 60000 + os.getpid() % 5000
@@ -60,8 +62,7 @@ class Use:
             self.memory += int(share[1]) / 1e3
             self.threads += len(os.listdir(folder / 'task'))
             self.descriptors += len(os.listdir(folder / 'fd'))
-            fields = (folder / 'stat').read_text().rpartition(')')[2].split()
-            self.cpu += (int(fields[11]) + int(fields[12])) / TICKS
+            self.cpu += time.clock_gettime(~pid << 3 | CPU_CLOCK)
 
 
 def measure(pids, begun, before, asked, seconds):
