@@ -198,12 +198,14 @@ class Connections:
     @staticmethod
     def reaches(endpoint, name):
         """Whether a rospy Publisher is connected to the node of that name."""
-        return endpoint.impl is not None and endpoint.impl.fanout.reaches(name)
+        topic = endpoint.impl  # None from the moment on in which another thread closes it
+        return topic is not None and topic.fanout.reaches(name)
 
     @staticmethod
     def is_closed(endpoint):
         """Whether rospy has closed a Publisher or Subscriber, as it does when the node stops."""
-        return endpoint.impl is None or endpoint.impl.closed
+        topic = endpoint.impl
+        return topic is None or topic.closed
 
     # -- links
 
