@@ -15,7 +15,7 @@ from helpers import create, ended, in_thread, interrupted_at, registrations, spe
 from pharos.testing import Mailbox, TIMEOUT, until
 import pharos
 from pharos import Master, node_registry, watcher
-from pharos.private_rospy import proxies, registration, sender
+from pharos.private_rospy import condition, proxies, registration, sender
 from pharos.private_rospy.connections import Connections
 
 STRING = 'std_msgs/String'
@@ -391,3 +391,20 @@ def test_a_signal_that_interrupts_a_send_over_tcpros_anywhere_leaves_it_to_other
             break
     assert step > 3
     assert ended(in_thread(sent.node.stop))
+
+
+def test_a_condition_is_left_taken_nowhere():
+    """Those of threading are, where a handler of signals raises as they are taken."""
+    for step in itertools.count():
+        lock = condition.Condition()
+
+        def take(lock=lock):
+            with lock:
+                lock.notify_all()
+
+        is_through = not interrupted_at(step, take, [threading, condition])
+        is_free = []
+        assert ended(in_thread(lambda: is_free.append(lock.acquire(blocking=False))))
+        assert is_free == [True]
+        if is_through:
+            return

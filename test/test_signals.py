@@ -651,9 +651,11 @@ class Lock:
         return self.acquire()
     def __exit__(self, *error):
         self.release()
+    def __getattr__(self, name):
+        return getattr(self.lock, name)
 is_armed = False
 me = node()
-pharos.node_registry.changed._lock = Lock(pharos.node_registry.changed._lock)
+pharos.node_registry.changed = Lock(pharos.node_registry.changed)
 for handler in me.ros.impl.rosout.logging.getLogger('rosout').handlers:
     handler.lock = Lock(handler.lock)
 ready()

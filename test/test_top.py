@@ -227,7 +227,7 @@ def test_more_than_2_gib_through_a_connection_are_counted_on(master, sender):
                 (each for each in impl.connections if each.transport_type == 'TCPROS'), None
             )
         )
-        with impl.c_lock, socket._lock:  # nothing is counted meanwhile
+        with impl.c_lock, socket._changed:  # nothing is counted meanwhile
             socket._connection.stat_bytes = impl.message_data_sent = 2**31 - 10
         node_api(sender.uri).getBusStats('/test')
         until(lambda: socket.stat_bytes > 2**31)

@@ -1,7 +1,6 @@
 """The next message on a topic, for a thread that waits for it: :meth:`Node.wait_for_message
 <pharos.Node.wait_for_message>`."""
 import collections
-import threading
 import time
 from typing import TYPE_CHECKING, Any, Callable, Deque, Dict, NoReturn, Optional
 
@@ -13,6 +12,7 @@ from pharos.channel import InputChannel
 from pharos.errors import NodeStoppedError, PharosError
 from pharos.intraprocess.dispatcher import Dispatcher
 from pharos.intraprocess.inbox import Inbox
+from pharos.private_rospy.condition import Condition
 from pharos.private_rospy.lifetime import Interruption, wait_for
 from pharos.seconds import check_limit
 from pharos.topic import QUEUE_SIZE, Topic, TypedAs
@@ -72,7 +72,7 @@ class NextMessages(InputChannel):
     def __init__(self, node: 'Node', topic: str, message_class: Any) -> None:
         # nobody starts its thread: it holds the inboxes that have messages, in their order
         self._waiting = Dispatcher(lambda target, name: None)
-        self._changed = threading.Condition()  # notified when there are some
+        self._changed = Condition()  # notified when there are some
         self._taken: Deque[genpy.Message] = collections.deque()
         super().__init__(node, topic, message_class, queue_size=QUEUE_SIZE)
 

@@ -14,6 +14,7 @@ from pharos.blocks import name_of
 from pharos.errors import NodeNameInUseError, NodeStoppedError, PharosError
 from pharos.lookers import is_looker
 from pharos.private_rospy import process_rospy
+from pharos.private_rospy.condition import Condition
 from pharos.private_rospy.lifetime import SIGNAL_LATENCY, Interruption, join, wait_for
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ STOP_LIMIT = 30.0
 #: how many times all that run are stopped, where others start some in answer to that
 STOP_ROUNDS = 5
 
-changed = threading.Condition()  # guards the life cycles of all nodes, and what follows
+changed = Condition()  # guards the life cycles of all nodes, and what follows
 # (master, name) -> those that the master may know, in the order of their starts
 _nodes: 'Dict[Tuple[Any, str], Node]' = {}
 # node -> the identifier of the thread that runs its stop(), and the time.monotonic() until which
@@ -381,7 +382,7 @@ def _forget() -> None:
     """In a process that was forked: the nodes are its parent's, as are the programs, and it must
     not end them."""
     global changed, _finalizer
-    changed = threading.Condition()
+    changed = Condition()
     _finalizer = None  # its parent's, which multiprocessing has dropped
     former = list(_nodes.values())
     for known in (_nodes, _stops, _starts, _waiting, _others, _starters):

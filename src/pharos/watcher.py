@@ -13,6 +13,7 @@ from pharos.blocks import name_of
 from pharos.errors import MasterUnreachableError
 from pharos.failures import Failures
 from pharos.private_rospy import threads
+from pharos.private_rospy.condition import Condition
 from pharos.transcript import Transcript
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ class Watcher:
 
     def __init__(self, master: 'Master') -> None:
         self._master = master
-        self._changed = threading.Condition()  # guards the two below
+        self._changed = Condition()  # guards the two below
         self._listeners: List[Callable[[Graph], None]] = []  # replaced when it changes
         self._thread: Optional[threading.Thread] = None
         self.reachable_since: Optional[float] = None

@@ -1,11 +1,11 @@
 """Waiting for connections of the publishers of this process."""
 import os
-import threading
 
+from pharos.private_rospy.condition import Condition
 from pharos.private_rospy.lifetime import Interruption, wait_for
 
 # notified whenever a publisher of this process gains or loses a connection
-_changed = threading.Condition()
+_changed = Condition()
 
 
 def notify():
@@ -27,7 +27,7 @@ def wait_until(lifetime, predicate, timeout):
 def _forget():
     """In a process that was forked, when another thread may have held the lock."""
     global _changed
-    _changed = threading.Condition()
+    _changed = Condition()
 
 
 os.register_at_fork(after_in_child=_forget)

@@ -4,10 +4,11 @@ import os
 import threading
 from typing import Any, Optional
 
+from pharos.private_rospy.condition import Condition
 from pharos.private_rospy.threads import NoThreadError, start
 
 PERIOD = 0.5  # seconds between two looks, as rospy's
-_changed = threading.Condition()  # guards the two below; notified when the last node has gone
+_changed = Condition()  # guards the two below; notified when the last node has gone
 _nodes: Any = {}  # PrivateRospy -> the thread that removes those who left it, None: none did yet
 _thread: Optional[threading.Thread] = None
 
@@ -68,7 +69,7 @@ def _remove(node: Any) -> None:
 def _forget() -> None:
     """In a process that was forked."""
     global _changed, _thread
-    _changed, _thread = threading.Condition(), None
+    _changed, _thread = Condition(), None
     _nodes.clear()
 
 

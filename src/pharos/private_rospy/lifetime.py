@@ -291,9 +291,7 @@ def _is_rospys(frame: Any) -> bool:
     return str(frame.f_globals.get('__name__')).startswith('rospy.')
 
 
-def wait_for(
-    changed: threading.Condition, predicate: Callable[[], bool], timeout: Optional[float]
-) -> bool:
+def wait_for(changed: Any, predicate: Callable[[], bool], timeout: Optional[float]) -> bool:
     """Wait until ``predicate()`` holds, which is looked at when ``changed`` is notified; returns
     False where the time was up before.
 

@@ -2,10 +2,10 @@
 plain rospy Subscribers, and rospy's statistics."""
 import contextlib
 import math
-import threading
 
 from pharos.intraprocess.copier import serialized, thawer
 from pharos.intraprocess.inbox import ThreadedInbox
+from pharos.private_rospy.condition import Condition
 from pharos.private_rospy.socket_callback import SocketCallback
 
 # bytes that wait beside a publisher's queue, as they do in the sockets of TCPROS
@@ -53,7 +53,7 @@ class PlainCallbacks(PlainReceiver):
     def __init__(self, link, start_thread):
         self.latched = None  # the last message of a publisher that latches
         # notified when there is some, while a publisher waits for it
-        self._room = threading.Condition()
+        self._room = Condition()
         # publishers that wait; and threads for which they are not to wait
         self._waiting = self._excused = 0
         super().__init__(link, start_thread, 'dispatcher')

@@ -3,9 +3,9 @@ import collections
 import io
 import math
 import socket
-import threading
 import time
 
+from pharos.private_rospy.condition import Condition
 from pharos.signals import is_from_signal
 
 # bytes; copying more into the socket would hold the publisher up longer than waking a thread
@@ -73,10 +73,7 @@ class Sender:
         self._is_idle = True  # nothing is on its way but what the socket has
         self._error = None  # of the thread, for the next who publishes, as in rospy
         self.is_unsure = False  # whether who is interrupted leaves a part of a message, or disorder
-        # Taken by itself, and not by the condition, whose __enter__ is Python: a handler of signals
-        # may raise there, when it is taken already, and nobody would release it.
-        self._lock = threading.Lock()
-        self._changed = threading.Condition(self._lock)
+        self._changed = Condition()  # guards all above
         self._cleanup = connection.cleanup_cb  # where it has been in use without a queue
         connection.set_cleanup_callback(self._closed)
         start_thread(self._run, name='sender')
@@ -90,7 +87,7 @@ class Sender:
 
     def write_data(self, data):
         """Send ``data``, a message with its length; never waits for the subscriber."""
-        with self._lock:
+        with self._changed:
             if self._error is not None:
                 error, self._error = self._error, None
                 raise error
@@ -130,7 +127,7 @@ class Sender:
     def _run(self):
         connection = self._connection
         while True:
-            with self._lock:
+            with self._changed:
                 self._is_idle = not self._begun and not self._queue
                 if self._is_idle:
                     self._changed.notify_all()
@@ -144,18 +141,18 @@ class Sender:
             try:
                 connection.write_data(data)
             except Exception as error:
-                with self._lock:
+                with self._changed:
                     self._error = error
 
     def _closed(self, connection):
         if self._cleanup:
             self._cleanup(connection)
-        with self._lock:
+        with self._changed:
             self._changed.notify_all()
 
     def flush(self, timeout):
         """Wait until everything published is with the socket, up to ``timeout`` seconds."""
-        with self._lock:
+        with self._changed:
             self._changed.wait_for(
                 lambda: self._is_idle or self._connection.done, max(0.0, timeout)
             )
