@@ -4,6 +4,7 @@ import signal
 import socket
 import threading
 
+import numpy
 import pytest
 
 from helpers import InProcessMaster, create
@@ -350,3 +351,15 @@ def test_help_says_what_it_is_for():
     assert re.search(r'usage: bridge .*URL_A URL_B TOPIC', shown.stdout)
     for topics in ([], ['http://127.0.0.1:1/']):
         assert run(refused_url(), script('bridge'), *topics).returncode == 2
+
+
+@pytest.mark.parametrize('value', ['no', 'False', None, 2, [], numpy.array([1, 2])])
+def test_whether_connections_are_shared_is_true_or_false(master, value):
+    wanted = 'share_connections is True or False, not'
+    with pytest.raises(ValueError, match=wanted):
+        Master(master.url, share_connections=value)
+    with pytest.raises(ValueError, match=wanted):
+        master.compose(None, 'any.launch', share_connections=value)
+    master.share_connections = value
+    with pytest.raises(ValueError, match=wanted):
+        create(master)

@@ -1,17 +1,21 @@
 """One connection to a publisher elsewhere for the nodes of this process: what each of them gets is
 what its own connection would bring."""
+import contextlib
 import os
 import struct
+import sys
 import threading
 import types
 import warnings
 import weakref
 
+import genpy
 import pytest
 from std_msgs.msg import Int32, String
 
 from helpers import create, ended, in_thread, speak_tcpros_only
 from pharos import Master, NodeStoppedError, first_message
+import pharos
 from pharos.private_rospy import registration, shared_connections
 from pharos.private_rospy.patches import subscribers
 from pharos.private_rospy.tcpros_connection import TcprosConnection
@@ -51,6 +55,15 @@ def wait_until_heard(channel, *nodes):
     for node in nodes:
         until(lambda: (name, 'TCPROS') in node.channels[0].connections)
     until(lambda: channel.connections)
+
+
+def waits_for_its_turn(thread):
+    """Whether the thread waits for another one that makes a connection."""
+    frame = sys._current_frames().get(thread.ident)
+    return frame is not None and (frame.f_code.co_name, 'before' in frame.f_locals) == (
+        '_turn',
+        True,
+    )
 
 
 def data(box, count):
@@ -240,26 +253,142 @@ def test_a_process_forked_while_a_connection_is_made_makes_its_own():
     assert ended(connecting)
 
 
-def test_nodes_for_which_there_was_no_thread_hear_the_publisher_once_there_is_one(
-    master, sharing, monkeypatch
+@pytest.mark.parametrize('is_shared', [False, True], ids=['own', 'shared'])
+def test_a_node_for_which_there_was_no_thread_says_so_and_hears_the_publisher_once_there_is_one(
+    master, monkeypatch, is_shared
 ):
-    sender = create(master, '/sender').output_channel('/shared', Int32)
-    start, refused = threading.Thread.start, threading.Event()
+    node, heard, told = (
+        create(Master(master.url, share_connections=is_shared)),
+        Mailbox(),
+        Mailbox(),
+    )
+    speak_tcpros_only(node)
+    monkeypatch.setattr(registration, 'RETRY_DELAY', 0.1)
+    monkeypatch.setattr(node.latest_run.rospy, 'warn', lambda line: told(line, None))
+    start, refused = threading.Thread.start, []
 
     def refuse(self):
-        if self.name == '/shared of /sender':
-            monkeypatch.undo()
-            refused.set()
+        if self.name in ('/shared of /sender', '/node /shared') and len(refused) < 2:
+            refused.append(self)
             raise RuntimeError("can't start new thread")
         start(self)
 
     monkeypatch.setattr(threading.Thread, 'start', refuse)
-    ((first, one),) = listen(sharing, '/first')
-    assert refused.wait(TIMEOUT)
-    ((second, two),) = listen(sharing, '/second')
-    wait_until_heard(sender, first, second)
-    sender.send(data=1)
-    assert one.next().data == two.next().data == 1
+    node.interested_in('/shared', Int32, delegate=heard)
+    sender = create(master, '/sender')
+    sender.connect_timeout = 0
+    sender.latest_run.rospy.connections._neighbours = list  # as if it were of another process
+    channel = sender.output_channel('/shared', Int32)
+    wait_until_heard(channel, node)
+    assert len(refused) == 2
+    assert "can't start new thread" in told.next() and told.empty()
+    channel.send(data=1)
+    assert heard.next().data == 1
+
+
+def test_who_has_a_class_of_its_own_is_not_in_the_way_of_the_others(master, sharing):
+    """One that reads what comes as something else, or cannot."""
+
+    class Unreadable(Int32):
+        def deserialize(self, data):
+            raise genpy.DeserializationError('as it is')
+
+    class Other(Int32):
+        pass
+
+    listeners = [
+        *listen(sharing, '/unreadable', typed_as=Unreadable),
+        *listen(sharing, '/first', '/second', shared=True),
+        *listen(sharing, '/other', typed_as=Other, shared=True),
+    ]
+    channel = sender_of(master, *(node for node, _ in listeners[1:]))
+    channel.send(data=1)
+    messages = [box.next() for _, box in listeners[1:]]
+    assert [(type(each), each.data) for each in messages] == [(Int32, 1), (Int32, 1), (Other, 1)]
+    assert messages[0] is messages[1]
+
+
+def test_a_delegate_cannot_wait_for_what_its_thread_is_to_bring_to_another_node(
+    master, sharing, mailbox
+):
+    (first, _), (second, two) = listen(sharing, '/first', '/second')
+    first.channels[0].close()
+
+    def wait(message, channel):
+        try:
+            second.wait_for_message('/shared')
+        except pharos.PharosError as error:
+            mailbox(error, None)
+
+    first.interested_in('/shared', Int32, delegate=wait, inline=True)
+    sender_of(master, first, second).send(data=1)
+    assert 'this delegate runs in the thread that brings' in str(mailbox.next())
+    assert two.next().data == 1
+
+
+def test_who_waits_for_a_connection_that_fails_does_not_try_for_as_long_again():
+    """A publisher that does not answer would hold the last of ten nodes up for a hundred seconds."""
+    node, told = types.SimpleNamespace(ended=threading.Event(), name='/node'), Mailbox()
+    has_turn, fails = threading.Event(), threading.Event()
+
+    def fail():
+        with contextlib.suppress(ConnectionError), shared_connections._turn(node, 'key'):
+            has_turn.set()
+            fails.wait(TIMEOUT)
+            raise ConnectionError('no answer')
+
+    def take_turn():
+        try:
+            with shared_connections._turn(node, 'key'):
+                told('made', None)
+        except OSError as error:
+            told(str(error), None)
+
+    failing = in_thread(fail)
+    assert has_turn.wait(TIMEOUT)
+    waiting = [in_thread(take_turn) for _ in range(2)]
+    until(lambda: all(map(waits_for_its_turn, waiting)))
+    fails.set()
+    assert all(map(ended, [failing, *waiting]))
+    assert told.take(2) == ['another node could not connect to it'] * 2
+    take_turn()
+    assert told.next() == 'made'
+
+
+@pytest.mark.parametrize('is_shared', [False, True], ids=['own', 'shared'])
+@pytest.mark.parametrize('what', ['no md5sum', 'no address'])
+def test_a_publisher_that_answers_nonsense_is_heard_once_it_answers_properly(
+    master, monkeypatch, is_shared, what
+):
+    ((node, heard),) = listen(Master(master.url, share_connections=is_shared), '/node')
+    monkeypatch.setattr(registration, 'RETRY_DELAY', 0.1)
+    sender, said = create(master, '/sender'), []
+    of_sender = sender.latest_run.rospy.module.impl.tcpros_pubsub
+    really = of_sender.TCPROSHandler.init_publisher, of_sender.TCPROSPub.get_header_fields
+
+    def init_publisher(self, topic, protocol):
+        answer = really[0](self, topic, protocol)
+        said.append(answer)
+        return (
+            (1, 'ok', ['TCPROS', 'a..b', 5]) if what == 'no address' and len(said) < 3 else answer
+        )
+
+    def get_header_fields(self):
+        fields = really[1](self)
+        if what == 'no md5sum' and len(said) < 3:
+            del fields['md5sum']
+        return fields
+
+    monkeypatch.setattr(of_sender.TCPROSHandler, 'init_publisher', init_publisher)
+    monkeypatch.setattr(of_sender.TCPROSPub, 'get_header_fields', get_header_fields)
+    sender.connect_timeout = 0
+    channel = sender.output_channel('/shared', Int32)
+    until(lambda: node.latest_run.rospy.connections.hears('/shared'))
+    wait_until_heard(channel, node)
+    assert len(said) == 3
+    channel.send(data=1)
+    assert heard.next().data == 1
+    assert not node.channels[0].refused
 
 
 def test_what_is_no_message_ends_the_connection_and_is_told(master, sharing, monkeypatch):

@@ -5,7 +5,15 @@ import numbers
 import threading
 from typing import TYPE_CHECKING, Any, Callable, Dict, FrozenSet, List, Optional, TypeVar
 
-from pharos.blocks import Block, attempt, check_delegate, check_runs, check_soul, text_of
+from pharos.blocks import (
+    Block,
+    attempt,
+    check_delegate,
+    check_flag,
+    check_runs,
+    check_soul,
+    text_of,
+)
 from pharos import node_registry
 from pharos.errors import NodeStoppedError
 from pharos.failures import FailureList, Failures
@@ -275,7 +283,7 @@ def make(
         node: NodeType = node_class.__new__(node_class)
     finally:
         del _made_here.node_class
-    settings['shares_connections'] = master.share_connections
+    settings['shares_connections'] = check_flag('share_connections', master.share_connections)
     node._configure(master, Settings(named, master.url, **settings), soul, delegate)
     try:
         node.__init__(*args, **kwargs)

@@ -1,4 +1,4 @@
-"""Blocks: the callables that a node is made of."""
+"""Blocks: the callables that a node is made of, and what else users give that can be checked."""
 import functools
 import inspect
 import reprlib
@@ -180,3 +180,10 @@ def _is_reloaded(function: Any, other: Any) -> bool:
         return False
     names = function.__module__, function.__qualname__
     return names == (other.__module__, other.__qualname__)
+
+
+def check_flag(name: str, value: Any, hint: str = '') -> bool:
+    """``value`` if it is True or False, else ValueError."""
+    if not attempt(lambda: value in (True, False), False):  # numpy compares each of an array
+        raise ValueError(f'{name} is True or False, not {value!r}{hint}')
+    return bool(value)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Tuple, Ty
 import genpy
 
 from pharos import on_demand
-from pharos.blocks import Block, attempt, check_delegate
+from pharos.blocks import Block, attempt, check_delegate, check_flag
 from pharos.errors import NodeStoppedError, PharosError
 from pharos.intraprocess.inbox import Inbox, SocketInbox
 from pharos.restarts import check_not_over
@@ -15,13 +15,6 @@ if TYPE_CHECKING:
     from pharos.live.plot import Plot
     from pharos.node import Node
     from pharos.run import Run
-
-
-def check_flag(name: str, value: Any, hint: str = '') -> bool:
-    """``value`` if it is True or False, else ValueError."""
-    if value not in (True, False):
-        raise ValueError(f'{name} is True or False, not {value!r}{hint}')
-    return bool(value)
 
 
 class Channel:

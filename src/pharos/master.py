@@ -17,7 +17,7 @@ import rosgraph
 from rosgraph.rosenv import ROS_MASTER_URI
 
 from pharos import attributes, embedded_master, node_registry, on_demand, ros_process, starts
-from pharos.blocks import check_block
+from pharos.blocks import check_block, check_flag
 from pharos.errors import PharosError, UnknownNodeError, suggest
 from pharos.external_node import ExternalNode
 from pharos.master_services import MasterServices
@@ -66,7 +66,7 @@ class Master(MasterServices):
     """
 
     def __init__(self, url: Optional[str] = None, *, share_connections: bool = False) -> None:
-        self.share_connections = share_connections
+        self.share_connections = check_flag('share_connections', share_connections)
         self.url: str = (
             check_url(rosgraph.get_master_uri(), ROS_MASTER_URI) if url is None else check_url(url)
         )

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, Callable, Dict, NoReturn, Optional, Set, 
 import genpy
 
 from pharos import first_message, messages
-from pharos.blocks import check_filler, check_runs
-from pharos.channel import Channel, check_flag
+from pharos.blocks import check_filler, check_flag, check_runs
+from pharos.channel import Channel
 from pharos.errors import MessageTypeError, NodeStoppedError
 from pharos.intraprocess.copier import copier_for
 from pharos.intraprocess.fanout import ClosedFanout

@@ -11,6 +11,7 @@ import roslaunch.core
 import rospkg
 
 from pharos import node_registry, signals
+from pharos.blocks import check_flag
 from pharos.compose.apart import Apart, ApartNodes
 from pharos.compose.kept_node import KeptNode
 from pharos.compose.launch_file import LaunchedNode, LaunchFile, Problem
@@ -227,7 +228,7 @@ def compose(
     progress: Optional[Progress] = None,
 ) -> Composition:
     """What :meth:`Master.compose` does."""
-    if share_connections:
+    if check_flag('share_connections', share_connections):
         master = copy.copy(master)
         master.share_connections = True
     launch_file = LaunchFile(master.url, package, file, args, only, apart)

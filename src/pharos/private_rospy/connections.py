@@ -15,6 +15,7 @@ from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.proxies import ServerProxy
 from pharos.private_rospy.registration import UNREGISTER_TIMEOUT, registered
 from pharos.private_rospy.socket_callback import SocketCallback
+from pharos.private_rospy.threads import NoThreadError
 
 TCPROS = 'TCPROS'  # as ROS calls it
 
@@ -273,30 +274,40 @@ class Connections:
             offered = [each for transport in transports for each in transport.get_supported()]
             try:
                 code, text, chosen = ServerProxy(uri).requestTopic(self._node.name, topic, offered)
-                break
+                return (code, text, 0) if code <= 0 else self._open(transports, topic, uri, chosen)
             except ConnectionRefusedError as error:
                 return 0, str(error), 0
-            except Exception:  # whatever it answered
+            except Exception as error:  # whatever it answered
                 if is_local:  # else this goes on for as long as there is nothing to answer with
                     threads.check(f'{self._node.name} to connect to {topic}')
                     self._descriptors.check(topic)
                 else:
-                    self._descriptors.tell_lack(topic)
+                    self._descriptors.tell_lack(topic, error)
                 self._node.ended.wait(registration.RETRY_DELAY)
             if uri not in subscriber.publishers:
                 return 0, f'the master knows no publisher of {topic} at {uri}', 0
-        return (code, text, 0) if code <= 0 else self._open(transports, topic, uri, chosen)
 
     def _open(self, transports, topic, uri, chosen):
         for transport in transports:
             if chosen and transport.supports(chosen[0]):
-                if chosen[0] == TCPROS and self._node.settings.shares_connections:
-                    return shared_connections.connect(self._node, topic, uri, tuple(chosen[1:]))
                 try:
+                    if chosen[0] == TCPROS and self._node.settings.shares_connections:
+                        return shared_connections.connect(self._node, topic, uri, tuple(chosen[1:]))
                     return transport.create_transport(topic, uri, chosen)
                 except AttributeError:  # rospy's, where there is no subscription any more
                     return 0, f'the interest of {self._node.name} in {topic} ends', 0
+                except NoThreadError:  # to read it: it would count as connected
+                    self._give_up(topic, uri)
+                    raise
         return 0, f'{uri} chose {chosen}, which was not offered', 0
+
+    def _give_up(self, topic, uri):
+        """Have no connection to that publisher."""
+        subscriber = self._node.subscriber(topic)
+        for connection in tuple(subscriber and subscriber.connections or ()):
+            if connection.endpoint_id == uri:
+                connection.is_given_up = True
+                connection.close()
 
     def sends_to(self, name, topic):
         """Whether the node, if it publishes on the topic at all, is connected to the subscriber of
@@ -338,7 +349,9 @@ class Connections:
 
     def is_read_here(self, topic):
         """Whether this thread reads what comes on the topic, and runs a delegate meanwhile."""
-        return self._reading.get(threading.get_ident()) == topic
+        return self._reading.get(threading.get_ident()) == topic or shared_connections.is_read_here(
+            self._node, topic
+        )
 
     @staticmethod
     def local_node_at(uri):

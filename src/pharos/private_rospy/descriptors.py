@@ -1,10 +1,11 @@
 """The descriptors of files and sockets, of which a process may have so many."""
 import os
 import resource
-from typing import Any, Set
+from typing import Any, Optional, Set
 
 from pharos.errors import PharosError
 from pharos.private_rospy.registration import RETRY_DELAY
+from pharos.private_rospy.threads import NoThreadError
 
 STARTING = 8  # while a node starts; later it has three, and one for each connection
 CONNECTING = 2  # for a connection to a publisher, and while that is asked for one
@@ -48,10 +49,16 @@ class ForConnections:
         """Raise PharosError where there are none to connect to a publisher of the topic."""
         check_left(CONNECTING, f'{self._node.name} cannot connect to {topic}')
 
-    def tell_lack(self, topic: str) -> None:
-        """Say in the log, once for each topic, if that is why a connection has failed."""
+    def tell_lack(self, topic: str, error: Optional[Exception] = None) -> None:
+        """Say in the log, once for each topic, if that is why a connection has failed, or a lack of
+        threads.
+
+        :param error: what was raised
+        """
         if topic not in self._told:
             try:
+                if isinstance(error, NoThreadError):
+                    raise error
                 self.check(topic)
             except PharosError as error:
                 self._told.add(topic)

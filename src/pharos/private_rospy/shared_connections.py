@@ -26,8 +26,10 @@ CONNECT_TIMEOUT = 10.0  # seconds that one attempt may take, as for connections 
 SHARED = 'shared by nodes of this process'
 QUEUE_BYTES = 64 << 20  # bytes that wait for the callbacks of plain rospy in one node
 
-_shared: Dict[Any, Any] = {}  # (topic, URI of the publisher, md5sum) -> the SharedConnection
-# by the same, the lock that is held by who makes the connection, which others then share
+# (topic, URI of the publisher, message class, '*' for all that take any type) -> the SharedConnection
+_shared: Dict[Any, Any] = {}
+_reading: Dict[int, Any] = {}  # identifier of a thread -> the SharedConnection that it reads
+# by the keys of the first, the _Turn of who makes the connection, which others then share
 _turns: Any = weakref.WeakValueDictionary()
 _looking = threading.Lock()  # held to look for one there, for two threads would each find none
 
@@ -110,6 +112,7 @@ class SharedConnection:
 
     def _read(self):
         """Hand on what comes, until either side closes."""
+        _reading[threading.get_ident()] = self
         try:
             while not self.fanout.is_closed:
                 self._data = data = self._connection.read_message()
@@ -125,6 +128,7 @@ class SharedConnection:
             if isinstance(error, NoMessageError) or not isinstance(error, OSError):
                 self._tell_unreadable(error)
         finally:
+            del _reading[threading.get_ident()]
             self._close()
             self._connection.close()
 
@@ -181,9 +185,11 @@ class SharedLink(LocalLink):
     def run_inline(self):
         """Run the node's delegates that are inline, as the thread of a connection of its own would."""
         if any(inbox.inline for inbox in self.inboxes.values()):
-            topic, node = self.subscriber.resolved_name, self._node
-            with node.connections.reading(topic):
-                node.lifetime.run_on_behalf(node.on_received, topic)
+            self._node.lifetime.run_on_behalf(self._node.on_received, self.subscriber.resolved_name)
+
+    def is_of(self, node):
+        """Whether it is that node that hears through the link."""
+        return self._node is node
 
     def close(self, end):
         """One end was closed: the other goes too; but that of the connection has no lock that
@@ -232,7 +238,9 @@ def _connection_for(node, subscriber, uri, address):
     :raises OSError: if it does not answer, or the node stops while another one makes the connection
     """
     topic, data_class = subscriber.resolved_name, subscriber.data_class
-    key = topic, uri, data_class._md5sum
+    # Those who have a class of their own of the same md5sum, numpy_msg's for one, or one that cannot
+    # read what comes, are not in the way of the others.
+    key = topic, uri, '*' if data_class._md5sum == '*' else data_class
     with _turn(node, key):
         shared = _shared.get(key)
         if shared is not None:
@@ -245,8 +253,11 @@ def _connection_for(node, subscriber, uri, address):
         )
         header = connection.header
         refusal = header.get('error')
-        if refusal is None and not suits(data_class, header.get('md5sum')):
-            refusal = f"its md5sum is {header.get('md5sum')}"
+        if refusal is None and 'md5sum' not in header:
+            connection.close()
+            raise ConnectionError('its connection header has no md5sum')
+        if refusal is None and not suits(data_class, header['md5sum']):
+            refusal = f"its md5sum is {header['md5sum']}"
         if refusal is not None:
             connection.close()
             return None, (refusal, lambda: header if 'md5sum' in header else ask(address, topic))
@@ -254,18 +265,46 @@ def _connection_for(node, subscriber, uri, address):
         return shared, None
 
 
+def is_read_here(node, topic):
+    """Whether this thread reads what that node hears on the topic through a connection that is
+    shared."""
+    shared = _reading.get(threading.get_ident())
+    return (
+        shared is not None
+        and shared.resolved_name == topic
+        and any(end.link.is_of(node) for end in shared.fanout.connections)
+    )
+
+
+class _Turn:
+    """Whose turn it is to make a connection."""
+
+    def __init__(self):
+        self.lock = threading.Lock()
+        self.failures = 0
+
+
 @contextlib.contextmanager
 def _turn(node, key):
-    """Within this, no other node makes the connection."""
+    """Within this, no other node makes the connection.
+
+    :raises OSError: if another one could not, for whom this one has waited; or if the node stops
+    """
     with _looking:
-        lock = _turns.setdefault(key, threading.Lock())
-    while not lock.acquire(timeout=SIGNAL_LATENCY):
+        turn = _turns.setdefault(key, _Turn())
+    before = turn.failures
+    while not turn.lock.acquire(timeout=SIGNAL_LATENCY):
         if node.ended.is_set():
             raise ConnectionAbortedError(f'{node.name} stops')
     try:
+        if turn.failures != before:
+            raise ConnectionError('another node could not connect to it')
         yield
+    except OSError:
+        turn.failures += not node.ended.is_set()
+        raise
     finally:
-        lock.release()
+        turn.lock.release()
 
 
 def _forget():
@@ -274,6 +313,7 @@ def _forget():
     global _looking
     _looking = threading.Lock()
     _shared.clear()
+    _reading.clear()
     _turns.clear()
 
 

@@ -68,7 +68,7 @@ def remove_connection(self, c, *, node, original):
         return
     if not c.header:
         delay = registration.RETRY_DELAY if c.dest_address else None
-    elif 'error' in c.header:
+    elif 'error' in c.header or getattr(c, 'is_given_up', False):
         delay = None
     else:
         is_senseless = getattr(c, 'is_unreadable', False) and not c.stat_num_msg

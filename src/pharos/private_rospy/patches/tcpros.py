@@ -53,6 +53,7 @@ def robust_connect_subscriber(
         conn.connect(dest_addr, dest_port, pub_uri, timeout=CONNECT_TIMEOUT)
         refusals.check_md5sum(conn, protocol.recv_data_class)
     except module.rospy.exceptions.TransportInitError:
+        conn.is_unreadable = True  # if it has answered, and not refused
         conn.close()
         refusals.examine(node, conn, resolved_topic_name, pub_uri)
     else:
