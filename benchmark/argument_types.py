@@ -3,20 +3,20 @@ refuse."""
 import argparse
 
 
-def numbers(text):
+def numbers(text, what='a list as 1,10 of whole numbers'):
     """``'1,10'`` as [1, 10], and ``'6.2e6'`` as [6200000]: whole numbers above 0."""
     try:
         found = [float(number) for number in text.split(',')]
     except ValueError:
         found = [0.0]
-    if not all(1 <= each < 1e15 and each.is_integer() for each in found):
-        raise argparse.ArgumentTypeError(f'{text!r} is not a list as 1,10 of whole numbers above 0')
+    if not all(1 <= each <= 1e9 and each.is_integer() for each in found):
+        raise argparse.ArgumentTypeError(f'{text!r} is not {what} from 1 to 1e9')
     return [int(each) for each in found]
 
 
 def number(text):
     """A whole number above 0."""
-    found = numbers(text)
+    found = numbers(text, 'a whole number')
     if len(found) > 1:
         raise argparse.ArgumentTypeError(f'{text!r} is more than one number')
     return found[0]
