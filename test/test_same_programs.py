@@ -226,6 +226,21 @@ def without_topic(seen, program):
     ]
 
 
+def differences(one, other):
+    """Where two differ in what was seen, in few words."""
+    said = [('said', one[0], other[0])] if one[0] != other[0] else []
+    for number, (received, here) in enumerate(zip(one[1], other[1])):
+        for sender in sorted({*received, *here}):
+            both = received.get(sender, []), here.get(sender, [])
+            if both[0] != both[1]:
+                told = (
+                    [[fields, *sorted(header.items())] for _, fields, header in each]
+                    for each in both
+                )
+                said.append((f'receiver {number} of {sender}', *told))
+    return '\n'.join(map(str, said))
+
+
 @pytest.mark.filterwarnings('ignore:The publisher should be created')
 def test_a_program_sees_the_same_through_both_transports(master):
     senders = [create(master, name) for name in ('/one', '/two')]
@@ -243,6 +258,6 @@ def test_a_program_sees_the_same_through_both_transports(master):
             for name, *arguments in steps:
                 getattr(program, name)(*arguments)
             seen.append(without_topic(program.end(), program))
-        assert seen[0] == seen[1]
+        assert seen[0] == seen[1], differences(*seen)
 
     sees_the_same()
