@@ -15,7 +15,6 @@ from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.proxies import ServerProxy
 from pharos.private_rospy.registration import UNREGISTER_TIMEOUT, registered
 from pharos.private_rospy.socket_callback import SocketCallback
-from pharos.private_rospy.threads import NoThreadError
 
 TCPROS = 'TCPROS'  # as ROS calls it
 
@@ -277,7 +276,8 @@ class Connections:
                 return (code, text, 0) if code <= 0 else self._open(transports, topic, uri, chosen)
             except ConnectionRefusedError as error:
                 return 0, str(error), 0
-            except Exception as error:  # whatever it answered
+            except Exception as error:  # whatever it answered, or what reading it lacks
+                self._give_up(topic, uri)
                 if is_local:  # else this goes on for as long as there is nothing to answer with
                     threads.check(f'{self._node.name} to connect to {topic}')
                     self._descriptors.check(topic)
@@ -290,19 +290,16 @@ class Connections:
     def _open(self, transports, topic, uri, chosen):
         for transport in transports:
             if chosen and transport.supports(chosen[0]):
+                if chosen[0] == TCPROS and self._node.settings.shares_connections:
+                    return shared_connections.connect(self._node, topic, uri, tuple(chosen[1:]))
                 try:
-                    if chosen[0] == TCPROS and self._node.settings.shares_connections:
-                        return shared_connections.connect(self._node, topic, uri, tuple(chosen[1:]))
                     return transport.create_transport(topic, uri, chosen)
                 except AttributeError:  # rospy's, where there is no subscription any more
                     return 0, f'the interest of {self._node.name} in {topic} ends', 0
-                except NoThreadError:  # to read it: it would count as connected
-                    self._give_up(topic, uri)
-                    raise
         return 0, f'{uri} chose {chosen}, which was not offered', 0
 
     def _give_up(self, topic, uri):
-        """Have no connection to that publisher."""
+        """Have no connection to that publisher, of one that nobody reads."""
         subscriber = self._node.subscriber(topic)
         for connection in tuple(subscriber and subscriber.connections or ()):
             if connection.endpoint_id == uri:
