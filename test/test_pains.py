@@ -73,7 +73,9 @@ from std_msgs.msg import String
 from std_srvs.srv import Empty
 
 def show(found):
-    print('found', json.dumps(found), flush=True)
+    # in one piece: a callback may print meanwhile what it has raised
+    sys.stdout.write(f'found {json.dumps(found)}\\n')
+    sys.stdout.flush()
 
 def tcp_port():
     return rospy.impl.tcpros_base.get_tcpros_server_address()[1]
