@@ -9,6 +9,7 @@ from pharos.testing import Mailbox, TIMEOUT, until
 from pharos import Master
 import pharos
 from pharos.messages import define_service
+from pharos.openings import Openings
 from pharos.private_rospy import local_services
 from pharos.private_rospy.connections import Connections
 
@@ -315,18 +316,21 @@ def test_a_connection_that_is_removed_late_takes_none_with_it_that_has_its_descr
     assert mailbox.next().data == 'heard'
 
 
+OPENERS = {
+    'input': lambda node: node.interested_in('/restarted', STRING),
+    'output': lambda node: node.output_channel('/restarted', STRING),
+    'service': lambda node: node.serve('/restarted', 'std_srvs/Empty', lambda request: None),
+}
+
+
 @pytest.mark.parametrize(
     'opens, owner, way',
     [
-        (lambda node: node.interested_in('/restarted', STRING), Connections, 'subscribe'),
-        (lambda node: node.output_channel('/restarted', STRING), Connections, 'advertise'),
-        (
-            lambda node: node.serve('/restarted', 'std_srvs/Empty', lambda _: None),
-            local_services,
-            'offer',
-        ),
+        (OPENERS['input'], Connections, 'subscribe'),
+        (OPENERS['output'], Connections, 'advertise'),
+        (OPENERS['service'], local_services, 'offer'),
     ],
-    ids=['input', 'output', 'service'],
+    ids=OPENERS,
 )
 def test_what_is_opened_while_another_thread_restarts_the_node_says_so(
     master, monkeypatch, opens, owner, way
@@ -357,3 +361,82 @@ def test_what_is_opened_while_another_thread_restarts_the_node_says_so(
     assert not node.latest_run.opened
     opens(node)
     assert node.latest_run.opened
+
+
+@pytest.mark.parametrize('ends', ['stop', 'restart'])
+@pytest.mark.parametrize('opens', OPENERS.values(), ids=OPENERS)
+def test_what_is_opened_just_before_another_thread_ends_the_run_says_so(
+    master, monkeypatch, opens, ends
+):
+    node, really = create(master, '/node'), Openings.remember
+
+    def remember(*arguments):
+        monkeypatch.setattr(Openings, 'remember', really)
+        assert ended(in_thread(getattr(node, ends)))
+        really(*arguments)
+
+    monkeypatch.setattr(Openings, 'remember', remember)
+    with pytest.raises(pharos.NodeStoppedError, match='/node stopped while it opened /restarted'):
+        opens(node)
+    assert not node.latest_run.opened
+    if ends == 'stop':
+        node.start()
+    assert not node.latest_run.opened
+    opens(node)
+    assert len(node.latest_run.opened) == 1
+
+
+def test_a_start_that_another_one_follows_opens_nothing_in_that_one(master, monkeypatch):
+    node = create(master, '/node')
+    channel = node.interested_in('/restarted', STRING)
+    node.stop()
+    really = type(channel).open
+
+    def start_again():
+        node.stop()
+        node.start()
+
+    def open_after_another_start(*arguments):
+        monkeypatch.setattr(type(channel), 'open', really)
+        assert ended(in_thread(start_again))
+        really(*arguments)
+
+    monkeypatch.setattr(type(channel), 'open', open_after_another_start)
+    with pytest.raises(pharos.NodeStoppedError):
+        node.start()
+    assert node.channels == [channel]
+    assert len(node.latest_run.rospy.subscriber('/restarted').callbacks) == 1
+
+
+def test_what_another_thread_could_not_open_again_is_opened_when_it_is_needed(
+    master, monkeypatch, mailbox
+):
+    """A thread that sends while the node starts opens the channel itself."""
+    node = create(master, '/node')
+    node.interested_in('/first', STRING)
+    channel = node.output_channel('/restarted', STRING)
+    node.stop()
+    reopening, goes_on = threading.Event(), threading.Event()
+    reopen, advertise = Openings.reopen, Connections.advertise
+
+    def reopen_late(run, opened):
+        if opened is not channel:
+            reopening.set()
+            goes_on.wait(TIMEOUT)
+        reopen(run, opened)
+
+    def fail(*arguments):
+        monkeypatch.setattr(Connections, 'advertise', advertise)
+        raise pharos.MasterUnreachableError('for a moment')
+
+    monkeypatch.setattr(Openings, 'reopen', reopen_late)
+    monkeypatch.setattr(Connections, 'advertise', fail)
+    starting = in_thread(node.start)
+    assert reopening.wait(TIMEOUT)
+    with pytest.raises(pharos.MasterUnreachableError):
+        node.send_to('/restarted', data='lost')
+    goes_on.set()
+    assert ended(starting)
+    create(master, '/hearer').interested_in('/restarted', STRING, delegate=mailbox)
+    node.send_to('/restarted', data='sent')
+    assert mailbox.next().data == 'sent'

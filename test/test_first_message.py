@@ -191,7 +191,7 @@ def test_a_delegate_that_sends_while_its_node_starts_again_opens_no_second_chann
     before = node.interested_in('/first/before', STRING)
     node.output_channel('/first/again', STRING, latch=True)
     open_again = before.open
-    before.open = lambda: (open_again(), node.send_to('/first/again', data='early'))
+    before.open = lambda run: (open_again(run), node.send_to('/first/again', data='early'))
     for _ in range(3):
         node.stop()
         node.start()

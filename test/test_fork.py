@@ -1,10 +1,17 @@
 """A process forked off one with nodes has none of them, however it ends: they, and what they hold,
 are its parent's."""
+import os
 import sys
+import threading
+import warnings
 
 import pytest
 
-from pharos import BlockNode
+from helpers import create, ended, in_thread
+import pharos
+from pharos import BlockNode, memory
+from pharos.private_rospy import arguments, changes, parameters
+from pharos.testing import TIMEOUT
 from programs import Program
 
 CODE = '''
@@ -136,3 +143,47 @@ def test_a_node_of_the_parent_is_stopped_in_the_child(master, use):
         node.output_channel('/forks', 'std_msgs/String', latch=True).send(data='go')
         assert '/program' in program.wait_for('refused')
         program.wait_for('still running')
+
+
+@pytest.mark.parametrize(
+    'held',
+    [
+        'changes._changed',
+        'Transcript._lock',
+        'memory._lock',
+        'arguments._lock',
+        'parameters._adding',
+    ],
+)
+def test_a_process_forked_while_another_thread_holds_a_lock_does_not_hang(master, held):
+    create(master, '/node').output_channel('/forked', 'std_msgs/String')
+    owner, _, name = held.partition('.')
+    owners = {
+        'changes': changes,
+        'Transcript': pharos.Transcript,
+        'memory': memory,
+        'arguments': arguments,
+        'parameters': parameters,
+    }
+    lock, has_it, goes_on = getattr(owners[owner], name), threading.Event(), threading.Event()
+
+    def hold():
+        with lock:
+            has_it.set()
+            goes_on.wait(TIMEOUT)
+
+    holding = in_thread(hold)
+    assert has_it.wait(TIMEOUT)
+    with warnings.catch_warnings():  # Python 3.12 and later do not like what is tried here
+        warnings.simplefilter('ignore', DeprecationWarning)
+        child = os.fork()
+    if not child:
+        try:
+            is_free = getattr(owners[owner], name).acquire(timeout=1)
+            os._exit(0 if is_free else 1)
+        finally:
+            os._exit(2)
+    os.waitid(os.P_PID, child, os.WEXITED | os.WNOWAIT)
+    goes_on.set()
+    assert ended(holding)
+    assert os.waitpid(child, 0)[1] == 0

@@ -295,9 +295,9 @@ def test_a_start_that_is_interrupted_while_it_opens_what_it_had_loses_nothing(
 def test_a_start_during_which_the_master_goes_loses_nothing(away, stopped, mailbox, monkeypatch):
     begin = pharos.InputChannel.open
 
-    def open_when_it_has_gone(self):
+    def open_when_it_has_gone(*arguments):
         away.end()
-        begin(self)
+        begin(*arguments)
 
     with monkeypatch.context() as patch:
         patch.setattr(pharos.InputChannel, 'open', open_when_it_has_gone)

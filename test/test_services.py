@@ -292,7 +292,7 @@ def test_a_service_that_is_closed_while_its_node_starts_again_does_not_come_back
     channel = node.interested_in('/before', 'std_msgs/Empty')
     service = node.serve('/clear', 'std_srvs/Empty', lambda request: None)
     open_again = channel.open
-    channel.open = lambda: (open_again(), service.close())
+    channel.open = lambda run: (open_again(run), service.close())
     for _ in range(2):
         node.stop()
         node.start()

@@ -9,7 +9,6 @@ from pharos import on_demand
 from pharos.blocks import Block, attempt, check_delegate, check_flag
 from pharos.errors import NodeStoppedError, PharosError
 from pharos.intraprocess.inbox import Inbox, SocketInbox
-from pharos.restarts import check_not_over
 
 if TYPE_CHECKING:
     from pharos.live.plot import Plot
@@ -40,8 +39,11 @@ class Channel:
         # held to take the endpoint away, for two threads may close the channel at once
         self._lock = threading.Lock()
 
-    def open(self) -> None:
-        """Register with rospy, also after a restart of the node."""
+    def open(self, run: 'Run') -> None:
+        """Register with rospy, also after a restart of the node.
+
+        :param run: the node's that is to have it
+        """
         raise NotImplementedError
 
     def _unregister(self, endpoint: Any) -> None:
@@ -50,7 +52,7 @@ class Channel:
     def _begin(self, *arguments: Any) -> None:
         """Open it for the first time; where that fails, nothing is left behind."""
         try:
-            self.open(*arguments)
+            self.open(self._run, *arguments)
         except BaseException:
             self.close()
             raise
@@ -97,15 +99,17 @@ class Channel:
         if endpoint is not None:
             self._unregister(endpoint)
 
-    def _opened(self, run: 'Run', endpoint: Any) -> None:
+    def _opened(self, run: 'Run', endpoint: Any, give_back: Callable[[], Any]) -> None:
         """The channel is open, unless a delegate or another thread has closed it meanwhile.
 
-        :param run: the node's, when the opening began
+        :raises NodeStoppedError: if the run has ended, after ``give_back()``
         """
-        self._endpoint = endpoint
-        run.remember(self)
+        run.remember(self, self.topic, lambda: self._take(endpoint), give_back)
         if self.closed:
             self.close()
+
+    def _take(self, endpoint: Any) -> None:
+        self._endpoint = endpoint
 
     def node_stopped(self) -> None:
         """The node stops, and its rospy closes all endpoints."""
@@ -161,8 +165,7 @@ class InputChannel(Channel):
         self._has_told = False  # that there is no delegate
         self._begin()
 
-    def open(self) -> None:
-        run = self._run
+    def open(self, run: 'Run') -> None:
         dispatcher = run.dispatcher
         if not self.inline:
             dispatcher.need_thread()
@@ -176,8 +179,7 @@ class InputChannel(Channel):
         :raises NodeStoppedError: if the run ends meanwhile
         """
         endpoint = run.rospy.connections.subscribe(self, inbox, self.node.connect_timeout)
-        check_not_over(run, self.topic, lambda: run.rospy.connections.unsubscribe(self, endpoint))
-        self._opened(run, endpoint)
+        self._opened(run, endpoint, lambda: run.rospy.connections.unsubscribe(self, endpoint))
 
     def _unregister(self, endpoint: Any) -> None:
         self._rospy.connections.unsubscribe(self, endpoint)

@@ -1,5 +1,6 @@
 """The memory of nodes that have stopped."""
 import gc
+import os
 import threading
 
 # A stopped node's rospy is a web of cycles of 0.7 MB, which only the collector frees. It looks at
@@ -21,3 +22,12 @@ def collect(nodes_left: int) -> None:
             _runs_ended = 0
     if due:
         gc.collect()
+
+
+def _forget() -> None:
+    """In a process that was forked, when another thread may have held the lock."""
+    global _lock
+    _lock = threading.Lock()
+
+
+os.register_at_fork(after_in_child=_forget)

@@ -19,6 +19,7 @@ from pharos.topic import QUEUE_SIZE, Topic, TypedAs
 
 if TYPE_CHECKING:
     from pharos.node import Node
+    from pharos.run import Run
 
 
 def next_message(
@@ -76,9 +77,8 @@ class NextMessages(InputChannel):
         self._taken: Deque[genpy.Message] = collections.deque()
         super().__init__(node, topic, message_class, queue_size=QUEUE_SIZE)
 
-    def open(self) -> None:
-        inbox = _WaitingInbox(self, self._waiting)
-        self._subscribe(self._run, inbox)
+    def open(self, run: 'Run') -> None:
+        self._subscribe(run, _WaitingInbox(self, self._waiting))
 
     def _unregister(self, endpoint: Any) -> None:
         self._rospy.connections.unsubscribe(self, endpoint)

@@ -1,5 +1,6 @@
 """Services that a node offers."""
 import contextlib
+import functools
 import reprlib
 from typing import TYPE_CHECKING, Any, Dict, Union
 
@@ -14,10 +15,10 @@ from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.deadlines import time_limit
 from pharos.private_rospy.registration import UNREGISTER_TIMEOUT
 from pharos.private_rospy.xmlrpc_server import is_call_from_nearby
-from pharos.restarts import check_not_over
 
 if TYPE_CHECKING:
     from pharos.node import Node
+    from pharos.run import Run
 
 
 class OfferedService:
@@ -44,14 +45,17 @@ class OfferedService:
         self._check = copier_for(self.service_class._response_class).freeze
         self.block = block
         self.closed = False  # whether close() was called
+        self._service: Any = None  # rospy's, once it is open
         opened = node.current_run.opened
         if any(isinstance(other, OfferedService) and other.name == name for other in opened):
             raise self._is_offered()
-        self.open()
+        self.open(node.current_run)
 
-    def open(self) -> None:
-        """Register with the master, also after a restart of the node."""
-        run = self.node.current_run
+    def open(self, run: 'Run') -> None:
+        """Register with the master, also after a restart of the node.
+
+        :param run: the node's that is to have it
+        """
         try:
             service = local_services.offer(
                 run.rospy,
@@ -62,9 +66,8 @@ class OfferedService:
             )
         except rospy.ServiceException as error:  # a plain rospy Service has the name
             raise self._is_offered() from error
-        check_not_over(run, self.name, lambda: service.shutdown('its node stopped'))
-        self._service = service
-        run.remember(self)
+        take = functools.partial(setattr, self, '_service', service)
+        run.remember(self, self.name, take, lambda: service.shutdown('its node stopped'))
         if self.closed:  # meanwhile
             self.close()
 

@@ -14,7 +14,6 @@ from pharos.intraprocess.copier import copier_for
 from pharos.intraprocess.fanout import ClosedFanout
 from pharos.private_rospy.deadlines import time_limit
 from pharos.private_rospy.registration import REGISTER_TIMEOUT
-from pharos.restarts import check_not_over
 from pharos.seconds import check_limit
 from pharos.signals import is_from_signal
 
@@ -58,12 +57,12 @@ class OutputChannel(Channel):
         self._connected = threading.Event()
         self._begin(connect_timeout)
 
-    def open(self, connect_timeout: Optional[float] = None) -> None:
+    def open(self, run: 'Run', connect_timeout: Optional[float] = None) -> None:
         timeout = self.node.connect_timeout if connect_timeout is None else connect_timeout
         deadline = time.monotonic() + timeout
-        run, self._opener = self._run, threading.current_thread()
+        self._opener = threading.current_thread()
         try:
-            endpoint, fanout = run.rospy.connections.advertise(
+            endpoint = run.rospy.connections.advertise(
                 self.topic,
                 self.message_class,
                 self.latched,
@@ -71,14 +70,16 @@ class OutputChannel(Channel):
                 self.queue_size,
                 self.queue_bytes,
             )
-            check_not_over(
-                run, self.topic, lambda: run.rospy.connections.unadvertise(endpoint, self.latched)
+            self._opened(
+                run, endpoint, lambda: run.rospy.connections.unadvertise(endpoint, self.latched)
             )
-            self._fanout = fanout
-            self._opened(run, endpoint)
             first_message.wait_for_known_subscribers(self, timeout, deadline)
         finally:
             self._connected.set()
+
+    def _take(self, endpoint: Any) -> None:
+        super()._take(endpoint)
+        self._fanout = endpoint.impl.fanout
 
     def wait_until_connected(self, run: 'Run', timeout: float) -> None:
         """Wait for up to ``timeout`` seconds while another thread opens the channel and connects it

@@ -101,10 +101,11 @@ class Parameter:
         self.blocks.append(given)
         try:
             with self.node.master.reached():
-                run.rospy.parameters.watch(self.name, self._changed)
-                while run.is_over:  # the node was restarted meanwhile, or stopped
-                    run = self.node.current_run
+                while True:
                     run.rospy.parameters.watch(self.name, self._changed)
+                    if not run.is_over:
+                        break
+                    run = self.node.current_run  # the node was restarted meanwhile, or stopped
         except BaseException:
             self.blocks.remove(given)
             raise

@@ -18,6 +18,7 @@ from pharos.private_rospy.lifetime import Interruption, wait_for
 
 if TYPE_CHECKING:
     from pharos.node import Node
+    from pharos.run import Run
 
 KEPT = 1000  # messages that wait for a thread that is slower than they come
 QUEUE_SIZE = 100  # messages of nodes of this process that wait to be weighed
@@ -105,13 +106,13 @@ class Probe(InputChannel):
         self.restart()
         super().__init__(node, topic, node.ros.AnyMsg, queue_size=QUEUE_SIZE)
 
-    def open(self) -> None:
-        dispatcher = self._run.dispatcher
+    def open(self, run: 'Run') -> None:
+        dispatcher = run.dispatcher
         dispatcher.is_yielded_to = False
         if self.weighs:
             dispatcher.need_thread()
         inbox = _SocketTally(self, dispatcher)
-        self._subscribe(self._run, inbox)
+        self._subscribe(run, inbox)
 
     def restart(self) -> None:
         """Forget what came so far, such as latched messages."""

@@ -2,7 +2,7 @@
 import contextlib
 import os
 import threading
-from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, Optional
+from typing import TYPE_CHECKING, Dict, Iterator, Optional
 
 from pharos import node_registry, signals
 from pharos.errors import NodeStoppedError, PharosError
@@ -10,7 +10,6 @@ from pharos.private_rospy.lifetime import SIGNAL_LATENCY, on_nobodys_behalf
 
 if TYPE_CHECKING:
     from pharos.node import Node
-    from pharos.run import Run
 
 
 class Restart:
@@ -31,14 +30,6 @@ class Restart:
     def is_cancelled_here(self) -> bool:
         """Whether it is, and this thread does it."""
         return self.is_cancelled and self.thread == threading.get_ident()
-
-
-def check_not_over(run: 'Run', topic: str, give_back: Callable[[], Any]) -> None:
-    """Raise NodeStoppedError, after ``give_back()``, if the run has ended while something was opened
-    in it: perhaps another one is there by now, which has opened it."""
-    if run.is_over:
-        give_back()
-        raise NodeStoppedError(f'{run.node.name} stopped while it opened {topic}: open it again')
 
 
 # node that is stopped to be started again, and keeps its name -> its restart;

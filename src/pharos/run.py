@@ -3,19 +3,17 @@ import contextlib
 import functools
 import threading
 import weakref
-from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Tuple
+from typing import TYPE_CHECKING, Any, Callable, List, Optional, Tuple
 
 from pharos import memory, messages, node_registry, signals
 from pharos.blocks import attempt, name_of
-from pharos.channel import InputChannel
 from pharos.errors import MessageTypeError, NodeStoppedError
 from pharos.external_node import ExternalNode
 from pharos.health import told
 from pharos.intraprocess import common_thread
 from pharos.intraprocess.dispatcher import Dispatcher
-from pharos.intraprocess.fanout import Latch
 from pharos.lifecycle import Lifecycle
-from pharos.output_channel import OutputChannel
+from pharos.openings import Openings
 from pharos.private_rospy import changes, descriptors
 from pharos.private_rospy.instance import PrivateRospy
 from pharos.private_rospy.lifetime import JOIN_TIMEOUT, listed
@@ -25,7 +23,6 @@ from pharos.private_rospy.settings import Settings
 from pharos.restarts import Restart, is_restarting
 from pharos.seconds import check_seconds
 from pharos.souls import Souls
-from pharos.topic import Topic
 from pharos.transcript import Transcript
 from pharos.watcher import watcher_of
 
@@ -33,12 +30,11 @@ if TYPE_CHECKING:
     from pharos.node import Node
 
 
-class Run:
+class Run(Openings):
     """One run of a node, from a start to its stop; it is thrown away at the next start.
 
     :attr:`rospy` is the node's :class:`~pharos.private_rospy.instance.PrivateRospy`,
-    :attr:`dispatcher` runs its delegates, and :attr:`opened` are the channels and services that it
-    has open, in the order of their opening.
+    :attr:`dispatcher` runs its delegates.
     """
 
     #: what to say of souls that are left behind
@@ -48,18 +44,9 @@ class Run:
     may_run_elsewhere = True
 
     def __init__(self, node: 'Node', settings: Settings) -> None:
-        self.node = node
+        super().__init__(node)
         self.lifecycle = Lifecycle.STARTING
-        self.opened: List[Any] = []
-        # topic name, as given to send_to -> its OutputChannel
-        self.send_channels: Dict[str, Any] = {}
-        # topic name -> the lock of the thread that opens a channel to send on it
-        self._opening: Dict[str, Any] = {}
         self._settings = settings
-        self._to_reopen: List[Any] = []  # those of the former run's that are closed still
-        # what the former run had open, where the class's own start() opens channels: a channel that
-        # it opens for a topic that one of these latched on goes on with that one's Latch
-        self._former_opened: List[Any] = []
         self._starter: Optional[int] = threading.get_ident()  # the thread that starts the node
         self._is_cancelled = False  # whether a stop() came while the node started
         self._forked: 'weakref.WeakSet[threading.Thread]' = weakref.WeakSet()  # they run souls
@@ -109,7 +96,7 @@ class Run:
             watcher_of(self.node.master).check()
             for opened in self.opened:
                 self._check_not_stopped()
-                self._reopen(opened)
+                self.reopen(opened)
             with self.node.master.reached():
                 self.rospy.parameters.renew()
         except BaseException as error:
@@ -121,8 +108,6 @@ class Run:
                 self.node.latest_run = former  # type: ignore[assignment]
                 self._become(Lifecycle.STOPPED)
             self.end()
-            if self.node.latest_run is self:  # else those of the next one
-                self._close_opened()  # what was opened after another thread had stopped the node
             if is_stopped and isinstance(error, Exception):
                 raise NodeStoppedError(f'{self.node.name} was stopped while it started') from error
             raise
@@ -195,15 +180,14 @@ class Run:
             self.dispatcher.wait_for_delegate(JOIN_TIMEOUT)
 
     def _close_opened(self) -> None:
-        for opened in self.opened:
-            opened.node_stopped()
+        self.close_opened()
         changes.notify()  # for sends that began when the stop had, and wait for subscribers
 
     def abandon(self) -> None:
         """This is a process that was forked: the node runs in its parent, and here it is
         stopped."""
         self.lifecycle = Lifecycle.STOPPED
-        self._close_opened()
+        self.close_opened()
         self.opened = []
 
     def _become(self, lifecycle: Lifecycle) -> None:
@@ -240,74 +224,12 @@ class Run:
         attempt(lambda: self.node.log(f'stops: {reason}'))
         node_registry.stop(self.node)
 
-    # -- what is open
-
-    def remember(self, opened: Any) -> None:
-        """A channel or service is open from now on, also after a restart."""
-        with node_registry.changed:
-            if opened not in self.opened:
-                # replaced, so that others may iterate meanwhile
-                self.opened = [*self.opened, opened]
-
-    def forget(self, opened: Any) -> None:
-        """It was closed for good."""
-        with node_registry.changed:
-            self.opened = [other for other in self.opened if other is not opened]
-            self.send_channels.clear()
-
-    def _reopen(self, opened: Any) -> None:
-        """Open what the former run had open, unless that is done, or a thread is doing it."""
-        with node_registry.changed:
-            if opened not in self._to_reopen:
-                return
-            self._to_reopen.remove(opened)
-        opened.open()
-
-    def latch_for(self, topic: str, message_class: Any) -> Latch:
-        """The Latch of a new channel: the former run's, where start() opens that channel anew."""
-        with node_registry.changed:
-            for channel in self._former_opened:
-                if (
-                    isinstance(channel, OutputChannel)
-                    and (channel.topic, channel.message_class) == (topic, message_class)
-                    and channel.latched
-                    and not channel.closed
-                ):
-                    self._former_opened.remove(channel)
-                    return channel.latched
-        return Latch()
+    # -- what it knows by name
 
     @property
     def parameters(self) -> List[Any]:
         """The parameters whose changes are watched."""
         return [listener.__self__ for listener in self.rospy.parameters.listeners]
-
-    @property
-    def channels(self) -> List[Any]:
-        """The channels that are open."""
-        channels = (InputChannel, OutputChannel)
-        return [each for each in self.opened if isinstance(each, channels) and each.is_open]
-
-    def sender(
-        self, topic: Topic, typed_as: Any, connect_timeout: float, wait: float
-    ) -> OutputChannel:
-        """The channel for ``send_to``, opened by the first of several threads that come at once,
-        for which the others wait."""
-        opening = self._opening.setdefault(topic.name, threading.RLock())
-        limit = max(0.0, wait + connect_timeout)
-        # False: another thread is still opening it; this one then tries by itself
-        is_mine = opening.acquire(timeout=min(limit, threading.TIMEOUT_MAX))
-        try:
-            for channel in self.opened:
-                if isinstance(channel, OutputChannel) and channel.topic == topic.name:
-                    self._reopen(channel)  # else a start would open it beside another one
-                    return channel
-            return topic.output_channel(
-                self.node, typed_as, connect_timeout=connect_timeout, wait=wait
-            )
-        finally:
-            if is_mine:
-                opening.release()
 
     def resolve(self, name: str, what: str) -> str:
         """A name as the node means it, in its namespace and remapped, in full.

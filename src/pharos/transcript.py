@@ -55,6 +55,10 @@ class _Transcript:
                 attempt(lambda: _print(why))
             return False
 
+    def _forget(self) -> None:
+        """In a process that was forked, when another thread may have been showing a line."""
+        self._lock = threading.RLock()
+
     def on_show(self, receiver: Receiver) -> Receiver:
         """Send lines to ``receiver(text)`` from now on; ``None`` means standard output again.
 
@@ -92,3 +96,4 @@ def _print(line: str) -> None:
 
 
 Transcript = _Transcript()
+os.register_at_fork(after_in_child=Transcript._forget)

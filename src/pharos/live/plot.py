@@ -163,7 +163,7 @@ class _Collected:
         self.rows: Deque[Tuple[float, List[Optional[float]]]] = collections.deque(maxlen=KEPT)
         self._readers, self._node, self._looker = readers, run.node, looker
         self._begin = time.monotonic()
-        run.remember(self)
+        run.remember(self, 'a plot')
 
     def __call__(self, message: genpy.Message, channel: InputChannel) -> None:
         self.rows.append(
@@ -181,7 +181,7 @@ class _Collected:
         if not is_restarting(self._node):
             self.end()
 
-    def open(self) -> None:
+    def open(self, run: Run) -> None:
         """The channel's node starts again."""
 
 

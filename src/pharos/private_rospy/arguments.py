@@ -6,6 +6,7 @@ program. Here the first node takes the name, which is the program itself where i
 a script, else the first that is created with them; all else is for all. What is for one alone says
 so as in ROS 2: ``detector:image:=/camera/image``.
 """
+import os
 import re
 import threading
 from typing import List
@@ -117,3 +118,12 @@ def _is_name_of_program(name, master_url):
         and rospy.names.get_mappings().get('__name') == name
         and is_same_master(get_master_uri(), master_url)
     )
+
+
+def _forget():
+    """In a process that was forked, when another thread may have held the lock."""
+    global _lock
+    _lock = threading.Lock()
+
+
+os.register_at_fork(after_in_child=_forget)

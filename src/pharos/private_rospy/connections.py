@@ -124,7 +124,7 @@ class Connections:
             self._receivers[topic] = others
 
     def advertise(self, topic, message_class, latch, timeout, queue_size, queue_bytes):
-        """rospy's Publisher, and its fan-out; subscribers in this process are told at once.
+        """rospy's Publisher; subscribers in this process are told at once.
 
         rosmaster tells them in steps of 0.1 s.
 
@@ -158,7 +158,7 @@ class Connections:
         except BaseException:
             self.unadvertise(endpoint, latch)
             raise
-        return endpoint, fanout
+        return endpoint
 
     def known_subscribers(self, topic):
         """Names of the nodes that the master knew to be interested when this one registered as a

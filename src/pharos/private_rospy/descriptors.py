@@ -56,10 +56,14 @@ class ForConnections:
         :param error: what was raised
         """
         if topic not in self._told:
-            try:
-                if isinstance(error, NoThreadError):
-                    raise error
-                self.check(topic)
-            except PharosError as error:
+            lack = error if isinstance(error, NoThreadError) else self._lack(topic)
+            if lack is not None:
                 self._told.add(topic)
-                self._node.warn(f'{error}; meanwhile it is tried every {RETRY_DELAY:g} s')
+                self._node.warn(f'{lack}; meanwhile it is tried every {RETRY_DELAY:g} s')
+
+    def _lack(self, topic: str) -> Optional[Exception]:
+        try:
+            self.check(topic)
+        except PharosError as error:
+            return error
+        return None

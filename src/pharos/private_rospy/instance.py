@@ -11,7 +11,7 @@ import rosgraph.network
 from pharos.errors import MasterUnreachableError, NodeStoppedError, PharosError, PortInUseError
 from pharos.private_rospy import changes, logs, patches, process_rospy, refusals, registration
 from pharos.private_rospy.acceptor import Acceptor, Limits
-from pharos.private_rospy.lifetime import Lifetime
+from pharos.private_rospy.lifetime import Lifetime, listed
 from pharos.private_rospy.loader import PrivateImports
 from pharos.private_rospy.own_process import OwnProcess
 from pharos.private_rospy.patches import tcpros_server
@@ -358,7 +358,7 @@ class PrivateRospy:
     @property
     def thread_count(self):
         """How many threads the node has."""
-        return sum(thread.is_alive() for thread in list(self.lifetime.threads))
+        return sum(thread.is_alive() for thread in listed(self.lifetime.threads))
 
     def connection_header(self, publisher):
         """What a subscriber of rospy's _PublisherImpl gets as its messages'

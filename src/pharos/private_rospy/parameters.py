@@ -1,6 +1,7 @@
 """Parameters that a node watches, or keeps the values of, through the master's paramUpdate calls."""
 import contextlib
 import copy
+import os
 import reprlib
 import socket
 import threading
@@ -272,3 +273,12 @@ def _own(value):
 def _contains(namespace, name):
     """Whether ``name`` is the namespace or in it."""
     return (name + '/').startswith(namespace.rstrip('/') + '/')
+
+
+def _forget():
+    """In a process that was forked, when another thread may have held the lock."""
+    global _adding
+    _adding = threading.Lock()
+
+
+os.register_at_fork(after_in_child=_forget)
