@@ -7,6 +7,7 @@ import pathlib
 import shutil
 import sys
 import tempfile
+import threading
 
 # before pharos is imported: logs and addresses of the tests are their own
 os.environ['ROS_HOSTNAME'] = '127.0.0.1'
@@ -23,7 +24,20 @@ from helpers import InProcessMaster  # noqa: E402
 from pharos import node_registry, watcher  # noqa: E402
 from pharos.testing import mailbox, nothing_left  # noqa: E402, F401
 
+HOPELESS = 360.0  # seconds; more than the timeout in setup.cfg
 collect_ignore = ['programs']  # run by tests, and no tests of this package
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_protocol():
+    """End the worker where even pytest-timeout cannot end a test: Python runs no handler of a signal
+    while it waits for some locks. That test counts as failed, and the others go on in a new worker.
+    """
+    watchdog = threading.Timer(HOPELESS, os._exit, [3])
+    watchdog.daemon = True
+    watchdog.start()
+    yield
+    watchdog.cancel()
 
 
 @pytest.fixture(scope='session')

@@ -1,4 +1,5 @@
 """Running this package's scripts and ROS's tools as processes, and waiting for what they print."""
+import contextlib
 import os
 import pathlib
 import queue
@@ -7,6 +8,7 @@ import subprocess
 import threading
 import time
 
+import psutil
 import rosgraph
 from pharos.testing import TIMEOUT
 
@@ -33,6 +35,8 @@ def environment(master_url, **variables):
         'ROS_HOSTNAME': '127.0.0.1',
         'PYTHONPATH': str(ROOT / 'src'),
         'PYTHONUNBUFFERED': '1',
+        # Python 3.12 and later say so in the middle of what the child prints.
+        'PYTHONWARNINGS': 'ignore:This process (pid:DeprecationWarning',
         **variables,
     }
 
@@ -115,7 +119,26 @@ class Program:
         finally:
             self.process.kill()
             self._reader.join(TIMEOUT)
+            # to close what another thread reads would wait for that, for ever
+            holders = self._kill_holders() if self._reader.is_alive() else None
+            self._reader.join(TIMEOUT)
             self.process.stdout.close()
+            assert (
+                holders is None
+            ), f'the program ended, but what it printed on was open in {holders}'
+
+    def _kill_holders(self):
+        """Kill the others that have what this program prints on; returns their command lines."""
+        pipe = os.readlink(f'/proc/self/fd/{self.process.stdout.fileno()}')
+        holders = []
+        for process in psutil.process_iter():
+            with contextlib.suppress(OSError, psutil.Error):
+                folder = f'/proc/{process.pid}/fd'
+                files = {os.readlink(f'{folder}/{number}') for number in os.listdir(folder)}
+                if pipe in files and process.pid != os.getpid():
+                    holders.append(process.cmdline())
+                    process.kill()
+        return holders
 
     def __enter__(self):
         return self
