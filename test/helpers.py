@@ -1,5 +1,6 @@
 """What the tests of several files need: nodes, threads, a master in this process."""
 import itertools
+import signal
 import sys
 import threading
 
@@ -90,9 +91,12 @@ def registrations(master, name):
     ]
 
 
-def interrupted_at(step, block, modules):
+def interrupted_at(step, block, modules, with_signal=None):
     """Have ``block()`` end with a KeyboardInterrupt, as by a handler of signals, at a step of what is
-    in these modules; returns whether it came so far."""
+    in these modules; returns whether it came so far.
+
+    :param with_signal: the number of one, whose handler is to raise it; otherwise it comes without
+    """
     files = [module.__file__ for module in modules]
     steps = itertools.count()
 
@@ -100,7 +104,9 @@ def interrupted_at(step, block, modules):
         is_step = frame.f_code.co_filename in files and event in ('call', 'c_return')
         if is_step and next(steps) == step:
             sys.setprofile(None)
-            raise KeyboardInterrupt
+            if with_signal is None:
+                raise KeyboardInterrupt
+            signal.getsignal(with_signal)(with_signal, frame)  # as where that code takes it
 
     sys.setprofile(look)
     try:

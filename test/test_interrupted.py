@@ -14,7 +14,7 @@ import std_srvs.srv
 from helpers import create, ended, in_thread, interrupted_at, registrations, speak_tcpros_only
 from pharos.testing import Mailbox, TIMEOUT, until
 import pharos
-from pharos import Master, node_registry, watcher
+from pharos import Master, node_registry, openings, restarts, run, signals, watcher
 from pharos.private_rospy import condition, proxies, registration, sender
 from pharos.private_rospy.connections import Connections
 
@@ -364,6 +364,79 @@ def test_a_start_that_ends_as_its_node_is_started_again_takes_nothing_with_it(ma
     assert raised.next()
     assert node.channels == [channel]
     channel.send(data='sent')
+
+
+# -- a handler of the program's own raises
+
+
+@pytest.fixture
+def handler_that_raises():
+    def ring(*_):
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, ring)
+    yield ring
+    signal.signal(signal.SIGALRM, before)
+
+
+STEPS = {
+    'stop': (lambda node: node.start(), lambda node: node.stop(), False),
+    'start': (lambda node: node.stop(), lambda node: node.start(), True),
+    'restart': (lambda node: node.start(), lambda node: node.restart(), True),
+}
+
+
+@pytest.mark.parametrize('step', STEPS)
+def test_a_handler_that_raises_anywhere_in_it_tears_up_nothing(
+    master, mailbox, handler_that_raises, step
+):
+    """It has been done in full when that is raised, or not at all."""
+    prepare, do, is_to_run = STEPS[step]
+    node = create(master, '/node', delegate=mailbox)
+    node.interested_in('/interrupted/heard', STRING)
+    other = create(master, '/other').output_channel('/interrupted/heard', STRING)
+    modules = (contextlib, node_registry, openings, restarts, run, signals)
+    was_running = {'stop': True, 'start': False, 'restart': True}[step]
+    done = 0
+    for number in itertools.count():
+        if node.is_running != was_running:
+            prepare(node)
+        is_interrupted = interrupted_at(number, lambda: do(node), modules, signal.SIGALRM)
+        assert node.lifecycle.value in ('running', 'stopped')
+        assert not node_registry._stops and not restarts._restarts
+        names = [each.name for each in master.nodes()]
+        assert ('/node' in names) == node.is_running
+        done += node.is_running == is_to_run
+        if node.is_running:
+            assert other.wait_for_subscribers(timeout=TIMEOUT)
+            other.send(data=str(number))
+            assert mailbox.wait_for(lambda message: message.data == str(number))
+        if not is_interrupted:
+            break
+    assert node.is_running == is_to_run
+    assert signal.getsignal(signal.SIGALRM) is handler_that_raises
+    assert done > 20 or step == 'start'  # which is taken back
+
+
+@pytest.mark.parametrize('when', ['before', 'after'])
+def test_a_handler_that_raises_in_an_overriding_stop_cuts_that_off_at_once(
+    master, handler_that_raises, when
+):
+    went_on = []
+
+    class Careful(pharos.Node):
+        def stop(self):
+            if when == 'after':
+                super().stop()
+            signal.raise_signal(signal.SIGALRM)
+            went_on.append(self)
+
+    node = create(master, '/careful', Careful)
+    with pytest.raises(KeyboardInterrupt):
+        node.stop()
+    assert went_on == []
+    assert node.lifecycle.value == 'stopped'
+    assert signal.getsignal(signal.SIGALRM) is handler_that_raises
 
 
 # -- a send is interrupted

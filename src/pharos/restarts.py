@@ -45,7 +45,7 @@ def restart(node: 'Node', forks_itself: bool) -> None:
     if node.is_running:
         node.master.call('getPid')
     # torn up by Ctrl-C half way, it would leave a node that is stopped
-    with _turn_of(node) as mine, signals.held():
+    with signals.held(), _turn_of(node) as mine:
         if mine is None:
             return
         former = node.latest_run

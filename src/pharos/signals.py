@@ -10,7 +10,7 @@ import time
 import traceback
 import _thread
 from types import CodeType, FrameType
-from typing import Any, Callable, Iterator, Optional, Set
+from typing import Any, Callable, Iterator, List, Optional, Set
 
 import rosgraph
 
@@ -60,10 +60,12 @@ class _Signal:
     """A signal that ends what the main thread does as soon as that can be cut off.
 
     Torn up at any moment, a call of ours leaves a registration behind, or a lock held for ever.
+
+    :param error: what a handler of the program's own raised within a :func:`held`
     """
 
-    def __init__(self, number: int) -> None:
-        self.number = number
+    def __init__(self, number: int, error: Optional[BaseException] = None) -> None:
+        self.number, self.error = number, error
         # at the prompt, it ends the line that runs or is typed, and not what goes on beside it
         self.is_at_prompt = number == signal.SIGINT and is_at_prompt()
         self._came = time.monotonic()
@@ -77,7 +79,7 @@ class _Signal:
     def remind(self) -> None:
         """Have the main thread's handler look again and again, until it has raised an exception."""
         identifier = main_thread().ident
-        while signal.getsignal(self.number) is _on_signal:
+        while self.error is not None or signal.getsignal(self.number) is _on_signal:
             time.sleep(REMINDER)  # first: mostly it is cut off at once, and needs none
             if _coming is not self:
                 return
@@ -87,6 +89,8 @@ class _Signal:
         """Whether the main thread, which is at that frame, can be cut off there."""
         now = time.monotonic()
         if _holds:
+            if self.error is not None and not _runs_ours(_without_pythons(frame), 1):
+                return True  # in a block of the program's, whose handler it was
             return now - self._came > HOLD_LIMIT
         if _waits:
             return True
@@ -95,6 +99,47 @@ class _Signal:
         if self._stopped is None:
             return not _runs_ours(frame)
         return now - self._stopped > PATIENCE or not _runs_ours(_without_pythons(frame), 1)
+
+    def exception(self) -> BaseException:
+        """What it raises in the main thread."""
+        return _exception(self.number) if self.error is None else self.error
+
+
+class _Postponing:
+    """A handler of the program's own while the main thread is in a :func:`held`: it is called at
+    once, and what it raises in code of ours is raised afterwards."""
+
+    def __init__(self, number: int, handler: Any) -> None:
+        self._number = number
+        # one of these where the end of the last held() was itself interrupted
+        self._handler: Any = handler._handler if isinstance(handler, _Postponing) else handler
+
+    @classmethod
+    def of_all(cls) -> 'List[_Postponing]':
+        """Those for the handlers of the program's own that there are."""
+        handlers = ((number, signal.getsignal(number)) for number in range(1, signal.NSIG))
+        ours = _on_signal, _look_again
+        return [cls(*each) for each in handlers if callable(each[1]) and each[1] not in ours]
+
+    def begin(self) -> None:
+        """From now on."""
+        signal.signal(self._number, self)
+
+    def __call__(self, number: int, frame: Optional[FrameType]) -> None:
+        try:
+            self._handler(number, frame)
+        except BaseException as error:
+            if not _holds:
+                raise
+            if _coming is None:
+                _come(_Signal(number, error))
+            _look_again(number, frame)
+
+    def end(self) -> None:
+        """The program's own is the handler again, unless the program has set another one."""
+        current: Any = signal.getsignal(self._number)
+        if current is self:
+            signal.signal(self._number, self._handler)
 
 
 def _runs_ours(frame: Optional[FrameType], depth: Optional[int] = None) -> bool:
@@ -199,8 +244,8 @@ def interruptible_wait(is_cut_off: bool = False) -> Iterator[None]:
 
 @contextlib.contextmanager
 def held(is_end: bool = False) -> Iterator[None]:
-    """Within this, a signal raises nothing in the main thread, and afterwards what it would have
-    raised.
+    """Within this, a signal raises nothing in code of ours in the main thread, and afterwards what
+    it would have raised, by a handler of the program's own, too.
 
     A start or a stop that is torn up half way leaves registrations behind, and the end of the
     program programs, too. After HOLD_LIMIT seconds it is cut off all the same.
@@ -213,21 +258,25 @@ def held(is_end: bool = False) -> Iterator[None]:
         yield
         return
     _take_on(*_DEFAULTS)
-    _holds += 1
+    handlers = [] if _holds else _Postponing.of_all()
     try:
+        for handler in handlers:
+            handler.begin()
+        _holds += 1
         yield
     finally:
         _holds = max(0, _holds - 1)  # 0: the process was forked in it
+        for handler in handlers:
+            handler.end()
         coming = _coming
-        if coming is not None and not _holds and not _waits:
+        if coming is not None and not _holds and not (_waits and coming.error is None):
             _coming = None
             if not is_end:
-                raise _exception(coming.number)
+                raise coming.exception()
 
 
 def _on_signal(number: int, frame: Optional[FrameType]) -> None:
-    global _coming
-    if _coming is None:
+    if _coming is None or _coming.error is not None:
         if not (_holds or _is_needed()):
             _do_default(number, frame)
             return
@@ -238,18 +287,23 @@ def _on_signal(number: int, frame: Optional[FrameType]) -> None:
             _thread.start_new_thread(coming.stop_nodes, ())
             if _waits and not (_holds or _is_cut_off):
                 return  # the wait ends with the nodes
-        _coming = coming
-        signal.signal(_REMINDER_SIGNAL, _look_again)
-        _thread.start_new_thread(coming.remind, ())
+        _come(coming)
     _look_again(number, frame)
+
+
+def _come(coming: _Signal) -> None:
+    global _coming
+    _coming = coming
+    signal.signal(_REMINDER_SIGNAL, _look_again)
+    _thread.start_new_thread(coming.remind, ())
 
 
 def _look_again(_: int, frame: Optional[FrameType]) -> None:
     """Cut the main thread off, if it can be."""
     global _coming
     if _coming is not None and _coming.may_cut_off(frame):
-        number, _coming = _coming.number, None
-        raise _exception(number)
+        coming, _coming = _coming, None
+        raise coming.exception()
 
 
 def _exception(number: int) -> BaseException:
