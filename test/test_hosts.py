@@ -11,6 +11,7 @@ import xmlrpc.server
 import pytest
 import rosgraph
 import rosgraph.network
+from std_msgs.msg import Int32
 from catkin.find_in_workspaces import find_in_workspaces
 
 from helpers import InProcessMaster, create
@@ -521,10 +522,41 @@ def test_a_publisher_that_refuses_is_asked_once(master, impatient, stranger):
             )
             while connection.recv(4096):  # its handshake, and then that it closes
                 pass
+        connection, _ = server.accept()  # the question what it publishes
+        with connection:
+            rosgraph.network.write_ros_handshake_header(
+                connection,
+                {
+                    'callerid': '/stranger',
+                    'type': Int32._type,
+                    'md5sum': Int32._md5sum,
+                    'message_definition': Int32._full_text,
+                },
+            )
+            connection.recv(4096)
     until(lambda: not threads('/hosts/refused'))
     assert asked.acquire(blocking=False)
     assert not threads('reconnect')
     assert not asked.acquire(blocking=False)
+
+
+def test_a_publisher_that_refuses_for_another_reason_is_tried_again(
+    master, mailbox, impatient, stranger, speaker
+):
+    """It may have been about to end, or to begin."""
+    speaker.output_channel('/hosts/refused_once', STRING, latch=True).send(data='reached')
+    with socket.create_server(('127.0.0.1', 0)) as server:
+        server.settimeout(TIMEOUT)
+        stranger('/hosts/refused_once', server.getsockname()[1], speaker.tcp_port)
+        create(master, '/listener', delegate=mailbox).interested_in('/hosts/refused_once', STRING)
+        for _ in range(2):  # of the second, it asks what it publishes
+            connection, _ = server.accept()
+            with connection:
+                connection.settimeout(TIMEOUT)
+                rosgraph.network.write_ros_handshake_header(connection, {'error': 'not now'})
+                while connection.recv(4096):
+                    pass
+        assert mailbox.next().data == 'reached'
 
 
 # -- a look at all of them

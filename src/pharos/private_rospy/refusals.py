@@ -5,7 +5,7 @@ import threading
 import time
 from typing import NamedTuple
 
-from pharos.private_rospy import changes
+from pharos.private_rospy import changes, registration
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.tcpros_connection import publisher_header
 
@@ -55,7 +55,9 @@ class Refusals:
             _remember(subscription.refused, uri, (said, None))
         header = ask()
         if header is None or header.get('md5sum') == wanted._md5sum:
-            subscription.refused.pop(uri, None)  # it has gone, or changed its mind
+            # it has gone, or changed its mind, or the reason is another one, which may pass
+            subscription.refused.pop(uri, None)
+            self._node.connections.connect_later(subscription, uri, registration.RETRY_DELAY)
             return
         refusal = Refusal(topic, header.get('callerid', uri), wanted, header)
         with self._lock:
