@@ -168,6 +168,18 @@ def test_a_closed_channel_latches_nothing_any_more(master, come):
     assert texts(late, 1) == ['news']
 
 
+def test_what_is_under_way_while_its_channel_closes_is_latched_no_more(master, come):
+    closed = latched_channel(master, '/latch/under_way')
+    unlatched = closed.node.output_channel('/latch/under_way')
+    fanout, latch = closed._fanout, closed.latched
+    closed.close()
+    fanout.publish(std_msgs.msg.String('gone'), latch)  # as another thread that was about to
+    late, _ = come('/late', '/latch/under_way')
+    until(lambda: unlatched.connections)
+    unlatched.send(data='news')
+    assert texts(late, 1) == ['news']
+
+
 def test_a_latched_value_survives_a_restart_of_the_master():
     first = InProcessMaster()
     port = int(first.url.split(':')[-1].strip('/'))

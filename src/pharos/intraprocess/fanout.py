@@ -56,6 +56,7 @@ class Latch:
     """
 
     def __init__(self) -> None:
+        self.is_closed = False  # whether the channel is
         self._to_all: Tuple[Frozen, ...] = ()  # the message, if there is one
         self._to_one: Dict[str, Tuple[Frozen, ...]] = {}  # by node name, where that is newer
 
@@ -123,7 +124,7 @@ class Fanout:
         self._has_header = freeze is None and getattr(message_class, '_has_header', False)
         self._freeze, self._thaw, self._size = copier_for(message_class)[:3]
         self._freeze = freeze or self._freeze
-        self._latches: Dict[Latch, None] = {}  # those that hold something, in order
+        self._latches: Dict[Latch, None] = {}  # of channels, in the order in which they first sent
         self._last_wake = 0.0  # when the last message woke a dispatcher
         self.set_connections(())
 
@@ -165,8 +166,7 @@ class Fanout:
             frozen = self._freeze(message) if inboxes or latch else b''
             data = self._sockets.serialize(message, self.seq) if remote else b''
             if latch:
-                latch.keep(frozen, connection.endpoint_id if connection else to)
-                self._latches[latch] = None
+                self._keep(latch, frozen, connection.endpoint_id if connection else to)
             if inboxes:
                 size = self._size_of(message, frozen) if self._size else 0
                 message = mark.put_on(message) if mark else message
@@ -181,6 +181,12 @@ class Fanout:
         for dispatcher in inline if runs_inline else ():
             dispatcher.run()
         return True
+
+    def _keep(self, latch: Latch, frozen: Frozen, receiver: Optional[str]) -> None:
+        latch.keep(frozen, receiver)
+        self._latches[latch] = None
+        if latch.is_closed:  # while this message was under way
+            self.forget(latch)
 
     def _size_of(self, message: Any, frozen: Frozen) -> int:
         assert self._size
@@ -248,6 +254,7 @@ class Fanout:
         :meth:`run` is to be called afterwards, without the lock.
         """
         with self._lock:
+            latch.is_closed = False
             self._latches[latch] = None
             for connection in self.connections:
                 for frozen in latch.of(connection.endpoint_id):
@@ -271,9 +278,14 @@ class Fanout:
             if not inbox.inline and inbox.dispatcher.idle:
                 inbox.dispatcher.wake()
 
-    def forget(self, latch: Latch) -> None:
-        """A channel closes, and what it latched goes with it."""
-        self._latches.pop(latch, None)
+    def forget(self, latch: Optional[Latch]) -> None:
+        """A channel closes, and what it latched goes with it.
+
+        It waits for no message that is under way, whose receiver may take none.
+        """
+        if latch is not None:
+            latch.is_closed = True
+            self._latches.pop(latch, None)
 
     def close(self) -> None:
         """Nothing is sent any more."""
