@@ -217,6 +217,21 @@ def test_a_node_that_stops_before_the_first_message_is_waited_for_ends_the_wait(
     assert waiting.channels == []
 
 
+def test_a_restart_of_its_own_node_between_two_messages_is_what_ends_the_wait(master, pair):
+    waiting, sending, channel = pair
+
+    def restart(message):
+        assert ended(in_thread(waiting.restart))
+
+    restarted = sending.output_channel('/waited/restarted', INT)
+    thread = in_thread(
+        lambda: restarted.wait_for_subscribers(timeout=TIMEOUT) and restarted.send(data=1)
+    )
+    with pytest.raises(pharos.NodeStoppedError, match='/waiting stops, and the wait'):
+        waiting.wait_for_message('/waited/restarted', INT, where=restart)
+    assert ended(thread)
+
+
 def test_what_does_not_come_in_time_is_a_timeout_error_that_names_the_publishers(master, pair):
     waiting, sending, channel = pair
     for topic, who in ('/waited', '/sending'), ('/waited/never', 'nobody'):

@@ -44,7 +44,7 @@ def next_message(
         channel = topic.open_input(NextMessages, node, typed_as, wait)
         try:
             while True:
-                message = channel.take(deadline)
+                message = channel.take(deadline, rospy)
                 if message is None:
                     _tell_late(channel, topic, timeout)
                 if where is None or where(message):
@@ -86,31 +86,27 @@ class NextMessages(InputChannel):
     def open_inbox(self, thaw: Callable[[Any], Any], header: Dict[str, str]) -> Inbox:
         return _WaitingInbox(self, self._waiting, thaw, header)
 
-    def take(self, deadline: Optional[float]) -> Optional[genpy.Message]:
+    def take(self, deadline: Optional[float], rospy: Any) -> Optional[genpy.Message]:
         """The next message; None where none comes until the deadline, by ``time.monotonic()``.
 
+        :param rospy: that of the run in which the wait began
         :raises NodeStoppedError: if the node stops, or the one on whose behalf this thread runs
         """
-        run, scheduled = self._run, self._waiting.scheduled
+        scheduled = self._waiting.scheduled
         while not self._taken:
             timeout = None if deadline is None else deadline - time.monotonic()
-            with signals.interruptible_wait(), Interruption(
-                self.notify, run.rospy.lifetime
-            ) as stop:
+            with signals.interruptible_wait(), Interruption(self.notify, rospy.lifetime) as stop:
                 is_in_time = wait_for(
                     self._changed,
-                    lambda: bool(scheduled) or stop.came or run.rospy.ended.is_set(),
+                    lambda: bool(scheduled) or stop.came or rospy.ended.is_set(),
                     timeout,
                 )
             if scheduled:
                 # takes nothing where the publisher has just dropped it for a newer one
                 scheduled.popleft().run_next()
             elif is_in_time:
-                who = (
-                    self.node.name
-                    if run.rospy.ended.is_set()
-                    else 'the node in whose block this is'
-                )
+                is_own = rospy.ended.is_set()
+                who = self.node.name if is_own else 'the node in whose block this is'
                 raise NodeStoppedError(
                     f'{who} stops, and the wait for a message on {self.topic} with it'
                 )

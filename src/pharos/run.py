@@ -114,7 +114,7 @@ class Run(Openings):
 
     def _check_not_stopped(self) -> None:
         if self._is_cancelled or self.is_ending:
-            raise NodeStoppedError('another thread has stopped it')
+            raise NodeStoppedError(f'another thread has stopped {self.node.name}, which started')
 
     def cancel_start(self) -> None:
         """Have the start end, where the node is starting: its caller gets a NodeStoppedError."""
