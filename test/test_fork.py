@@ -9,7 +9,7 @@ import pytest
 
 from helpers import create, ended, in_thread
 import pharos
-from pharos import BlockNode, memory
+from pharos import BlockNode, memory, node_registry
 from pharos.private_rospy import arguments, changes, parameters
 from pharos.testing import TIMEOUT
 from programs import Program
@@ -143,6 +143,35 @@ def test_a_node_of_the_parent_is_stopped_in_the_child(master, use):
         node.output_channel('/forks', 'std_msgs/String', latch=True).send(data='go')
         assert '/program' in program.wait_for('refused')
         program.wait_for('still running')
+
+
+def test_a_process_forked_while_another_thread_creates_a_node_does_not_fail_in_that(
+    master, monkeypatch
+):
+    claims, goes_on, really = threading.Event(), threading.Event(), node_registry._claim_name
+
+    def claim_name(*arguments):
+        really(*arguments)
+        claims.set()
+        goes_on.wait(TIMEOUT)
+
+    monkeypatch.setattr(node_registry, '_claim_name', claim_name)
+    # what a handler of forks raises, Python tells there
+    monkeypatch.setattr(sys, 'unraisablehook', lambda _: os._exit(3))
+    creating = in_thread(lambda: create(master, '/claiming'))
+    assert claims.wait(TIMEOUT)
+    with warnings.catch_warnings():  # Python 3.12 and later do not like what is tried here
+        warnings.simplefilter('ignore', DeprecationWarning)
+        child = os.fork()
+    if not child:
+        try:
+            os._exit(len(node_registry.nodes()))
+        finally:
+            os._exit(2)
+    status = os.waitpid(child, 0)[1]
+    goes_on.set()
+    assert ended(creating)
+    assert status == 0
 
 
 @pytest.mark.parametrize(

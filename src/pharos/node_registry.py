@@ -388,7 +388,8 @@ def _forget() -> None:
     for known in (_nodes, _stops, _starts, _waiting, _others, _starters):
         known.clear()  # type: ignore[attr-defined]
     for node in former:
-        node.latest_run.abandon()
+        if node.latest_run is not None:  # another thread may just have begun its first one
+            node.latest_run.abandon()
 
 
 signals.serve(lambda: bool(_nodes or _others or _stops), stop_all)
