@@ -559,6 +559,29 @@ def test_a_publisher_that_refuses_for_another_reason_is_tried_again(
         assert mailbox.next().data == 'reached'
 
 
+@pytest.mark.parametrize('hangs', ['before it is asked', 'before it shakes hands'])
+@pytest.mark.parametrize('shares', [False, True], ids=['alone', 'sharing'])
+def test_a_stop_does_not_wait_for_a_publisher_that_hangs(
+    master, stranger, transcript, hangs, shares, ros_master
+):
+    node = create(pharos.Master(ros_master.url, share_connections=shares), '/listener')
+    with contextlib.ExitStack() as ends:
+        silent = ends.enter_context(socket.create_server(('127.0.0.1', 0)))
+        port = silent.getsockname()[1]
+        if hangs == 'before it is asked':
+            uri = f'http://127.0.0.1:{port}/'
+            api = rosgraph.Master('/stranger', master_uri=ros_master.url).handle
+            api.registerPublisher('/stranger', '/hosts/hangs', STRING, uri)
+            ends.callback(api.unregisterPublisher, '/stranger', '/hosts/hangs', uri)
+        else:
+            stranger('/hosts/hangs', port)
+        node.interested_in('/hosts/hangs', STRING)
+        silent.settimeout(TIMEOUT)
+        ends.enter_context(silent.accept()[0])
+        node.stop()
+        assert not [line for line in transcript if 'left behind' in line]
+
+
 # -- a look at all of them
 
 LOOKING = '''

@@ -12,7 +12,7 @@ from pharos.private_rospy import changes, departures, registration, shared_conne
 from pharos.private_rospy.deadlines import time_limit
 from pharos.private_rospy.descriptors import ForConnections
 from pharos.private_rospy.process_rospy import rospy
-from pharos.private_rospy.proxies import ServerProxy
+from pharos.private_rospy.proxies import ServerProxy, interruption
 from pharos.private_rospy.registration import UNREGISTER_TIMEOUT, registered
 from pharos.private_rospy.socket_callback import SocketCallback
 
@@ -271,8 +271,10 @@ class Connections:
                 return 1, f'connected to {uri} already', 0
             transports = tuple(handler.protocol_handlers or ())
             offered = [each for transport in transports for each in transport.get_supported()]
+            proxy = ServerProxy(uri)
             try:
-                code, text, chosen = ServerProxy(uri).requestTopic(self._node.name, topic, offered)
+                with interruption(proxy):  # who hangs answers nothing, and the stop does not wait
+                    code, text, chosen = proxy.requestTopic(self._node.name, topic, offered)
                 return (code, text, 0) if code <= 0 else self._open(transports, topic, uri, chosen)
             except ConnectionRefusedError as error:
                 return 0, str(error), 0
