@@ -339,7 +339,7 @@ class Topic:
         while True:
             try:
                 return self._class_of(self.type, receives)
-            except (UnknownTopicError, UnknownTypeError):  # only subscribers are there
+            except (UnknownTopicError, UnknownTypeError):  # no publisher is there yet
                 if time.monotonic() >= deadline:
                     raise
             except NodeStoppedError as error:

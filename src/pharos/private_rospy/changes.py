@@ -1,10 +1,11 @@
-"""Waiting for connections of the publishers of this process."""
+"""Waiting for what the nodes of this process are connected to."""
 import os
 
 from pharos.private_rospy.condition import Condition
 from pharos.private_rospy.lifetime import Interruption, wait_for
 
-# notified whenever a publisher of this process gains or loses a connection
+# notified whenever a publisher of this process gains or loses a connection, a subscription gains one or
+# is refused or cannot have it, and whenever a node stops
 _changed = Condition()
 
 
@@ -15,7 +16,7 @@ def notify():
 
 
 def wait_until(lifetime, predicate, timeout):
-    """Wait until ``predicate()``, which speaks of connections of publishers of this process, holds.
+    """Wait until ``predicate()``, which speaks of connections of this process's nodes, holds.
 
     :param timeout: seconds, None: no limit
     :param lifetime: of the node with whose stop the wait ends

@@ -73,7 +73,8 @@ class Sender:
         self._is_idle = True  # nothing is on its way but what the socket has
         self._error = None  # of the thread, for the next who publishes, as in rospy
         self.is_unsure = False  # whether who is interrupted leaves a part of a message, or disorder
-        self._changed = Condition()  # guards all above
+        # guards what waits and how it is written; notified when there is something, or the last was written
+        self._changed = Condition()
         self._cleanup = connection.cleanup_cb  # where it has been in use without a queue
         connection.set_cleanup_callback(self._closed)
         start_thread(self._run, name='sender')
