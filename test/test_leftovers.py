@@ -257,7 +257,8 @@ def test_two_nodes_that_have_no_descriptors_to_connect_say_so(master, monkeypatc
     with pytest.raises(pharos.PharosError, match='/receiver cannot connect to /lacking: .* -n'):
         sender.output_channel('/lacking', 'std_msgs/String')
     monkeypatch.undo()
-    assert sender.output_channel('/lacking', 'std_msgs/String').connections
+    channel = sender.output_channel('/lacking', 'std_msgs/String')
+    assert channel.wait_for_subscribers(timeout=TIMEOUT)
 
 
 def refuse_descriptors(monkeypatch):
