@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Tuple, Ty
 
 import genpy
 
-from pharos import on_demand
+from pharos import on_demand, signals
 from pharos.blocks import Block, attempt, check_delegate, check_flag
 from pharos.errors import NodeStoppedError, PharosError
 from pharos.intraprocess.inbox import Inbox, SocketInbox
@@ -88,9 +88,10 @@ class Channel:
         When it returns, no delegate runs for the channel any more; but for the one that calls it,
         if one does, and one that does not end within the node's ``stop_timeout``.
         """
-        self.closed = True  # where it is only just being opened, it is closed right after that
-        self._run.forget(self)
-        self._release()
+        with signals.held():
+            self.closed = True  # where it is only just being opened, it is closed right after that
+            self._run.forget(self)
+            self._release()
 
     def _release(self) -> None:
         """Give rospy's Publisher or Subscriber back, if there is one."""

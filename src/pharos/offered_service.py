@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Dict, Union
 
 import genpy
 
-from pharos import messages
+from pharos import messages, signals
 from pharos.blocks import Block, check_block, text_of
 from pharos.errors import MessageTypeError, PharosError
 from pharos.intraprocess.copier import copier_for
@@ -175,11 +175,12 @@ class OfferedService:
 
     def close(self) -> None:
         """Offer it no longer. Harmless when done twice."""
-        self.closed = True  # where it is only just being opened, it is closed right after that
-        if self in self.node.latest_run.opened:
-            self.node.latest_run.forget(self)
-            with time_limit(UNREGISTER_TIMEOUT):
-                self._service.shutdown('closed')
+        with signals.held():
+            self.closed = True  # where it is only just being opened, it is closed right after that
+            if self in self.node.latest_run.opened:
+                self.node.latest_run.forget(self)
+                with time_limit(UNREGISTER_TIMEOUT):
+                    self._service.shutdown('closed')
 
     def __repr__(self) -> str:
         return f'<OfferedService {self.name} {self.type} of {self.node.name}>'

@@ -89,8 +89,6 @@ class _Signal:
         """Whether the main thread, which is at that frame, can be cut off there."""
         now = time.monotonic()
         if _holds:
-            if self.error is not None and not _runs_ours(_without_pythons(frame), 1):
-                return True  # in a block of the program's, whose handler it was
             return now - self._came > HOLD_LIMIT
         if _waits:
             return True
@@ -107,7 +105,7 @@ class _Signal:
 
 class _Postponing:
     """A handler of the program's own while the main thread is in a :func:`held`: it is called at
-    once, and what it raises in code of ours is raised afterwards."""
+    once, and what it raises is raised afterwards."""
 
     def __init__(self, number: int, handler: Any) -> None:
         self._number = number
@@ -244,8 +242,8 @@ def interruptible_wait(is_cut_off: bool = False) -> Iterator[None]:
 
 @contextlib.contextmanager
 def held(is_end: bool = False) -> Iterator[None]:
-    """Within this, a signal raises nothing in code of ours in the main thread, and afterwards what
-    it would have raised, by a handler of the program's own, too.
+    """Within this, a signal raises nothing in the main thread, and afterwards what it would have
+    raised, by a handler that the program had before, too.
 
     A start or a stop that is torn up half way leaves registrations behind, and the end of the
     program programs, too. After HOLD_LIMIT seconds it is cut off all the same.
