@@ -26,9 +26,8 @@ from std_msgs.msg import Int32
 
 clock = time.perf_counter
 PATIENCE = 60.0  # seconds for all to be there
-CPU_CLOCK = (
-    2  # of the clocks of a process, that of what it computes; /proc has it in ticks of 10 ms
-)
+# of the clocks of a process, that of what it computes, which /proc has in ticks of 10 ms
+CPU_CLOCK = 2
 # Who has limits, where this runs as root: a user of no other process, also of none in other containers,
 # which the kernel counts and /proc does not show.
 NOBODY = 60000 + os.getpid() % 5000
