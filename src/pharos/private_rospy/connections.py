@@ -11,6 +11,7 @@ from pharos.private_rospy.names import Resolved
 from pharos.private_rospy import changes, departures, registration, shared_connections, threads
 from pharos.private_rospy.deadlines import time_limit
 from pharos.private_rospy.descriptors import ForConnections
+from pharos.private_rospy.lifetime import Interruption
 from pharos.private_rospy.process_rospy import rospy
 from pharos.private_rospy.proxies import ServerProxy, interruption
 from pharos.private_rospy.registration import UNREGISTER_TIMEOUT, registered
@@ -231,8 +232,11 @@ class Connections:
                 return 1, f'connecting to {uri} already', 0
             self._connecting[key] = False
         while True:
+            # A publisher elsewhere that hangs is not waited for when the node stops.
+            waits = None if is_local else Interruption(lifetime=self._node.lifetime)
             try:
-                answer = self._negotiate(topic, uri, is_local)
+                with waits or contextlib.nullcontext():
+                    answer = self._negotiate(topic, uri, is_local)
             except BaseException:  # else nobody would ever connect to it again
                 with self._lock:
                     del self._connecting[key]
@@ -271,9 +275,9 @@ class Connections:
                 return 1, f'connected to {uri} already', 0
             transports = tuple(handler.protocol_handlers or ())
             offered = [each for transport in transports for each in transport.get_supported()]
-            proxy = ServerProxy(uri)
             try:
-                with interruption(proxy):  # who hangs answers nothing, and the stop does not wait
+                proxy = ServerProxy(uri)
+                with contextlib.nullcontext() if is_local else interruption(proxy):
                     code, text, chosen = proxy.requestTopic(self._node.name, topic, offered)
                 return (code, text, 0) if code <= 0 else self._open(transports, topic, uri, chosen)
             except ConnectionRefusedError as error:
