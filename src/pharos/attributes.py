@@ -50,6 +50,7 @@ def _check_run(name: str, value: Any) -> Any:
 _CHECKS: Dict[str, Callable[[str, Any], Any]] = {
     'connect_timeout': check_seconds,
     'stop_timeout': check_seconds,
+    'client_timeout': check_seconds,
     'queue_bytes': _check_bytes,
     'soul': lambda name, block: check_soul(block),
     'delegate': lambda name, block: check_delegate(block),
@@ -72,6 +73,8 @@ class NodeAttributes:
     queue_bytes = 64 << 20
     #: whether any host may ask it to stop, not only this one and the master's
     allow_remote_shutdown = False
+    #: seconds in which a client that connects must have said who it is
+    client_timeout = 5.0
     #: seconds that :meth:`stop` waits for souls, and for messages under way
     stop_timeout = 2.0
     #: the block that says what the node does, called as ``soul(node)`` by :meth:`execute` and

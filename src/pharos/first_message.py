@@ -40,13 +40,13 @@ def wait_for_known_subscribers(channel: 'OutputChannel', timeout: float, deadlin
             other.name for other in node.master.local_nodes() if other.latest_run.is_ending
         )
         missing.difference_update(rospy.refusals.subscribers(channel.topic))
-        return not missing or not channel.is_open
+        return not missing or not channel.is_open or not node.is_running
 
     with Interruption(lifetime=rospy.lifetime) as stop:
         while True:
             left = deadline - time.monotonic()
             rospy.wait_until(connected, min(left, ANSWER_TIMEOUT))
-            if connected() or stop.came or not node.is_running:
+            if connected() or stop.came:
                 return
             if left <= ANSWER_TIMEOUT:
                 break
@@ -59,13 +59,13 @@ def wait_for_known_subscribers(channel: 'OutputChannel', timeout: float, deadlin
 
 
 def _may_connect(channel: 'OutputChannel', name: str) -> bool:
-    """Whether a subscriber is worth the wait: it answers, was not killed for example, and does not
-    hear the channel through the connection of another node of its process."""
+    """False if the subscriber refuses connections, or hears the channel through another node of its
+    process. One that does not answer may connect yet."""
     node = channel.node
     connections = node.master.bus_info(name)
     return connections is not None and not any(
-        uri == node.uri and topic == channel.topic and about and SHARED in about[-1]
-        for _, uri, _, _, topic, *about in connections
+        node.uri in told and channel.topic in told and SHARED in told
+        for told in (str(connection) for connection in connections)
     )
 
 

@@ -142,15 +142,15 @@ class MasterCalls:
             return or_busy and not isinstance(error, ConnectionRefusedError)
 
     def bus_info(self, name: str) -> Optional[List[Any]]:
-        """The connections of the node of that name as ROS's getBusInfo has them; None where it does
-        not answer."""
+        """The connections of the node of that name as ROS's getBusInfo has them, [] if it does not
+        answer as a node does; None if it is not registered, or refuses the connection."""
         try:
             answer = self._ask_node(name, 'getBusInfo')
-        except xmlrpc.client.Fault:  # it has no such method
-            return []
-        except COMMUNICATION_ERRORS:
+            return answer and list(answer[2])
+        except ConnectionRefusedError:
             return None
-        return answer and answer[2]
+        except (*COMMUNICATION_ERRORS, xmlrpc.client.Fault, TypeError, LookupError):
+            return []
 
     def _ask_node(self, name: str, method: str) -> Any:
         """What the XML-RPC server of a node answers, None where the master knows no such node.

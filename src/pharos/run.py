@@ -58,6 +58,8 @@ class Run(Openings):
         self.restart: Optional[Restart] = None
         descriptors.check_left(descriptors.STARTING, f'{settings.name} cannot start')
         self.rospy = PrivateRospy(settings, self._stop_for_ros, lambda: node.allow_remote_shutdown)
+        limits = self.rospy.limits
+        limits.handshake_timeout = limits.request_timeout = node.client_timeout
         on_behalf = self.rospy.lifetime.run_on_behalf if self.may_run_elsewhere else None
         self.dispatcher = Dispatcher(self.rospy.start_thread, on_behalf=on_behalf)
         self.rospy.on_received = self.dispatcher.run
