@@ -1,23 +1,25 @@
-"""What the tests of several files need: nodes, threads, a master in this process."""
-import itertools
+"""Masters, nodes, peers and programs that the tests of several files need."""
+import os
+import pathlib
+import pickle
 import signal
+import socket
+import subprocess
 import sys
 import threading
 
-import numpy
-import pytest
 import rosmaster.master
 
-from pharos import BlockNode
-from pharos.private_rospy.local_link import PROTOCOL
-from pharos.testing import TIMEOUT
+import pharos
+from pharos import BlockNode, Master, Node
+from pharos.testing import until
 
-#: of a test that serializes a numpy_msg
-serializes_numpy = pytest.mark.skipif(
-    not hasattr(numpy.ndarray, 'tostring'),
-    reason="genpy's code writes numpy_msg with ndarray.tostring, which this numpy has no more; "
-    'bare rospy fails, too',
-)
+ROOT = pathlib.Path(__file__).resolve().parent.parent
+PYTHON = '/usr/bin/python3'
+#: begins a command whose signals do what they do by default, also under nohup
+DEFAULT_SIGNALS = ['env', '--default-signal=INT,TERM,HUP']
+TIMEOUT = 30  # seconds; a test that passes never waits so long
+_created = []
 
 
 class InProcessMaster:
@@ -26,93 +28,225 @@ class InProcessMaster:
     def __init__(self, port=0):
         self._master = rosmaster.master.Master(port=port)
         self._master.start()
-        ready = threading.Event()
-        while not self._master.uri:
-            ready.wait(0.001)  # rosmaster has no event for it
+        until(lambda: self._master.uri)
         self.url = f'http://127.0.0.1:{self._master.master_node.port}/'
 
-    @property
-    def handler(self):
-        """What answers its calls."""
-        return self._master.handler
-
     def forget(self):
-        """Forget the parameters, and the type of each topic that no node has, which rosmaster itself
-        never does: the next test may use the names for others."""
-        handler = self.handler
+        """Forget parameters and types of topics, so that the next test can use their names."""
+        handler = self._master.handler
         with handler.param_server.lock:
             handler.param_server.parameters.clear()
         with handler.ps_lock:
-            kept = set(handler.publishers.map) | set(handler.subscribers.map)
-            for topic in set(handler.topics_types) - kept:
-                del handler.topics_types[topic]
+            handler.topics_types.clear()
 
     def stop(self):
-        """End its server."""
+        """End its server; rosgraph only closes the socket, and its thread spins (ros_comm #2238)."""
         node = self._master.master_node
         node.is_shutdown = True
-        # rosgraph itself only closes its socket, and its thread spins (ros_comm #2238)
         node.server.shutdown()
         self._master.stop()
 
 
+class MortalMaster:
+    """A rosmaster in a process of its own, which can be killed and started again at its URL."""
+
+    def __init__(self):
+        with socket.create_server(('127.0.0.1', 0)) as free:
+            self.url = f'http://127.0.0.1:{free.getsockname()[1]}/'
+        self.master = Master(self.url)
+        self.come_back()
+
+    @property
+    def pid(self):
+        return self._program.pid
+
+    def come_back(self):
+        """Start an empty one."""
+        port = self.url.rsplit(':', 1)[1].strip('/')
+        self._program = Program(['rosmaster', '--core', '-p', port], self.url)
+        until(self.master.is_reachable)
+
+    def end(self):
+        """Kill it, as by kill -9."""
+        self._program.__exit__()
+
+
 def create(master, name='/node', node_class=BlockNode, **settings):
-    """A node on the loopback interface; the fixture of the master stops it."""
-    return master.create(node_class, named=name, **{'domain': '127.0.0.1', **settings})
-
-
-def speak_tcpros_only(node):
-    """Have the node connect by sockets alone, as those of other processes do; returns it."""
-    handlers = node.latest_run.rospy.lifetime.xmlrpc.handler.protocol_handlers
-    handlers[:] = [handler for handler in handlers if not handler.supports(PROTOCOL)]
-    impl = node.latest_run.rospy.module.impl
-    impl.tcpros_service.TCPROSTransport = impl.tcpros_base.TCPROSTransport
+    """Create a node, which the fixture of the master stops."""
+    node = master.create(node_class, named=name, **settings)
+    _created.append(node)
     return node
 
 
-def in_thread(block, *arguments):
-    """Run ``block(*arguments)`` in a thread; returns that."""
-    thread = threading.Thread(target=block, args=arguments, daemon=True)
-    thread.start()
-    return thread
-
-
-def ended(thread):
-    """Wait for the end of a thread; returns whether it came."""
-    thread.join(TIMEOUT)
-    return not thread.is_alive()
+def stop_nodes(master=None):
+    """Stop all nodes of this process that `create` made or that the master knows."""
+    known = [node for node in master.nodes() if isinstance(node, Node)] if master else []
+    for node in [*_created, *known]:
+        node.stop()
+    _created.clear()
 
 
 def registrations(master, name):
-    """The topics that the node publishes, those it hears, and the services that it offers."""
+    """The topics that a node publishes, those that it hears, and its services, as three lists."""
     return [
-        sorted(topic for topic, nodes in kind.items() if name in nodes)
+        sorted(key for key, nodes in kind.items() if name in nodes)
         for kind in master.system_state()
     ]
 
 
-def interrupted_at(step, block, modules, with_signal=None):
-    """Have ``block()`` end with a KeyboardInterrupt, as by a handler of signals, at a step of what is
-    in these modules; returns whether it came so far.
+class Peer:
+    """A rospy node in a process of its own, which runs Python as the test asks.
 
-    :param with_signal: the number of one, whose handler is to raise it; otherwise it comes without
+    ``peer.run(code)`` executes statements, ``peer.value(expression)`` returns a value; both know
+    rospy, pharos' message_class, and what earlier code defined.
     """
-    files = [module.__file__ for module in modules]
-    steps = itertools.count()
 
-    def look(frame, event, argument):
-        is_step = frame.f_code.co_filename in files and event in ('call', 'c_return')
-        if is_step and next(steps) == step:
-            sys.setprofile(None)
-            if with_signal is None:
-                raise KeyboardInterrupt
-            signal.getsignal(with_signal)(with_signal, frame)  # as where that code takes it
+    def __init__(self, url, name='peer'):
+        environ = {**os.environ, 'ROS_MASTER_URI': url}
+        command = [*DEFAULT_SIGNALS, PYTHON, __file__, name]
+        self.name = '/' + name.lstrip('/')
+        self.process = subprocess.Popen(
+            command, env=environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
+        self._lock = threading.Lock()
+        assert self._answer() == 'ready'
 
-    sys.setprofile(look)
-    try:
-        block()
-    except KeyboardInterrupt:
-        return True
-    finally:
-        sys.setprofile(None)
-    return False
+    @property
+    def pid(self):
+        return self.process.pid
+
+    def run(self, code):
+        """Execute statements; raises here what they raise there."""
+        self._ask('exec', code)
+
+    def value(self, expression):
+        """Return the value of an expression; it must pickle."""
+        return self._ask('eval', expression)
+
+    def hear(self, topic, type_):
+        """Subscribe; the messages come into the list of the topic in ``heard``."""
+        self.run(
+            f'heard.setdefault({topic!r}, []); subscribers.append(rospy.Subscriber({topic!r},'
+            f' message_class({type_!r}), heard[{topic!r}].append))'
+        )
+
+    def heard(self, topic, count=1):
+        """Wait for so many messages of a topic; returns all that came."""
+        until(lambda: self.value(f'len(heard[{topic!r}])') >= count, TIMEOUT)
+        return self.value(f'heard[{topic!r}]')
+
+    def _ask(self, kind, text):
+        with self._lock:
+            pickle.dump((kind, text), self.process.stdin)
+            self.process.stdin.flush()
+            return self._answer()
+
+    def _answer(self):
+        answer = pickle.load(self.process.stdout)
+        if isinstance(answer, BaseException):
+            raise answer
+        return answer
+
+    def end(self):
+        """Kill it, as by kill -9."""
+        self.process.kill()
+        self.process.wait()
+        self.process.stdin.close()
+        self.process.stdout.close()
+
+    def close(self):
+        """Let it end and unregister."""
+        self.process.stdin.close()
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGCONT)
+            self.process.wait(TIMEOUT)
+        self.end()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.close()
+
+
+class Program:
+    """A program in a child process, whose lines of output a test can wait for.
+
+    :param source: Python code as text, or a command as a list
+    """
+
+    def __init__(self, source, url, *arguments, **environ):
+        command = [PYTHON, '-u', '-c', source] if isinstance(source, str) else list(source)
+        self._process = subprocess.Popen(
+            [*DEFAULT_SIGNALS, *command, *arguments],
+            env={**os.environ, 'ROS_MASTER_URI': url, 'PYTHONUNBUFFERED': '1', **environ},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        self._lines = []
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+        self.pid, self.poll = self._process.pid, self._process.poll
+
+    def _read(self):
+        for line in self._process.stdout:
+            self._lines.append(line)
+
+    @property
+    def output(self):
+        """What it has written so far, to standard output and error."""
+        return ''.join(self._lines)
+
+    def expect(self, text):
+        """Wait until it has written the text."""
+        until(lambda: text in self.output or self.poll() is not None, TIMEOUT, repr(text))
+        self._reader.join(TIMEOUT if self.poll() is not None else 0)
+        assert text in self.output, self.output
+
+    def signal(self, number):
+        """Send it a signal."""
+        self._process.send_signal(number)
+
+    def wait(self):
+        """Wait for its end; returns its exit code, negative if a signal ended it."""
+        code = self._process.wait(TIMEOUT)
+        self._reader.join(TIMEOUT)
+        return code
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        if self.poll() is None:
+            self._process.kill()
+        self.wait()
+        self._process.stdout.close()
+
+
+def _serve_as_peer():
+    """Answer the requests of a Peer until standard input ends."""
+    import rospy
+
+    answers = os.fdopen(os.dup(1), 'wb')
+    os.dup2(2, 1)  # what is printed must not come between
+    rospy.init_node(sys.argv[1])
+    scope = {'rospy': rospy, 'message_class': pharos.message_class, 'heard': {}, 'subscribers': []}
+    answer = 'ready'
+    while True:
+        pickle.dump(answer, answers)
+        answers.flush()
+        try:
+            kind, text = pickle.load(sys.stdin.buffer)
+        except EOFError:
+            return
+        try:
+            answer = eval(text, scope) if kind == 'eval' else exec(text, scope)
+            pickle.dumps(answer)
+        except BaseException as error:
+            answer = RuntimeError(f'{type(error).__name__}: {error}')
+
+
+if __name__ == '__main__':
+    _serve_as_peer()

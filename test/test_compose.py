@@ -1,292 +1,711 @@
-"""master.compose: launch files whose Python nodes run in this process."""
-import json
+"""Unmodified rospy programs and launch files run as nodes of one process."""
+import importlib
 import os
 import pathlib
+import shutil
 import signal
+import sys
+import textwrap
+import traceback
+import xmlrpc.client
 
+import genpy
 import pytest
 
 import pharos
-from helpers import create
-from pharos.compose import composition
-from pharos.testing import Mailbox, TIMEOUT, until
-from programs import ROOT, forget_parameters
+from helpers import TIMEOUT, Peer, Program, create, registrations
+from pharos import ExternalNode, Master, PharosError, ScriptNode, UnknownNodeError
+from pharos.testing import Mailbox, until
 
-PACKAGE = ROOT / 'test' / 'programs' / 'composed_robot'
+ROBOT = pathlib.Path(__file__).parent / 'robot'
+COMPOSE = ['rosrun', 'pharos', 'compose']
 STRING = 'std_msgs/String'
+HEAD = (
+    '#!/usr/bin/python3\nimport os, sys, threading\nimport rospy\nfrom std_msgs.msg import String\n'
+)
+SPIN = "rospy.init_node('program')\nrospy.spin()\n"
+
+
+@pytest.fixture(scope='module')
+def packages(tmp_path_factory):
+    """A folder with the package robot, where rospack does not ignore it."""
+    folder = tmp_path_factory.mktemp('packages')
+    shutil.copytree(
+        ROBOT, folder / 'robot', ignore=shutil.ignore_patterns('CATKIN_IGNORE', '*.pyc')
+    )
+    return folder
 
 
 @pytest.fixture(autouse=True)
-def packages(monkeypatch, tmp_path):
-    """The packages of test/programs are on ROS_PACKAGE_PATH; ROS's own folder is the test's."""
-    monkeypatch.setenv('ROS_PACKAGE_PATH', os.pathsep.join([str(PACKAGE.parent), '/usr/share']))
+def package_path(packages, monkeypatch, tmp_path):
+    """ROS finds the package robot, and the package of the test's own scripts."""
+    (tmp_path / 'bench').mkdir()
+    (tmp_path / 'bench' / 'package.xml').write_text('<package><name>bench</name></package>')
+    paths = [packages, tmp_path / 'bench', os.environ.get('ROS_PACKAGE_PATH', ''), '/usr/share']
+    monkeypatch.setenv('ROS_PACKAGE_PATH', os.pathsep.join(map(str, paths)))
     monkeypatch.setenv('ROS_HOME', str(tmp_path))
 
 
 @pytest.fixture
-def compose(master):
-    """``compose('chat.launch', text='hello')``: a Composition, which ends with the test."""
+def write(tmp_path):
+    """``write(text, name)`` makes a script of the package bench; returns its path."""
+
+    def write(text, name='program', head=HEAD):
+        path = tmp_path / 'bench' / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(head + textwrap.dedent(text))
+        path.chmod(0o755)
+        return str(path)
+
+    return write
+
+
+@pytest.fixture
+def load(master, write):
+    """``load(text, *args, **options)`` loads a script; the fixture of the master stops it."""
+    return lambda text, *args, **options: master.load(write(text), None, *args, **options)
+
+
+@pytest.fixture
+def ends(master, tmp_path):
+    """``ends(how)`` loads a script that ends in this way; it may write to tmp_path/said."""
+    return lambda how: master.load('robot', 'ends', how, str(tmp_path / 'said'))
+
+
+@pytest.fixture
+def compose(master, tmp_path):
+    """``compose('<node .../>')`` or ``compose('a.launch')`` of robot; it ends with the test."""
     begun = []
 
-    def compose(file, **options):
-        begun.append(master.compose('composed_robot', file, **options))
+    def compose(what, **options):
+        package = 'robot'
+        if what.startswith('<'):
+            package, path = None, tmp_path / 'test.launch'
+            path.write_text(f'<launch>{what}</launch>')
+            what = str(path)
+        begun.append(master.compose(package, what, **options))
         return begun[-1]
 
     yield compose
-    for each in begun:
-        each.stop()
-    forget_parameters(master.url)
+    for composition in begun:
+        composition.stop()
 
 
-def test_the_python_nodes_of_a_launch_file_run_in_this_process(master, compose):
-    composed = compose('chat.launch')
-    assert [node.name for node in composed.nodes] == ['/talker']
-    assert isinstance(composed, pharos.Composition)
-    assert master.node('/talker') is composed.nodes[0]
+def node(type_, package='bench', more='', inside=''):
+    """Return the element of a launch file for a node, named after its type."""
+    return f'<node pkg="{package}" type="{type_}" name="{type_}" {more}>{inside}</node>'
 
 
-def test_the_others_run_as_roslaunch_starts_them(master, compose):
-    mailbox = Mailbox(create(master, '/hearer'), '/heard', STRING)
-    composed = compose('chat.launch', text='by way of C++')
-    assert mailbox.next(TIMEOUT).data == 'by way of C++'
-    assert isinstance(master.node('/relay'), pharos.ExternalNode)
-    assert composed.process.poll() is None
+def links(ros_node):
+    """Return the links by which a node sends, as ``(topic, receiver, transport)``."""
+    _, _, found = xmlrpc.client.ServerProxy(ros_node.uri).getBusInfo('/test')
+    return {(topic, receiver, how) for _, receiver, way, how, topic, *_ in found if way == 'o'}
 
 
-def test_there_is_no_process_where_all_nodes_run_here(compose):
-    assert compose('respawn.launch', delay=100).process is None
+# -- a whole robot, composed and as processes
 
 
-def test_a_python_node_runs_apart_where_asked_for(master, compose):
-    composed = compose('chat.launch', apart=['talker'])
-    assert composed.nodes == []
-    assert isinstance(master.wait_for_node('/talker', TIMEOUT), pharos.ExternalNode)
+SCRIPTS = 'front', 'avoider', 'gripper', 'settings', 'heartbeat', 'mission'
+FACTS = (
+    'started_as ranges commands beats latched_by_timer service private_service action'
+    ' preempted_action state parameters log warning topics registrations switched_off left'
+).split()
 
 
-def test_the_parameters_of_the_file_are_set(master, compose):
-    compose('chat.launch', only=['talker'])
-    assert master.parameters['/said_by'] == 'the file'
-    assert master.parameters['/talker/text'] == 'hello'
+def behaviour(start):
+    """Return what a rospy node in another process finds out about the robot that `start` starts."""
+    with Master.embedded() as master, Peer(master.url) as peer:
+        peer.run((ROBOT / 'observer.py').read_text())
+        with start(master):
+            facts = peer.value('observe()')
+            names = [f'/rover/{name}' for name in SCRIPTS]
+            facts['registrations'] = [registrations(master, name) for name in names]
+        facts['switched_off'] = master.parameters['/switched_off']
+        facts['left'] = [registrations(master, name) for name in names]
+        return facts
 
 
-def test_parameters_are_cleared_where_the_file_says_so(master, compose):
-    master.parameters['/cleared/old'] = 1
-    master.parameters['/kept/old'] = 1
-    compose('cleared.launch')
-    assert master.parameters['/cleared'] == {'new': 1}
-    assert master.parameters['/kept/old'] == 1
+@pytest.fixture(scope='module')
+def robots(packages):
+    """What others find out about the robot: composed, and started by roslaunch."""
+    path = os.pathsep.join([str(packages), '/usr/share'])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv('ROS_PACKAGE_PATH', path)
+        composed = behaviour(lambda master: master.compose('robot', 'robot.launch'))
+        launched = behaviour(lambda master: master.launch('robot', 'robot.launch'))
+    return composed, launched
 
 
-def test_what_the_master_refuses_is_told_with_the_file(compose):
-    with pytest.raises(pharos.PharosError, match='parameters.launch: Failed to clear parameter'):
-        compose('parameters.launch', cleared='/')
+def test_composed_robot_behaves_as_launched(robots):
+    composed, launched = robots
+    assert composed == launched
 
 
-def test_a_node_finds_what_roslaunch_would_have_given_it(master, compose):
-    mailbox = Mailbox(create(master, '/hearer'), '/reflection', STRING)
-    compose('mirror.launch')
-    told = json.loads(mailbox.next(TIMEOUT).data)
-    run_id = master.parameters['/run_id']
-    log = os.path.join(os.environ['ROS_LOG_DIR'], run_id, 'deep-mirror-1.log')
-    assert told['argv'] == [
-        *(str(PACKAGE / 'scripts' / 'mirror.py'), 'one', 'two words'),
-        *('mirrored:=/reflection', '__name:=mirror', f'__log:={log}'),
-    ]
-    assert told['environment']['FOR_ONE'] == '1'
-    assert told['environment']['ROS_NAMESPACE'] == '/deep'
-    assert told['environment']['ROS_MASTER_URI'] == master.url
-    assert told['parameters'] == {'list': [1, 2]}
-    assert os.path.exists(log)
+# -- master.load: one script
 
 
-def test_the_environment_of_a_node_is_its_own(compose):
-    compose('mirror.launch')
-    assert 'FOR_ONE' not in os.environ
+def test_loaded_script_is_a_node(master, load):
+    script = load(SPIN)
+    assert isinstance(script, ScriptNode) and isinstance(script, pharos.Node)
+    assert master.node('/program') is script
+    assert script in master.nodes()
+    assert script.is_running
 
 
-@pytest.mark.parametrize('where, folder', [('node', PACKAGE / 'scripts'), ('ROS_HOME', None)])
-def test_the_working_directory_of_a_node_is_its_own(master, compose, where, folder, tmp_path):
-    before = os.getcwd()
-    mailbox = Mailbox(create(master, '/hearer'), '/reflection', STRING)
-    compose('mirror.launch', cwd=where)
-    told = json.loads(mailbox.next(TIMEOUT).data)
-    assert told['folder'] == str(folder or tmp_path)
-    assert os.getcwd() == before
+def test_path_and_args_are_kept(master, packages):
+    script = master.load('robot', 'gripper', '--fast', 'x:=y')
+    assert script.path == str(packages / 'robot' / 'scripts' / 'gripper')
+    assert list(script.args)[:2] == ['--fast', 'x:=y']
 
 
-def printed_by_mirror(master, compose, output, capfd):
-    """What comes on the screen, on standard output and the errors, and into its file."""
-    mailbox = Mailbox(create(master, '/hearer'), '/reflection', STRING)
-    composed = compose('mirror.launch', output=output)
-    mailbox.next(TIMEOUT)  # printed before this
-    composed.stop()
-    folder = os.path.join(os.environ['ROS_LOG_DIR'], master.parameters['/run_id'])
-    path = pathlib.Path(folder, 'deep-mirror-1-stdout.log')
-    return (*capfd.readouterr(), path.read_text() if path.exists() else '')
+@pytest.mark.parametrize(
+    'args, options, name',
+    [
+        ([], {}, '/program'),
+        ([], {'name': 'arm'}, '/arm'),
+        ([], {'namespace': '/left'}, '/left/program'),
+        ([], {'namespace': 'left', 'name': 'arm'}, '/left/arm'),
+        (['__name:=leg'], {}, '/leg'),
+        (['__ns:=/right', '__name:=leg'], {}, '/right/leg'),
+    ],
+)
+def test_node_takes_given_name(load, args, options, name):
+    script = load(SPIN, *args, **options)
+    assert script.name == script.ros.get_name() == name
 
 
-def test_what_a_node_prints_goes_to_its_log_file_and_errors_to_the_screen(master, compose, capfd):
-    printed, errors, logged = printed_by_mirror(master, compose, 'log', capfd)
-    assert 'mirror' not in printed
-    assert '[/deep/mirror] complained\n' in errors
-    assert logged == 'printed by the mirror\n'
+def test_anonymous_names_are_unique(master, write):
+    path = write("rospy.init_node('program', anonymous=True)\nrospy.spin()")
+    with master.load(path) as one, master.load(path) as other:
+        assert one.name.startswith('/program_')
+        assert one.name != other.name
 
 
-def test_what_a_node_prints_comes_on_the_screen_with_its_name(master, compose, capfd):
-    printed, errors, logged = printed_by_mirror(master, compose, 'screen', capfd)
-    assert printed == '[/deep/mirror] printed by the mirror\n'
-    assert '[/deep/mirror] complained\n' in errors
-    assert logged == ''
+SAY = "rospy.init_node('program')\nrospy.set_param('/said', {})\nrospy.spin()"
 
 
-def test_callbacks_and_child_processes_are_in_the_working_directory_too(master, compose):
-    node = create(master, '/asking')
-    mailbox = Mailbox(node, '/reflection', STRING)
-    compose('mirror.launch')
-    mailbox.next(TIMEOUT)
-    node.send_to('/deep/where', typed_as=STRING)
-    assert mailbox.next(TIMEOUT).data == f"{PACKAGE / 'scripts'} {PACKAGE / 'scripts'}"
+@pytest.mark.parametrize(
+    'expression, expected',
+    [
+        ('sys.argv[1:4]', ['--mode', 'two words', '_depth:=3']),
+        ('rospy.myargv()[1:]', ['--mode', 'two words']),
+        ("os.environ['ROS_MASTER_URI']", 'URL'),
+        ('__name__', '__main__'),
+        ("sys.modules['__main__'].__dict__ is globals()", True),
+        ("rospy.resolve_name('range')", '/sonar'),
+        ("rospy.get_param('~gains')", {'p': [1, 2]}),
+        ("rospy.get_param('~depth')", 3),
+        ('threading.current_thread() is threading.main_thread()', True),
+    ],
+)
+def test_script_finds_what_it_was_given(master, load, expression, expected):
+    args = '--mode', 'two words', '_depth:=3'
+    load(SAY.format(expression), *args, remap={'range': '/sonar'}, params={'gains': {'p': [1, 2]}})
+    until(lambda: '/said' in master.parameters)
+    assert master.parameters['/said'] == (master.url if expected == 'URL' else expected)
 
 
-def test_a_node_that_needs_a_working_directory_runs_apart_where_it_cannot_have_one(
-    compose, monkeypatch
-):
-    monkeypatch.setattr(pharos.working_directory, 'is_possible', lambda: False)
-    composed = compose('mirror.launch')
-    assert composed.nodes == []
-    assert composed.process.poll() is None
+def test_exit_code_is_the_scripts(master, ends):
+    for how, code in [
+        ('exit', 0),
+        ('exit 3', 3),
+        ('exit text', 1),
+        ('error', 1),
+        ('signal_shutdown', 0),
+    ]:
+        script = ends(how)
+        assert script.wait(TIMEOUT) == code
+        assert script.exit_code == code
+        assert not script.is_running
+        assert registrations(master, '/ends') == [[], [], []]
 
 
-@pytest.mark.leaves('the registrations of a node that was killed')
-def test_the_nodes_apart_end_where_roslaunch_is_killed(master, compose):
-    composed = compose('chat.launch')
-    relay = master.wait_for_node('/relay', TIMEOUT)
-    os.kill(composed.process.pid, signal.SIGKILL)
-    until(lambda: not relay.is_alive())
-    assert dict(composed.outcomes())['/relay'] == (
-        'ran apart: asked to end, as roslaunch was killed'
-    )
+def test_script_without_node_has_exit_code(load):
+    assert load('sys.exit(4)').wait(TIMEOUT) == 4
 
 
-def test_a_stop_ends_all_nodes(master, compose):
-    composed = compose('chat.launch')
-    master.wait_for_node('/relay', TIMEOUT)
-    composed.stop()
-    assert not composed.nodes[0].is_running
-    assert composed.process.poll() is not None
-    assert dict(composed.outcomes())['/relay'] == 'ran apart, by roslaunch, which ended with 0'
-    assert {node.name for node in master.nodes()} <= {'/rosout'}
+def test_error_in_script_is_its_failure(load, transcript):
+    script = load("rospy.init_node('program')\nrospy.sleep(0)\n1 / 0")
+    script.wait(TIMEOUT)
+    assert isinstance(script.errors[0], ZeroDivisionError)
+    assert traceback.extract_tb(script.errors[0].__traceback__)[-1].line == '1 / 0'
+    assert script.failures[0].error is script.errors[0]
 
 
-def test_it_ends_with_its_block(master, compose):
-    with compose('chat.launch') as composed:
-        pass
-    assert not composed.nodes[0].is_running
+@pytest.mark.parametrize(
+    'error, arguments',
+    [
+        (UnknownNodeError, ('no_such_package', 'talker')),
+        (UnknownNodeError, ('robot', 'no_such_program')),
+        (UnknownNodeError, ('/no/such/file.py',)),
+        (PharosError, ('robot', 'relay')),
+    ],
+)
+def test_missing_script_is_an_error(master, error, arguments):
+    with pytest.raises(error, match=arguments[0]):
+        master.load(*arguments)
 
 
-@pytest.mark.parametrize('names', [['/talker'], ['/relay'], ['/talker', '/relay']])
-def test_to_wait_has_a_limit(compose, names):
-    says = f"not ended within 0.1 s: {', '.join(names)}; stop"
-    with pytest.raises(TimeoutError, match=says):
-        compose('chat.launch', only=names).wait(0.1)
+@pytest.mark.parametrize('text, cause', [('1 / 0', ZeroDivisionError), ('return 1', SyntaxError)])
+def test_script_that_fails_early_is_an_error(load, text, cause):
+    with pytest.raises(PharosError) as error:
+        load(text)
+    assert isinstance(error.value.__cause__, cause)
 
 
-def test_a_required_node_that_ends_here_ends_all(master, compose, transcript):
-    composed = compose('required.launch')
-    master.wait_for_node('/relay', TIMEOUT)
-    del master.parameters['/ends/stay']
-    assert composed.wait(TIMEOUT) == 1
-    assert not any(node.is_running for node in composed.nodes)
-    assert composed.process.poll() is not None
-    assert '/ends, which is required, has ended: all others end' in transcript
+def test_name_in_use_is_refused(load, master, write):
+    first = load(SPIN)
+    with pytest.raises(pharos.NodeNameInUseError):
+        master.load(write(SPIN, 'another'))
+    assert first.is_running
 
 
-def test_a_required_node_that_is_restarted_has_not_ended(master, compose, transcript):
-    composed = compose('required.launch', only=['ends'])
-    (node,) = composed.nodes
-    node.restart()
-    assert node.is_running
+def test_script_needs_a_master(write):
+    with pytest.raises(pharos.MasterUnreachableError):
+        Master('http://127.0.0.1:1/').load(write(SPIN))
+
+
+def test_wait_has_a_time_limit(load):
+    with pytest.raises(TimeoutError):
+        load(SPIN).wait(0.01)
+
+
+@pytest.mark.parametrize('how', ['spin', 'loop', 'rate', 'threads'])
+def test_stop_ends_script(master, ends, how):
+    """The fixture of the master finds that its threads have ended, too."""
+    script = ends(how)
+    script.stop()
+    assert script.exit_code == 0
+    assert not script.is_running
+    assert registrations(master, '/ends') == [[], [], []]
+
+
+def test_script_starts_again(master, ends):
+    script = ends('spin')
+    until(lambda: master.parameters.get('/ends/starts') == 1)
+    script.stop()
+    script.start()
     until(lambda: master.parameters['/ends/starts'] == 2)
-    assert not composed.is_over
-    assert not [line for line in transcript if 'ended' in line]
-    del master.parameters['/ends/stay']
-    assert composed.wait(TIMEOUT) == 1
-    assert '/ends, which is required, has ended: all others end' in transcript
+    assert master.node('/ends') is script
+    script.restart()
+    until(lambda: master.parameters['/ends/starts'] == 3)
 
 
-def test_a_required_node_that_ends_apart_ends_all(master, compose, transcript):
-    composed = compose('required.launch', apart=['ends'])
-    master.wait_for_node('/ends', TIMEOUT)
-    del master.parameters['/ends/stay']
-    assert composed.wait(TIMEOUT) == 1
-    assert not any(node.is_running for node in composed.nodes)
-    assert (
-        'a required one of /relay, /ends, which run apart, has ended: all others end' in transcript
+def test_rosnode_kill_ends_script(master, load):
+    script = load(SPIN)
+    with Program(['rosnode', 'kill', '/program'], master.url) as program:
+        program.expect('killed')
+    assert script.wait(TIMEOUT) == 0
+
+
+def stop_when_ready(script, path):
+    """Stop the script; return the lines that it wrote."""
+    until(lambda: '/ends/ready' in registrations(script.master, '/ends')[0])
+    script.stop()
+    return path.read_text().split()
+
+
+def test_end_comes_in_order(ends, tmp_path):
+    lines = stop_when_ready(ends('order'), tmp_path / 'said')
+    assert lines == ['on_shutdown', 'main', 'atexit']
+
+
+@pytest.mark.parametrize('name', ['SIGINT', 'SIGTERM'])
+def test_signal_handler_is_called_at_stop(ends, tmp_path, name):
+    script = ends(name)
+    assert stop_when_ready(script, tmp_path / 'said') == [name]
+    assert script.exit_code == 5
+
+
+@pytest.mark.parametrize('how', ['thread', 'timer', 'executor'])
+def test_script_waits_for_its_threads(master, ends, how):
+    assert ends(how).wait(TIMEOUT) == 0
+    assert master.parameters['/ends/worked'] is True
+
+
+# -- what is a script's own
+
+
+def test_helpers_beside_scripts_are_their_own(master, write):
+    for side in 'left', 'right':
+        write(f'SIDE = {side!r}', f'{side}/helpers.py')
+        path = write(
+            "import helpers\nrospy.init_node('program')\nrospy.set_param('~side', helpers.SIDE)",
+            f'{side}/program',
+        )
+        master.load(path, name=side).wait(TIMEOUT)
+    assert [master.parameters[f'/{side}/side'] for side in ('left', 'right')] == ['left', 'right']
+
+
+def test_each_run_has_modules_anew(master, write):
+    write('calls = []', 'helpers.py')
+    path = write(
+        '''
+        import helpers
+        rospy.init_node('program')
+        helpers.calls.append(1)
+        rospy.set_param('~calls', len(helpers.calls))
+        '''
+    )
+    for name in 'left', 'right':
+        script = master.load(path, name=name)
+        script.wait(TIMEOUT)
+        script.start()
+        script.wait(TIMEOUT)
+        assert master.parameters[f'/{name}/calls'] == 1
+
+
+def test_library_on_rospy_is_each_scripts(master, write, tmp_path, monkeypatch):
+    write('def name():\n    return rospy.get_name()', 'lib/names_its_node.py')
+    monkeypatch.syspath_prepend(str(tmp_path / 'bench' / 'lib'))
+    path = write(
+        '''
+        import names_its_node
+        rospy.init_node('program')
+        rospy.set_param('~found', names_its_node.name())
+        '''
+    )
+    for name in '/left', '/right':
+        master.load(path, name=name).wait(TIMEOUT)
+        assert master.parameters[f'{name}/found'] == name
+
+
+@pytest.mark.parametrize(
+    'module, is_shared',
+    [('numpy', True), ('std_msgs.msg', True), ('rospy', False), ('actionlib', False)],
+)
+def test_modules_without_rospy_are_shared(master, load, module, is_shared):
+    load(SAY.format(f"str(id(__import__('importlib').import_module({module!r})))"))
+    until(lambda: '/said' in master.parameters)
+    ours = str(id(importlib.import_module(module)))
+    assert (master.parameters['/said'] == ours) == is_shared
+
+
+def test_settings_of_process_stay(load):
+    before = os.getcwd(), list(sys.argv), list(sys.path)
+    load("os.environ['GREETING'] = 'x'\nsys.argv[:] = []\nsys.path.insert(0, '/x')").wait(TIMEOUT)
+    assert 'GREETING' not in os.environ
+    assert before == (os.getcwd(), sys.argv, sys.path)
+
+
+# -- links
+
+
+def test_links_between_scripts_are_intraprocess(master, compose):
+    compose('sensing.launch')
+    until(lambda: ('/range', '/avoider', 'INTRAPROCESS') in links(master.node('/sonar')))
+
+
+def test_own_node_hears_script_intraprocess(master):
+    node_ = create(master)
+    mailbox = Mailbox(node_, '/range', 'sensor_msgs/Range')
+    with master.load('robot', 'sonar'):
+        mailbox.next()
+        assert node_.channels[0].connections == [('/sonar', 'INTRAPROCESS')]
+
+
+def test_clock_moves_time_of_script(master, load):
+    master.parameters['/use_sim_time'] = True
+    script = load(
+        '''
+        rospy.init_node('program')
+        rospy.sleep(1000)
+        rospy.set_param('/woke', rospy.get_time())
+        '''
+    )
+    clock = create(master, '/clock_node').output_channel('/clock', 'rosgraph_msgs/Clock')
+    seconds = iter(range(0, 10**9, 500))
+
+    def has_ended_by_now():
+        clock.send(clock=genpy.Time(next(seconds)))
+        return not script.is_running
+
+    until(has_ended_by_now)
+    assert master.parameters['/woke'] >= 1000
+
+
+def test_scripts_of_two_masters_are_apart(master, write):
+    path = write(SPIN)
+    with Master.embedded() as other, master.load(path) as one, other.load(path) as two:
+        assert one.name == two.name
+        assert (one.master.url, two.master.url) == (master.url, other.url)
+
+
+# -- master.compose: launch files
+
+
+def test_python_nodes_run_in_this_process(master, compose):
+    composition = compose('sensing.launch')
+    assert isinstance(composition, pharos.Composition)
+    assert [each.name for each in composition.nodes] == ['/sonar', '/avoider']
+    assert all(isinstance(each, ScriptNode) for each in composition.nodes)
+    assert composition.process is None
+
+
+def test_others_run_as_roslaunch_starts_them(master, compose):
+    mailbox = Mailbox(create(master, '/ear'), '/relayed', 'sensor_msgs/Range')
+    composition = compose('mixed.launch', frame='back')
+    assert mailbox.next().header.frame_id == 'back'
+    assert [each.name for each in composition.nodes] == ['/sonar']
+    assert composition.process.poll() is None
+    assert all(
+        isinstance(master.wait_for_node(name, TIMEOUT), ExternalNode)
+        for name in ('/relay', '/gripper')
     )
 
 
-def test_a_required_node_that_cannot_start_ends_all(compose, transcript):
-    composed = compose('required_broken.launch')
-    assert composed.wait(TIMEOUT) == 1
-    assert not any(node.is_running for node in composed.nodes)
-    assert '/broken, which is required, did not start: all others end' in transcript
+def test_named_nodes_run_apart(master, compose):
+    composition = compose('sensing.launch', apart=['sonar'])
+    assert [each.name for each in composition.nodes] == ['/avoider']
+    assert isinstance(master.wait_for_node('/sonar', TIMEOUT), ExternalNode)
 
 
-def test_a_required_node_that_the_system_cannot_start_ends_all(compose, transcript):
-    composed = compose('unstartable.launch', required=True)
-    assert composed.wait(TIMEOUT) == 1
-    assert transcript[-1] == (
-        '/no_first_line, which is required, cannot be started: all others end'
-    )
+def test_only_chosen_nodes_run(compose):
+    composition = compose('mixed.launch', only=['/sonar'])
+    assert [each.name for each in composition.nodes] == ['/sonar']
+    assert composition.process is None
 
 
-def test_programs_that_the_system_cannot_start_do_not_end_those_apart(master, compose, transcript):
-    composed = compose('unstartable.launch')
+def test_parameters_of_launch_file_are_set(master, compose, tmp_path):
+    for xml, name, value in [
+        ('<param name="a" value="1" type="str"/>', '/a', '1'),
+        ('<group ns="n"><param name="a" value="x"/></group>', '/n/a', 'x'),
+        ('<rosparam>{a: {b: [1, x]}}</rosparam>', '/a', {'b': [1, 'x']}),
+        ('<arg name="x" default="7"/><param name="a" value="$(eval x * 2)"/>', '/a', 14),
+        ('<param name="a" value="1" if="false"/><param name="a" value="2" if="1"/>', '/a', 2),
+        ('<param name="a" command="echo text"/>', '/a', 'text\n'),
+        ('<group ns="o" clear_params="true"><param name="b" value="1"/></group>', '/o', {'b': 1}),
+        ('<rosparam command="load" file="$(find bench)/a.yaml"/>', '/loaded', True),
+        ('<include file="$(find bench)/a.launch"><arg name="x" value="5"/></include>', '/a', 5),
+    ]:
+        (tmp_path / 'bench' / 'a.yaml').write_text('loaded: true')
+        (tmp_path / 'bench' / 'a.launch').write_text(
+            '<launch><arg name="x"/><param name="a" value="$(arg x)"/></launch>'
+        )
+        master.parameters['/o/value'] = 1
+        compose(xml)
+        assert master.parameters[name] == value
+
+
+@pytest.mark.parametrize(
+    'xml, expression, value',
+    [
+        ('<group ns="deep">{}</group>', 'rospy.get_name()', '/deep/tell'),
+        ('<remap from="a" to="b"/>{}', "rospy.resolve_name('a')", '/b'),
+        ('<env name="GREETING" value="hi"/>{}', "os.environ['GREETING']", 'hi'),
+        ('<group ns="deep">{}</group>', 'rospy.get_namespace()', '/deep/'),
+        ('<node pkg="bench" type="tell" name="$(anon x)"/>', 'rospy.get_name()[:3]', '/x_'),
+        ('<node pkg="bench" type="tell" name="x" args="\'2 3\'"/>', 'rospy.myargv()[1]', '2 3'),
+    ],
+)
+def test_node_of_launch_file_gets(master, compose, write, xml, expression, value):
+    write(SAY.format(expression), 'tell')
+    compose(xml.replace('{}', node('tell')))
+    until(lambda: '/said' in master.parameters)
+    assert master.parameters['/said'] == value
+
+
+def test_bad_launch_file_is_an_error(compose):
+    for error, said, file, args in [
+        (UnknownNodeError, 'no_such.launch', 'no_such.launch', {}),
+        (UnknownNodeError, 'framee', 'mixed.launch', {'framee': 1}),
+        (UnknownNodeError, 'sonor', 'mixed.launch', {'only': ['sonor']}),
+        (PharosError, 'mismatched tag', '<node>', {}),
+        (PharosError, '<param> tag must have', '<param name="a"/>', {}),
+        (PharosError, 'robott', '<arg name="robott"/><param name="a" value="$(arg robott)"/>', {}),
+        (PharosError, 'multiple nodes', node('sonar', 'robot') * 2, {}),
+        (PharosError, 'no_such_package', '<include file="$(find no_such_package)/a.launch"/>', {}),
+    ]:
+        with pytest.raises(error, match=said):
+            compose(file, **args)
+
+
+@pytest.mark.parametrize(
+    'bad', [node('no_such_program'), node('x', 'no_such_package'), node('broken'), node('fails')]
+)
+def test_others_run_without_bad_node(compose, write, transcript, bad):
+    write('return 1', 'broken')
+    write('1 / 0', 'fails')
+    composition = compose(bad + node('sonar', 'robot'))
+    assert [each.name for each in composition.nodes if each.is_running] == ['/sonar']
+    assert transcript
+
+
+def ending(more=''):
+    """Return the element for a node that goes on while /stay is true."""
+    return node('ends', 'robot', f'args="told" {more}')
+
+
+def test_respawned_node_starts_again(master, compose):
+    compose(ending('respawn="true"'))
+    until(lambda: master.parameters.get('/ends/starts', 0) >= 3)
+
+
+@pytest.mark.parametrize('apart', [[], ['ends']])
+def test_required_node_ends_all(master, compose, apart):
+    master.parameters['/stay'] = True
+    composition = compose(ending('required="true"') + node('sonar', 'robot'), apart=apart)
+    until(lambda: '/ends/starts' in master.parameters)
+    assert any(each.is_running for each in composition.nodes)
+    master.parameters['/stay'] = False
+    assert composition.wait(TIMEOUT) == 1
+    assert not any(each.is_running for each in composition.nodes)
+
+
+def test_wait_returns_when_all_ended(master, compose):
+    master.parameters['/stay'] = True
+    composition = compose(ending())
+    with pytest.raises(TimeoutError):
+        composition.wait(0.01)
+    master.parameters['/stay'] = False
+    assert composition.wait(TIMEOUT) == 0
+    assert composition.nodes[0].exit_code == 3
+
+
+def test_stop_ends_all_nodes(master, compose):
+    composition = compose('mixed.launch')
     master.wait_for_node('/relay', TIMEOUT)
-    assert composed.process.poll() is None
-    until(lambda: any('/unknown_kind is not started: Unable' in line for line in transcript))
+    composition.stop()
+    assert not any(each.is_running for each in composition.nodes)
+    assert composition.process.poll() is not None
 
 
-def test_a_node_that_is_to_be_started_again_is(master, compose):
-    compose('respawn.launch')
-    until(lambda: master.parameters.get('/ends/starts', 0) > 2)
+def test_composition_ends_with_its_block(compose):
+    with compose('sensing.launch') as composition:
+        assert all(each.is_running for each in composition.nodes)
+    assert not any(each.is_running for each in composition.nodes)
 
 
-def test_a_node_is_started_again_after_the_delay(master, compose):
-    composed = compose('respawn.launch', delay=1000)
-    (kept,) = composed.kept
-    until(lambda: kept.outcome == 'ended with exit code 1')
-    assert not composed.is_over
+def test_composed_nodes_share_connections(peer, compose, write):
+    write(
+        '''
+        rospy.init_node('hearer')
+        rospy.Subscriber('/words', String, lambda m: rospy.set_param('~heard', m.data))
+        rospy.spin()
+        ''',
+        'hearer',
+    )
+    peer.run("String = message_class('std_msgs/String')")
+    peer.run("publisher = rospy.Publisher('/words', String, queue_size=1, latch=True)")
+    peer.run("publisher.publish('hello')")
+    names = 'left', 'right', 'middle'
+    xml = ''.join(f'<node pkg="bench" type="hearer" name="{name}"/>' for name in names)
+    composition = compose(xml, share_connections=True)
+    parameters = composition.nodes[0].master.parameters
+    until(lambda: all(f'/{name}/heard' in parameters for name in names))
+    assert peer.value('publisher.get_num_connections()') == 1
 
 
-@pytest.mark.parametrize('how', ['stop', 'stop_all'])
-def test_what_has_been_ended_is_not_started_again(compose, how):
-    composed = compose('respawn.launch')
-    {'stop': composed.stop, 'stop_all': pharos.node_registry.stop_all}[how]()
-    until(lambda: composed.is_over)
-    assert not composed.nodes[0].is_running
+# -- rosrun pharos compose
 
 
-def test_one_that_is_ended_while_it_starts_again_has_not_failed(master, compose):
-    composed = compose('once.launch')
-    until(lambda: '/again' in master.parameters)
-    composed.stop()
-    assert composed.wait(TIMEOUT) == 0
+@pytest.fixture
+def program(master):
+    """``program(*arguments)`` runs rosrun pharos compose, which ends with the test."""
+    begun = []
+
+    def program(*arguments, url=master.url):
+        begun.append(Program(COMPOSE, url, *map(str, arguments)))
+        return begun[-1]
+
+    yield program
+    for each in begun:
+        if each.poll() is None:
+            each.signal(signal.SIGINT)
+            each.wait()
+        each.__exit__()
 
 
-def test_a_node_that_takes_long_to_start_does_not_keep_the_others(master, compose, monkeypatch):
-    monkeypatch.setattr(composition, 'PATIENCE', 0.1)
-    composed = compose('hangs.launch')
-    assert [node.name for node in composed.nodes][1] == '/talker'
-    master.parameters['/go'] = True
-    assert isinstance(master.wait_for_node('/hangs', TIMEOUT), pharos.ScriptNode)
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_program_composes_until_signal(master, program, number):
+    composed = program('robot', 'mixed.launch', 'frame:=back')
+    mailbox = Mailbox(create(master, '/ear'), '/relayed', 'sensor_msgs/Range')
+    assert mailbox.next().header.frame_id == 'back'
+    assert master.wait_for_node('/sonar', TIMEOUT).pid == composed.pid
+    composed.signal(number)
+    composed.wait()
+    until(lambda: {each.name for each in master.nodes()} <= {'/ear', '/rosout', '/pharos'})
 
 
-def test_what_cannot_be_started_is_told_and_the_others_go_on(compose, transcript):
-    composed = compose('missing.launch')
-    assert [node.name for node in composed.nodes if node.is_running] == ['/talker']
-    package, program, syntax = transcript
-    assert "missing.launch: /without_package is not started: there is no ROS package" in package
-    assert 'missing.launch: /without_program is not started: Cannot locate node' in program
-    assert "missing.launch: /with_syntax_error (composed_robot/broken) is not started" in syntax
-    assert "'return' outside function" in syntax
+def test_program_takes_only_and_apart(master, program):
+    chosen = '--only', 'heartbeat', 'gripper', '--apart', 'gripper'
+    composed = program('robot', 'robot.launch', 'robot:=r2', *chosen)
+    assert master.wait_for_node('/r2/heartbeat', TIMEOUT).pid == composed.pid
+    assert master.wait_for_node('/r2/gripper', TIMEOUT).pid != composed.pid
+    assert '/r2/mission' not in [each.name for each in master.nodes()]
+
+
+def test_program_prefixes_what_scripts_print(master, program, write):
+    path = write(
+        '''
+        rospy.init_node('program')
+        print('printed')
+        print('aside', file=sys.stderr)
+        rospy.loginfo('logged')
+        1 / 0
+        '''
+    )
+    composed = program('--script', path)
+    composed.wait()
+    lines = composed.output.splitlines()
+    assert {'[/program] printed', '[/program] aside'} <= set(lines)
+    assert any(line.startswith('[/program] [INFO]') and 'logged' in line for line in lines)
+    assert any('1 / 0' in line for line in lines)
+
+
+def test_program_runs_several_scripts(master, program):
+    composed = program('--script', 'robot/gripper', 'robot/heartbeat')
+    for name in '/gripper', '/heartbeat':
+        assert master.wait_for_node(name, TIMEOUT).pid == composed.pid
+
+
+@pytest.mark.parametrize(
+    'arguments, said',
+    [
+        (['robot', 'no_such.launch'], 'no_such.launch'),
+        (['bad.launch'], 'mismatched tag'),
+        (['robot', 'mixed.launch', 'framee:=x'], 'framee'),
+        (['--script', 'robot/no_such_program'], 'no_such_program'),
+    ],
+)
+def test_program_fails_with_status(program, arguments, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'bad.launch').write_text('<launch><node></launch>')
+    composed = program(*arguments)
+    assert composed.wait() == 1
+    assert said in composed.output
+    assert 'Traceback' not in composed.output
+
+
+def test_required_node_is_programs_status(program, tmp_path):
+    element = ending('required="true"')
+    (tmp_path / 'a.launch').write_text(f'<launch>{element}</launch>')
+    assert program(tmp_path / 'a.launch').wait() == 1
+
+
+def test_program_is_a_nodelet_manager(master, program):
+    program('__name:=manager', '__ns:=/rig')
+    load = master.wait_for_service('/rig/manager/load_nodelet', TIMEOUT)
+    listed = master.wait_for_service('/rig/manager/list', TIMEOUT)
+    unload = master.wait_for_service('/rig/manager/unload_nodelet', TIMEOUT)
+    master.parameters['/rig/sonar/frame_id'] = 'left'
+    mailbox = Mailbox(create(master, '/ear'), '/left', 'sensor_msgs/Range')
+    remap = {'remap_source_args': ['range'], 'remap_target_args': ['/left']}
+    assert load.call(name='sonar', type='robot/sonar', **remap).success
+    assert mailbox.next().header.frame_id == 'left'
+    assert listed.call().nodelets == ['/rig/sonar']
+    assert unload.call(name='sonar').success
+    assert listed.call().nodelets == []
+    with pytest.raises(pharos.ServiceCallError):
+        load.call(name='x', type='robot/no_such_program')
+
+
+def test_launch_file_of_nodelets_loads_scripts(master, program):
+    composed = program()
+    master.wait_for_service('/compose/load_nodelet', TIMEOUT)
+    mailbox = Mailbox(create(master, '/ear'), '/left/range', 'sensor_msgs/Range')
+    with master.launch('robot', 'nodelets.launch'):
+        assert mailbox.next().header.frame_id == 'left'
+        assert master.wait_for_service('/compose/list').call().nodelets == ['/left_sonar']
+    until(lambda: master.wait_for_service('/compose/list').call().nodelets == [])
+    assert composed.poll() is None

@@ -1,365 +1,539 @@
-"""Several masters in one process, and the bridge between two."""
-import re
+"""Masters: what they know of the graph, embedded ones, programs, and nodes outside this process."""
+import contextlib
+import os
 import signal
 import socket
 import threading
 
-import numpy
+import psutil
 import pytest
 
-from helpers import InProcessMaster, create
-from pharos.testing import Mailbox, TIMEOUT
+from helpers import TIMEOUT, InProcessMaster, Program, create, stop_nodes
 import pharos
-from pharos import Master
-from pharos.private_rospy import addresses
-from programs import Program, run, script
-from sockets import refused_url
+from pharos import BlockNode, ExternalNode, Master, RosProcess
+from pharos.testing import Mailbox, until
 
 STRING = 'std_msgs/String'
+MANIFEST = """<package format="2"><name>small_robot</name><version>0.0.0</version>
+<description>d</description><maintainer email="a@b.org">m</maintainer><license>BSD</license>
+</package>"""
+PRINTS_ARGUMENTS = 'for a in "$@"; do echo "<$a>"; done'
+TALKER = """#!/usr/bin/python3
+import rospy, std_msgs.msg
+rospy.init_node('talker')
+sent = rospy.Publisher('talk', std_msgs.msg.String, queue_size=1, latch=True)
+sent.publish(rospy.get_param('~text', 'nothing'))
+rospy.spin()
+"""
+EMBEDDING = """
+import os, sys, threading, pharos
+master = pharos.Master.embedded()
+print('master', master.url, master.pid, flush=True)
+"""
 
 
 @pytest.fixture
-def masters():
-    """Two masters, as of two robots."""
-    both = InProcessMaster(), InProcessMaster()
-    yield [Master(ros_master.url) for ros_master in both]
-    pharos.node_registry.stop_all()
-    for ros_master in both:
-        ros_master.stop()
+def masters(master):
+    """The ROS masters of two robots, in this process."""
+    second = InProcessMaster()
+    yield [master, Master(second.url)]
+    stop_nodes()
+    second.stop()
 
 
-def listen(master, topic, type_=STRING, name='/listener'):
-    mailbox = Mailbox()
-    create(master, name, delegate=mailbox).interested_in(topic, type_)
-    return mailbox
+@pytest.fixture
+def robot(tmp_path, monkeypatch):
+    """``robot(name, text)`` writes a program of the package small_robot and returns its name."""
+    folder = tmp_path / 'src' / 'small_robot'
+    (folder / 'scripts').mkdir(parents=True)
+    (folder / 'launch').mkdir()
+    (folder / 'package.xml').write_text(MANIFEST)
+    monkeypatch.setenv('ROS_PACKAGE_PATH', f'{tmp_path / "src"}:/usr/share')
+    monkeypatch.setenv('ROS_HOME', str(tmp_path / 'home'))
+
+    def write(name, text):
+        path = folder / ('launch' if name.endswith('.launch') else 'scripts') / name
+        path.write_text(text if text[0] in '#<' else f'#!/bin/sh\n{text}\n')
+        path.chmod(0o755)
+        return name
+
+    return write
 
 
-# -- side by side
+@pytest.fixture
+def unreachable():
+    """A master at a port that nobody listens on."""
+    with socket.create_server(('127.0.0.1', 0)) as server:
+        port = server.getsockname()[1]
+    return Master(f'http://127.0.0.1:{port}/')
+
+
+def port_of(master):
+    return int(master.url.rstrip('/').rpartition(':')[2])
+
+
+def has_ended(pid):
+    """True if there is no such process any more; a zombie has ended."""
+    with contextlib.suppress(psutil.NoSuchProcess):
+        return psutil.Process(pid).status() == psutil.STATUS_ZOMBIE
+    return True
+
+
+def names(nodes):
+    return [node.name for node in nodes]
+
+
+# -- a master and its URL
+
+
+def test_master_makes_no_connection_yet():
+    with socket.create_server(('127.0.0.1', 0)) as server:
+        server.setblocking(False)
+        Master('http://127.0.0.1:%d/' % server.getsockname()[1])
+        with pytest.raises(BlockingIOError):
+            server.accept()
+
+
+def test_master_url_comes_from_environment(monkeypatch):
+    monkeypatch.setenv('ROS_MASTER_URI', 'http://127.0.0.1:12345/')
+    assert Master() == Master('http://127.0.0.1:12345/')
+
+
+def test_master_url_defaults_to_roscore(monkeypatch):
+    monkeypatch.delenv('ROS_MASTER_URI', raising=False)
+    assert Master() == Master('http://localhost:11311/')
+
+
+def test_malformed_url_raises_value_error():
+    for url in [
+        'robot',
+        'robot:11311',
+        'http://',
+        'http://robot:port/',
+        'http://robot:99999/',
+        'ftp://robot:11311/',
+        'http://a robot:11311/',
+    ]:
+        with pytest.raises(ValueError):
+            Master(url)
+
+
+def test_malformed_environment_raises_value_error(monkeypatch):
+    monkeypatch.setenv('ROS_MASTER_URI', 'robot')
+    with pytest.raises(ValueError):
+        Master()
+
+
+def test_masters_of_one_address_are_equal():
+    for other, are_one in [
+        ('http://127.0.0.1:11311', True),
+        ('http://localhost:11311/', True),
+        ('HTTP://LOCALHOST:11311/', True),
+        ('http://127.0.0.1:11312/', False),
+        ('http://127.0.0.2:11311/', False),
+    ]:
+        master = Master('http://127.0.0.1:11311/')
+        assert (master == Master(other)) is are_one
+        assert (len({master, Master(other)}) == 1) is are_one
+
+
+def test_own_node_is_own_under_other_spelling(master):
+    node = create(master, '/own')
+    assert Master(master.url.replace('127.0.0.1', 'localhost')).node('/own') is node
+
+
+def test_spellings_of_one_master_share_intraprocess(master):
+    box = Mailbox(create(master, '/hearer'), '/spelt', STRING)
+    other = Master(master.url.replace('127.0.0.1', 'localhost'))
+    channel = create(other, '/speaker').output_channel('/spelt', STRING)
+    channel.send(data='next door')
+    assert box.next().data == 'next door'
+    assert channel.connections == [('/hearer', 'INTRAPROCESS')]
+
+
+# -- what it knows
+
+
+def test_nodes_are_own_and_external(master, peer):
+    node = create(master, '/own')
+    assert names(master.nodes()) == ['/own', '/peer']
+    assert master.node('/own') is node
+    assert isinstance(master.node('/peer'), ExternalNode)
+
+
+def test_unknown_node_raises_its_error(master):
+    with pytest.raises(pharos.UnknownNodeError):
+        master.node('/nobody')
+
+
+def test_system_state_lists_users_by_name(master):
+    node = create(master, '/n')
+    node.output_channel('/out', STRING)
+    node.interested_in('/in', STRING)
+    node.serve('/clear', 'std_srvs/Empty', lambda request: None)
+    publishers, subscribers, services = master.system_state()
+    assert publishers['/out'] == subscribers['/in'] == services['/clear'] == ['/n']
+
+
+def test_topic_knows_type_and_users(master):
+    create(master, '/speaker').output_channel('/t', STRING)
+    create(master, '/hearer').interested_in('/t', STRING)
+    topic = master.topic('/t')
+    assert (topic.name, topic.type) == ('/t', STRING)
+    assert (topic.publishers, topic.subscribers) == (['/speaker'], ['/hearer'])
+    assert '/t' in names(master.topics())
+
+
+def test_services_are_listed_by_name(master):
+    create(master, '/n').serve('/clear', 'std_srvs/Empty', lambda request: None)
+    assert '/clear' in master.services()
+
+
+def test_pid_is_that_of_rosmaster(master):
+    assert master.pid == os.getpid()
+
+
+def test_reachable_master_is_waited_for(master):
+    master.wait(TIMEOUT)
+    assert master.is_reachable()
+
+
+def test_wait_lasts_until_master_comes(mortal_master):
+    mortal_master.end()
+    master, waited = Master(mortal_master.url), threading.Event()
+    assert not master.is_reachable()
+    thread = threading.Thread(target=lambda: (master.wait(TIMEOUT), waited.set()))
+    thread.start()
+    mortal_master.come_back()
+    assert waited.wait(TIMEOUT)
+    thread.join(TIMEOUT)
+
+
+def test_unreachable_master_raises_its_error(unreachable):
+    for question in [
+        lambda master: master.nodes(),
+        lambda master: master.node('/n'),
+        lambda master: master.topics(),
+        lambda master: master.topic('/t').type,
+        lambda master: master.topic('/t').publishers,
+        lambda master: master.services(),
+        lambda master: master.system_state(),
+        lambda master: master.pid,
+        lambda master: master.wait(0.01),
+        lambda master: master.wait_for_node('/n', 0.01),
+        lambda master: master.lookup_service('/s'),
+        lambda master: master.create(BlockNode, named='/n'),
+        lambda master: master.graph(),
+    ]:
+        with pytest.raises(pharos.MasterUnreachableError):
+            question(unreachable)
+
+
+def test_unreachable_master_is_not_reachable(unreachable):
+    assert not unreachable.is_reachable()
+
+
+def test_wait_for_node_finds_own_node(master):
+    node = create(master, '/n')
+    assert master.wait_for_node('/n', TIMEOUT) is node
+
+
+def test_wait_for_node_lasts_until_it_comes(master):
+    found = []
+    thread = threading.Thread(target=lambda: found.append(master.wait_for_node('/late', TIMEOUT)))
+    thread.start()
+    node = create(master, '/late')
+    thread.join(TIMEOUT)
+    assert found == [node]
+
+
+def test_wait_for_node_ends_after_timeout(master):
+    with pytest.raises(pharos.UnknownNodeError):
+        master.wait_for_node('/nobody', 0.05)
+
+
+# -- several masters
 
 
 def test_nodes_of_one_name_live_on_two_masters(masters):
     nodes = [create(master, '/same') for master in masters]
-    for master, node in zip(masters, nodes):
-        assert master.nodes() == [node]
-        assert master.node('/same') is node
-        assert master.local_nodes() == [node]
-        assert run(master.url, 'rosnode', 'list').stdout == '/same\n'
-        assert node.uri in run(master.url, 'rosnode', 'info', '/same').stdout
+    assert [master.node('/same') for master in masters] == nodes
     nodes[0].stop()
     assert masters[0].nodes() == []
     assert masters[1].nodes() == [nodes[1]]
 
 
-def test_topics_services_and_parameters_of_two_masters_do_not_mix(masters):
-    one, two = masters
-    heard = [listen(master, '/t') for master in masters]
-    for master, text in (one, 'of one'), (two, 'of two'):
-        node = create(master, '/speaker')
-        node.serve(
-            '/who',
-            'std_srvs/Trigger',
-            lambda request, text=text: {'success': True, 'message': text},
-        )
-        node.parameter('~text', initialized=text)
-        node.send_to('/t', data=text)
-    assert [mailbox.next().data for mailbox in heard] == ['of one', 'of two']
-    assert [master.lookup_service('/who').call().message for master in masters] == [
-        'of one',
-        'of two',
-    ]
-    assert [master.parameters['/speaker/text'] for master in masters] == ['of one', 'of two']
-    assert all(mailbox.empty() for mailbox in heard)
-    assert len(one.topic('/t').channels) == 2 == len(two.topic('/t').channels)
+def test_topics_of_two_masters_do_not_mix(masters):
+    boxes = [Mailbox(create(master, '/hearer'), '/t', STRING) for master in masters]
+    speakers = [create(master, '/speaker') for master in masters]
+    for text in 'said', 'end':
+        for number, speaker in enumerate(speakers):
+            speaker.send_to('/t', typed_as=STRING, data=f'{text} {number}')
+    for number, box in enumerate(boxes):
+        box.wait_for(lambda message: message.data.startswith('end'))
+        assert [message.data for message in box.all()] == [f'said {number}', f'end {number}']
 
 
-def test_each_master_has_rospy_peers_of_its_own(masters):
-    heard = [listen(master, '/t') for master in masters]
-    with Program(masters[0].url, 'rostopic', 'pub', '/t', STRING, 'data: one'), Program(
-        masters[1].url, 'rostopic', 'pub', '/t', STRING, 'data: two'
-    ):
-        assert [mailbox.next().data for mailbox in heard] == ['one', 'two']
+def test_services_of_two_masters_do_not_mix(masters):
+    for master, text in zip(masters, ('one', 'two')):
+        create(master, '/n').serve('/who', 'std_srvs/Trigger', lambda _, text=text: (True, text))
+    answers = [master.lookup_service('/who').call().message for master in masters]
+    assert answers == ['one', 'two']
 
 
-def test_a_master_that_goes_away_leaves_the_nodes_of_another_alone(masters, mailbox):
-    with Master.embedded() as third:
-        node = create(third, '/n')
-        listener = create(masters[0], '/n', delegate=mailbox)
-        listener.interested_in('/t', STRING)
-    assert not node.is_running
-    assert listener.is_running
-    create(masters[0], '/speaker').send_to('/t', data='still here')
-    assert mailbox.next().data == 'still here'
+def test_delegate_joins_two_masters(masters):
+    box = Mailbox(create(masters[1], '/hearer'), '/map', STRING)
+    there = create(masters[1], '/bridge').output_channel('/map', STRING)
+    here = create(masters[0], '/bridge', delegate=lambda message, _: there.publish(message))
+    here.interested_in('/map', STRING)
+    create(masters[0], '/speaker').send_to('/map', data='across')
+    assert box.next().data == 'across'
 
 
-def test_a_block_joins_two_masters(masters):
-    """The five lines that `bridge --help` shows."""
-    heard = listen(masters[1], '/map')
-    speaker = create(masters[0], '/speaker')
-    sent = speaker.output_channel('/map', STRING)
-    lines = [
-        line.strip() for line in run(masters[0].url, script('bridge'), '--help').stdout.splitlines()
-    ]
-    start = next(number for number, line in enumerate(lines) if line.startswith('a = Master'))
-    code = '\n'.join(lines[start : start + 4])
-    assert lines[start + 4 : start + 6] == ['spin()', '']
-    for old, new in (
-        ('http://robot-a:11311/', masters[0].url),
-        ('http://robot-b:11311/', masters[1].url),
-        ('nav_msgs/OccupancyGrid', STRING),
-    ):
-        assert old in code
-        code = code.replace(old, new)
-    exec(code, vars(pharos).copy())
-    assert sent.wait_for_subscribers(1, TIMEOUT)
-    for number in range(100):
-        sent.send(data=str(number))
-    assert [message.data for message in heard.take(100)] == [str(number) for number in range(100)]
+def test_dead_master_leaves_other_nodes_alone(master):
+    box = Mailbox(create(master, '/n'), '/t', STRING)
+    with Master.embedded() as other:
+        create(other, '/n')
+        os.kill(other.pid, signal.SIGKILL)
+        create(master, '/speaker').send_to('/t', data='still here')
+        assert box.next().data == 'still here'
 
 
-# -- one master, spelt in several ways
+# -- embedded
 
 
-@pytest.fixture
-def spellings(master):
-    """The session's master, as given and by another name of its address."""
-    return master, Master(master.url.replace('127.0.0.1', 'LocalHost').rstrip('/'))
+def test_embedded_master_serves_real_nodes():
+    with Master.embedded() as master:
+        assert master.pid != os.getpid()
+        create(master, '/n')
+        with Program(['rosnode', 'list'], master.url) as program:
+            assert program.wait() == 0
+            assert {'/n', '/rosout'} <= set(program.output.split())
+        stop_nodes(master)
 
 
-def test_masters_of_one_address_are_one(spellings):
-    given, other = spellings
-    assert given == other
-    assert hash(given) == hash(other)
-    assert len({given, other}) == 1
-    assert other.url == given.url.replace('127.0.0.1', 'localhost')
-    assert given.topic('/t') == other.topic('/t')
-    assert len({given.topic('/t'), other.topic('/t')}) == 1
-    assert pharos.ExternalNode(given, '/n') == pharos.ExternalNode(other, '/n')
-    node = create(given, '/own')
-    assert other.node('/own') is node
-    assert other.local_nodes() == [node]
-    assert other.wait_for_node('/own', TIMEOUT) is node
-    assert other.nodes() == [node]
-    assert pharos.watcher.watcher_of(given) is pharos.watcher.watcher_of(other)
+def test_embedded_master_has_wanted_port():
+    with Master.embedded() as master:
+        port = port_of(master)
+    with Master.embedded(port=port) as master:
+        assert port_of(master) == port
+        assert master.is_reachable()
 
 
-def test_an_address_that_is_any_of_this_host_is_this_hosts(master):
-    everywhere = Master(master.url.replace('127.0.0.1', '0.0.0.0'))
-    assert everywhere == master
-    node = create(master, '/own')
-    assert everywhere.node('/own') is node
+def test_embedded_master_refuses_busy_port():
+    with socket.create_server(('127.0.0.1', 0)) as server:
+        with pytest.raises(pharos.PortInUseError):
+            Master.embedded(port=server.getsockname()[1])
 
 
-@pytest.mark.parametrize('url', ['', 'robot1', 'http://robot1/'])
-def test_the_variable_that_gives_no_masters_url_is_named(monkeypatch, url):
-    monkeypatch.setenv('ROS_MASTER_URI', url)
-    with pytest.raises(
-        ValueError, match=f"^ROS_MASTER_URI is '{url}', which is not the URL of a ROS master"
-    ):
-        Master()
+def test_stop_ends_embedded_master():
+    master = Master.embedded()
+    pid = master.pid
+    master.stop()
+    master.stop()  # harmless
+    assert has_ended(pid)
+    assert not master.is_reachable()
 
 
-def test_nodes_at_one_master_are_neighbours_however_it_is_spelt(spellings):
-    given, other = spellings
-    heard = listen(given, '/spelt')
-    speaker = create(other, '/speaker')
-    speaker.serve('/spelt', 'std_srvs/Empty', lambda request: None)
-    channel = speaker.output_channel('/spelt', STRING)
-    channel.send(data='next door', to=given.node('/listener'))
-    assert heard.next().data == 'next door'
-    assert channel.connections == [('/listener', 'INTRAPROCESS')]
-    assert other.topic('/spelt').channels == given.topic('/spelt').channels != []
-
-
-def test_an_embedded_master_stops_the_nodes_that_spell_it_otherwise():
-    with Master.embedded() as embedded:
-        node = create(Master(embedded.url.replace('127.0.0.1', 'localhost')), '/n')
-    assert not node.is_running
+def test_with_block_ends_embedded_master():
+    with pytest.raises(RuntimeError), Master.embedded() as master:
+        pid = master.pid
+        raise RuntimeError
+    assert has_ended(pid)
 
 
 @pytest.mark.parametrize(
-    'one, other, are_one',
+    'ending, code',
     [
-        ('http://127.0.0.1:11311', 'HTTP://127.0.0.1:011311/', True),
-        ('http://localhost:11311', 'http://127.0.0.1:11311', True),
-        ('http://me:11311', 'http://localhost:11311', True),
-        ('http://me:11311', 'http://ME:11311', True),
-        ('http://me:11311', 'http://10.0.0.1:11311', True),
-        ('http://robot:11311', 'http://10.0.0.2:11311', True),
-        ('http://robot:11311', 'http://me:11311', False),
-        ('http://127.0.0.2:11311', 'http://127.0.0.1:11311', False),
-        ('http://127.0.0.1:11311', 'http://127.0.0.1:11312', False),
-        ('http://nowhere:11311', 'http://nowhere:11311', True),
-        ('http://nowhere:11311', 'http://127.0.0.1:11311', False),
+        ('', 0),
+        ('sys.exit(3)', 3),
+        ('raise RuntimeError', 1),
+        ('os._exit(4)', 4),
+        ('os.kill(os.getpid(), 9)', -signal.SIGKILL),
     ],
+    ids='end exit exception _exit killed'.split(),
 )
-def test_which_urls_mean_one_address(monkeypatch, one, other, are_one):
-    """On a host called me, as Debian sets one up, with a robot beside it."""
-    looked_up = []
-    known = {'me': '127.0.1.1', 'localhost': '127.0.0.1', 'robot': '10.0.0.2'}
+def test_embedded_master_ends_with_its_program(ending, code):
+    with Program(EMBEDDING + ending, 'http://127.0.0.1:1/') as program:
+        assert program.wait() == code
+        pid = int(program.output.split()[2])
+        until(lambda: has_ended(pid), TIMEOUT)
 
-    def getaddrinfo(host, *_, **__):
-        looked_up.append(host)
-        if host == 'nowhere':
-            raise socket.gaierror('Name or service not known')
-        return [(socket.AF_INET, socket.SOCK_STREAM, 6, '', (known.get(host, host), 0))]
 
-    addresses._of_master.cache_clear()
-    monkeypatch.setattr(addresses.socket, 'getaddrinfo', getaddrinfo)
-    monkeypatch.setattr(addresses.socket, 'gethostname', lambda: 'me')
-    monkeypatch.setattr(
-        addresses.rosgraph.network, 'get_local_addresses', lambda: ['127.0.0.1', '10.0.0.1']
+# -- programs
+
+
+def test_run_starts_node_of_package(master, robot):
+    with master.run('small_robot', robot('talker', TALKER), '__name:=robot7') as process:
+        assert isinstance(process, RosProcess)
+        assert process.poll() is None
+        assert master.wait_for_node('/robot7', TIMEOUT).pid == process.pid
+    assert process.poll() is not None
+    assert '/robot7' not in names(master.nodes())
+
+
+def test_run_starts_installed_c_program(master):
+    with master.run('topic_tools', 'relay', '/from', '/to', '__name:=relay'):
+        until(lambda: '/relay' in master.topic('/from').subscribers, TIMEOUT)
+    assert master.topic('/from').subscribers == []
+
+
+def test_run_gives_arguments_unchanged(master, robot):
+    shows = robot('shows', PRINTS_ARGUMENTS)
+    with master.run('small_robot', shows, 'two words', 3, '--flag') as process:
+        assert process.wait(TIMEOUT) == 0
+        assert process.output.splitlines() == ['<two words>', '<3>', '<--flag>']
+
+
+def test_run_gives_masters_uri(master, robot, monkeypatch):
+    monkeypatch.setenv('ROS_MASTER_URI', 'http://127.0.0.1:1/')
+    with master.run('small_robot', robot('tells', 'echo $ROS_MASTER_URI')) as process:
+        process.wait(TIMEOUT)
+        assert Master(process.output.strip()) == master
+
+
+def test_run_returns_exit_status(master, robot):
+    with master.run('small_robot', robot('fails', 'exit 7')) as process:
+        assert process.wait(TIMEOUT) == 7 == process.poll()
+
+
+def test_run_keeps_output_and_errors(master, robot):
+    with master.run('small_robot', robot('tells', 'echo said; echo complained >&2')) as process:
+        process.wait(TIMEOUT)
+        assert process.output.split() == ['said', 'complained']
+
+
+def test_send_writes_to_standard_input(master, robot):
+    asks = robot('asks', 'read name; echo "hello $name"')
+    with master.run('small_robot', asks) as process:
+        process.send('bob\n')
+        assert process.wait(TIMEOUT) == 0
+        assert 'hello bob' in process.output
+
+
+def test_terminate_ends_program_for_good(master, robot):
+    process = master.run('small_robot', robot('sleeps', 'exec sleep 1000'))
+    process.terminate()
+    process.terminate()  # harmless
+    assert process.poll() is not None
+    assert has_ended(process.pid)
+
+
+@pytest.mark.parametrize('way', ['run', 'launch'])
+@pytest.mark.parametrize('package', ['no_such_robot', 'small_robot'])
+def test_missing_program_raises_pharos_error(master, robot, way, package):
+    with pytest.raises(pharos.PharosError):
+        getattr(master, way)(package, 'missing.launch' if way == 'launch' else 'missing')
+
+
+@pytest.mark.parametrize('ending, code', [('', 0), ('raise RuntimeError', 1)], ids=repr)
+def test_program_ends_with_its_starter(master, robot, ending, code):
+    source = f"""
+import pharos
+print(pharos.Master().run('small_robot', {robot('sleeps', 'exec sleep 1000')!r}).pid)
+{ending}
+"""
+    with Program(source, master.url) as program:
+        assert program.wait() == code
+        pid = int(program.output.split()[0])
+        until(lambda: has_ended(pid), TIMEOUT)
+
+
+LAUNCH = '<launch><arg name="to" default="0"/><param name="/launched" value="$(arg to)"/></launch>'
+
+
+def test_launch_starts_file_of_package(master, robot):
+    with master.launch('small_robot', robot('sets.launch', LAUNCH)) as process:
+        assert process.wait(2 * TIMEOUT) == 0, process.output
+    assert master.parameters['/launched'] == 0
+
+
+def test_launch_starts_nodes_of_file(master, robot, tmp_path):
+    """By its path, with an argument."""
+    robot('talker', TALKER)
+    node = '<node name="launched" pkg="small_robot" type="talker"/>'
+    file = tmp_path / 'own.launch'
+    file.write_text(LAUNCH.replace('</launch>', node + '</launch>'))
+    with master.launch(None, str(file), to='it'):
+        master.wait_for_node('/launched', TIMEOUT)
+        assert master.parameters['/launched'] == 'it'
+    assert '/launched' not in names(master.nodes())
+
+
+# -- nodes outside this process
+
+
+def test_external_node_tells_who_it_is(master, peer):
+    node = master.node('/peer')
+    assert (node.name, node.pid, node.host) == ('/peer', peer.pid, '127.0.0.1')
+    assert node.uri == peer.value('rospy.get_node_uri()')
+    assert node.is_alive()
+
+
+def test_external_node_tells_what_it_uses(master, peer):
+    peer.hear('/in', STRING)
+    peer.run(
+        "publisher = rospy.Publisher('/out', message_class('std_msgs/Int32'), queue_size=1)\n"
+        'import std_srvs.srv\n'
+        "service = rospy.Service('/clear', std_srvs.srv.Empty, lambda request: {})"
     )
-    try:
-        one, other = Master(one), Master(other)
-        assert {one: 1} and not looked_up  # neither by making one nor by keeping one
-        assert (one == other, other == one) == (are_one, are_one)
-        assert len({one, other}) == (1 if are_one else 2)
-    finally:
-        addresses._of_master.cache_clear()
+    node = master.node('/peer')
+    assert node.subscriptions['/in'] == STRING
+    assert node.publications['/out'] == 'std_msgs/Int32'
+    assert '/clear' in node.services
 
 
-def test_a_master_at_a_host_that_does_not_resolve_is_unreachable():
-    with pytest.raises(
-        pharos.MasterUnreachableError, match='http://nowhere.invalid:11311/ .*not known'
-    ):
-        create(Master('http://nowhere.invalid:11311'), '/n')
+def test_external_node_is_shut_down(master, peer):
+    node = master.node('/peer')
+    node.shutdown()
+    until(lambda: '/peer' not in names(master.nodes()), TIMEOUT)
+    assert not node.is_alive()
 
 
-# -- the script
+def test_dead_external_node_stays_known(master, peer):
+    peer.end()
+    node = master.node('/peer')
+    assert not node.is_alive()
+    assert node.publications['/rosout'] == 'rosgraph_msgs/Log'
+    for question in (lambda: node.pid, node.shutdown):
+        with pytest.raises(pharos.PharosError):
+            question()
+    with Program(['sh', '-c', 'echo y | rosnode cleanup'], master.url) as program:
+        assert program.wait() == 0, program.output
+    with pytest.raises(pharos.UnknownNodeError):
+        node.uri
 
 
-def bridge(masters, *arguments, wait_for=None):
-    program = Program(
-        masters[0].url, script('bridge'), *(master.url for master in masters), *arguments
-    )
-    for topic in wait_for or ():
-        program.wait_for(f'{topic} (')
-    return program
+# -- the graph
 
 
-def test_the_bridge_passes_messages_both_ways_without_echo(masters):
-    heard = [listen(master, '/chat') for master in masters]
-    speakers = [create(master, '/speaker').output_channel('/chat', STRING) for master in masters]
-    with bridge(masters, '/chat', wait_for=['/chat']):
-        for speaker in speakers:
-            assert speaker.wait_for_subscribers(2, TIMEOUT)
-        for number in range(100):
-            for side, speaker in zip('ab', speakers):
-                speaker.send(data='%s%d' % (side, number))
-        for mailbox in heard:
-            told = [message.data for message in mailbox.take(200)]
-            for side in 'ab':
-                assert [text for text in told if text[0] == side] == [
-                    '%s%d' % (side, i) for i in range(100)
-                ]
-        # what echoed would come before what is sent after it
-        for speaker in speakers:
-            speaker.send(data='end')
-        for mailbox in heard:
-            assert [message.data for message in mailbox.take(2)] == [
-                'end',
-                'end',
-            ]
-            assert mailbox.empty()
+@pytest.fixture
+def graph(master):
+    """The graph of a speaker and a hearer."""
+    create(master, '/hearer').interested_in('/t', STRING)
+    create(master, '/speaker').send_to('/t', typed_as=STRING, data='x')
+    return master.graph()
 
 
-def test_the_bridge_joins_rospys_nodes(masters):
-    one, two = (master.url for master in masters)
-    with bridge(masters, '/t'), Program(two, 'rostopic', 'echo', '/t') as echo, Program(
-        one, 'rostopic', 'pub', '-r', '20', '/t', STRING, 'data: across'
-    ):
-        assert echo.wait_for('across')
-    with Program(one, 'rostopic', 'echo', '/back') as echo, bridge(masters, '/back'), Program(
-        two, 'rostopic', 'pub', '-r', '20', '/back', STRING, 'data: and back'
-    ):
-        assert echo.wait_for('and back')
+def test_graph_has_nodes_and_topics(graph):
+    assert {'/hearer', '/speaker'} <= set(graph.nodes)
+    assert '/t' in graph.topics
+    assert len(graph.edges) == 2
 
 
-def test_the_type_is_found_on_whichever_side_names_it_first(masters):
-    with bridge(masters, '/a_first', '/b_first', '/later') as program:
-        heard = [
-            listen(masters[1], '/a_first', 'geometry_msgs/Twist'),
-            listen(masters[0], '/b_first', 'sensor_msgs/LaserScan', name='/second'),
-        ]
-        line = program.wait_for('/b_first (')
-        assert 'sensor_msgs/LaserScan' in line + ''.join(program.printed)
-        first, second = create(masters[0], '/one'), create(masters[1], '/two')
-        wait_for_subscriber(masters[0], '/a_first')
-        first.send_to('/a_first', linear={'x': 2})  # the first message is not lost on the way
-        second.send_to('/b_first', ranges=[1, 2])
-        assert (heard[0].next().linear.x, heard[1].next().ranges) == (2, (1, 2))
-        listen(masters[1], '/later', name='/third')
-        assert STRING in program.wait_for('/later (')
+def test_graph_is_drawn_as_dot(graph):
+    assert graph.dot().lstrip().startswith('digraph')
+    assert all(name in graph.dot() for name in ('/hearer', '/speaker', '/t'))
 
 
-def wait_for_subscriber(master, topic):
-    while not master.topic(topic).subscribers:
-        threading.Event().wait(0.01)  # another process: the master is all there is to ask
+@pytest.mark.parametrize(
+    'kind, start', [('svg', b'<?xml'), ('png', b'\x89PNG'), ('dot', b'digraph')]
+)
+def test_graph_is_saved_by_suffix(graph, tmp_path, kind, start):
+    path = tmp_path / f'graph.{kind}'
+    graph.save(str(path))
+    assert path.read_bytes().lstrip().startswith(start)
 
 
-def test_a_latched_message_is_latched_on_the_other_side(masters):
-    create(masters[0], '/map_server').output_channel('/map', STRING, latch=True).send(
-        data='the map'
-    )
-    first = listen(masters[1], '/map')
-    with bridge(masters, '/map'):
-        assert first.next().data == 'the map'
-        assert listen(masters[1], '/map', name='/late').next().data == 'the map'
-
-
-def test_two_bridges_to_one_robot_have_names_of_their_own(masters):
-    heard = listen(masters[1], '/one'), listen(masters[1], '/two', name='/other')
-    with bridge(masters, '/one', wait_for=['/one']), bridge(
-        masters, '/two', '__name:=second', wait_for=['/two']
-    ):
-        assert {'/bridge', '/second'} <= {node.name for node in masters[0].nodes()}
-        speaker = create(masters[0], '/speaker')
-        speaker.send_to('/one', data='1')
-        speaker.send_to('/two', data='2')
-        assert [mailbox.next().data for mailbox in heard] == ['1', '2']
-
-
-@pytest.mark.parametrize('with_signal', [signal.SIGINT, signal.SIGTERM])
-def test_the_bridge_ends_when_it_is_told(masters, with_signal):
-    listen(masters[0], '/t')
-    program = bridge(masters, '/t', '/unknown', wait_for=['/t'])
-    assert program.end(with_signal) == 0
-    assert 'Traceback' not in program.read_to_the_end()
-    for master in masters:
-        assert '/bridge' not in [node.name for node in master.nodes()]
-
-
-def test_a_bridge_that_cannot_start_says_why_in_one_line(masters):
-    url = masters[0].url
-    for arguments, reason in (
-        ((url, refused_url(), '/t'), 'bridge: no ROS master answers at '),
-        ((refused_url(), url, '/t'), 'bridge: no ROS master answers at '),
-        ((url, url, '/t'), f'bridge: {url} and {url} are one master: give two'),
-        ((url, 'robot-b', '/t'), "bridge: 'robot-b' is not the URL of a ROS master"),
-    ):
-        ended = run(url, script('bridge'), *arguments)
-        assert ended.returncode == 1
-        assert len(ended.stderr.splitlines()) == 1
-        assert ended.stderr.startswith(reason)
-    assert masters[0].nodes() == []
-
-
-def test_help_says_what_it_is_for():
-    shown = run(refused_url(), script('bridge'), '--help')
-    assert shown.returncode == 0
-    assert not shown.stderr
-    assert re.search(r'usage: bridge .*URL_A URL_B TOPIC', shown.stdout)
-    for topics in ([], ['http://127.0.0.1:1/']):
-        assert run(refused_url(), script('bridge'), *topics).returncode == 2
-
-
-@pytest.mark.parametrize('value', ['no', 'False', None, 2, [], numpy.array([1, 2])])
-def test_whether_connections_are_shared_is_true_or_false(master, value):
-    wanted = 'share_connections is True or False, not'
-    with pytest.raises(ValueError, match=wanted):
-        Master(master.url, share_connections=value)
-    with pytest.raises(ValueError, match=wanted):
-        master.compose(None, 'any.launch', share_connections=value)
-    master.share_connections = value
-    with pytest.raises(ValueError, match=wanted):
-        create(master)
+def test_graph_shows_itself_in_jupyter(graph):
+    assert '<svg' in graph._repr_svg_()

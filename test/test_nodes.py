@@ -1,409 +1,704 @@
-"""Nodes: real ROS nodes, many in one process."""
-import subprocess
-import sys
+"""Nodes: their names, addresses and arguments, souls and time, starts, stops and changes."""
+import contextlib
+import re
+import socket
 import threading
-import xmlrpc.client
+import urllib.parse
 
 import pytest
-import rosnode
+import rosgraph_msgs.msg
+import rospy
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
-from helpers import create
-from pharos.testing import Mailbox, TIMEOUT, until
 import pharos
-from pharos import Node, node_registry
-from pharos.run import Lifecycle
+from helpers import TIMEOUT, Program, create, registrations
+from pharos import BlockNode, Node, NodeStoppedError, PharosError
+from pharos.testing import Mailbox, until
+
+STRING = 'std_msgs/String'
 
 
-def registered(master):
-    """The node names that the master knows."""
-    return {name for kind in master.system_state() for names in kind.values() for name in names}
+@pytest.fixture
+def node(master):
+    return create(master)
 
 
-def run(*command):
-    return subprocess.run(
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=60
-    ).stdout
+class Driver(Node):
+    """It opens its channels itself, and says when it starts and stops."""
+
+    def __init__(self, wheels=4, log=None):
+        super().__init__()
+        self.wheels, self.log_of_life = wheels, [] if log is None else log
+
+    def start(self):
+        super().start()
+        self.log_of_life.append('start')
+        self.interested_in('/steer', STRING, delegate=self.steer)
+
+    def steer(self, message, channel):
+        self.send_to('/steered', typed_as=STRING, data=f'{message.data} {self.wheels}')
+
+    def stop(self):
+        self.log_of_life.append('stop')
+        super().stop()
 
 
-def test_ten_nodes_of_one_process_are_ten_ros_nodes(master):
-    """rospy refuses a second init_node (ros_comm #185, #214)."""
-    names = ['/ten/n%d' % i for i in range(10)]
-    nodes = [create(master, name) for name in names]
-    assert set(names) <= set(run('rosnode', 'list').split())
-    assert 'xmlrpc reply' in run('rosnode', 'ping', '-c', '1', names[3])
-    assert '/rosout' in run('rosnode', 'info', names[7])
-    nodes[4].stop()
-    assert registered(master) & set(names) == set(names) - {names[4]}
-    assert len({node.tcp_port for node in nodes} | {node.xmlrpc_port for node in nodes}) == 20
+# -- names
 
 
-def test_a_message_goes_from_node_to_node(master, mailbox):
-    receiver = create(master, '/receiver', delegate=mailbox)
-    receiver.interested_in('/chat', 'std_msgs/String')
-    create(master, '/sender').send_to('/chat', data='hello')
-    message, channel = mailbox.next_with_channel()
-    assert message.data == 'hello'
-    assert (channel.topic, channel.type, channel.node) == ('/chat', 'std_msgs/String', receiver)
+@pytest.mark.parametrize(
+    'named, argv, namespace, name',
+    [
+        ('driver', [], None, '/driver'),
+        ('/driver', [], None, '/driver'),
+        ('/robot/driver', [], None, '/robot/driver'),
+        ('robot/driver', [], None, '/robot/driver'),
+        ('driver', [], '/robot', '/robot/driver'),
+        ('/driver', [], '/robot', '/driver'),
+        ('driver', ['__name:=pilot'], None, '/pilot'),
+        ('/robot/driver', ['__name:=helmsman'], None, '/robot/helmsman'),
+        ('driver', ['__ns:=/robot'], None, '/robot/driver'),
+        ('driver', ['__ns:=robot'], '/outer', '/robot/driver'),
+        ('driver', ['__name:=pilot', '__ns:=/robot'], None, '/robot/pilot'),
+        ('driver', ['program', 'plain', '--option'], None, '/driver'),
+    ],
+)
+def test_name_comes_from_arguments(master, monkeypatch, named, argv, namespace, name):
+    if namespace:
+        monkeypatch.setenv('ROS_NAMESPACE', namespace)
+    assert create(master, named, argv=argv).name == name
+    assert name in [node.name for node in master.nodes()]
 
 
-def test_a_ready_message_is_sent_as_rospy_publishes_it(master, mailbox):
-    node, cls = create(master), pharos.message_class('std_msgs/String')
-    ready = cls('first')
-    assert node.send_to('/ready', ready) is ready  # whose type the topic then has
-    assert master.topic('/ready').type == 'std_msgs/String'
-    create(master, '/other', delegate=mailbox).interested_in('/ready')
-    for send in node.output_channel('/ready').send, lambda data: node.send_to('/ready', data):
-        assert send(ready) is ready
-        assert mailbox.next().data == 'first'
-    create(master, '/third').send_to('/ready', cls('known'))
-    assert mailbox.next().data == 'known'
+BAD_NAMES = ['', '/', 'two words', '1st', 'a//b', 'a-b', '~a', 'ä', 'a/', None, 7, '/a/1']
 
 
-def test_the_first_message_to_an_external_node_is_not_lost(master):
-    """In one call, its type found. rospy has no such call (ros_comm #1377), and loses 3 of 3 (#176,
-    #286)."""
-    with subprocess.Popen(
-        [sys.executable, '-c', RECEIVE_ONE, '/first'], stdout=subprocess.PIPE, text=True
-    ) as echo:
-        wait_for_subscriber(master, '/first')
-        create(master, '/sender').send_to('/first', data='not lost')
-        assert 'not lost' in echo.communicate(timeout=60)[0]
+def test_impossible_name_raises_value_error(master):
+    for name in BAD_NAMES:
+        with pytest.raises(ValueError):
+            create(master, name)
 
 
-RECEIVE_ONE = """
-import sys, rospy, std_msgs.msg
-rospy.init_node('external_receiver')
-print(rospy.wait_for_message(sys.argv[1], std_msgs.msg.String).data)
-"""
+LETTERS = 'abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ'
+BASES = st.text(f'{LETTERS}0123456789_', min_size=1, max_size=12).filter(lambda s: s[0] in LETTERS)
 
 
-def wait_for_subscriber(master, topic):
-    ready = threading.Event()
-    while not master.topic(topic).subscribers:
-        ready.wait(0.01)  # another process: the master is all there is to ask
+@settings(max_examples=12, suppress_health_check=list(HealthCheck), deadline=None)
+@given(parts=st.lists(BASES, min_size=1, max_size=3))
+def test_every_legal_name_works(master, parts):
+    name = '/' + '/'.join(parts)
+    with master.create(BlockNode, named=name) as node:
+        assert node.name == name
+        assert registrations(master, name)[0] == ['/rosout']
 
 
-def test_rostopic_publishes_to_a_node(master, mailbox):
-    node = create(master, '/listener', delegate=mailbox)
-    node.interested_in('/from_outside', 'std_msgs/Int32')
-    run('rostopic', 'pub', '-1', '/from_outside', 'std_msgs/Int32', '42')
-    assert mailbox.next().data == 42
+def test_name_in_use_is_refused(master, node):
+    with pytest.raises(pharos.NodeNameInUseError, match='/node'):
+        create(master)
+    assert node.is_running
 
 
-def test_a_roscpp_relay_passes_messages_between_two_nodes(master, mailbox):
-    receiver = create(master, '/receiver', delegate=mailbox)
-    receiver.interested_in('/relayed', 'std_msgs/String')
-    with master.run('topic_tools', 'relay', '/direct', '/relayed'):
-        sender = create(master, '/sender')
-        wait_for_subscriber(master, '/direct')
-        # relay advertises only once it has received something, so its own first messages are lost
-        sender.fork(
-            lambda me: [
-                me.send_to('/direct', data='through C++', typed_as='std_msgs/String')
-                for _ in me.every(0.02)
-            ]
-        )
-        assert mailbox.next().data == 'through C++'
+def test_name_of_peer_is_refused(master, peer):
+    with pytest.raises(pharos.NodeNameInUseError):
+        create(master, peer.name)
+    assert peer.value('rospy.is_shutdown()') is False
 
 
-def test_a_node_starts_again_under_the_same_name_and_ports(master, mailbox):
-    """rospy's stays shut down, and its TCPROS port taken (ros_comm #185, #214)."""
-    node = create(master, '/phoenix', delegate=mailbox)
-    node.interested_in('/ashes', 'std_msgs/String')
-    ports = node.tcp_port, node.xmlrpc_port
-    sender = create(master, '/sender')
-    for turn in range(3):
-        node.stop()
-        assert node.lifecycle is Lifecycle.STOPPED
-        assert '/phoenix' not in registered(master)
-        node.start()
-        assert node.lifecycle is Lifecycle.RUNNING
-        assert (node.tcp_port, node.xmlrpc_port) == ports
-        sender.stop()
-        sender.start()  # its channels come back as well, and wait for who is interested
-        sender.send_to('/ashes', data=str(turn), typed_as='std_msgs/String')
-        assert mailbox.next().data == str(turn)
+def test_name_of_dead_peer_is_free(master, peer):
+    peer.hear('/dead', STRING)
+    peer.end()
+    create(master, peer.name)
+    assert registrations(master, peer.name)[1] == []
 
 
-def test_a_node_that_waits_for_no_subscriber_waits_for_the_master(master, mailbox):
-    node = create(master, '/node')
-    create(master, '/receiver').interested_in('/t', 'std_msgs/Int32', delegate=mailbox)
-    node.connect_timeout = 0
-    node.send_to('/t', data=1)
-    node.restart()
-    node.send_to('/t', to='/receiver', data=2)
-    until(lambda: node.channels[0].connections)
-    node.send_to('/t', to='/receiver', data=3)
-    while mailbox.next().data != 3:
-        pass
+def test_first_node_takes_name_of_argv(master):
+    argv = ['__name:=pilot', '__ns:=/robot', '/a:=/b']
+    names = [create(master, name, argv=argv).name for name in ('one', 'two', 'three')]
+    assert names == ['/robot/pilot', '/robot/two', '/robot/three']
 
 
-def test_a_subclass_makes_its_channels_in_start(master, mailbox):
-    class Logger(Node):
+def test_remappings_hold_for_all(master):
+    nodes = [create(master, name, argv=['/a:=/b', 'c:=d']) for name in ('/one', '/two')]
+    for node in nodes:
+        assert node.interested_in('/a', STRING).topic == '/b'
+        assert node.interested_in('c', STRING).topic == '/d'
+
+
+def test_argv_sets_private_parameters(master):
+    create(master, '/node', argv=['_rate:=2.5', '_text:=abc', '_list:=[1, 2]'])
+    values = [master.parameters[f'/node/{name}'] for name in ('rate', 'text', 'list')]
+    assert values == [2.5, 'abc', [1, 2]]
+
+
+def test_nodes_are_many_in_one_process(master):
+    nodes = [create(master, f'/node{number}') for number in range(10)]
+    found = {node.name: node for node in master.nodes()}
+    assert [found[node.name] for node in nodes] == nodes
+    assert len({node.uri for node in nodes}) == len({node.tcp_port for node in nodes}) == 10
+
+
+def test_rosnode_lists_and_pings_node(master, node):
+    with Program(['rosnode', 'ping', '-c', '1', '/node'], master.url) as program:
+        assert program.wait() == 0
+        assert 'xmlrpc reply from http://127.0.0.1' in program.output
+
+
+# -- addresses
+
+
+def test_ports_are_those_asked_for(master):
+    with socket.create_server(('127.0.0.1', 0)) as one, socket.create_server(
+        ('127.0.0.1', 0)
+    ) as two:
+        ports = one.getsockname()[1], two.getsockname()[1]
+    node = create(master, '/node', tcp_port=ports[0], xmlrpc_port=ports[1])
+    assert (node.tcp_port, node.xmlrpc_port) == ports
+    assert urllib.parse.urlsplit(node.uri).port == ports[1]
+
+
+@pytest.mark.parametrize('which', ['tcp_port', 'xmlrpc_port'])
+def test_busy_port_leaves_nothing_behind(master, which):
+    with socket.create_server(('127.0.0.1', 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(pharos.PortInUseError, match=str(port)):
+            create(master, '/node', **{which: port})
+    assert registrations(master, '/node') == [[], [], []]
+    assert create(master, '/node', **{which: port}).is_running
+
+
+def test_impossible_port_is_refused(master):
+    for port in [-1, 65536, 'any', 1.5]:
+        with pytest.raises((ValueError, TypeError)):
+            create(master, '/node', tcp_port=port)
+
+
+def test_domain_is_what_node_advertises(master):
+    node = create(master, '/node', domain='127.0.0.2')
+    assert node.domain == urllib.parse.urlsplit(node.uri).hostname == '127.0.0.2'
+
+
+def test_loopback_domain_listens_there_alone(master):
+    node = create(master, '/node', domain='127.0.0.2')
+    for port in node.tcp_port, node.xmlrpc_port:
+        socket.create_connection(('127.0.0.2', port), TIMEOUT).close()
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection(('127.0.0.1', port), TIMEOUT)
+
+
+def test_impossible_domain_is_refused(master):
+    for domain in ['', 'two words', 'http://host', 7]:
+        with pytest.raises((ValueError, TypeError)):
+            create(master, '/node', domain=domain)
+
+
+# -- classes and blocks
+
+
+def test_keywords_go_to_init(master):
+    assert create(master, '/driver', Driver, wheels=3).wheels == 3
+
+
+def test_unknown_keyword_is_a_type_error(master):
+    with pytest.raises(TypeError):
+        create(master, '/driver', Driver, wings=2)
+    assert registrations(master, '/driver') == [[], [], []]
+
+
+def test_class_that_is_no_node_is_refused(master):
+    with pytest.raises(TypeError):
+        create(master, '/node', dict)
+
+
+def test_subclass_opens_channels_in_start(master, node):
+    create(master, '/driver', Driver)
+    box = Mailbox(node, '/steered', STRING)
+    node.send_to('/steer', data='left')
+    assert box.next().data == 'left 4'
+
+
+def test_failing_start_leaves_nothing(master):
+    class Broken(Node):
         def start(self):
             super().start()
-            self.delegate = mailbox
-            self.interested_in('/log_me', typed_as='std_msgs/String')
+            self.interested_in('/a', STRING)
+            raise RuntimeError('no wheels')
 
-    logger = master.create(Logger, named='/logger')
-    logger.stop()
-    logger.start()
-    assert len(logger.channels) == 1
-    create(master, '/sender').send_to('/log_me', data='once')
-    assert mailbox.next().data == 'once'
-    assert mailbox.empty()
+    with pytest.raises(RuntimeError, match='no wheels'):
+        create(master, '/broken', Broken)
+    assert registrations(master, '/broken') == [[], [], []]
 
 
-def test_further_keywords_go_to_the_nodes_init(master):
-    class Driver(Node):
-        def __init__(self, speed, turn=0.5):
-            super().__init__()
-            self.speed, self.turn = speed, turn
+def test_delegate_gets_message_and_channel(master, node):
+    box, seen = Mailbox(), threading.Event()
 
-    driver = master.create(Driver, named='/driver', speed=3)
-    assert (driver.speed, driver.turn, driver.name) == (3, 0.5, '/driver')
+    def delegate(message, channel):
+        box(message, channel)
+        box(channel, channel)
+        seen.set()
+
+    other = create(master, '/other', delegate=delegate)
+    channel = other.interested_in('/a', STRING)
+    node.send_to('/a', data='hello')
+    assert box.next().data == 'hello'
+    assert box.next() is channel
 
 
-def test_stop_twice_is_harmless_and_start_twice_is_not(master):
-    node = create(master, '/twice')
-    with pytest.raises(pharos.PharosError, match='running already: stop'):
+def test_new_delegate_takes_next_message(master, node):
+    first, second = Mailbox(), Mailbox()
+    other = create(master, '/other', delegate=first)
+    other.interested_in('/a', STRING)
+    node.send_to('/a', data='one')
+    assert first.next().data == 'one'
+    other.delegate = second
+    node.send_to('/a', data='two')
+    assert second.next().data == 'two'
+    assert len(first.all()) == 1
+
+
+@pytest.mark.parametrize('attribute', ['soul', 'delegate'])
+def test_block_must_be_callable(node, attribute):
+    with pytest.raises(TypeError):
+        setattr(node, attribute, 'no block')
+
+
+def test_delegates_run_one_at_a_time(master, node):
+    running, most, done = [], [], threading.Semaphore(0)
+
+    def delegate(message, channel):
+        running.append(channel)
+        most.append(len(running))
+        threading.Event().wait(0.001)
+        running.remove(channel)
+        done.release()
+
+    other = create(master, '/other', delegate=delegate)
+    for topic in '/a', '/b', '/c':
+        other.interested_in(topic, STRING)
+    for _ in range(5):
+        for topic in '/a', '/b', '/c':
+            node.send_to(topic, data='x')
+    for _ in range(15):
+        assert done.acquire(timeout=TIMEOUT)
+    assert set(most) == {1}
+
+
+# -- souls and time
+
+
+def test_execute_runs_soul_and_returns(master):
+    node = create(master, '/node', soul=lambda me: (me.name, threading.current_thread()))
+    assert node.execute() == ('/node', threading.current_thread())
+
+
+def test_execute_without_soul_is_an_error(node):
+    with pytest.raises(PharosError, match='soul'):
+        node.execute()
+
+
+def test_new_soul_runs_next(node):
+    node.soul = lambda me: 'one'
+    assert node.execute() == 'one'
+    node.soul = lambda me: 'two'
+    assert node.execute() == 'two'
+
+
+def test_fork_runs_soul_in_thread(node):
+    ran = []
+    node.soul = lambda me: ran.append(threading.current_thread())
+    thread = node.fork()
+    thread.join(TIMEOUT)
+    assert ran == [thread]
+
+
+def test_fork_takes_block_and_name(node):
+    ran = []
+    thread = node.fork(lambda me: ran.append(me), name='steering')
+    thread.join(TIMEOUT)
+    assert ran == [node]
+    assert 'steering' in thread.name
+
+
+@pytest.mark.parametrize('wait', ['every', 'sleep'])
+def test_stop_ends_soul(node, wait):
+    began, ended = threading.Event(), threading.Event()
+
+    def soul(me):
+        try:
+            began.set()
+            if wait == 'sleep':
+                me.sleep(3600)
+            for turn in me.every(3600):
+                began.set()
+        finally:
+            ended.set()
+
+    thread = node.fork(soul)
+    assert began.wait(TIMEOUT)
+    node.stop()
+    assert ended.is_set()
+    thread.join(TIMEOUT)
+    assert not node.errors
+
+
+def test_soul_says_farewell(master, node):
+    box = Mailbox(create(master, '/ear'), '/speed', STRING)
+    began = threading.Event()
+
+    def soul(me):
+        try:
+            for _ in me.every(3600):
+                me.send_to('/speed', data='full')
+                began.set()
+        finally:
+            me.send_to('/speed', data='zero')
+
+    node.fork(soul)
+    assert began.wait(TIMEOUT)
+    node.stop()
+    assert [box.next().data for _ in range(2)] == ['full', 'zero']
+
+
+def test_stubborn_soul_is_left_behind(master):
+    class Hasty(BlockNode):
+        stop_timeout = 0.05
+
+    node, end = create(master, '/hasty', Hasty), threading.Event()
+    thread = node.fork(lambda me: end.wait(TIMEOUT))
+    node.stop()
+    assert thread.is_alive()
+    assert registrations(master, '/hasty') == [[], [], []]
+    end.set()
+    thread.join(TIMEOUT)
+
+
+def test_opening_soul_does_not_hold_stop_up(master, peer):
+    """Opening a channel is nobody's last word, though its subscriber does not connect."""
+
+    class Patient(BlockNode):
+        connect_timeout = stop_timeout = 3600
+
+    node, began, ended = create(master, '/node', Patient), threading.Event(), threading.Event()
+    peer.run("rospy.Subscriber('/late', message_class('std_msgs/Int8'))")
+
+    def soul(me):
+        try:
+            began.set()
+            me.sleep(3600)
+        finally:
+            try:
+                me.send_to('/late', typed_as=STRING, data='x')
+            finally:
+                ended.set()
+
+    node.fork(soul)
+    assert began.wait(TIMEOUT)
+    stopping = threading.Thread(target=node.stop, daemon=True)
+    stopping.start()
+    stopping.join(TIMEOUT)
+    assert not stopping.is_alive() and ended.is_set()
+
+
+def test_every_counts_its_turns(node):
+    turns = []
+    for turn in node.every(0.001):
+        turns.append(turn)
+        if len(turns) == 3:
+            break
+    assert turns == [0, 1, 2]
+
+
+def test_impossible_period_is_refused(node):
+    for seconds in [0, -1, 'often', float('nan')]:
+        with pytest.raises((ValueError, TypeError)):
+            node.every(seconds)
+
+
+def test_every_and_sleep_follow_ros_time(master):
+    master.parameters['/use_sim_time'] = True
+    try:
+        node, clock = create(master), create(master, '/clock_of_all')
+        clocks = clock.output_channel('/clock', 'rosgraph_msgs/Clock')
+        ended = [threading.Event(), threading.Event()]
+
+        def turn(me):
+            for turn in me.every(100):
+                if turn == 2:
+                    break
+            ended[0].set()
+
+        def sleep(me):
+            me.sleep(100)
+            ended[1].set()
+
+        clocks.publish(rosgraph_msgs.msg.Clock(rospy.Time(1)))
+        until(lambda: node.ros.Time.now().to_sec() == 1)
+        node.fork(turn), node.fork(sleep)
+        seconds = 1
+        while not all(event.wait(0.01) for event in ended):
+            seconds += 50
+            assert seconds < 1e5
+            clocks.publish(rosgraph_msgs.msg.Clock(rospy.Time(seconds)))
+    finally:
+        del master.parameters['/use_sim_time']
+
+
+# -- starts and stops
+
+
+def test_stop_unregisters_everything(master, node):
+    node.interested_in('/a', STRING), node.output_channel('/b', STRING)
+    node.serve('/c', 'std_srvs/Empty', lambda request: None)
+    assert registrations(master, '/node')[:2] == [['/b', '/rosout'], ['/a']]
+    node.stop()
+    assert registrations(master, '/node') == [[], [], []]
+
+
+def test_stop_frees_ports_and_threads(master):
+    threads = threading.active_count()
+    node = create(master)
+    ports = node.tcp_port, node.xmlrpc_port
+    node.stop()
+    for port in ports:
+        socket.create_server(('127.0.0.1', port)).close()
+    until(lambda: threading.active_count() <= threads + 1)
+
+
+def test_second_stop_does_nothing(node):
+    node.stop()
+    node.stop()
+    assert not node.is_running
+
+
+def test_second_start_is_an_error(node):
+    with pytest.raises(PharosError):
         node.start()
-    node.stop()
-    node.stop()
-    with pytest.raises(pharos.NodeStoppedError, match='/twice is stopped: start'):
-        node.send_to('/x', data='', typed_as='std_msgs/String')
+    assert node.is_running
 
 
-def test_the_end_of_a_with_block_stops_the_node(master):
-    with create(master, '/within') as node:
+def test_with_block_stops_node(master):
+    with create(master) as node:
         assert node.is_running
     assert not node.is_running
 
 
-def test_who_asks_a_node_to_stop_finds_it_gone(master):
-    """As with rospy: rosnode asks the next thing at once."""
-    for number in range(5):
-        victim = create(master, '/victim')
-        victim.interested_in('/nodes/victim', 'std_msgs/Empty')
-        victim.fork(lambda me: me.sleep(60))
-        with xmlrpc.client.ServerProxy(victim.uri) as proxy:
-            assert proxy.shutdown('/test', 'enough') == [1, 'shutdown', 0]
-        assert not rosnode.rosnode_ping('/victim', max_count=1)
-        assert not any(
-            '/victim' in users for kind in master.system_state() for users in kind.values()
-        )
-        victim.stop()  # waits for the rest
+def test_lifecycle_is_told(master):
+    seen = []
 
+    class Watched(Node):
+        def __init__(self):
+            seen.append(self.lifecycle.value)
 
-def test_rosnode_kill_stops_that_node_and_no_other(master):
-    victim, other = create(master, '/victim'), create(master, '/other')
-    stopped = threading.Event()
-    victim.fork(lambda me: [None for _ in me.every(0.01)] and stopped.set())
-    run('rosnode', 'kill', '/victim')
-    assert stopped.wait(TIMEOUT)
-    with node_registry.changed:
-        assert node_registry.changed.wait_for(
-            lambda: victim.lifecycle is Lifecycle.STOPPED, TIMEOUT
-        )
-    assert other.is_running
-    assert '/victim' not in registered(master)
-    assert '/other' in registered(master)
+        def stop(self):
+            seen.append(self.lifecycle.value)
+            super().stop()
 
-
-def test_a_shutdown_meant_for_an_earlier_owner_of_the_uri_does_not_reach_a_node(master):
-    """The master tells the old URI of a name to shut down, and a rospy node there by now does so
-    (ros_comm #2241)."""
-    node = create(master, '/heir')
-    code, reason, _ = pharos.private_rospy.proxies.ServerProxy(node.uri).shutdown(
-        '/master', '[/old] Reason: new node registered with same name'
-    )
-    assert node.is_running
-    assert 'still this node' in reason
-
-
-def test_a_node_stops_from_its_own_delegate(master):
-    done = threading.Event()
-
-    def stop(message, channel):
-        channel.node.stop()
-        done.set()
-
-    node = create(master, '/suicide', delegate=stop)
-    node.interested_in('/poison', 'std_msgs/Empty')
-    create(master, '/sender').send_to('/poison')
-    assert done.wait(TIMEOUT)
-    assert node.lifecycle is Lifecycle.STOPPED
-
-
-def test_what_was_sent_before_the_stop_arrives(master, mailbox):
-    create(master, '/receiver', delegate=mailbox).interested_in('/late', 'std_msgs/String')
-    with create(master, '/sender') as sender:
-        for number in range(200):
-            sender.send_to('/late', data=str(number) + 'x' * 20000, typed_as='std_msgs/String')
-    assert [message.data.rstrip('x') for message in mailbox.take(200)] == [
-        str(number) for number in range(200)
-    ]
-
-
-def test_a_soul_says_farewell(master, mailbox):
-    """A robot is to be halted when its driver stops."""
-    create(master, '/wheels', delegate=mailbox).interested_in('/speed', 'std_msgs/Float32')
-
-    def drive(me):
-        try:
-            while True:
-                me.send_to('/speed', data=1.0)
-                me.sleep(3600)
-        finally:
-            me.send_to('/speed', data=0.0)
-
-    driver = create(master, '/driver', soul=drive)
-    driver.fork()
-    assert mailbox.next().data == 1.0
-    driver.stop()
-    assert mailbox.next().data == 0.0
-    assert not driver.errors
-
-
-def test_a_soul_that_ignores_the_stop_is_named_and_left_behind(master, capfd):
-    release = threading.Event()
-    node = create(master, '/stubborn')
-    node.stop_timeout = 0.1
-    node.fork(lambda me: release.wait(), name='deaf')
+    node = create(master, '/watched', Watched)
     node.stop()
-    release.set()
-    assert 'left behind' in capfd.readouterr().err
+    assert [*seen, node.lifecycle.value] == ['new', 'running', 'stopped']
 
 
-def test_an_exception_in_a_delegate_ends_only_that_run(master, transcript, mailbox):
-    """rospy logs it, and nothing in the program is told."""
-
-    def delegate(message, channel):
-        if message.data == 'bad':
-            raise ValueError('this one is bad')
-        mailbox(message, channel)
-
-    node = create(master, '/careful', delegate=delegate)
-    node.interested_in('/mixed', 'std_msgs/String')
-    sender = create(master, '/sender')
-    sender.send_to('/mixed', data='bad')
-    sender.send_to('/mixed', data='good')
-    assert mailbox.next().data == 'good'
-    assert [str(error) for error in node.errors] == ['this one is bad']
-    assert '/careful' in transcript[0]
-    assert '/mixed' in transcript[0]
-    assert 'ValueError: this one is bad' in transcript[0]
+@pytest.mark.parametrize('where', ['delegate', 'soul', 'service'])
+def test_node_stops_from_own_block(master, node, where):
+    other = create(master, '/other')
+    if where == 'delegate':
+        other.interested_in('/a', STRING, delegate=lambda message, channel: other.stop())
+        node.send_to('/a', data='x')
+    elif where == 'soul':
+        other.fork(lambda me: me.stop())
+    else:
+        other.serve('/end', 'std_srvs/Empty', lambda request: other.stop())
+        with contextlib.suppress(PharosError):  # the answer may end with the node
+            master.lookup_service('/end').call()
+    until(lambda: other.lifecycle is pharos.Lifecycle.STOPPED)
+    until(lambda: registrations(master, '/other') == [[], [], []])
 
 
-def test_execute_runs_the_soul_here_and_returns_its_value(master):
-    node = create(master, '/soul', soul=lambda me: (me.name, threading.current_thread()))
-    assert node.execute() == ('/soul', threading.current_thread())
-    node.soul = lambda me: 1 / 0
-    assert node.execute() is None
-    assert isinstance(node.errors[-1], ZeroDivisionError)
-    node.soul = None
-    with pytest.raises(pharos.PharosError, match='no soul'):
-        node.execute()
-
-
-def test_every_turns_until_the_node_stops(master):
-    node = create(master, '/metronome')
-    turns = []
-    for _ in node.every(0.001):
-        turns.append(1)
-        if len(turns) == 20:
-            node.stop()
-    assert len(turns) == 20
-
-
-def test_sleep_ends_when_the_node_stops(master):
-    node = create(master, '/sleeper')
-    slept = threading.Event()
-    threading.Thread(target=lambda: (node.sleep(3600), slept.set()), daemon=True).start()
-    node.stop()
-    assert slept.wait(TIMEOUT)
-
-
-def test_every_and_sleep_follow_simulated_time(master):
-    master.api().setParam('/use_sim_time', True)
-    try:
-        clock = create(master, '/clock_server').output_channel('/clock', 'rosgraph_msgs/Clock')
-        node, turns = create(master, '/simulated'), Mailbox()
-        until(lambda: '/simulated' in dict(clock.connections))
-        clock.send(clock={'secs': 100})
-        until(lambda: node.ros.Time.now().secs == 100)
-
-        def soul(me):
-            for turn in me.every(10):
-                turns((turn, me.ros.Time.now().secs), None)
-
-        node.fork(soul)
-        # a turn that comes late does not delay those after it
-        for turn, seconds in enumerate((100, 110, 125, 130, 140)):
-            clock.send(clock={'secs': seconds})
-            assert turns.next() == (turn, seconds)
-        node.stop()  # time stands still, the soul ends all the same
-    finally:
-        master.api().deleteParam('/use_sim_time')
-
-
-def test_loops_sleeps_and_timers_go_on_after_a_jump_back_in_time(master):
-    master.api().setParam('/use_sim_time', True)
-    try:
-        clock = create(master, '/clock_server').output_channel('/clock', 'rosgraph_msgs/Clock')
-        node = create(master, '/simulated')
-        loop, sleeper, timer = Mailbox(), Mailbox(), Mailbox()
-        until(lambda: '/simulated' in dict(clock.connections))
-        clock.send(clock={'secs': 100})
-        until(lambda: node.ros.Time.now().secs == 100)
-
-        def turn(me):
-            for _ in me.every(10):
-                loop(me.ros.Time.now().secs, None)
-
-        def sleep(me):
-            while True:
-                sleeper(me.ros.Time.now().secs, None)
-                me.sleep(10)
-
-        node.fork(turn)
-        node.fork(sleep)
-        node.ros.Timer(
-            node.ros.Duration(10), lambda event: timer(event.current_real.secs, None), reset=True
-        )
-        assert (loop.next(), sleeper.next()) == (100, 100)
-        waiting = node.ros.rostime.get_rostime_cond()._waiters
-        for seconds in (110, 120, 50, 60, 70):  # as rosbag play does it when it begins anew
-            until(lambda: len(waiting) == 3)
-            clock.send(clock={'secs': seconds})
-            assert (loop.next(), sleeper.next(), timer.next()) == (seconds, seconds, seconds)
-        assert not node.errors
-    finally:
-        master.api().deleteParam('/use_sim_time')
-
-
-def test_delegates_of_a_node_run_one_at_a_time(master, mailbox):
-    """rospy's callbacks run in as many threads as there are connections (ros_comm #1377)."""
-    busy = threading.Lock()
-    overlaps = []
-
-    def delegate(message, channel):
-        if not busy.acquire(blocking=False):
-            overlaps.append(message)
-        else:
-            busy.release()
-        mailbox(message, channel)
-
-    node = create(master, '/single', delegate=delegate)
-    senders = [create(master, '/sender%d' % i) for i in range(4)]
-    for i in range(4):
-        node.interested_in('/lane%d' % i, 'std_msgs/Int32')
+def test_sent_before_stop_arrives(master, node, peer):
+    peer.hear('/a', STRING)
     for number in range(50):
-        for i, sender in enumerate(senders):
-            sender.send_to('/lane%d' % i, data=number)
-    received = [mailbox.next_with_channel() for _ in range(200)]
-    assert not overlaps
-    for i in range(4):
-        assert [m.data for m, channel in received if channel.topic == '/lane%d' % i] == list(
-            range(50)
-        )
+        node.send_to('/a', typed_as=STRING, data=str(number))
+    node.stop()
+    assert [message.data for message in peer.heard('/a', 50)] == [str(n) for n in range(50)]
+
+
+def test_node_starts_again(master, node):
+    about = node.name, node.tcp_port, node.xmlrpc_port
+    node.stop()
+    node.start()
+    assert (node.name, node.tcp_port, node.xmlrpc_port) == about
+    assert '/node' in [each.name for each in master.nodes()]
+
+
+@pytest.mark.parametrize('again', ['start', 'restart'])
+def test_channels_and_services_come_back(master, node, again):
+    other = create(master, '/other')
+    box = Mailbox(other, '/a', STRING)
+    out = other.output_channel('/b', STRING, latch=True)
+    out.send(data='kept')
+    other.serve('/c', 'std_srvs/Trigger', lambda request: (True, 'yes'))
+    if again == 'start':
+        other.stop()
+        other.start()
+    else:
+        other.restart()
+    node.send_to('/a', data='x')
+    assert box.next().data == 'x'
+    assert Mailbox(node, '/b').next().data == 'kept'
+    assert master.lookup_service('/c').call().message == 'yes'
+    assert out in other.channels and box.channel in other.channels
+
+
+def test_start_of_class_opens_once(master, node):
+    log = []
+    driver = create(master, '/driver', Driver, log=log)
+    driver.restart()
+    box = Mailbox(node, '/steered', STRING)
+    node.send_to('/steer', data='left')
+    assert box.next().data == 'left 4'
+    node.send_to('/steer', data='right')
+    assert box.next().data == 'right 4'
+    assert log == ['start', 'stop', 'start']
+
+
+def test_restart_forks_souls_again(node):
+    begun = threading.Semaphore(0)
+
+    def soul(me):
+        begun.release()
+        me.sleep(3600)
+
+    node.fork(soul)
+    assert begun.acquire(timeout=TIMEOUT)
+    node.restart()
+    assert begun.acquire(timeout=TIMEOUT)
+
+
+def test_overridden_stop_runs_at_rosnode_kill(master):
+    log = []
+    driver = create(master, '/driver', Driver, log=log)
+    with Program(['rosnode', 'kill', '/driver'], master.url) as program:
+        program.wait()
+    until(lambda: driver.lifecycle is pharos.Lifecycle.STOPPED)
+    assert log == ['start', 'stop']
+
+
+STOPPED = {
+    'interested_in': lambda node: node.interested_in('/a', STRING),
+    'output_channel': lambda node: node.output_channel('/a', STRING),
+    'send_to': lambda node: node.send_to('/a', typed_as=STRING, data='x'),
+    'serve': lambda node: node.serve('/a', 'std_srvs/Empty', lambda request: None),
+    'parameter': lambda node: node.parameter('~a'),
+    'execute': lambda node: node.execute(),
+    'fork': lambda node: node.fork(),
+    'sleep': lambda node: node.sleep(0.01),
+    'every': lambda node: list(node.every(0.01)),
+    'wait_for_message': lambda node: node.wait_for_message('/a', STRING, 0.01),
+    'lookup_service': lambda node: node.lookup_service('/a'),
+    'ros': lambda node: node.ros,
+    'ros_import': lambda node: node.ros_import('message_filters'),
+}
+
+
+def test_stopped_node_refuses_use(node):
+    node.soul = lambda me: None
+    node.stop()
+    for use in STOPPED.values():
+        with pytest.raises(NodeStoppedError, match='/node'):
+            use(node)
+
+
+# -- becoming another
+
+
+class Slow(Node):
+    def on_message(self, message, channel):
+        self.said.append(f'slow {message.data}')
+
+    def answer(self, request):
+        return True, 'slow'
+
+
+class Fast(Slow):
+    def on_message(self, message, channel):
+        self.said.append(f'fast {message.data}')
+
+    def answer(self, request):
+        return True, 'fast'
+
+
+def test_node_becomes_another_class(master, node):
+    other = create(master, '/other', Slow)
+    other.said = []
+    channel = other.interested_in('/a', STRING, delegate=other.on_message)
+    other.serve('/which', 'std_srvs/Trigger', other.answer)
+    node.send_to('/a', data='1')
+    until(lambda: other.said)
+    uri = other.uri
+    other.become(Fast)
+    node.send_to('/a', data='2')
+    until(lambda: len(other.said) == 2)
+    assert other.said == ['slow 1', 'fast 2']
+    assert isinstance(other, Fast) and other.uri == uri and channel in other.channels
+    assert master.lookup_service('/which').call().message == 'fast'
+
+
+@pytest.mark.parametrize('cls', [dict, 'Fast', None])
+def test_node_becomes_only_a_node(node, cls):
+    with pytest.raises(TypeError):
+        node.become(cls)
+
+
+# -- its rospy, its log, its health
+
+
+def test_rospy_of_node_is_whole(node):
+    ticked = threading.Event()
+    node.ros.Timer(node.ros.Duration(0.001), lambda event: ticked.set())
+    assert ticked.wait(TIMEOUT)
+    assert node.ros.get_name() == '/node'
+    assert node.ros.Time.now().to_sec() > 0
+
+
+def test_imported_library_belongs_to_node(master, node):
+    filters = node.ros_import('message_filters')
+    heard = Mailbox()
+    filters.Subscriber('/a', pharos.message_class(STRING)).registerCallback(
+        lambda m: heard(m, None)
+    )
+    assert registrations(master, '/node')[1] == ['/a']
+    create(master, '/other').send_to('/a', data='x')
+    assert heard.next().data == 'x'
+
+
+@pytest.mark.parametrize(
+    'level, number', [('info', 2), ('warn', 4), ('warning', 4), ('error', 8), ('fatal', 16)]
+)
+def test_log_goes_to_rosout(master, node, level, number):
+    box = Mailbox(create(master, '/ear'), '/rosout', 'rosgraph_msgs/Log')
+    node.log('out of fuel', level)
+    line = box.wait_for(lambda line: line.name == '/node' and line.msg == 'out of fuel')
+    assert line.level == number
+    assert line.file == 'test_nodes.py'
+
+
+def test_unknown_log_level_is_refused(node):
+    with pytest.raises(ValueError, match='loud'):
+        node.log('x', 'loud')
+
+
+def test_health_tells_about_node(master, node, peer):
+    peer.hear('/a', STRING)
+    node.send_to('/a', typed_as=STRING, data='x')
+    health = node.health()
+    assert health.registered is True
+    assert health.connections['TCPROS'] >= 1
+    assert (health.dropped, health.errors) == (0, 0)
+    assert health.threads > 0
+    assert re.match('registered', str(health))
+
+
+def test_other_process_sees_service_of_node(master, node, peer):
+    node.serve('/add', 'std_srvs/SetBool', lambda request: (request.data, 'done'))
+    answer = peer.value("rospy.ServiceProxy('/add', __import__('std_srvs.srv').srv.SetBool)(True)")
+    assert (answer.success, answer.message) == (True, 'done')

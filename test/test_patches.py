@@ -1,166 +1,150 @@
-"""The table of what is mended in rospy."""
+"""The functions of rospy that are patched, and the host's own rospy, which is not."""
+import ast
+import hashlib
+import importlib
+import json
 import pathlib
-import runpy
-import types
+import tokenize
 
 import pytest
+import rospy
 
-from pharos.errors import PharosError
-from pharos.private_rospy.patches import table
-from pharos.private_rospy.process_rospy import rospy
+from helpers import Program
 
-TOOL = runpy.run_path(str(pathlib.Path(__file__).resolve().parent.parent / 'tools' / 'patches'))
+KNOWN = pathlib.Path(__file__).with_name('patched_sources.txt')
+DEBIAN = pathlib.Path(rospy.__file__).parent.parent
 
-SOURCE = """
-import time
 
-def double(number, times=2):
-    return number * times
+def patched():
+    """``[(module, target, has an original)]``: all that is known here of the table of patches."""
+    from pharos.private_rospy.patches import TABLE
 
-def apivalidate(f):
-    def validated_f(*args):
-        return ('checked', f(*args))
-    return validated_f
+    return [(patch.module, patch.target, patch.kind != 'added') for patch in TABLE]
 
-class Base:
-    def inherited(self, value):
-        return 'inherited', value
 
-class Handler(Base):
-    @apivalidate
-    def call(self, caller_id):
-        return 'called by ' + caller_id
+def fingerprint(module, target):
+    """The hash of a target's source, without comments, docstrings and layout; None without target.
+
+    Of a variable of the module: of the functions that use it.
+    """
+    path = DEBIAN.joinpath(*module.split('.'))
+    path = path / '__init__.py' if path.is_dir() else path.with_suffix('.py')
+    tree = ast.parse(path.read_text())
+    found = definition(tree, tree, target.split('.'))
+    nodes = [found] if found else users(tree, target)
+    text = ''.join(f'{word}\n' for node in nodes for word in words(path, node))
+    return hashlib.sha256(text.encode()).hexdigest()[:8] if nodes else None
+
+
+def definition(tree, scope, path):
+    """The definition in a module or class, or in a base of that class."""
+    for node in scope.body:
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and node.name == path[0]:
+            return definition(tree, node, path[1:]) if path[1:] else node
+    bases = [base.id for base in getattr(scope, 'bases', ()) if isinstance(base, ast.Name)]
+    inherited = (definition(tree, tree, [base]) for base in bases)
+    return next((definition(tree, base, path) for base in inherited if base), None)
+
+
+def users(tree, name):
+    """The functions of a module that use a name."""
+    uses = {node for node in ast.walk(tree) if isinstance(node, ast.Name) and node.id == name}
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    return [function for function in functions if uses & {*ast.walk(function)}]
+
+
+def words(path, node):
+    """The tokens of a definition, decorators included."""
+    first = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
+    docstrings = {
+        (part.body[0].lineno, part.body[0].col_offset)
+        for part in ast.walk(node)
+        if isinstance(part, (ast.FunctionDef, ast.ClassDef)) and ast.get_docstring(part)
+    }
+    with open(path, 'rb') as file:
+        for token in tokenize.tokenize(file.readline):
+            if not first <= token.start[0] <= node.end_lineno or token.start in docstrings:
+                continue
+            if token.type in (tokenize.INDENT, tokenize.DEDENT):
+                yield tokenize.tok_name[token.type]
+            elif token.type not in (tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE):
+                yield token.string
+
+
+def known():
+    """``{target: fingerprints in the known releases}``."""
+    rows = [line.split() for line in KNOWN.read_text().splitlines() if line[0] != '#']
+    return {target: set(fingerprints) for target, *fingerprints in rows}
+
+
+def test_patched_sources_are_known():
+    """After a look at what changed, ``python3 test_patches.py`` notes the installed release."""
+    for module in sorted({module for module, _, _ in patched()}):
+        unknown = [
+            target
+            for of, target, has_original in patched()
+            if (of, has_original) == (module, True)
+            and fingerprint(module, target) not in known().get(f'{module}.{target}', ())
+        ]
+        assert unknown == []
+
+
+def test_added_functions_are_missing_in_rospy():
+    there = []
+    for module, target, has_original in patched():
+        owner, _, name = target.rpartition('.')
+        scope = importlib.import_module(module)
+        if not has_original and name in vars(getattr(scope, owner) if owner else scope):
+            there.append(target)
+    assert there == []
+
+
+HOST = """
+import importlib, json, logging, operator, signal, sys, threading
+import rospy
+
+TARGETS = json.loads(sys.argv[1])
+
+def look():
+    modules = [importlib.import_module(module) for module, _ in TARGETS]
+    loggers = [logging.getLogger(name) for name in (None, 'rosout', 'rospy')]
+    return {
+        'functions': [operator.attrgetter(each[1])(of) for of, each in zip(modules, TARGETS)],
+        'modules': modules,
+        'logging': [(each.level, list(each.handlers), each.propagate) for each in loggers],
+        'hooks': (sys.excepthook, threading.excepthook, sys.stdout, sys.stderr),
+        'signals': [signal.getsignal(number) for number in signal.valid_signals()],
+        'node': (rospy.get_name(), rospy.core.is_initialized(), rospy.is_shutdown()),
+    }
+
+for number in signal.SIGINT, signal.SIGTERM, signal.SIGHUP:
+    signal.signal(number, lambda number, frame: None)
+before = look()
+import pharos
+with pharos.Master().create(pharos.BlockNode, named='/node') as node:
+    node.send_to('/t', typed_as='std_msgs/String', data='x')
+    node.ros_import('actionlib')
+print('changed', json.dumps([what for what, now in look().items() if now != before[what]]))
 """
 
 
-@pytest.fixture
-def entries(monkeypatch):
-    """An empty table."""
-    monkeypatch.setattr(table, 'TABLE', [])
+@pytest.fixture(scope='module')
+def changed(ros_master):
+    """What a node changed of its process, in a process of its own."""
+    targets = json.dumps([(module, target) for module, target, original in patched() if original])
+    with Program(HOST, ros_master.url, targets) as program:
+        assert program.wait() == 0, program.output
+        return json.loads(program.output.partition('changed ')[2])
 
 
-def patched(node=None):
-    """A module made of the source above, with the patches of the table."""
-    module = types.ModuleType('rospy.example')
-    exec(SOURCE, vars(module))
-    table.apply(module, node)
-    return module
+def test_node_leaves_host_unchanged(changed):
+    for what in 'functions modules logging hooks signals node'.split():
+        assert what not in changed
 
 
-@pytest.mark.usefixtures('entries')
-class TestTheTable:
-    def test_a_patch_gets_its_node_the_original_and_the_private_module(self):
-        @table.patch('rospy.example', 'double', 'doubles')
-        def double(number, times=2, *, node, original, module):
-            return node, module, original(number, times)
-
-        module = patched('a node')
-        assert module.double(3) == ('a node', module, 6)
-
-    def test_each_node_has_patches_of_its_own(self):
-        @table.patch('rospy.example', 'double', 'doubles')
-        def double(number, times=2, *, node):
-            return node
-
-        one, other = patched('one'), patched('other')
-        assert one.double(1) == 'one'
-        assert other.double(1) == 'other'
-
-    def test_a_method_that_is_inherited_is_replaced_where_the_patch_says(self):
-        @table.patch('rospy.example', 'Handler.inherited', 'is inherited')
-        def inherited(self, value, *, original):
-            return original(self, value) + ('patched',)
-
-        module = patched()
-        assert module.Handler().inherited(1) == ('inherited', 1, 'patched')
-        assert module.Base().inherited(1) == ('inherited', 1)
-
-    def test_rospy_goes_on_checking_the_arguments_of_a_remote_call(self):
-        @table.patch('rospy.example', 'Handler.call', 'says too little')
-        def call(self, caller_id, *, original):
-            return original(self, caller_id) + ', patched'
-
-        assert patched().Handler().call('me') == ('checked', 'called by me, patched')
-
-    def test_a_function_is_added_to_a_class(self):
-        @table.addition('rospy.example', 'Handler.more', 'is missing')
-        def more(self, *, node):
-            return self, node
-
-        handler = patched('a node').Handler()
-        assert handler.more() == (handler, 'a node')
-
-    def test_a_name_of_a_module_is_substituted(self):
-        @table.substitute('rospy.example', 'time', 'waits for long')
-        def time(*, node, original):
-            return node, original.__name__
-
-        assert patched('a node').time == ('a node', 'time')
-
-    @pytest.mark.parametrize('target', ['gone', 'Gone.method', 'Handler.gone'])
-    def test_a_target_that_is_missing_is_named_with_its_patch(self, target):
-        @table.patch('rospy.example', target, 'is gone')
-        def mended():
-            """Never called."""
-
-        with pytest.raises(
-            PharosError, match=rf'test_patches\.mended .*rospy\.example\.{target} is not there'
-        ):
-            patched()
-
-    def test_a_target_with_other_parameters_is_named_with_its_patch(self):
-        @table.patch('rospy.example', 'Handler.call', 'takes more')
-        def mended(self, caller_id, message):
-            """Never called."""
-
-        with pytest.raises(
-            PharosError,
-            match=r'mended .*Handler\.call takes \(self, caller_id\), not \(self, caller_id, mess',
-        ):
-            patched()
-
-    def test_what_is_no_function_cannot_be_patched_as_one(self):
-        @table.patch('rospy.example', 'Handler', 'is a class')
-        def mended():
-            """Never called."""
-
-        with pytest.raises(PharosError, match=r'rospy\.example\.Handler is no function'):
-            patched()
-
-    def test_an_addition_to_a_class_that_has_it_by_now_is_an_error(self):
-        @table.addition('rospy.example', 'Handler.call', 'is missing')
-        def mended(self):
-            """Never called."""
-
-        with pytest.raises(PharosError, match=r'mended .*Handler\.call is there already'):
-            patched()
-
-    def test_a_target_has_one_patch(self):
-        table.patch('rospy.example', 'double', 'doubles')(lambda: None)
-        with pytest.raises(PharosError, match=r'rospy\.example\.double has two patches'):
-            table.patch('rospy.example', 'double', 'doubles')(lambda: None)
-
-    def test_a_patch_of_a_module_that_is_never_loaded_is_an_error(self):
-        table.patch('rospy.gone', 'double', 'doubles')(patched)
-        with pytest.raises(PharosError, match=r'patched .*rospy\.gone\.double is not there'):
-            table.check_applied({'rospy.example': None})
-
-
-class TestWhatIsPatched:
-    """What rospy has there, as tools/patches sees it."""
-
-    def test_it_is_what_it_is_in_a_release_that_is_known(self):
-        """A new release of rospy is known when each target that this names was looked at, its patch
-        fits, and ``tools/patches RELEASE FOLDER`` has noted the release (it says how)."""
-        _, known = TOOL['read_notes']()
-        found = TOOL['fingerprints'](pathlib.Path(rospy.__file__).parent.parent)
-        changed = [
-            target
-            for target, fingerprint in found.items()
-            if fingerprint == TOOL['UNKNOWN'] or fingerprint not in known.get(target, {}).values()
-        ]
-        assert changed == [], 'rospy has others than known: see the docstring of this test'
-        assert found.keys() == known.keys(), 'run tools/patches RELEASE FOLDER'
-
-    def test_the_page_of_the_documentation_shows_the_table(self):
-        assert TOOL['PAGE'].read_text() == TOOL['page'](), 'run tools/patches'
+if __name__ == '__main__':
+    notes, text = known(), '# The sources of the targets in the known releases.\n'
+    for module, target in sorted(entry[:2] for entry in patched() if entry[2]):
+        found = {fingerprint(module, target)} | notes.get(f'{module}.{target}', set())
+        text += f'{module}.{target} {" ".join(sorted(found))}\n'
+    KNOWN.write_text(text)

@@ -1,443 +1,484 @@
-"""Programs and libraries of ROS as a node's own: they find what they would in a process of their
-own."""
-import builtins
-import asyncio
-import concurrent.futures
-import importlib
-import io
-import logging
-import os
-import pathlib
-import pickle
-import shutil
+"""The programs that rosrun starts, pharos.testing, spin() and the Transcript."""
+import contextlib
+import re
 import signal
 import socket
-import sys
-import termios
+import subprocess
 import threading
 
-import numpy
 import pytest
 
 import pharos
-import programs
-from helpers import create, ended, in_thread
-from pharos.private_rospy import ownership
-from pharos.testing import TIMEOUT, until
-from workspaces import SPACES, build, forget
+from helpers import PYTHON, TIMEOUT, Program, create
+from pharos import BlockNode, Master, Transcript
+from pharos.testing import Mailbox, until
 
-PROGRAMS = pathlib.Path(__file__).parent / 'programs'
-
-
-@pytest.fixture
-def node(master):
-    """A node whose rospy the programs use."""
-    return create(master, '/program_node')
-
-
-def run(node, program, *arguments):
-    """Run a program of the tests as the node's, in this thread; returns its ``__main__``."""
-    path = str(PROGRAMS / program)
-    node.latest_run.rospy.run_main(path, [path, *arguments])
-    return node.ros_import('__main__')
-
-
-@pytest.fixture(params=SPACES)
-def space(request, tmp_path, monkeypatch):
-    """A space with the packages of the tests, on Python's path."""
-    folder = build(request.param, tmp_path)
-    monkeypatch.syspath_prepend(str(folder))
-    monkeypatch.setattr(sys, 'path', list(sys.path))  # packages of a devel space add to it
-    if request.param == 'debian':
-        monkeypatch.setattr(ownership, '_SITES', {*ownership._SITES, str(folder)})
-    yield folder
-    forget()
-
-
-# -- programs
-
-
-def test_a_program_is_main_and_has_its_arguments_and_the_modules_beside_it(master):
-    path = 'siblings/counting.py'
-    for name in '/first_program', '/second_program':
-        node = create(master, name)
-        with pytest.raises(SystemExit) as exit_:
-            run(node, path, 'one', '--two')
-        found = node.parameter('~found').value
-        assert found == ['__main__', *2 * [str(PROGRAMS / path)], 'one', '--two', name]
-        assert exit_.value.code == 3
-
-
-def test_what_a_program_finds_in_a_folder_of_its_own_path_is_its_own(master):
-    for name in '/first_program', '/second_program':
-        main = run(create(master, name), 'own/adds_a_folder.py')
-        assert main.plain_module.USERS == [main.sys.argv[0]]
-        assert main.pharos is pharos
-
-
-def test_a_module_beside_a_program_is_read_anew_when_it_has_changed(node, tmp_path):
-    for text in 'before', 'after, and longer':
-        (tmp_path / 'beside_it.py').write_text(f'TEXT = {text!r}')
-        os.utime(tmp_path / 'beside_it.py', (len(text), len(text)))
-        (tmp_path / 'program.py').write_text('from beside_it import TEXT')
-        assert run(node, tmp_path / 'program.py').TEXT == text
-        node.stop()
-        node.start()
-
-
-def test_classes_of_a_program_are_found_by_the_name_of_their_module(node):
-    main = run(node, 'own/looks_itself_up.py')
-    assert main.itself
-    assert main.fields == ['x', 'at']
-    assert isinstance(main.pose, main.Pose) and main.pose.x == 1
-    assert isinstance(main.colour, main.Colour) and main.colour.red == 7
-    assert main.source.startswith('class Stamp:')
-    assert main.module == '__main__'
-    assert main.hints['at'] is main.Stamp
-    assert main.time == node.ros.Time(3, 4)
-    assert [type(each) for each in main.copied] == [node.ros.Time, node.ros.Duration]
-
-
-@pytest.mark.parametrize('kind', ['Time', 'Duration'])
-def test_times_of_a_node_pickle(node, kind):
-    time = getattr(node.ros, kind)(3, 4)
-    copy = pickle.loads(pickle.dumps([time]))[0]
-    assert copy == time
-    assert type(copy).__module__.startswith('genpy')
-
-
-def test_a_program_that_is_a_test_finds_its_tests(node):
-    with pytest.raises(SystemExit) as exit_:
-        run(node, 'own/unit_tests.py')
-    assert exit_.value.code  # of all its tests, one fails
-    result = node.ros_import('__main__').result
-    assert (result.testsRun, result.failures, result.errors) == (1, [], [])
-
-
-def test_children_see_the_environment_of_the_node(node):
-    found = run(node, 'own/children.py').found
-    assert found == {
-        'getenv': 'own',
-        'expandvars': 'own',
-        'subprocess': '/ own\n',
-        'run': 'too\n',
-        'popen': 'own\n',
-        'system': 0,
-        'system_fails': 7,
-        'spawn': 0,
-        'check_call': 1,
-        'child_of_child': '/ own\n',
-        'multiprocessing': 'own',
-        'answer': True,
-        'exit_code': 0,
-    }
-    assert 'OWN_VARIABLE' not in os.environ
-    assert os.system('test -z "$OWN_VARIABLE$OWN_VARIABLE_TOO"') == 0
-
-
-def test_what_a_program_sets_is_not_the_processs(node, capsys):
-    before = sys.argv, sys.path, sys.stdout, logging.getLogger().handlers, logging.getLogger().level
-    copies = [list(each) for each in before[:2]]
-    main = run(node, 'own/speaks.py')
-    assert main.sys.stdout.getvalue() == 'own\nlogged\nlogged too\n'
-    assert main.redirected.getvalue() == 'redirected\n'
-    assert capsys.readouterr().out == ''
-    root = logging.getLogger()
-    assert before == (sys.argv, sys.path, sys.stdout, root.handlers, root.level)
-    assert copies == [sys.argv, sys.path]
-    assert main.root is not root
-
-
-def test_arguments_are_the_programs_own_after_star_imports_too(node, master):
-    main = run(node, 'own/reads_arguments.py', '--speed', '3', '/a:=/b')
-    assert main.argv[1:] == ['--speed', '3', '/a:=/b']
-    assert main.speed == 3
-    assert main.program == 'reads_arguments.py'
-    assert main.usage == 'reads_arguments.py'
-    assert main.rest == ['/a:=/b']
-    assert main.variable == master.url
-
-
-def test_a_program_has_builtins_of_its_own_and_its_exit_closes_nothing(node, capsys, monkeypatch):
-    monkeypatch.setattr(sys, 'stdin', io.StringIO('a line'))
-    before = dict(vars(builtins))
-    with pytest.raises(SystemExit, match='enough'):
-        run(node, 'own/changes_builtins.py')
-    main = node.ros_import('__main__')
-    assert main.said == [('hello', 42)]
-    assert main.found == 'what'
-    assert vars(builtins) == before
-    assert sys.stdin.read() == 'a line'
-
-
-def test_rospy_is_the_nodes_in_whatever_way_it_is_imported(node):
-    main = run(node, 'own/imports_rospy.py')
-    assert main.names == {'/program_node'}
-    assert main.same
-    assert main.reloaded
-    assert main.known == [True, True, True, False]
-    assert main.by_file == main.by_run == main.by_code['NAME'] == '/program_node'
-    assert main.examples == (0, 1)
-
-
-def test_a_programs_time_limit_of_sockets_holds(node):
-    try:
-        main = run(node, 'own/limits_sockets.py')
-        assert socket.getdefaulttimeout() == main.found == 1.5
-    finally:
-        socket.setdefaulttimeout(None)
-
-
-@pytest.mark.parametrize('how, code', [('fork', 1), ('spawn', 0)])
-def test_a_forked_child_of_a_program_is_told_that_it_cannot_be_a_node(how, code, master, capfd):
-    script = master.load(str(PROGRAMS / 'own/has_a_child.py'), None, how)
-    assert script.wait(TIMEOUT) == code
-    assert ('which has the thread that forked alone' in capfd.readouterr().err) == bool(code)
-
-
-# -- the end
-
-
-def test_exit_handlers_and_those_of_signals_run_at_the_stop_and_timers_end(node):
-    main = run(node, 'own/ends.py')
-    assert main.known
-    node.stop()
-    assert main.ended == [('SIGINT', None), 'last registered', 'first registered']
-    assert ended(main.timer)
-
-
-def test_an_event_loop_of_a_program_hears_of_its_end(master):
-    node = master.load(str(PROGRAMS / 'own' / 'loops.py'))
-    main = node.ros_import('__main__')
-    assert main.begun.wait(TIMEOUT)
-    node.stop()
-    assert node.exit_code == 0
-    assert main.ended == ['by the signal']
-
-
-def test_a_program_ends_as_python_ends_it_after_its_threads(node):
-    main = run(node, 'own/threads.py')
-    ending = in_thread(node.latest_run.rospy.exit_main)
-    assert main.ended == []
-    main.go_on.set()
-    assert ended(ending)
-    assert main.ended == ['thread', 'atexit']
-
-
-def test_a_program_that_goes_on_until_a_signal_ends_with_its_node(master, capfd):
-    script = master.load(str(PROGRAMS / 'own/until_signal.py'))
-    until(lambda: '/until_signal/is_ready' in master.parameters)
-    script.stop()
-    assert script.exit_code == 5
-    assert capfd.readouterr().out == 'the last\n'
-
-
-@pytest.mark.parametrize(
-    'how, name',
-    [('timer', 'SIGALRM'), ('raise', 'SIGUSR1'), ('kill', 'SIGUSR2'), ('outside', 'SIGUSR1')],
+COMMANDS = '/turtle1/command_velocity'
+VELOCITY = 'turtlesim/Velocity'
+STRING = 'std_msgs/String'
+LISTINGS = (
+    'block_both block_publisher block_subscriber clear_turtle turtle_driver turtle_logger'.split()
 )
-def test_a_signal_calls_the_handler_of_a_program(how, name, master):
-    with master.load(str(PROGRAMS / 'own/signals.py'), None, how) as script:
-        main = script.ros_import('__main__')
-        assert main.is_ready.wait(TIMEOUT)
-        if how == 'outside':
-            os.kill(os.getpid(), signal.SIGUSR1)
-        assert main.came.wait(TIMEOUT)
-        assert main.names[0] == name
-        assert script.is_running
+OTHERS = 'bridge compose create_package graph top turtle_simulator workspace'.split()
+NEED_MASTER = 'turtle_driver block_subscriber clear_turtle turtle_simulator graph'.split()
+NOWHERE = 'http://127.0.0.1:1/'  # no master is there
 
 
-def test_what_a_handler_of_signals_raises_is_a_failure_of_its_node(master, transcript):
-    with master.load(str(PROGRAMS / 'own/signals.py'), None, 'fail') as script:
-        until(lambda: script.errors)
-        assert isinstance(script.errors[0], ZeroDivisionError)
-        until(lambda: 'the handler of SIGALRM of /signals' in '\n'.join(transcript))
-        assert script.is_running
+@contextlib.contextmanager
+def running(url, name, *arguments):
+    """Run a program of pharos for the block; end it by Ctrl-C, as its user would."""
+    with Program(['rosrun', 'pharos', name], url, *arguments) as program:
+        yield program
+        if program.poll() is None:
+            program.signal(signal.SIGINT)
+            program.wait()
 
 
-def test_a_handler_of_signals_that_exits_ends_its_node_alone(node, master):
-    script = master.load(str(PROGRAMS / 'own/signals.py'), None, 'exit')
-    script.wait(TIMEOUT)
-    assert not script.errors
-    assert node.is_running
+def run(url, name, *arguments):
+    """Run a program of pharos to its end; returns its exit code and what it printed."""
+    with Program(['rosrun', 'pharos', name], url, *arguments) as program:
+        return program.wait(), program.output
 
 
-def test_an_alarm_that_a_program_does_not_handle_ends_its_node_alone(node, master):
-    script = master.load(str(PROGRAMS / 'own/signals.py'), None, 'unhandled')
-    script.wait(TIMEOUT)
-    assert 'SIGALRM' in str(script.errors[0])
-    assert node.is_running
+# -- each program
 
 
-@pytest.mark.parametrize('how, code', [('interrupt', 0), ('interrupt early', -signal.SIGINT)])
-def test_a_program_may_interrupt_itself_alone(how, code, node, master):
-    script = master.load(str(PROGRAMS / 'own/signals.py'), None, how)
-    assert script.wait(TIMEOUT) == code
-    assert node.is_running
+def run_all(names, *arguments):
+    """Run programs side by side where there is no master: ``{name: (exit code, output)}``."""
+    with contextlib.ExitStack() as stack:
+        programs = [
+            stack.enter_context(Program(['rosrun', 'pharos', name, *arguments], NOWHERE))
+            for name in names
+        ]
+        return {name: (each.wait(), each.output) for name, each in zip(names, programs)}
 
 
-@pytest.mark.skipif(sys.version_info < (3, 11), reason='asyncio does not handle SIGINT itself')
-def test_the_stop_interrupts_what_asyncio_runs(master):
-    done = programs.run(master.url, sys.executable, PROGRAMS / 'stops_a_coroutine.py')
-    assert done.stdout == f'in order {-signal.SIGINT}\n', done.stderr
+@pytest.fixture(scope='module')
+def failed():
+    return run_all(NEED_MASTER)
 
 
-def test_an_alarm_tells_how_much_was_left_of_the_one_before(master):
-    with master.load(str(PROGRAMS / 'own/signals.py'), None, 'alarm') as script:
-        main = script.ros_import('__main__')
-        assert main.is_ready.wait(TIMEOUT)
-        assert main.left == (0, 100)
+def test_missing_master_is_named(failed):
+    for name in NEED_MASTER:
+        code, output = failed[name]
+        assert code == 1
+        assert NOWHERE.rstrip('/') in output
+        assert 'Traceback' not in output
 
 
-def test_the_main_thread_of_a_program_has_an_event_loop(master):
-    master.load(str(PROGRAMS / 'own/event_loop.py')).wait(TIMEOUT)
-    assert master.parameters['/event_loop/said'] == 'done'
-
-
-def test_a_program_that_has_ended_gets_no_signal(node):
-    main = run(node, 'own/ends.py')
-    main.timer.cancel()
-    assert ended(main.timer)
-    node.latest_run.rospy.exit_main()
-    node.stop()
-    assert main.ended == ['last registered', 'first registered']
-
-
-def test_an_exit_handler_that_raises_or_hangs_is_told_and_the_stop_goes_on(node, transcript):
-    library, go_on = node.ros_import('rospy.core'), threading.Event()
-    library.atexit.register(go_on.wait)
-    library.atexit.register(lambda: 1 / 0)
-    node.stop()
-    go_on.set()
-    assert [type(error) for error in node.errors] == [ZeroDivisionError]
-    assert any('/program_node left behind' in line and 'atexit' in line for line in transcript)
-
-
-def test_the_threads_of_an_executor_end_with_their_node(node, transcript):
-    pool = node.ros_import('concurrent.futures').ThreadPoolExecutor(1)
-    worker = pool.submit(threading.current_thread).result(TIMEOUT)
-    node.stop()
-    assert ended(worker)
-    assert transcript == []
-
-
-def test_asyncio_takes_an_executor_of_a_node(node):
-    pool = node.ros_import('concurrent.futures').ThreadPoolExecutor(1)
-
-    async def main():
-        loop = asyncio.get_running_loop()
-        loop.set_default_executor(pool)
-        return await loop.run_in_executor(None, threading.current_thread)
-
-    assert asyncio.run(main()).name.startswith('/program_node')
-
-
-def test_hooks_and_finalizers_of_a_program_run_as_in_a_process(master, tmp_path, monkeypatch):
-    monkeypatch.setenv('TMPDIR', str(tmp_path))
-    node = master.load(str(PROGRAMS / 'own' / 'hooks.py'))
-    assert node.wait(TIMEOUT) == 1
-    main = node.latest_run.rospy.import_library('__main__')
-    assert main.told == [('worker', 'in vain'), ('main thread', 'in vain'), 'finalized']
-    assert pathlib.Path(main.folder.name).parent == tmp_path
-    assert list(tmp_path.iterdir()) == []
-    assert [str(error) for error in node.errors] == ['in vain']
-
-
-def test_what_pythons_library_prints_for_a_program_goes_where_that_prints(master, capsys):
-    master.load(str(PROGRAMS / 'own' / 'prints.py'), output='screen', name='prints')
-    printed = capsys.readouterr()
-    assert printed.out == "[/prints] ['shown']\n"
-    assert printed.err.splitlines()[-1] == '[/prints] ValueError: in vain'
-
-
-# -- packages
-
-
-@pytest.mark.parametrize('imported_first', ['messages', 'code'])
-def test_messages_of_a_package_with_code_are_the_same_for_all(master, space, imported_first):
-    if imported_first == 'messages':
-        importlib.import_module('robot_eyes.msg')
-    nodes = [create(master, name) for name in ('/left_eye', '/right_eye')]
-    left, right = (each.ros_import('robot_eyes.looking') for each in nodes)
-    messages = importlib.import_module('robot_eyes.msg')
-    assert left is not right
-    for library in left, right:
-        assert library.Look is messages.Look
-        assert library.Find is importlib.import_module('robot_eyes.srv').Find
-        assert isinstance(library.look('red'), messages.Look)
-    assert messages.Look().spots == []
-    assert left.robot_eyes.SEEN == [('/left_eye', nodes[0].ros.core.sys.argv[0])]
-
-
-def test_a_message_class_of_a_package_with_code_is_one_also_by_the_name_of_its_module(node, space):
-    looking = node.ros_import('robot_eyes.looking')
-    for name in 'msg._Look', 'srv._Find':
-        assert node.ros_import(f'robot_eyes.{name}') is importlib.import_module(
-            f'robot_eyes.{name}'
-        )
-    own_pickle = node.ros_import('pickle')
-    assert isinstance(own_pickle.loads(own_pickle.dumps(looking.Look())), looking.Look)
-
-
-def test_a_module_of_a_subpackage_finds_its_package(node, space):
-    deep = node.ros_import('robot_eyes.nested.deep')
-    assert deep.looking is node.ros_import('robot_eyes.looking')
-    assert deep.Spot is importlib.import_module('robot_eyes.msg').Spot
-
-
-def test_a_module_in_a_folder_without_init_is_the_nodes(node, space):
-    assert node.ros_import('robot_eyes.plain.deeper').NAME == node.name
-
-
-def test_a_package_that_reaches_rospy_through_another_one_is_the_nodes(master, space):
-    nodes = [create(master, name) for name in ('/left_mind', '/right_mind')]
-    left, right = (each.ros_import('robot_mind') for each in nodes)
-    assert left is not right
-    assert [mind.looking.rospy.get_name() for mind in (left, right)] == [
-        '/left_mind',
-        '/right_mind',
-    ]
-    assert left.robot_maths.Vector is right.robot_maths.Vector
-
-
-def test_a_c_extension_is_shared_also_in_a_package_that_is_the_nodes(master, space):
-    nodes = [create(master, name) for name in ('/left_hand', '/right_hand')]
-    shutil.copy(termios.__file__, space / 'robot_eyes')
-    left, right = (each.ros_import('robot_eyes.termios') for each in nodes)
-    assert left is right is importlib.import_module('robot_eyes.termios')
-    assert nodes[0].ros_import('numpy') is numpy
-
-
-# -- threads
+# -- the listings of the report, with a node in the turtle's place
 
 
 @pytest.fixture
-def rings(node, tmp_path, monkeypatch):
-    """The packages whose modules import each other in a circle."""
-    monkeypatch.syspath_prepend(str(build('install', tmp_path)))
-    return node
+def turtle(master):
+    """The commands to a turtle, as a Mailbox."""
+    node = create(master, '/turtlesim')
+    node.output_channel('/turtle1/pose', 'turtlesim/Pose')
+    return Mailbox(node, COMMANDS, VELOCITY)
 
 
-def test_threads_that_import_the_same_get_it_whole(rings):
-    started = []
-    rings.ros.started = started.append
-    both = threading.Barrier(8)
-
-    def get():
-        both.wait(TIMEOUT)
-        return rings.ros_import('robot_rings.one').two.NAME
-
-    with concurrent.futures.ThreadPoolExecutor(8) as pool:
-        names = [each.result(TIMEOUT) for each in [pool.submit(get) for _ in range(8)]]
-    assert names == ['two'] * 8
-    assert sorted(started) == ['one', 'two']
+def speeds(mailbox):
+    """Return the speeds of the next command."""
+    command = mailbox.next()
+    return command.linear, command.angular
 
 
-def test_threads_that_import_in_a_circle_do_not_wait_for_each_other_for_ever(rings):
-    both = threading.Barrier(2)
-    rings.ros.started = lambda name: both.wait(TIMEOUT)
-    with concurrent.futures.ThreadPoolExecutor(2) as pool:
-        names = ['robot_rings.one', 'robot_rings.two']
-        modules = [pool.submit(rings.ros_import, name) for name in names]
-        assert [module.result(TIMEOUT).NAME for module in modules] == ['one', 'two']
-    assert rings.ros_import('robot_rings.two').one is rings.ros_import('robot_rings.one')
+def test_turtle_driver_drives_again_and_again(master, turtle):
+    with running(master.url, 'turtle_driver', '_linear:=0.5', '_angular:=-1', '_period:=0.02'):
+        assert [speeds(turtle) for _ in range(3)] == 3 * [(0.5, -1.0)]
+        assert master.node('/my_turtle_driver').is_alive()
+
+
+def test_turtle_driver_has_address_and_port(master, turtle):
+    with socket.create_server(('127.0.0.1', 0)) as free:
+        port = free.getsockname()[1]
+    with running(master.url, 'turtle_driver', '--domain', '127.0.0.1', '--xmlrpc-port', str(port)):
+        assert speeds(turtle) == (2.0, 1.0)
+        assert master.node('/my_turtle_driver').uri == f'http://127.0.0.1:{port}/'
+
+
+@pytest.mark.parametrize('name', ['turtle_logger', 'block_subscriber', 'block_both'])
+def test_subscriber_prints_what_it_hears(master, turtle, name):
+    with running(master.url, name, '__name:=listener') as program:
+        driver = create(master, '/driver').output_channel(COMMANDS, VELOCITY)
+        until(lambda: '/listener' in master.topic(COMMANDS).subscribers)
+        driver.wait_for_subscribers(2, TIMEOUT)
+        driver.send(linear=1.25, angular=-3.5)
+        program.expect('linear: 1.25')
+        program.expect('angular: -3.5')
+
+
+@pytest.mark.parametrize('how', [[], ['--execute']])
+def test_block_publisher_sends_one_command(master, turtle, how):
+    assert run(master.url, 'block_publisher', *how, '_linear:=0.25')[0] == 0
+    assert speeds(turtle) == (0.25, 1.0)
+    assert len(turtle.all()) == 1
+
+
+def test_block_publisher_sends_in_background(master, turtle):
+    with running(master.url, 'block_publisher', '--background'):
+        assert [speeds(turtle) for _ in range(2)] == 2 * [(-2.0, 1.0)]
+
+
+def test_block_both_hears_itself(master, turtle):
+    with running(master.url, 'block_both', '_angular:=0.5') as program:
+        assert speeds(turtle) == (-2.0, 0.5)
+        program.expect('angular: 0.5')
+
+
+@pytest.mark.parametrize('arguments', [[], ['_md5sum:=d41d8cd98f00b204e9800998ecf8427e']])
+def test_clear_turtle_calls_the_service(master, arguments):
+    cleared = threading.Event()
+    create(master, '/turtlesim').serve('/clear', 'std_srvs/Empty', lambda _: cleared.set())
+    code, output = run(master.url, 'clear_turtle', *arguments)
+    assert code == 0
+    assert cleared.is_set()
+    assert 'std_srvs/Empty' in output
+
+
+def test_clear_turtle_fails_with_wrong_md5sum(master):
+    create(master, '/turtlesim').serve('/clear', 'std_srvs/Empty', lambda _: None)
+    code, output = run(master.url, 'clear_turtle', '_md5sum:=0123456789abcdef0123456789abcdef')
+    assert code == 1
+    assert '/clear' in output and 'std_srvs/Empty' in output
+
+
+def test_listing_follows_remappings(master):
+    node = create(master, '/turtlesim')
+    node.output_channel('/turtle2/pose', 'turtlesim/Pose')
+    mailbox = Mailbox(node, '/turtle2/velocity', VELOCITY)
+    with running(master.url, 'turtle_driver', f'{COMMANDS}:=/turtle2/velocity'):
+        assert speeds(mailbox) == (2.0, 1.0)
+
+
+# -- the turtle of this package
+
+
+@pytest.fixture(scope='module')
+def drive():
+    """What came of turtle.launch without a window, and of a second turtle."""
+    with Master.embedded() as master, master.create(BlockNode, named='/ear') as ear:
+        poses = Mailbox(ear, '/turtle1/pose', 'turtlesim/Pose')
+        args = {'window': 'false', 'picture': '', 'period': 0.1, 'linear': 1.5}
+        with master.launch('pharos', 'turtle.launch', **args) as process:
+            first = poses.next()
+            driven = poses.wait_for(lambda pose: pose.theta > 0.1)
+            until(lambda: 'linear: 1.5' in ''.join(process.output), TIMEOUT)
+            spawned = master.lookup_service('/spawn').call(x=1.0, y=2.0, theta=0.0, name='leo')
+            leo = ear.wait_for_message('/leo/pose', 'turtlesim/Pose', TIMEOUT)
+            names = {node.name for node in master.nodes()}
+    return {'poses': [first, driven], 'spawned': spawned, 'leo': leo, 'names': names}
+
+
+def test_turtle_launch_starts_all_three(drive):
+    assert {'/turtlesim', '/turtle_driver', '/turtle_logger'} <= drive['names']
+
+
+def test_simulated_turtle_is_driven(drive):
+    first, driven = drive['poses']
+    assert driven.x > first.x
+    assert driven.linear_velocity == 1.5
+
+
+def test_simulator_spawns_another_turtle(drive):
+    assert drive['spawned'].name == 'leo'
+    assert (drive['leo'].x, drive['leo'].y) == (1.0, 2.0)
+
+
+def test_simulator_saves_a_picture(master, tmp_path):
+    path = tmp_path / 'turtle.png'
+    with running(master.url, 'turtle_simulator', '_window:=false', f'_picture:={path}'):
+        name = master.wait_for_node('/turtlesim', TIMEOUT).name
+        assert master.wait_for_service(f'{name}/save_picture', TIMEOUT).call().success
+        assert path.read_bytes().startswith(b'\x89PNG')
+
+
+# -- bridge
+
+
+@pytest.fixture
+def robots(master):
+    """Two masters, as of two robots, with the bridge for /chat; and a node with Mailbox on each."""
+    with Master.embedded() as other:
+        nodes = [create(each, '/talker') for each in (master, other)]
+        boxes = [Mailbox(node, '/chat', STRING) for node in nodes]
+        with running(master.url, 'bridge', master.url, other.url, '/chat'):
+            until(
+                lambda: all(
+                    '/bridge' in each.topic('/chat').subscribers for each in (master, other)
+                )
+            )
+            yield nodes, boxes
+        for node in nodes:
+            node.stop()
+
+
+@pytest.mark.parametrize('here, there', [(0, 1), (1, 0)])
+def test_bridge_joins_two_masters(robots, here, there):
+    nodes, boxes = robots
+    for text in 'abc':
+        nodes[here].send_to('/chat', typed_as=STRING, data=text)
+    assert [boxes[there].next().data for _ in 'abc'] == ['a', 'b', 'c']
+    nodes[there].send_to('/chat', typed_as=STRING, data='back')
+    assert boxes[here].wait_for(lambda message: message.data == 'back')
+    assert [message.data for message in boxes[here].all()] == ['a', 'b', 'c', 'back']
+
+
+def test_bridge_passes_latched_messages_on(master):
+    with Master.embedded() as other:
+        map_server = create(master, '/map_server').output_channel('/map', STRING, latch=True)
+        map_server.send(data='map')
+        with running(master.url, 'bridge', master.url, other.url, '/map'):
+            with other.create(BlockNode, named='/early') as early:
+                assert early.wait_for_message('/map', STRING, TIMEOUT).data == 'map'
+            with other.create(BlockNode, named='/late') as late:
+                assert late.wait_for_message('/map', STRING, TIMEOUT).data == 'map'
+
+
+def test_bridge_needs_two_masters(master):
+    code, output = run(master.url, 'bridge', master.url, master.url, '/chat')
+    assert code == 1
+    assert master.url in output
+
+
+# -- create_package
+
+
+@pytest.fixture(scope='module')
+def made(tmp_path_factory):
+    """A package made in a workspace."""
+    source = tmp_path_factory.mktemp('made') / 'src'
+    source.mkdir()
+    command = [
+        'rosrun',
+        'pharos',
+        'create_package',
+        'my_robot',
+        '--node',
+        'camera',
+        'line_follower',
+    ]
+    subprocess.run(command, cwd=source, check=True, stdout=subprocess.PIPE)
+    return source / 'my_robot'
+
+
+def test_made_package_has_its_nodes(made):
+    assert {'camera', 'line_follower'} <= {path.name for path in (made / 'scripts').iterdir()}
+
+
+def test_made_package_passes_its_tests(made):
+    done = subprocess.run(
+        [PYTHON, '-m', 'pytest', '-q', 'test'], cwd=made, text=True, stdout=subprocess.PIPE
+    )
+    assert done.returncode == 0, done.stdout
+
+
+def test_made_package_builds_and_runs(made, master):
+    make = ['catkin_make', '-C', str(made.parent.parent), f'-DPYTHON_EXECUTABLE={PYTHON}']
+    done = subprocess.run(make, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    assert done.returncode == 0, done.stdout
+    setup = f'. {made.parent.parent}/devel/setup.sh && exec rosrun my_robot camera'
+    with Program(['sh', '-c', setup], master.url) as program:
+        assert master.wait_for_node('/camera', TIMEOUT).is_alive()
+        program.signal(signal.SIGINT)
+        program.wait()
+
+
+# -- pharos.testing
+
+TESTS = '''
+import threading
+import pytest
+import rosgraph
+from pharos import BlockNode, Master, Node
+from pharos.testing import Mailbox, expect_failures, until
+
+STRING = 'std_msgs/String'
+
+
+class Echo(Node):
+    def __init__(self, times=1):
+        super().__init__()
+        self.times = times
+
+    def start(self):
+        super().start()
+        self.interested_in('/heard', STRING, delegate=self.repeat)
+
+    def repeat(self, message, channel):
+        if not message.data:
+            raise ValueError('nothing was said')
+        self.send_to('/said', typed_as=STRING, data=message.data * self.times)
+
+
+@pytest.fixture
+def said(create_node):
+    return Mailbox(create_node(BlockNode, '/ear'), '/said', STRING)
+
+
+def test_master_is_embedded(master):
+    assert isinstance(master, Master) and master.is_reachable()
+    assert Master().url == master.url
+
+
+def test_node_is_created(create_node, said):
+    create_node(Echo, times=2).send_to('/heard', typed_as=STRING, data='hey')
+    assert said.next(timeout=20).data == 'heyhey'
+
+
+def test_node_is_named(create_node):
+    assert create_node(Echo, '/deep/echo').name == '/deep/echo'
+    assert create_node(Echo).name != create_node(Echo).name
+
+
+def test_mailbox_keeps_all(create_node, said):
+    echo = create_node(Echo)
+    for text in 'abc':
+        echo.send_to('/heard', typed_as=STRING, data=text)
+    assert said.wait_for(lambda message: message.data == 'b', 20).data == 'b'
+    until(lambda: len(said.all()) == 3, 20)
+    assert [message.data for message in said.all()] == ['a', 'b', 'c']
+    assert said.next().data == 'c'
+
+
+def test_mailbox_has_time_limit(said):
+    with pytest.raises(TimeoutError):
+        said.next(0.01)
+    with pytest.raises(TimeoutError):
+        said.wait_for(lambda message: True, 0.01)
+
+
+def test_until_returns_value():
+    values = iter([None, 0, 7])
+    assert until(lambda: next(values), 20) == 7
+
+
+def test_until_has_time_limit():
+    with pytest.raises(TimeoutError):
+        until(lambda: False, 0.01)
+
+
+def test_failure_is_expected(create_node):
+    expect_failures()
+    echo = create_node(Echo)
+    echo.send_to('/heard', typed_as=STRING, data='')
+    until(lambda: echo.failures, 20)
+
+
+def test_failure_fails(create_node):
+    echo = create_node(Echo)
+    echo.send_to('/heard', typed_as=STRING, data='')
+    until(lambda: echo.failures, 20)
+
+
+def test_left_node_fails(master):
+    master.create(BlockNode, named='/forgotten')
+'''
+SLOW_TESTS = '''
+import threading
+import rosgraph
+from pharos import testing
+
+
+def test_left_thread_fails(master, monkeypatch):
+    monkeypatch.setattr(testing, 'TIMEOUT', 0.1, raising=False)
+    threading.Thread(target=threading.Event().wait, name='forgotten', daemon=True).start()
+
+
+def test_left_registration_fails(master, monkeypatch):
+    monkeypatch.setattr(testing, 'TIMEOUT', 0.1, raising=False)
+    api = rosgraph.Master('/forgotten', master.url)
+    api.registerPublisher('/t', 'std_msgs/String', 'http://x/')
+'''
+SUCCESSES = re.findall(r'def (test_\w+(?<!_fails))\(', TESTS)
+FAILURES = re.findall(r'def (test_\w+_fails)\(', TESTS + SLOW_TESTS)
+
+
+@pytest.fixture(scope='module')
+def tested(tmp_path_factory):
+    """The outcome of each test of a user's package: ``{name: [PASSED, ERROR ...]}``."""
+    folder = tmp_path_factory.mktemp('tested')
+    (folder / 'conftest.py').write_text("pytest_plugins = ['pharos.testing']\n")
+    (folder / 'test_robot.py').write_text(TESTS)
+    (folder / 'test_slow.py').write_text(SLOW_TESTS)
+    command = [PYTHON, '-m', 'pytest', '-rA', '-p', 'no:cacheprovider', f'--rootdir={folder}']
+    done = subprocess.run([*command, str(folder)], cwd=folder, text=True, stdout=subprocess.PIPE)
+    outcomes = {}
+    for outcome, name in re.findall(
+        r'^(PASSED|FAILED|ERROR) \S+::(\w+)', done.stdout, re.MULTILINE
+    ):
+        outcomes.setdefault(name, []).append(outcome)
+    return outcomes
+
+
+@pytest.mark.parametrize('name', SUCCESSES)
+def test_users_test_passes(tested, name):
+    assert tested[name] == ['PASSED']
+
+
+@pytest.mark.parametrize('name', FAILURES)
+def test_users_test_fails_for_its_rest(tested, name):
+    assert set(tested[name]) & {'ERROR', 'FAILED'}
+
+
+# -- spin and the Transcript
+
+
+def test_spin_ends_with_last_node(master):
+    source = '''
+from pharos import BlockNode, Master, spin
+nodes = [Master().create(BlockNode, named=name) for name in ('/one', '/two')]
+nodes[0].stop()
+nodes[1].soul = lambda me: me.stop()
+nodes[1].fork()
+spin()
+print('over')
+'''
+    with Program(source, master.url) as program:
+        assert program.wait() == 0
+        assert program.output == 'over\n'
+
+
+def test_spin_waits_for_nodes(master):
+    source = '''
+from pharos import BlockNode, Master, spin
+node = Master().create(BlockNode, named='/node')
+node.serve('/end', 'std_srvs/Empty', lambda request: node.fork(lambda me: me.stop()) and None)
+spin()
+'''
+    with Program(source, master.url) as program:
+        master.wait_for_service('/end', TIMEOUT).call()
+        assert program.wait() == 0
+
+
+def test_transcript_shows_on_standard_output(master, capsys):
+    Transcript.show('a line')
+    Transcript.show(42)
+    assert capsys.readouterr().out == 'a line\n42\n'
+
+
+def test_transcript_shows_a_message(capsys):
+    Transcript.show(pharos.message_class(STRING)('text'))
+    assert capsys.readouterr().out == 'data: "text"\n'
+
+
+def test_transcript_is_redirected(capsys):
+    lines = []
+    before = Transcript.on_show(lines.append)
+    Transcript.show('kept')
+    Transcript.on_show(before)
+    Transcript.show('shown')
+    assert lines == ['kept']
+    assert capsys.readouterr().out == 'shown\n'
+
+
+def test_transcript_keeps_lines_whole(capsys):
+    threads = [
+        threading.Thread(target=lambda: [Transcript.show('x' * 100) for _ in range(100)])
+        for _ in range(4)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(TIMEOUT)
+    assert capsys.readouterr().out == 400 * ('x' * 100 + '\n')

@@ -1,561 +1,550 @@
-"""Services: offered by a node with a block, and called by name alone."""
-import contextlib
-import io
+"""Services: offered with a block, found by name, called from this process and from others."""
+import concurrent.futures
+import functools
 import os
+import signal
 import socket
+import subprocess
 import threading
 
+import psutil
 import pytest
-import rosgraph.network
+import rosgraph
+import rospy
 import std_srvs.srv
 
-from helpers import create, speak_tcpros_only
-from pharos.testing import TIMEOUT
+from helpers import PYTHON, TIMEOUT, InProcessMaster, Peer, create, registrations, stop_nodes
 import pharos
-from pharos.private_rospy.process_rospy import rospy
-from programs import run
+from pharos import Master, Node, ServiceCallError, UnknownServiceError
+from pharos.testing import Mailbox, until
 
+EMPTY = 'std_srvs/Empty'
+SET = 'std_srvs/SetBool'  # data -> success, message
 SPAWN = 'turtlesim/Spawn'  # x, y, theta, name -> name
-SET_BOOL = 'std_srvs/SetBool'  # data -> success, message
-SET_BOOL_MD5SUM = std_srvs.srv.SetBool._md5sum
+LIST = 'nodelet/NodeletList'  # -> nodelets, an array
+SET_MD5SUM = std_srvs.srv.SetBool._md5sum
+OTHER_MD5SUM = std_srvs.srv.Empty._md5sum
+FAILED = ServiceCallError, UnknownServiceError, rospy.ServiceException, RuntimeError  # the peer's
+needs_mux = pytest.mark.skipif(
+    not os.path.exists('/usr/lib/topic_tools/mux'), reason='needs topic-tools'
+)
+# what a peer offers to all tests, and how it calls
+PEER = '''
+import pharos, std_srvs.srv
+
+def serve(name, block):
+    """Offer a SetBool; the block takes the request and returns (success, message)."""
+    return rospy.Service(name, std_srvs.srv.SetBool, block)
+
+def fail(request):
+    raise RuntimeError('no room for bob')
+
+def call(name, type_, fields):
+    """Call it with rospy's ServiceProxy; returns the fields of the response."""
+    response = rospy.ServiceProxy(name, pharos.service_class(type_))(**fields)
+    return [getattr(response, field) for field in response.__slots__]
+
+services = [
+    serve('/there/not', lambda request: (not request.data, request._connection_header['callerid'])),
+    serve('/there/fail', fail),
+]
+'''
+pool = concurrent.futures.ThreadPoolExecutor()
 
 
-def call_here(master, service, /, **fields):
-    """The way of this package: from node to node of this process."""
-    return master.lookup_service(service, '/caller').call(**fields)
+@pytest.fixture(scope='module')
+def network():
+    """A ROS master, and one peer for all tests: each test has service names of its own."""
+    ros_master = InProcessMaster()
+    with Peer(ros_master.url) as peer:
+        peer.run(PEER)
+        yield Master(ros_master.url), peer
+    ros_master.stop()
 
 
-def call_through_tcp(master, service, /, **fields):
-    """The way of any other ROS node."""
-    with speak_tcpros_only(create(master, '/caller')) as caller:
-        service_class = master.lookup_service(service, '/caller').service_class
-        return caller.ros.ServiceProxy(service, service_class)(**fields)
+@pytest.fixture
+def master(network, monkeypatch):
+    """The master of the network, which a test leaves as it was."""
+    master, _ = network
+    monkeypatch.setenv('ROS_MASTER_URI', master.url)
+    yield master
+    stop_nodes(master)
+    until(lambda: [node.name for node in master.nodes()] == ['/peer'], 10, 'the end of all nodes')
 
 
-both_ways = pytest.mark.parametrize('call', [call_here, call_through_tcp], ids=['here', 'tcp'])
+@pytest.fixture
+def peer(network):
+    return network[1]
+
+
+@pytest.fixture
+def node(master):
+    """A node that offers services."""
+    return create(master, '/provider')
+
+
+@pytest.fixture(params=['Service', 'ServiceProxy', 'persistent', 'peer'])
+def call(request, master):
+    """Call a service in each way; returns the fields of the response as a list."""
+    if request.param == 'peer':
+        peer = request.getfixturevalue('peer')
+        return lambda name, type_, /, **fields: peer.value(f'call({name!r}, {type_!r}, {fields!r})')
+
+    def call_here(name, type_, /, **fields):
+        if request.param == 'Service':
+            answer = master.lookup_service(name, '/caller').call
+        else:
+            class_, persistent = pharos.service_class(type_), request.param == 'persistent'
+            answer = caller.ros.ServiceProxy(name, class_, persistent)
+        response = answer(**fields)
+        return [getattr(response, field) for field in response.__slots__]
+
+    caller = create(master, '/caller') if request.param != 'Service' else None
+    return call_here
+
+
+def answer_set(request):
+    return {'success': request.data, 'message': 'done'}
 
 
 # -- offered
 
 
-@both_ways
 @pytest.mark.parametrize(
-    'block',
+    'type_, value, fields',
     [
-        lambda request: pharos.service_class(SET_BOOL)._response_class(
-            success=request.data, message='done'
-        ),
-        lambda request: {'success': request.data, 'message': 'done'},
-        lambda request: (request.data, 'done'),
-        lambda request: [request.data, 'done'],
+        (SET, std_srvs.srv.SetBoolResponse(True, 'done'), [True, 'done']),
+        (SET, {'success': True, 'message': 'done'}, [True, 'done']),
+        (SET, {'success': True}, [True, '']),
+        (SET, (True, 'done'), [True, 'done']),
+        (SET, [True, 'done'], [True, 'done']),
+        (SPAWN, 'bob', ['bob']),
+        (SPAWN, '', ['']),
+        (SPAWN, ['bob'], ['bob']),
+        (LIST, [['a', 'b']], [['a', 'b']]),
+        (EMPTY, None, []),
     ],
-    ids=['a response', 'a dict', 'a tuple', 'a list'],
 )
-def test_a_block_returns_a_response_or_its_fields(master, call, block):
-    create(master, '/provider').serve('/set', SET_BOOL, block)
-    response = call(master, '/set', data=True)
-    assert (response.success, response.message) == (True, 'done')
+def test_block_returns_response_or_fields(master, node, type_, value, fields):
+    node.serve('/gives', type_, lambda request: value)
+    response = master.lookup_service('/gives').call()
+    assert [getattr(response, field) for field in response.__slots__] == fields
 
 
-@both_ways
-@pytest.mark.parametrize(
-    'block',
-    [
-        lambda request: request.name + '!',
-        lambda request: {'name': request.name + '!'},
-        lambda request: (request.name + '!',),
-    ],
-    ids=['the field', 'a dict', 'a tuple'],
-)
-def test_a_block_returns_the_only_field(master, call, block):
-    create(master, '/provider').serve('/spawn', SPAWN, block)
-    assert call(master, '/spawn', name='bob').name == 'bob!'
+@pytest.mark.parametrize('value', [None, (True,), (7, 7), {'no_such_field': 1}], ids=repr)
+def test_unfit_result_fails_at_both_ends(master, node, value):
+    node.serve('/set', SET, lambda request: value)
+    with pytest.raises(ServiceCallError, match='/set'):
+        master.lookup_service('/set').call()
+    assert len(node.errors) == 1
 
 
-@both_ways
-@pytest.mark.parametrize('value', [['a', 'b'], ('a', 'b'), [['a', 'b']], (('a', 'b'),)], ids=repr)
-def test_an_only_field_that_is_an_array_may_be_in_a_list_as_rospy_has_it(master, call, value):
-    create(master, '/provider').serve('/list', 'roscpp/GetLoggers', lambda request: nested(value))
-    assert [each.name for each in call(master, '/list').loggers] == ['a', 'b']
-
-
-def nested(value):
-    """The value with messages in the place of texts."""
-    if isinstance(value, str):
-        return pharos.message_class('roscpp/Logger')(name=value)
-    return type(value)(map(nested, value))
-
-
-@both_ways
-def test_a_falsy_value_is_the_only_field_too(master, call):
-    create(master, '/provider').serve('/spawn', SPAWN, lambda request: '')
-    assert call(master, '/spawn', name='bob').name == ''
-
-
-@both_ways
-@pytest.mark.parametrize('value', [None, {}, 7], ids=repr)
-def test_what_a_block_returns_as_an_empty_response_does_not_matter(master, call, value):
-    create(master, '/provider').serve('/clear', 'std_srvs/Empty', lambda request: value)
-    assert call(master, '/clear') == std_srvs.srv.EmptyResponse()
-
-
-def test_fields_that_a_dict_leaves_out_have_their_defaults(master):
-    create(master, '/provider').serve('/set', SET_BOOL, lambda request: {'success': True})
-    assert call_here(master, '/set').message == ''
-
-
-@both_ways
-def test_the_block_gets_the_request(master, call):
+def test_block_gets_request_and_caller(node, call):
     got = []
-    create(master, '/provider').serve('/spawn', SPAWN, lambda request: got.append(request) or '')
-    call(master, '/spawn', x=1.0, y=2, name='bob')
+    node.serve('/spawn', SPAWN, lambda request: got.append(request) or '')
+    call('/spawn', SPAWN, x=1.0, y=2, name='bob')
     (request,) = got
     assert (request.x, request.y, request.theta, request.name) == (1.0, 2.0, 0.0, 'bob')
-    assert request._connection_header['callerid'] == '/caller'
+    assert request._connection_header['callerid'] in ('/caller', '/peer')
 
 
-@both_ways
-@pytest.mark.parametrize(
-    'value, said',
-    [
-        (None, r'must return .* its fields \(success: bool, message: string\); it returned None'),
-        (True, r'must return a response, a dict, tuple or list of its fields .* it returned True'),
-        (
-            (True,),
-            r'a std_srvs/SetBool, must return .*it returned \(True,\), of length 1 and not 2',
-        ),
-        ([True, '', ''], r'block of /set, .* of length 3 and not 2'),
-        ((7, 7), r'block of /set returned .*std_srvs/SetBoolResponse.message = 7 does not fit str'),
-        ({'ok': True}, r'block of /set .*SetBoolResponse has no field .ok.*success: bool, mess'),
-        ({'message': 7}, r'SetBoolResponse.message = 7 does not fit string'),
-        (std_srvs.srv.EmptyResponse(), 'must return a response'),
-    ],
-    ids=repr,
-)
-def test_what_does_not_fit_is_an_error_at_both_ends(master, transcript, call, value, said):
-    node = create(master, '/provider')
-    node.serve('/set', SET_BOOL, lambda request: value)
-    with pytest.raises((pharos.ServiceCallError, rospy.ServiceException), match=said):
-        call(master, '/set')
-    assert len(node.errors) == 1
-    with pytest.raises(type(node.errors[0]), match=said):
-        raise node.errors[0]
+def test_raising_block_reaches_caller_and_errors(node, call):
+    def block(request):
+        if not request.data:
+            raise RuntimeError('no room for bob')
+        return True, ''
 
-
-@both_ways
-def test_an_exception_in_the_block_reaches_the_caller(master, transcript, call):
-    node = create(master, '/provider')
-    offered = node.serve('/spawn', SPAWN, no_room)
-    with pytest.raises(
-        (pharos.ServiceCallError, rospy.ServiceException), match='RuntimeError: no room for bob'
-    ):
-        call(master, '/spawn', name='bob')
+    node.serve('/set', SET, block)
+    with pytest.raises(FAILED, match='ServiceException|no room for bob'):
+        call('/set', SET, data=False)
     assert [str(error) for error in node.errors] == ['no room for bob']
-    assert transcript == [
-        'service /spawn no_room of /provider raised RuntimeError: no room for bob'
-    ]
-    offered.block = lambda request: 'room again'  # the node goes on
-    assert call(master, '/spawn').name == 'room again'
+    assert call('/set', SET, data=True) == [True, '']  # the node goes on
 
 
-def no_room(request):
-    raise RuntimeError(f'no room for {request.name}')
-
-
-def test_a_failed_call_is_a_service_call_error(master, transcript):
-    create(master, '/provider').serve('/fail', 'std_srvs/Empty', lambda request: 1 / 0)
-    service = master.lookup_service('/fail')
-    with pytest.raises(pharos.ServiceCallError, match='/fail failed: .*division by zero'):
-        service.call()
-    assert service.response is None
-
-
-def test_rosservice_knows_an_offered_service(master):
-    node = create(master, '/provider')
-    node.serve('/set', SET_BOOL, lambda request: {'success': True})
-    assert '/set' in run(master.url, 'rosservice', 'list').stdout.split()
-    assert run(master.url, 'rosservice', 'type', '/set').stdout.strip() == SET_BOOL
-    assert run(master.url, 'rosservice', 'info', '/set').stdout.splitlines() == [
-        'Node: /provider',
-        'URI: rosrpc://127.0.0.1:%d' % node.tcp_port,
-        'Type: ' + SET_BOOL,
-        'Args: data',
-    ]
-
-
-def test_rosservice_calls_an_offered_service(master, transcript):
-    node = create(master, '/provider')
-    node.serve('/set', SET_BOOL, lambda request: {'success': request.data, 'message': 'done'})
-    assert (
-        run(master.url, 'rosservice', 'call', '/set', 'true').stdout
-        == 'success: True\nmessage: "done"\n'
+@pytest.mark.parametrize(
+    'verb, code, said',
+    [('call', 2, ['division by zero']), ('info', 0, ['/provider', EMPTY, 'rosrpc://'])],
+)
+def test_rosservice_understands_service(master, node, verb, code, said):
+    node.serve('/divide', EMPTY, lambda request: 1 / 0)
+    ended = subprocess.run(
+        [PYTHON, '/usr/bin/rosservice', verb, '/divide'],
+        env={**os.environ, 'ROS_MASTER_URI': master.url},
+        capture_output=True,
+        text=True,
+        timeout=2 * TIMEOUT,
     )
-    node.serve('/fail', 'std_srvs/Empty', lambda request: 1 / 0)
-    failed = run(master.url, 'rosservice', 'call', '/fail')
-    assert failed.returncode
-    assert 'division by zero' in failed.stderr
+    assert ended.returncode == code
+    assert [part for part in said if part not in ended.stdout + ended.stderr] == []
 
 
-def test_close_ends_the_offer(master):
-    node = create(master, '/provider')
-    offered = node.serve('/clear', 'std_srvs/Empty', lambda request: None)
-    service = master.lookup_service('/clear')
-    offered.close()
-    offered.close()
-    assert '/clear' not in master.services()
-    assert '/provider/get_loggers' in master.services()
-    with pytest.raises((pharos.ServiceCallError, pharos.UnknownServiceError), match='/clear'):
-        service.call(timeout=TIMEOUT)
-    node.serve('/clear', 'std_srvs/Empty', lambda request: None).close()  # the name is free
+@pytest.mark.parametrize(
+    'asked, name',
+    [('~halt', '/robot/driver/halt'), ('stop', '/robot/stop'), ('/all', '/all'), ('/a', '/b')],
+)
+def test_service_name_is_resolved(master, asked, name):
+    driver = create(master, '/robot/driver', argv=['/a:=/b'])
+    driver.serve(asked, SET, lambda request: (True, name))
+    assert name in master.services()
+    assert master.lookup_service(name).call().message == name
+    assert driver.lookup_service(asked).call().message == name
 
 
-def test_a_node_offers_a_name_once(master):
-    node = create(master, '/provider')
-    node.serve('/clear', 'std_srvs/Empty', lambda request: None)
-    with pytest.raises(
-        pharos.PharosError, match='/provider offers /clear already: close that one first'
-    ):
-        node.serve('/clear', SET_BOOL, lambda request: None)
-    assert call_here(master, '/clear') == std_srvs.srv.EmptyResponse()
+def test_node_serves_a_name_once(master, node):
+    node.serve('/set', SET, lambda request: (True, 'first'))
+    with pytest.raises(pharos.PharosError, match='/provider.*/set'):
+        node.serve('/set', SET, lambda request: (True, 'second'))
+    assert master.lookup_service('/set').call().message == 'first'
 
 
-def test_names_are_resolved_in_the_nodes_namespace(master):
-    node = create(master, '/robot1/driver')
-    names = [
-        node.serve(name, 'std_srvs/Empty', lambda request: None).name
-        for name in ('~halt', 'stop', '/all')
-    ]
-    assert names == ['/robot1/driver/halt', '/robot1/stop', '/all']
-    assert set(names) <= set(master.services())
-    remapped = create(master, '/other', argv=['stop:=/elsewhere'])
-    assert remapped.serve('/stop', 'std_srvs/Empty', lambda request: None).name == '/elsewhere'
+def test_newest_node_answers_taken_name(master, node):
+    node.serve('/set', SET, lambda request: (True, 'older'))
+    create(master, '/newer').serve('/set', SET, lambda request: (True, 'newer'))
+    assert master.lookup_service('/set').call().message == 'newer'
 
 
-@pytest.mark.parametrize('block', [None, 7, lambda: None, lambda request, more: None])
-def test_a_service_needs_a_block_of_one_argument(master, block):
-    with pytest.raises(TypeError, match=r'block\(request\)'):
-        create(master, '/provider').serve('/clear', 'std_srvs/Empty', block)
-    assert '/clear' not in master.services()
-
-
-def test_an_unknown_service_type(master):
-    with pytest.raises(
-        pharos.UnknownTypeError, match="unknown service type 'std_srvs/Emty'.*did you mean"
-    ):
-        create(master, '/provider').serve('/clear', 'std_srvs/Emty', lambda request: None)
-    assert '/clear' not in master.services()
-
-
-def test_services_come_back_with_their_node(master):
-    node = create(master, '/provider')
-    node.serve('/spawn', SPAWN, lambda request: request.name)
-    service = master.lookup_service('/spawn')
-    for name in 'ann', 'bob':
-        node.stop()
-        assert '/spawn' not in master.services()
-        with pytest.raises((pharos.ServiceCallError, pharos.UnknownServiceError), match='/spawn'):
-            service.call(name='nobody', timeout=TIMEOUT)
-        node.start()
-        assert service.call(name=name).name == name  # the same address again
-        assert call_through_tcp(master, '/spawn', name=name).name == name
-
-
-def test_a_service_is_the_newest_nodes_that_offers_it_and_the_olders_again_when_that_has_gone(
-    master,
-):
-    def look_again():
-        for node in newer, older:
-            if node.is_running:
-                node.latest_run.rospy.repair(
-                    master.system_state(), False
-                )  # as the watcher does every second
-        return call_here(master, '/taken').message
-
-    older, newer = create(master, '/older'), create(master, '/newer')
-    for node in older, newer:
-        node.serve('/taken', SET_BOOL, lambda request, name=node.name: {'message': name})
-    assert [look_again(), look_again()] == ['/newer', '/newer']
-    newer.stop()
-    assert [look_again(), look_again()] == ['/older', '/older']
-
-
-def test_a_closed_service_does_not_come_back(master):
-    node = create(master, '/provider')
-    node.serve('/clear', 'std_srvs/Empty', lambda request: None).close()
+def test_stop_closes_and_start_reopens(master, node, call):
+    node.serve('/set', SET, answer_set)
+    before = master.lookup_service('/set')
     node.stop()
+    assert registrations(master, node.name) == [[], [], []]
+    for use in functools.partial(call, '/set', SET), before.call:
+        with pytest.raises(FAILED):
+            use()
     node.start()
-    assert '/clear' not in master.services()
+    assert call('/set', SET, data=True) == [True, 'done']
+    assert before.call(data=True).success
 
 
-def test_a_service_that_is_closed_while_its_node_starts_again_does_not_come_back(master):
-    node = create(master)
-    channel = node.interested_in('/before', 'std_msgs/Empty')
-    service = node.serve('/clear', 'std_srvs/Empty', lambda request: None)
-    open_again = channel.open
-    channel.open = lambda run: (open_again(run), service.close())
-    for _ in range(2):
-        node.stop()
-        node.start()
-        assert '/clear' not in master.services()
+class Driver(Node):
+    """A node that offers a method of its own."""
+
+    def start(self):
+        super().start()
+        self.serve('~greet', SPAWN, self.greet)
+
+    def greet(self, request):
+        return f'hello {request.name}'
+
+
+def test_service_of_start_outlives_restart(master):
+    driver = create(master, '/driver', Driver)
+    driver.restart()
+    assert master.lookup_service('/driver/greet').call(name='bob').name == 'hello bob'
 
 
 # -- called
 
+both_providers = pytest.mark.parametrize('name', ['/there/not', '/here/set'])
 
-def test_a_name_is_enough(master):
-    create(master, '/provider').serve('/spawn', SPAWN, lambda request: request.name)
-    service = master.lookup_service('/spawn', '/me')
-    assert (service.name, service.caller_id, service.type) == ('/spawn', '/me', SPAWN)
-    assert service.md5sum == '0b2d2e872a8e2887d5ed626f2bf2c561'
-    assert service.uri.startswith('rosrpc://127.0.0.1:')
+
+@both_providers
+def test_provider_tells_type_and_md5sum(master, node, name):
+    node.serve('/here/set', SET, answer_set)
+    service = master.lookup_service(name, caller_id='/my_id')
+    assert (service.name, service.caller_id, service.type) == (name, '/my_id', SET)
+    assert service.md5sum == SET_MD5SUM
+    assert service.uri.startswith('rosrpc://')
+
+
+@both_providers
+def test_response_of_last_call_is_kept(master, node, name):
+    node.serve('/here/set', SET, answer_set)
+    service = master.lookup_service(name)
     assert service.response is None
-    assert service.call(name='bob') is service.response
+    first = service.call(data=True)
+    assert service.response is first
+    assert service.call(data=False) is service.response is not first
 
 
-def test_a_block_and_keywords_fill_the_request(master):
-    create(master, '/provider').serve(
-        '/spawn', SPAWN, lambda request: f'{request.x:g} {request.y:g} {request.name}'
-    )
+def test_caller_id_reaches_provider_elsewhere(master, node):
+    assert master.lookup_service('/there/not', '/my_id').call().message == '/my_id'
+    assert node.lookup_service('/there/not').call().message == node.name
+    proxy = node.ros.ServiceProxy('/there/not', std_srvs.srv.SetBool, persistent=True)
+    assert [proxy(data).success for data in (True, False)] == [False, True]
+    assert proxy().message == node.name
+    proxy.close()
 
+
+def test_block_and_keywords_fill_request(master, node):
     def fill(request):
         request.x, request.y = 1.0, 2.0
 
+    node.serve('/spawn', SPAWN, lambda request: f'{request.x:g} {request.y:g} {request.name}')
     service = master.lookup_service('/spawn')
     assert service.call(fill).name == '1 2 '
-    assert service.call(fill, y=3.0, name='bob').name == '1 3 bob'
-
-
-def test_an_unknown_service_names_the_near_ones(master):
-    create(master, '/provider').serve('/turtle1/teleport', 'std_srvs/Empty', lambda request: None)
-    with pytest.raises(
-        pharos.UnknownServiceError,
-        match='offers the service /turtle1/telport.*did you mean '
-        './turtle1/teleport.*: see rosservice list',
-    ):
-        master.lookup_service('/turtle1/telport')
-
-
-def test_a_service_of_nobody_that_answers(master):
-    with socket.socket() as sock:
-        sock.bind(('127.0.0.1', 0))
-        dead = 'rosrpc://127.0.0.1:%d' % sock.getsockname()[1]
-    master.api('/dead').registerService('/dead/clear', dead, 'http://127.0.0.1:1/')
-    try:
-        with pytest.raises(
-            pharos.ServiceCallError, match=f'provider of /dead/clear at {dead} does not answer'
-        ):
-            master.lookup_service('/dead/clear')
-    finally:
-        master.api('/dead').unregisterService('/dead/clear', dead)
-
-
-def test_an_md5sum_by_hand_is_what_is_sent(master):
-    create(master, '/provider').serve('/set', SET_BOOL, lambda request: {'success': True})
-    service = master.lookup_service('/set')
-    service.md5sum = SET_BOOL_MD5SUM
-    assert service.call().success
-    service.md5sum = '*'  # ROS's own for "whatever it is"
-    assert service.call().success
-    service.md5sum = 'd41d8cd98f00b204e9800998ecf8427e'  # std_srvs/Empty
-    with pytest.raises(pharos.ServiceTypeError) as error:
-        service.call()
-    for said in (
-        '/set',
-        SET_BOOL,
-        service.md5sum,
-        SET_BOOL_MD5SUM,
-        'request: data: bool',
-        'response: success: bool, message: string',
-    ):
-        assert said in str(error.value)
-    service.md5sum = SET_BOOL_MD5SUM
-    assert service.call().success
+    assert service.call(y=3.0, name='bob').name == '0 3 bob'
+    assert service.call(fill, name='bob').name == '1 2 bob'
 
 
 @pytest.mark.parametrize(
     'block, fields, said',
     [
-        (None, {'nam': 'bob'}, 'turtlesim/SpawnRequest has no field .nam. .*did you mean .name.'),
-        (
-            None,
-            {'x': 'far'},
-            'turtlesim/SpawnRequest.x = .far. does not fit float32: give a number',
-        ),
-        (
-            lambda request: setattr(request, 'x', 'far'),
-            {},
-            'turtlesim/SpawnRequest.x = .far. does not fit float32',
-        ),
-        (
-            lambda request: setattr(request, 'nam', 'bob'),
-            {},
-            'turtlesim/SpawnRequest has no field .nam.',
-        ),
+        (None, {'dat': True}, 'dat'),
+        (None, {'data': 'yes'}, 'data'),
+        (lambda request: setattr(request, 'data', 'yes'), {}, 'data'),
     ],
 )
-def test_a_field_that_does_not_exist_or_does_not_fit(master, block, fields, said):
+def test_wrong_field_is_told_before_call(master, node, block, fields, said):
     called = []
-    create(master, '/provider').serve('/spawn', SPAWN, lambda request: called.append(request) or '')
-    with pytest.raises(pharos.MessageTypeError, match=said):
-        master.lookup_service('/spawn').call(block, **fields)
-    assert not called
+    node.serve('/here/set', SET, called.append)
+    for name in '/here/set', '/there/fail':
+        with pytest.raises(pharos.MessageTypeError, match=said):
+            master.lookup_service(name).call(block, **fields)
+    assert called == []
 
 
-def test_calls_of_several_threads_do_not_wait_for_each_other(master):
-    together = threading.Barrier(3)
-    create(master, '/provider').serve(
-        '/meet', 'std_srvs/Trigger', lambda request: {'success': together.wait(TIMEOUT) >= 0}
+def test_unknown_service_raises_its_error(master, node):
+    for lookup, name in (master.lookup_service, '/no_such'), (node.lookup_service, '~no_such'):
+        with pytest.raises(UnknownServiceError, match='/no_such'):
+            lookup(name)
+
+
+@both_providers
+def test_wrong_md5sum_is_answered_with_all(master, node, name):
+    node.serve('/here/set', SET, answer_set)
+    service = master.lookup_service(name)
+    service.md5sum = OTHER_MD5SUM
+    with pytest.raises(pharos.ServiceTypeError) as caught:
+        service.call()
+    for said in name, SET, SET_MD5SUM, OTHER_MD5SUM, 'data', 'success', 'message':
+        assert said in str(caught.value)
+    service.md5sum = SET_MD5SUM
+    service.call()
+
+
+def test_other_definition_here_is_refused(master, peer):
+    text = 'int32 {}\nint32 {}\n---\nint32 difference\n'
+    peer.run(
+        f"cls = pharos.define_service('other_srvs/Subtract', {text.format('a', 'b')!r})\n"
+        "subtract = rospy.Service('/subtract', cls, lambda request: request.a - request.b)"
     )
-    service, answers = master.lookup_service('/meet'), []
-    threads = [
-        threading.Thread(target=lambda: answers.append(service.call().success), daemon=True)
-        for _ in range(3)
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(TIMEOUT)
-    assert answers == [True] * 3
+    defined = pharos.define_service('other_srvs/Subtract', text.format('b', 'a'))
+    with pytest.raises(pharos.ServiceTypeError, match='/subtract.*other_srvs/Subtract') as caught:
+        master.lookup_service('/subtract').call(a=9, b=1)
+    assert defined._md5sum in str(caught.value)
+
+
+def test_service_of_unknown_type_is_told(master, peer):
+    peer.run(
+        "cls = pharos.define_service('far_srvs/Add', 'int32 a\\n---\\nint32 b\\n')\n"
+        "far = rospy.Service('/far', cls, lambda request: request.a + 1)"
+    )
+    with pytest.raises(pharos.UnknownTypeError, match='far_srvs/Add'):
+        master.lookup_service('/far').call()
+    pharos.define_service('far_srvs/Add', 'int32 a\n---\nint32 b\n')
+    assert master.lookup_service('/far').call(a=1).b == 2
+
+
+def connections_to(node):
+    """The connections of this process to a node's TCPROS port."""
+    connections = psutil.Process().connections('tcp')
+    return [each for each in connections if each.raddr and each.raddr.port == node.tcp_port]
+
+
+@pytest.mark.parametrize('served_by', ['serve', 'ros.Service'])
+@pytest.mark.parametrize('called_by', ['Service', 'ServiceProxy', 'persistent ServiceProxy'])
+def test_call_in_process_needs_no_socket(master, node, served_by, called_by):
+    found, class_ = [], std_srvs.srv.Trigger
+    serve = node.serve if served_by == 'serve' else node.ros.Service
+    serve('/trigger', class_, lambda request: (not found.append(connections_to(node)), ''))
+    if called_by == 'Service':
+        answer = master.lookup_service('/trigger').call
+        until(lambda: not connections_to(node))  # that of the look-up
+    else:
+        caller = create(master, '/caller')
+        answer = caller.ros.ServiceProxy('/trigger', class_, called_by.startswith('persistent'))
+    assert [answer().success for _ in range(3)] == [True] * 3
+    assert found == [[]] * 3
+
+
+# -- waits and time limits
+
+
+@pytest.mark.parametrize('who, timeout', [('master', None), ('node', None), ('node', TIMEOUT)])
+def test_service_is_waited_for(master, node, who, timeout):
+    waiting = master if who == 'master' else create(master, '/waiting')
+    waits = pool.submit(waiting.wait_for_service, 'late', timeout)
+    node.serve('/late', SET, answer_set)
+    assert waits.result(TIMEOUT).call(data=True).success
+
+
+@pytest.mark.parametrize('timeout', [0, 0.1])
+def test_wait_ends_after_its_timeout(master, node, timeout):
+    for waiting in master, node:
+        with pytest.raises(UnknownServiceError, match='/never'):
+            waiting.wait_for_service('/never', timeout)
+
+
+def test_rospy_waits_for_service(master, node):
+    wait = create(master, '/caller').ros.wait_for_service
+    with pytest.raises(rospy.ROSException):
+        wait('/set', timeout=0.05)
+    waits = pool.submit(wait, '/set', TIMEOUT)
+    node.serve('/set', SET, answer_set)
+    assert waits.result(TIMEOUT) is None
+
+
+def test_timeout_ends_call_to_hanging_process(master, peer):
+    service = master.lookup_service('/there/not')
+    os.kill(peer.pid, signal.SIGSTOP)
+    try:
+        with pytest.raises(ServiceCallError, match='/there/not'):
+            service.call(timeout=0.1)
+    finally:
+        os.kill(peer.pid, signal.SIGCONT)
+    assert service.call(timeout=TIMEOUT).success
+
+
+def test_timeout_holds_for_block_here(master, node):
+    ends = threading.Event()
+    node.serve('/wait', SET, lambda request: (ends.wait(TIMEOUT), ''))
+    service = master.lookup_service('/wait')
+    with pytest.raises(ServiceCallError, match='/wait'):
+        service.call(timeout=0.1)
+    ends.set()
+    assert service.call(timeout=TIMEOUT).success
+
+
+def test_timeout_is_for_the_whole_call(master, node):
+    """Each byte of the response comes in time, the last one never."""
+    node.serve('/drips', SET, answer_set)
+    service = master.lookup_service('/drips')
+    node.stop()
+    given_up = threading.Event()
+    header = b'callerid=/drips', b'type=std_srvs/SetBool', f'md5sum={SET_MD5SUM}'.encode()
+
+    def drip(listening):
+        packed = b''.join(len(each).to_bytes(4, 'little') + each for each in header)
+        with listening.accept()[0] as connection:
+            connection.sendall(len(packed).to_bytes(4, 'little') + packed + b'\x01\xff\0\0\0')
+            while not given_up.wait(0.02):
+                connection.sendall(b'x')
+
+    with socket.create_server(('127.0.0.1', 0)) as listening:
+        address = f'rosrpc://127.0.0.1:{listening.getsockname()[1]}'
+        api = rosgraph.Master('/drips', master_uri=master.url)
+        api.registerService('/drips', address, 'http://127.0.0.1:1/')
+        dripped = pool.submit(drip, listening)
+        with pytest.raises(ServiceCallError, match='/drips'):
+            service.call(timeout=0.3)
+        given_up.set()
+        api.unregisterService('/drips', address)
+        dripped.exception(TIMEOUT)
+
+
+# -- providers that go
+
+
+def test_moved_service_is_found_again(master, node, peer):
+    node.serve('/moves', SET, lambda request: (True, 'here'))
+    service = master.lookup_service('/moves')
+    assert service.call().message == 'here'
+    peer.run("moves = serve('/moves', lambda request: (True, 'there'))")
+    node.stop()
+    assert service.call().message == 'there'
+    create(master, '/next').serve('/moves', SET, lambda request: (True, 'here again'))
+    peer.run('moves.shutdown()')
+    assert service.call().message == 'here again'
+
+
+def test_stop_ends_call_under_way(master, node):
+    called, ends = threading.Event(), threading.Event()
+    node.serve('/wait', SET, lambda request: called.set() or (ends.wait(TIMEOUT), ''))
+    waits = pool.submit(master.lookup_service('/wait').call, timeout=TIMEOUT)
+    assert called.wait(TIMEOUT)
+    stops = pool.submit(node.stop)
+    assert isinstance(waits.exception(TIMEOUT), ServiceCallError)  # the block has not returned
+    ends.set()
+    assert stops.result(TIMEOUT) is None
+
+
+# -- several at once
 
 
 @pytest.mark.parametrize('timeout', [None, TIMEOUT])
-def test_a_service_calls_its_own_node_and_itself(master, timeout):
-    def countdown(request):
-        return (
-            request.name
-            if len(request.name) > 3
-            else inner.call(name=request.name + '!', timeout=timeout).name
-        )
-
-    node = create(master, '/provider')
-    node.serve('/spawn', SPAWN, countdown)
-    inner = master.lookup_service('/spawn')
-    assert inner.call(name='', timeout=timeout).name == '!!!!'
+def test_calls_run_side_by_side(master, node, timeout):
+    together = threading.Barrier(3)
+    node.serve('/meet', SET, lambda request: (together.wait(TIMEOUT) >= 0, ''))
+    service = master.lookup_service('/meet')
+    calls = [pool.submit(service.call, timeout=timeout) for _ in range(3)]
+    assert [each.result(TIMEOUT).success for each in calls] == [True] * 3
 
 
-# -- time limits
+@pytest.mark.parametrize('where', ['here', 'there'])
+def test_each_thread_gets_its_own_answers(master, node, peer, where):
+    if where == 'here':
+        node.serve('/here/echo', SPAWN, lambda request: request.name)
+    else:
+        class_ = f'pharos.service_class({SPAWN!r})'
+        peer.run(f"rospy.Service('/there/echo', {class_}, lambda request: request.name)")
+    service = master.lookup_service(f'/{where}/echo')
+
+    def ask(number):
+        return [service.call(name=f'{number} {turn}').name for turn in range(10)]
+
+    expected = [[f'{number} {turn}' for turn in range(10)] for number in range(4)]
+    assert list(pool.map(ask, range(4), timeout=TIMEOUT)) == expected
 
 
-class SilentProvider:
-    """A provider at a real address: it tells its type, accepts a call, and never answers it."""
-
-    def __init__(self, master, answer=b''):
-        self._answer, self._taken = answer, []
-        self._listening = socket.create_server(('127.0.0.1', 0))
-        self.uri = 'rosrpc://127.0.0.1:%d' % self._listening.getsockname()[1]
-        self._api = master.api('/silent')
-        self._api.registerService('/silent/spawn', self.uri, 'http://127.0.0.1:1/')
-        self._thread = threading.Thread(target=self._serve, daemon=True)
-        self._thread.start()
-
-    def _serve(self):
-        with contextlib.suppress(OSError):
-            while True:
-                connection = self._listening.accept()[0]
-                self._taken.append(connection)
-                header = rosgraph.network.read_ros_handshake_header(connection, io.BytesIO(), 4096)
-                rosgraph.network.write_ros_handshake_header(
-                    connection,
-                    {
-                        'callerid': '/silent',
-                        'type': SPAWN,
-                        'md5sum': '0b2d2e872a8e2887d5ed626f2bf2c561',
-                        'request_type': SPAWN + 'Request',
-                        'response_type': SPAWN + 'Response',
-                    },
-                )
-                if header.get('probe') != '1':
-                    connection.sendall(self._answer)
-
-    def callers_gone(self):
-        """Wait until all callers have closed their connections."""
-        for connection in self._taken:
-            connection.settimeout(TIMEOUT)
-            # one that gives up may do so before it has read all, which resets the connection
-            with contextlib.suppress(ConnectionResetError):
-                while connection.recv(4096):
-                    pass
-        return True
-
-    def close(self):
-        self._api.unregisterService('/silent/spawn', self.uri)
-        self._listening.shutdown(socket.SHUT_RDWR)
-        self._listening.close()
-        self._thread.join(TIMEOUT)
-        for connection in self._taken:
-            connection.close()
-
-
-@pytest.fixture
-def silent(master, request):
-    provider = SilentProvider(master, getattr(request, 'param', b''))
-    yield provider
-    provider.close()
-
-
-def descriptors():
-    return len(os.listdir('/proc/self/fd'))
-
-
-def test_a_provider_that_never_answers_is_given_up(master, silent):
-    """A call of rospy's has no time limit, and lasts for ever (ros_comm #152)."""
-    service = master.lookup_service('/silent/spawn')
-    assert silent.callers_gone()
-    silent._taken.clear()
-    before = set(threading.enumerate())
-    for _ in range(3):
-        with pytest.raises(
-            pharos.ServiceCallError, match='/silent/spawn did not answer in time.*longer timeout='
-        ):
-            service.call(timeout=0.05)
-    assert silent.callers_gone()
-    assert service.response is None
-    assert set(threading.enumerate()) <= before
-
-
-@pytest.mark.parametrize(
-    'silent',
-    [b'\x01', b'\x01\x08\x00\x00\x00\x04\x00'],
-    indirect=True,
-    ids=['within the length', 'within the response'],
-)
-def test_a_provider_that_stops_in_the_middle_is_given_up(master, silent):
-    with pytest.raises(pharos.ServiceCallError, match='did not answer in time'):
-        master.lookup_service('/silent/spawn').call(timeout=0.05)
-    assert silent.callers_gone()
-
-
-@pytest.mark.parametrize('silent', [b'\x01\xff\xff\xff\xff'], indirect=True)
-def test_a_response_of_4_gib_is_refused(master, silent):
-    with pytest.raises(pharos.ServiceCallError, match='/silent/spawn .*4294967295 bytes'):
-        master.lookup_service('/silent/spawn').call(timeout=TIMEOUT)
-
-
-@pytest.mark.parametrize('silent', [b'\x00\x07\x00\x00\x00no room'], indirect=True)
-def test_the_reason_of_a_provider_elsewhere_is_told(master, silent):
-    with pytest.raises(pharos.ServiceCallError, match='/silent/spawn failed: no room'):
-        master.lookup_service('/silent/spawn').call(timeout=TIMEOUT)
-
-
-def test_a_time_limit_holds_for_a_block_of_this_process(master):
-    release, node = threading.Event(), create(master, '/provider')
-    node.serve('/wait', 'std_srvs/Trigger', lambda request: {'success': release.wait(TIMEOUT)})
-    service = master.lookup_service('/wait')
-    with pytest.raises(pharos.ServiceCallError, match='/wait did not answer in time'):
-        service.call(timeout=0.05)
-    release.set()
-    assert service.call(timeout=TIMEOUT).success
-    node.stop()
-    assert [
-        thread.name for thread in threading.enumerate() if thread.name.startswith('/provider')
-    ] == []
-
-
-def test_many_calls_leave_no_descriptor(master):
-    create(master, '/provider').serve('/spawn', SPAWN, lambda request: request.name)
-    service = master.lookup_service('/spawn')
+def test_calls_leave_no_descriptor(master):
+    service, process = master.lookup_service('/there/not'), psutil.Process()
     service.call()
-    before = descriptors()
-    for _ in range(200):
+    before = process.num_fds()
+    for _ in range(30):
         service.call(timeout=TIMEOUT)
-    assert descriptors() <= before + 5  # the master of the tests is in this process, too
+    until(lambda: process.num_fds() <= before + 5)  # the master is in this process
+
+
+@pytest.mark.parametrize('timeout', [None, TIMEOUT])
+@pytest.mark.parametrize('start', ['thread', 'delegate'])
+def test_cycle_of_services_does_not_deadlock(master, node, timeout, start):
+    """Two nodes call each other until the name is long enough."""
+    other = create(master, '/other')
+
+    def ask(caller, to, name):
+        return caller.lookup_service(to).call(name=name, timeout=timeout).name
+
+    def block(caller, to, request):
+        return ask(caller, to, request.name + '!') if len(request.name) < 4 else request.name
+
+    node.serve('/first', SPAWN, functools.partial(block, node, '/second'))
+    other.serve('/second', SPAWN, functools.partial(block, other, '/first'))
+    if start == 'thread':
+        assert ask(node, '/first', '') == '!!!!'
+        return
+
+    def answer(message, channel):
+        node.send_to('/answers', data=ask(node, '/first', message.data))
+
+    answers = Mailbox(other, '/answers', 'std_msgs/String')
+    node.interested_in('/ask', 'std_msgs/String', answer)
+    other.send_to('/ask', data='go')
+    assert answers.next().data == 'go!!'
+
+
+# -- C++
+
+
+@needs_mux
+def test_roscpp_service_is_called(master):
+    pharos.define_service('topic_tools/MuxList', '---\nstring[] topics\n')
+    pharos.define_service('topic_tools/MuxAdd', 'string topic\n---\n')
+    with master.run('topic_tools', 'mux', '/mux_out', '/mux_a', '/mux_b') as mux:
+        master.wait_for_service('/mux/add', TIMEOUT).call(topic='/mux_c', timeout=TIMEOUT)
+        topics = master.wait_for_service('/mux/list', TIMEOUT)
+        assert topics.type == 'topic_tools/MuxList'
+        assert topics.call().topics == ['/mux_a', '/mux_b', '/mux_c']
+        os.kill(mux.pid, signal.SIGINT)  # unlike a kill, it unregisters
+        mux.wait(TIMEOUT)
+
+
+@needs_mux
+@pytest.mark.parametrize('topic, code', [('front', 0), ('broken', 1)])
+def test_roscpp_program_calls_node(master, node, topic, code):
+    pharos.define_service('topic_tools/MuxSelect', 'string topic\n---\nstring prev_topic\n')
+    answers = {'front': 'back'}
+    node.serve('/ours_select', 'topic_tools/MuxSelect', lambda request: answers[request.topic])
+    with master.run('topic_tools', 'switch_mux', '/ours', topic) as client:
+        assert client.wait(TIMEOUT) == code
+    assert len(node.errors) == code

@@ -1,187 +1,751 @@
-"""What ends or silences a rospy node does not end or silence this one."""
-import http.server
-import subprocess
-import sys
+"""What ends or silences a rospy node does not end or silence these nodes: doc/robustness.md."""
+import concurrent.futures
+import contextlib
+import itertools
+import json
+import os
+import pathlib
+import signal
+import socket
+import struct
 import threading
-import xmlrpc.server
+import time
+import xmlrpc.client
 
+import psutil
 import pytest
+import rosgraph
+import rosnode
+import std_msgs.msg
+import std_srvs.srv
+from rosgraph.network import encode_ros_handshake_header
 
-from helpers import create, registrations
-from pharos.testing import Mailbox, TIMEOUT, until
 import pharos
-from pharos import Master
-from pharos.private_rospy import registration
+from helpers import PYTHON, TIMEOUT, Peer, Program, create, registrations
+from pharos import BlockNode, Master
+from pharos.testing import Mailbox, until
+from programs.raw_tcpros import (
+    FakeNode,
+    connect,
+    is_without_delay,
+    leave,
+    receive,
+    string_message,
+    subscribe,
+    text,
+)
+
+STRING = 'std_msgs/String'
+LOG = 'rosgraph_msgs/Log'
+BARE_ROSPY = pathlib.Path(__file__).parent / 'programs' / 'bare_rospy.py'
+LARGE = 'x' * 1_000_000
 
 
-# -- the master restarts
+def sockets_of(port):
+    """Return duplicates of this process's connected sockets whose own port this is."""
+    return [
+        socket.socket(fileno=os.dup(found.fd))
+        for found in psutil.Process().connections('tcp4')
+        if found.laddr.port == port and found.status == psutil.CONN_ESTABLISHED
+    ]
 
 
-def test_everything_is_registered_again_when_the_master_comes_back_empty(mortal_master, mailbox):
-    """With rospy, the node is never registered again: rosnode list lacked it 20 s later, and
-    nothing in rospy tries."""
-    master = Master(mortal_master.url)
-    receiver = create(master, '/receiver', delegate=mailbox, argv=['_private:=7'])
-    receiver.interested_in('/t', 'std_msgs/String')
+def listening():
+    """Return the addresses, with ports, on which this process listens."""
+    found = psutil.Process().connections('tcp')
+    return {tuple(each.laddr) for each in found if each.status == psutil.CONN_LISTEN}
+
+
+def is_closed(sock):
+    """Wait until the other side closes the connection."""
+    sock.settimeout(TIMEOUT)
+    with contextlib.suppress(ConnectionResetError):
+        while sock.recv(1 << 16):
+            pass
+    return True
+
+
+@contextlib.contextmanager
+def unanswered_port():
+    """Bind a port at which nobody listens."""
+    with socket.socket() as bound:
+        bound.bind(('127.0.0.1', 0))
+        yield bound.getsockname()[1]
+
+
+def publish_from(peer, topic):
+    """Have the peer get a `publisher` of a topic, and wait until a node hears it."""
+    string = 'message_class("std_msgs/String")'
+    peer.run(f'publisher = rospy.Publisher({topic!r}, {string}, queue_size=100)')
+    until(lambda: peer.value('publisher.get_num_connections()'))
+
+
+class LogOf:
+    """The log of a node that runs, as /rosout has it."""
+
+    def __init__(self, master, node):
+        self._mailbox, self._node = Mailbox(create(master, '/log_reader'), '/rosout', LOG), node
+        until(lambda: node.name in dict(self._mailbox.channel.connections))
+
+    def warnings(self, marker):
+        """Return the warnings and errors up to a line with the marker."""
+        found = []
+        while True:
+            line = self._mailbox.next()
+            if line.name == self._node.name and line.level > line.INFO:
+                found.append(line.msg)
+            if marker in line.msg:
+                return found
+
+
+# -- the twins: bare rospy has the pain
+
+
+WISHES = """
+second_node starts_again no_core_is_busy_after_the_shutdown port_is_free_after_the_shutdown
+silent_client_blocks_none busy_xmlrpc_port_is_named busy_tcpros_port_is_named
+shutdown_for_an_earlier_owner_is_ignored first_messages_arrive small_messages_without_delay
+latched_by_value each_latched_publisher_keeps_its_message subscriber_that_left_is_known
+service_call_takes_a_timeout others_are_served_beside_one_that_reads_nothing
+one_callback_at_a_time subscription_needs_no_type one_interface_alone
+exception_in_a_callback_is_told""".split()
+
+
+@pytest.fixture(scope='module')
+def bare(ros_master):
+    """Return what a program with rospy alone can do, as ``{wish: True or False}``."""
+    with Program([PYTHON, '-W', 'ignore', str(BARE_ROSPY)], ros_master.url) as program:
+        program.wait()
+    assert 'found ' in program.output, program.output
+    found = json.loads(program.output.rpartition('found ')[2])
+    assert set(found) == set(WISHES)
+    return found
+
+
+@pytest.mark.parametrize('wish', WISHES)
+def test_bare_rospy_still_fails(bare, wish):
+    """If this fails, rospy was mended: delete the twin, and its mark in robustness.md."""
+    assert bare[wish] is False
+
+
+# -- the 21 pains, in the table's order
+
+
+def test_second_node_and_second_start(master):
+    first = create(master, '/first')
+    create(master, '/second')
+    assert {'/first', '/second'} <= {node.name for node in master.nodes()}
+    ports = first.tcp_port, first.xmlrpc_port
+    first.stop()
+    first.start()
+    assert (first.tcp_port, first.xmlrpc_port) == ports
+    assert rosnode.rosnode_ping('/first', max_count=1)
+
+
+def test_stopped_node_uses_no_core(master):
+    create(master).stop()
+    begin = time.process_time()
+    threading.Event().wait(0.5)
+    assert time.process_time() - begin < 0.25
+
+
+def test_ports_are_free_after_stop(master):
+    node = create(master)
+    node.stop()
+    for port in node.tcp_port, node.xmlrpc_port:
+        socket.create_server(('127.0.0.1', port)).close()
+    assert registrations(master, '/node') == [[], [], []]
+
+
+@pytest.fixture
+def host(master):
+    """A node that publishes and serves, for clients to misbehave at."""
+
+    class Patient(BlockNode):
+        client_timeout = TIMEOUT
+
+    node = create(master, '/host', Patient)
+    node.output_channel('/out', STRING, latch=True).send(data='hello')
+    node.serve('/set', 'std_srvs/SetBool', lambda request: {'success': request.data})
+    return node
+
+
+def assert_served(node):
+    """Assert that the node answers a call, and that a new subscriber gets its message."""
+    with xmlrpc.client.ServerProxy(node.uri) as proxy:
+        assert proxy.getPid('/test')[0] == 1
+    with subscribe(node.tcp_port, '/out') as client:
+        receive(client)
+        assert text(receive(client)) == 'hello'
+
+
+def test_silent_clients_keep_nobody_out(host, peer):
+    """Half of the 100 at each port say nothing at all; the others begin, and do not go on."""
+    beginnings = {host.tcp_port: struct.pack('<I', 1000), host.xmlrpc_port: b'POST / HTTP/1.1'}
+    with contextlib.ExitStack() as clients:
+        for number in range(100):
+            for port, beginning in beginnings.items():
+                client = clients.enter_context(connect(port))
+                client.sendall(beginning if number % 2 else b'')
+        peer.hear('/out', STRING)
+        assert peer.heard('/out')[0].data == 'hello'
+        peer.run('from std_srvs.srv import SetBool; rospy.wait_for_service("/set", 20)')
+        assert peer.value('rospy.ServiceProxy("/set", SetBool)(True).success')
+        assert_served(host)
+
+
+@pytest.mark.parametrize('which', ['tcp_port', 'xmlrpc_port'])
+def test_busy_port_is_named(master, which):
+    with socket.create_server(('127.0.0.1', 0)) as busy:
+        port = busy.getsockname()[1]
+        with pytest.raises(pharos.PortInUseError, match=str(port)):
+            create(master, **{which: port})
+    assert registrations(master, '/node') == [[], [], []]
+
+
+def test_shutdown_for_earlier_owner_is_refused(master):
+    node = create(master)
+    with xmlrpc.client.ServerProxy(node.uri) as proxy:
+        proxy.shutdown('/master', '[/old] Reason: new node registered with same name')
+        assert proxy.getPid('/test')[0] == 1
+    assert node.is_running
+
+
+def test_restarted_master_knows_all_again(mortal):
+    master = Master(mortal.url)
+    heard, changes = Mailbox(), Mailbox()
+    receiver = create(master, '/receiver', delegate=heard, argv=['_private:=7'])
+    receiver.interested_in('/t', STRING)
     receiver.serve('/service', 'std_srvs/Empty', lambda request: None)
-    changes = Mailbox()
     receiver.parameter('~watched', 1).on_change(lambda value: changes(value, None))
-    sender = create(master, '/sender')
-    sent = sender.output_channel('/t', 'std_msgs/String')
+    sent = create(master, '/sender').output_channel('/t', STRING)
     before = [registrations(master, name) for name in ('/receiver', '/sender')]
-    mortal_master.end()
-    sent.send(data='while the master is away')
-    assert mailbox.next().data == 'while the master is away'
-    mortal_master.come_back()
+    mortal.end()
+    sent.send(data='while it is away')
+    assert heard.next().data == 'while it is away'
+    mortal.come_back()
     until(lambda: [registrations(master, name) for name in ('/receiver', '/sender')] == before)
-    until(lambda: '/receiver/private' in master.parameters)
-    assert master.parameters['/receiver/private'] == 7
-    late = create(master, '/late')
-    late.send_to('/t', data='from a new peer')
+    until(lambda: master.parameters.get('/receiver/private') == 7)
+    create(master, '/late').send_to('/t', data='from a new node')
     sent.send(data='from the old one')
-    assert {message.data for message in mailbox.take(2)} == {
-        'from a new peer',
-        'from the old one',
-    }
-    assert mailbox.empty()
+    assert {heard.next().data, heard.next().data} == {'from a new node', 'from the old one'}
+    assert len(heard.all()) == 3
     master.lookup_service('/service').call(timeout=TIMEOUT)
     master.parameters['/receiver/watched'] = 2
-    assert changes.next() == 2
+    assert changes.wait_for(lambda value: value == 2)
 
 
-def test_a_node_stops_while_the_master_is_away(mortal_master):
-    node = create(Master(mortal_master.url), '/node')
-    node.interested_in('/t', 'std_msgs/String')
-    mortal_master.end()
+def test_first_message_arrives(master, peer):
+    node = create(master)
+    for number in range(3):
+        peer.hear(f'/first{number}', STRING)
+        node.output_channel(f'/first{number}', STRING).send(data='first')
+        node.send_to(f'/first{number}', data='second')
+        assert [each.data for each in peer.heard(f'/first{number}', 2)] == ['first', 'second']
+
+
+def test_slow_receiver_gets_newest_next(master, peer):
+    began, go_on = Mailbox(), threading.Semaphore(0)
+
+    def look(message, channel):
+        began(message, channel)
+        go_on.acquire(timeout=TIMEOUT)
+
+    channel = create(master).interested_in('/image', STRING, delegate=look, queue_size=1)
+    publish_from(peer, '/image')
+    peer.run('publisher.publish("first")')
+    assert began.next().data == 'first'
+    peer.run('for number in range(1, 40): publisher.publish(f"{number:02}" + "x" * 100000)')
+    until(lambda: channel.dropped == 38)
+    go_on.release(40)
+    assert began.next().data[:2] == '39'
+
+
+def test_small_messages_go_without_delay(master, peer):
+    """A subscriber that asks for Nagle's algorithm, and a publisher of rospy's, which has it on."""
+    node = create(master)
+    channel = node.output_channel('/small', STRING)
+    with subscribe(node.tcp_port, '/small') as client:
+        receive(client)
+        until(lambda: channel.connections)
+        (connection,) = sockets_of(node.tcp_port)
+        with connection:
+            assert is_without_delay(connection)
+    node.interested_in('/asked', STRING)
+    publish_from(peer, '/asked')
+    sock = 'publisher.impl.connections[0].socket'
+    assert peer.value(f'{sock}.getsockopt({socket.IPPROTO_TCP}, {socket.TCP_NODELAY})')
+
+
+def test_latched_message_stays_as_sent(master):
+    channel = create(master).output_channel('/latched', STRING, latch=True)
+    message = std_msgs.msg.String('as it was')
+    channel.publish(message)
+    message.data = 'changed since'
+    assert Mailbox(create(master, '/late'), '/latched').next().data == 'as it was'
+
+
+def test_each_latched_channel_keeps_its_message(master):
+    node = create(master)
+    for data in 'first', 'second':
+        node.output_channel('/latches', STRING, latch=True).send(data=data)
+    late = Mailbox(create(master, '/late'), '/latches')
+    assert [late.next().data, late.next().data] == ['first', 'second']
+
+
+def test_subscriber_that_left_is_known(master):
+    node = create(master)
+    channel = node.output_channel('/leaving', STRING)
+    for number in range(10):
+        with subscribe(node.tcp_port, '/leaving', f'/raw{number}') as client:
+            assert channel.wait_for_subscribers(1, TIMEOUT)
+            assert channel.connections == [(f'/raw{number}', 'TCPROS')]
+            channel.send(data=str(number))
+            receive(client)
+            assert text(receive(client)) == str(number)
+            leave(client, until)
+        assert channel.connections == []
+        assert not channel.wait_for_subscribers(1, 0)
+
+
+def test_service_call_has_a_timeout(master):
+    with socket.create_server(('127.0.0.1', 0)) as silent:
+        address = f'rosrpc://127.0.0.1:{silent.getsockname()[1]}'
+        api = rosgraph.Master('/silent', master_uri=master.url)
+        api.registerService('/silent/set', address, 'http://127.0.0.1:1/')
+        try:
+            service = master.lookup_service('/silent/set')
+            with pytest.raises(pharos.ServiceCallError, match='/silent/set'):
+                service.call(timeout=0.1)
+        finally:
+            api.unregisterService('/silent/set', address)
+
+
+def test_link_comes_back_after_a_loss(master):
+    """The publisher's port refuses for a while, and nobody tells the node when it does not."""
+    with FakeNode(master, '/lossy').publish_here() as publisher:
+        heard = Mailbox(create(master), '/lossy', STRING)
+        with publisher.accept() as connection:
+            connection.sendall(string_message('before'))
+            assert heard.next().data == 'before'
+            publisher.move()
+        for _ in range(3):  # one for the first connection, one that is refused, and the next
+            assert publisher.asked.acquire(timeout=TIMEOUT)
+        with publisher.accept() as connection:
+            connection.sendall(string_message('after'))
+            assert heard.next().data == 'after'
+
+
+def test_silent_loss_is_noticed_soon(master):
+    """The kernel probes a silent connection, and breaks it within 30 s."""
+    node = create(master)
+    channel = node.output_channel('/quiet', STRING)
+    with subscribe(node.tcp_port, '/quiet') as client:
+        receive(client)
+        until(lambda: channel.connections)
+        (connection,) = sockets_of(node.tcp_port)
+        with connection:
+            assert connection.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+            idle, interval, count = (
+                connection.getsockopt(socket.IPPROTO_TCP, option)
+                for option in (socket.TCP_KEEPIDLE, socket.TCP_KEEPINTVL, socket.TCP_KEEPCNT)
+            )
+            assert idle + interval * count <= 30
+
+
+def test_stuck_subscriber_starves_nobody(master):
+    node = create(master)
+    channel = node.output_channel('/stuck', STRING, queue_size=20)
+    port = node.tcp_port
+    with subscribe(port, '/stuck', '/stuck'), subscribe(port, '/stuck', '/reader') as reader:
+        assert channel.wait_for_subscribers(2, TIMEOUT)
+        for number in range(20):
+            channel.send(data=f'{number:02}{LARGE}')
+        receive(reader)
+        assert [int(text(receive(reader))[:2]) for _ in range(20)] == list(range(20))
+
+
+def test_delegates_run_one_at_a_time(master, peer):
+    """One message comes through INTRAPROCESS, the other through TCPROS."""
+    began, go_on = Mailbox(), threading.Event()
+
+    def delegate(message, channel):
+        began(message, channel)
+        if message.data == 'wait':
+            go_on.wait(TIMEOUT)
+
+    node = create(master, '/careful', delegate=delegate)
+    node.interested_in('/left', STRING)
+    right = node.interested_in('/right', STRING, queue_size=1)
+    create(master, '/sender').send_to('/left', typed_as=STRING, data='wait')
+    assert began.next().data == 'wait'
+    publish_from(peer, '/right')
+    peer.run('publisher.publish("dropped"); publisher.publish("kept")')
+    until(lambda: right.dropped == 1)
+    assert len(began.all()) == 1
+    go_on.set()
+    assert began.next().data == 'kept'
+
+
+def test_publishing_takes_one_step(master, peer):
+    peer.hear('/speed', 'geometry_msgs/Point')
+    create(master).send_to('/speed', x=2.0)
+    assert peer.heard('/speed')[0].x == 2.0
+
+
+def test_subscription_needs_no_type(master):
+    """The type is on no disk: it comes from the publisher."""
+    with FakeNode(master, '/unknown', 'nowhere_msgs/Thing').publish_here() as publisher:
+        with publisher.sending('found'):
+            heard = Mailbox(create(master), '/unknown')
+            assert heard.next().data == 'found'
+        assert heard.channel.type == 'nowhere_msgs/Thing'
+
+
+def test_loopback_domain_listens_there_alone(master):
+    before = listening()
+    node = create(master, domain='127.0.0.2')
+    ports = {('127.0.0.2', node.tcp_port), ('127.0.0.2', node.xmlrpc_port)}
+    assert listening() - before == ports
+
+
+def test_failed_delegate_is_told(master, transcript):
+    def fail(message, channel):
+        raise ValueError(f'bad {message.data}')
+
+    node = create(master, delegate=fail)
+    log = LogOf(master, node)
+    node.interested_in('/raising', STRING)
+    create(master, '/sender').send_to('/raising', data='luck')
+    until(lambda: node.errors)
+    assert str(node.errors[-1]) == 'bad luck'
+    assert 'bad luck' in ''.join(log.warnings('bad luck'))
+    until(lambda: 'bad luck' in ''.join(transcript))
+
+
+# -- the master
+
+
+def test_link_to_rospy_survives_the_master(mortal):
+    """Nothing comes twice, though the node and its peer are registered at another master now."""
+    master = Master(mortal.url)
+    heard = Mailbox(create(master), '/chat', STRING)
+    with Peer(mortal.url) as peer:
+        publish_from(peer, '/chat')
+        peer.run('publisher.publish("before")')
+        mortal.end()
+        peer.run('publisher.publish("meanwhile")')
+        mortal.come_back()
+        until(lambda: '/chat' in registrations(master, '/node')[1])
+        peer.run('publisher.publish("after")')
+        assert heard.wait_for(lambda message: message.data == 'after')
+        assert [message.data for message in heard.all()] == ['before', 'meanwhile', 'after']
+
+
+def test_plain_rospy_is_registered_later(mortal):
+    master = Master(mortal.url)
+    node, heard = create(master), Mailbox()
+    mortal.end()
+    node.ros.Subscriber('/plain', std_msgs.msg.String, lambda message: heard(message, None))
+    publisher = node.ros.Publisher('/plain', std_msgs.msg.String, queue_size=5)
+    node.ros.Service('/plain_service', std_srvs.srv.Empty, lambda request: None)
+    mortal.come_back()
+    until(publisher.get_num_connections)
+    publisher.publish('found')
+    assert heard.next().data == 'found'
+    until(lambda: '/plain_service' in registrations(master, '/node')[2])
+
+
+OPENERS = {
+    'interested_in': lambda node: node.interested_in('/opened', STRING),
+    'output_channel': lambda node: node.output_channel('/opened', STRING),
+    'send_to': lambda node: node.send_to('/opened', typed_as=STRING, data='x'),
+    'serve': lambda node: node.serve('/opened', 'std_srvs/Empty', lambda request: None),
+    'parameter': lambda node: node.parameter('/opened', 5),
+    'lookup_service': lambda node: node.lookup_service('/opened'),
+}
+
+
+def test_killed_master_is_unreachable_and_harmless(mortal):
+    """What cannot be opened raises, and is not there later; what is closed is gone later."""
+    master = Master(mortal.url)
+    node = create(master)
+    before = registrations(master, '/node')
+    closed = node.interested_in('/closed', STRING)
+    mortal.end()
+    for opener in OPENERS.values():
+        with pytest.raises(pharos.MasterUnreachableError):
+            opener(node)
+    closed.close()
+    mortal.come_back()
+    until(lambda: registrations(master, '/node') == before)
+    assert node.channels == []
+
+
+def test_node_stops_without_its_master(mortal):
+    node = create(Master(mortal.url))
+    node.interested_in('/t', STRING)
+    mortal.end()
     node.stop()
-    assert node.lifecycle.value == 'stopped'
+    assert not node.is_running
 
 
-def test_there_is_one_watcher_per_master_and_none_without_a_node(master):
-    watching = f'watcher of {master.url}'
+def test_absent_master_is_unreachable():
+    with unanswered_port() as port:
+        master = Master(f'http://127.0.0.1:{port}/')
+        assert not master.is_reachable()
+        for ask in master.system_state, master.services, master.topics, lambda: create(master):
+            with pytest.raises(pharos.MasterUnreachableError, match=str(port)):
+                ask()
 
-    def watchers():
-        return [thread.name for thread in threading.enumerate()].count(watching)
 
-    nodes = [create(master, '/n%d' % i) for i in range(3)]
-    assert watchers() == 1
-    for node in nodes:
-        node.stop()
-    until(lambda: watchers() == 0)
+@contextlib.contextmanager
+def stopped(pid):
+    """Have a process hang meanwhile."""
+    os.kill(pid, signal.SIGSTOP)
+    until(lambda: psutil.Process(pid).status() == psutil.STATUS_STOPPED)
+    try:
+        yield
+    finally:
+        os.kill(pid, signal.SIGCONT)
+
+
+def test_hanging_master_ends_no_wait(mortal):
+    """Each question ends with an error in its own time, and a node stops."""
+    master = Master(mortal.url)
+    node, other = create(master), create(master, '/other')
+    other.interested_in('/t', STRING)
+    node.connect_timeout = 0.5
+    with stopped(mortal.pid):
+        asks = [
+            master.system_state,
+            lambda: master.parameters['/x'],
+            lambda: node.lookup_service('/x'),
+            lambda: create(Master(mortal.url), '/third'),
+        ]
+        with concurrent.futures.ThreadPoolExecutor() as pool:
+            asked = [pool.submit(ask) for ask in asks]
+            other.stop()
+            assert not other.is_running
+            for ask in asked:
+                assert isinstance(ask.exception(TIMEOUT), pharos.MasterUnreachableError)
+    node.send_to('/goes_on', typed_as=STRING, data='x')
 
 
 # -- peers that die
 
-PEER = """
-import rospy, std_msgs.msg
-rospy.init_node('peer')
-rospy.Subscriber('/to_peer', std_msgs.msg.String, lambda message: None)
-publisher = rospy.Publisher('/from_peer', std_msgs.msg.String, latch=True, queue_size=1)
-publisher.publish('hello')
-rospy.spin()
-"""
 
-
-def test_a_peer_killed_outright_is_let_go_and_found_again(master, mailbox):
-    node = create(master, '/node', delegate=mailbox)
-    heard = node.interested_in('/from_peer', 'std_msgs/String')
-    told = node.output_channel('/to_peer', 'std_msgs/String')
+def test_killed_peer_is_found_again(master):
+    heard, node = Mailbox(), create(master, '/node', delegate=Mailbox())
+    channel = node.interested_in('/from_peer', STRING, delegate=heard)
+    told = node.output_channel('/to_peer', STRING)
+    service = None
     for _ in range(2):
-        with subprocess.Popen([sys.executable, '-c', PEER]) as peer:
-            assert mailbox.next().data == 'hello'
-            assert told.wait_for_subscribers(1, TIMEOUT)
-            peer.kill()
-        until(lambda: not heard.connections and not told.connections)
+        peer = Peer(master.url)
+        peer.run(
+            'from std_srvs.srv import Empty, Trigger\n'
+            'def hang(request): called.append(1); rospy.sleep(3600)\n'
+            'called, string = [], message_class("std_msgs/String")\n'
+            'hanging = rospy.Service("/hang", Empty, hang)\n'
+            'quick = rospy.Service("/quick", Trigger, lambda request: (True, "here"))\n'
+            'publisher = rospy.Publisher("/from_peer", string, latch=True, queue_size=1)\n'
+            'publisher.publish("hello"); subscriber = rospy.Subscriber("/to_peer", string)'
+        )
+        assert heard.next().data == 'hello'
+        assert told.wait_for_subscribers(1, TIMEOUT)
+        service = service or master.lookup_service('/quick')
+        assert service.call(timeout=TIMEOUT).message == 'here'
+        with concurrent.futures.ThreadPoolExecutor() as pool:
+            call = pool.submit(master.lookup_service('/hang').call)
+            until(lambda: peer.value('called'))
+            peer.end()
+            assert isinstance(call.exception(TIMEOUT), pharos.ServiceCallError)
+        until(lambda: not channel.connections and not told.connections)
         told.send(data='into the void')
-    # whose name it is from now on: nothing of the killed one stays with the master
-    create(master, '/peer')
+        with pytest.raises(pharos.PharosError):
+            service.call(timeout=TIMEOUT)
+    create(master, '/peer')  # it takes the name, so that nothing of the killed one stays
 
 
-# -- stop at any moment
+# -- clients that misbehave
+
+FOUR_GIB = struct.pack('<I', 0xFFFFFFFF)
+NONSENSE = {
+    'tcp_port': {
+        'announced 4 GiB': FOUR_GIB,
+        'HTTP': b'GET / HTTP/1.0\r\n\r\n',
+        'no fields': struct.pack('<I', 0),
+        'no equals sign': struct.pack('<II', 7, 3) + b'abc',
+        'length of a field': struct.pack('<II', 8, 1000) + b'abcd',
+        'other topic': encode_ros_handshake_header(
+            {'callerid': '/bad', 'topic': '/other', 'type': '*', 'md5sum': '*'}
+        ),
+        'other type': encode_ros_handshake_header(
+            {'callerid': '/bad', 'topic': '/out', 'type': 'a/B', 'md5sum': '0' * 32}
+        ),
+        'ends at once': b'',
+        'ends early': struct.pack('<I', 100) + b'abc',
+    },
+    'xmlrpc_port': {
+        'no HTTP': b'\0\1\2\3\r\n\r\n',
+        'no XML': b'POST / HTTP/1.0\r\nContent-Length: 3\r\n\r\nabc',
+        'announced 4 GiB': b'POST / HTTP/1.0\r\nContent-Length: 4294967295\r\n\r\nabc',
+        'no length': b'POST / HTTP/1.0\r\n\r\n',
+        'no number': b'POST / HTTP/1.0\r\nContent-Length: many\r\n\r\n',
+        'ends early': b'POST / HTTP/1.0\r\nContent-Length: 30\r\n\r\nabc',
+    },
+}
 
 
-def test_two_threads_may_stop_a_node_at_once(master):
-    for round_ in range(10):
-        node = create(master, '/node')
-        threads = [threading.Thread(target=node.stop) for _ in range(4)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join(TIMEOUT)
-        assert node.lifecycle.value == 'stopped'
-        assert not any(registrations(master, '/node'))
+@pytest.mark.parametrize('which', NONSENSE)
+def test_nonsense_closes_its_client_alone(host, which):
+    for kind, nonsense in NONSENSE[which].items():
+        with connect(getattr(host, which)) as client:
+            with contextlib.suppress(OSError):
+                client.sendall(nonsense)
+                client.shutdown(socket.SHUT_WR)
+            assert is_closed(client), kind
+    assert_served(host)
 
 
-def test_a_node_stops_while_it_publishes_receives_and_calls(master):
-    server = create(master, '/server')
-    server.serve('/echo', 'std_srvs/SetBool', lambda request: {'success': request.data})
-    for _ in range(5):
-        node = create(master, '/node')
-        busy = threading.Event()
-        service = master.lookup_service('/echo')
-        channel = node.output_channel('/t', 'std_msgs/String')
-
-        def work(me):
-            while True:
-                channel.send(data='x' * 1000)
-                service.call(data=True)
-                busy.set()
-                me.sleep(0)
-
-        node.interested_in('/t', delegate=lambda message, channel: service.call(data=True))
-        node.fork(work)
-        assert busy.wait(TIMEOUT)
-        node.stop()
-        assert not [
-            error for error in node.errors if not isinstance(error, pharos.NodeStoppedError)
-        ]
+@pytest.mark.parametrize('kind', ['announced 4 GiB', 'HTTP', 'other type'])
+def test_nonsense_is_logged_in_one_line(master, host, kind):
+    """The line names the client's address."""
+    log = LogOf(master, host)
+    with connect(host.tcp_port) as client:
+        client.sendall(NONSENSE['tcp_port'][kind])
+        assert is_closed(client)
+        address = '{}:{}'.format(*client.getsockname())
+    lines = log.warnings(address)
+    host.log('the end', level='warning')
+    assert log.warnings('the end') == ['the end']
+    assert len(lines) == 1
 
 
-# -- peers that answer nonsense
+@pytest.mark.parametrize('beginning', ['', 'a byte at a time'])
+@pytest.mark.parametrize('which', ['tcp_port', 'xmlrpc_port'])
+def test_slow_client_is_closed(master, which, beginning):
+    class Host(BlockNode):
+        client_timeout = 0.5
+
+    host = create(master, '/host', Host)
+    host.output_channel('/out', STRING, latch=True).send(data='hello')
+    said = {'tcp_port': struct.pack('<I', 100000), 'xmlrpc_port': b'POST / HTTP/1.1\r\n'}[which]
+    pause = threading.Event()
+    with connect(getattr(host, which)) as client:
+        if beginning:
+            with contextlib.suppress(OSError):
+                for byte in said + b'x' * 5000:
+                    client.sendall(bytes([byte]))
+                    pause.wait(0.01)
+                pytest.fail('it listens for ever')
+        assert is_closed(client)
+    assert_served(host)
 
 
-def test_a_publisher_that_once_answers_nonsense_is_asked_again(master, monkeypatch):
-    monkeypatch.setattr(registration, 'RETRY_DELAY', 0.1)
-    codes = Mailbox()
-    node = create(master, '/node')
-    node.interested_in('/survival/nonsense', 'std_msgs/String', delegate=Mailbox())
-    handler = node.latest_run.rospy.lifetime.xmlrpc.handler
-    asked, proceed = threading.Semaphore(0), threading.Event()
-
-    def request_topic(caller_id, topic, protocols):
-        asked.release()
-        proceed.wait(TIMEOUT)
-        return 1, 'a dict is no protocol', {'protocol': 'TCPROS'}
-
-    with xmlrpc.server.SimpleXMLRPCServer(('127.0.0.1', 0), logRequests=False) as publisher:
-        publisher.register_function(request_topic, 'requestTopic')
-        threading.Thread(target=publisher.serve_forever, daemon=True).start()
-        uri = 'http://127.0.0.1:%d/' % publisher.server_address[1]
-
-        def connect():
-            codes(handler._connect_topic('/survival/nonsense', uri)[0], None)
-
-        first = threading.Thread(target=connect, daemon=True)
-        first.start()
-        assert asked.acquire(timeout=TIMEOUT)
-        assert handler._connect_topic('/survival/nonsense', uri)[0] == 1  # it is being asked
-        proceed.set()
-        first.join(TIMEOUT)
-        connect()
-        assert codes.take(2) == [0, 0]
-        assert asked.acquire(timeout=TIMEOUT)
-        publisher.shutdown()
+def test_lying_publisher_is_tried_again(master):
+    with FakeNode(master, '/huge').publish_here() as publisher:
+        heard = Mailbox(create(master), '/huge', STRING)
+        with publisher.accept() as connection:
+            connection.sendall(FOUR_GIB)
+            assert is_closed(connection)
+        with publisher.accept() as connection:
+            connection.sendall(string_message('small'))
+            assert heard.next().data == 'small'
 
 
-def test_a_name_whose_dead_node_left_its_port_to_another_server_is_refused_with_advice(master):
-    with http.server.HTTPServer(('127.0.0.1', 0), http.server.SimpleHTTPRequestHandler) as other:
-        threading.Thread(target=other.serve_forever, daemon=True).start()
-        uri = 'http://127.0.0.1:%d/' % other.server_address[1]
-        left_behind = master.api('/left_behind')
-        left_behind.registerPublisher('/survival/left', 'std_msgs/String', uri)
-        try:
-            with pytest.raises(pharos.NodeNameInUseError, match='rosnode cleanup'):
-                create(master, '/left_behind')
-        finally:
-            left_behind.unregisterPublisher('/survival/left', uri)
-            other.shutdown()
+# -- the first message, and subscribers that cannot take it
+
+
+ASKED_WITHIN = 1.5  # seconds; a node that has not connected by then was asked about it
+
+
+def test_hanging_subscriber_is_named_in_log(master, peer):
+    """A send to a subscriber that hangs returns, and a warning says who did not connect."""
+    peer.hear('/first', STRING)
+    node = create(master)
+    node.connect_timeout = ASKED_WITHIN
+    log = LogOf(master, node)
+    with stopped(peer.pid):
+        node.send_to('/first', typed_as=STRING, data='x')
+        node.log('the end', level='warning')
+        assert '/peer' in ''.join(log.warnings('the end'))
+
+
+def test_nonsense_about_connections_breaks_no_send(master):
+    """Subscribers that do not connect answer getBusInfo with nonsense."""
+    answers = [[0, 0, 0, 0]], [0, 0, 0, 0], [[]], 'nonsense', 5, {'a': 1}, [[1, 2, 3, 4, 5]]
+    with contextlib.ExitStack() as fakes:
+        for number, info in enumerate(answers):
+            fake = FakeNode(master, '/first', bus_info=info, name=f'/fake{number}')
+            fakes.enter_context(fake).hear_here()
+        node = create(master)
+        node.connect_timeout = ASKED_WITHIN
+        assert node.send_to('/first', typed_as=STRING, data='x').data == 'x'
+        assert not node.errors
+
+
+def test_dead_subscriber_is_not_waited_for(master):
+    """Its port refuses connections, as that of a node that was killed."""
+    with FakeNode(master, '/first').hear_here() as dead:
+        dead.stop_answering()
+        node = create(master)
+        node.connect_timeout = 10 * TIMEOUT
+        fields = {'typed_as': STRING, 'data': 'x'}
+        send = threading.Thread(target=node.send_to, args=('/first',), kwargs=fields, daemon=True)
+        send.start()
+        send.join(TIMEOUT)
+        assert not send.is_alive()
+
+
+# -- for a while
+
+
+def in_use(master):
+    """Return how many threads, descriptors and registered names there are."""
+    names = sum(map(len, master.system_state()))
+    return threading.active_count(), len(os.listdir('/proc/self/fd')), names
+
+
+def come_and_go(master, is_killed):
+    """Have nodes, channels and a peer start, talk and end."""
+    with create(master, '/one') as one, create(master, '/two') as two, Peer(master.url) as peer:
+        heard, told = Mailbox(two, '/soak', STRING), Mailbox(one, '/from_peer', STRING)
+        two.serve('/set', 'std_srvs/SetBool', lambda request: {'success': request.data})
+        publish_from(peer, '/from_peer')
+        peer.run('publisher.publish("hello")')
+        assert told.next().data == 'hello'
+        peer.hear('/soak', STRING)
+        for number in range(10):
+            one.send_to('/soak', data=str(number))
+            assert heard.next().data == str(number)
+            assert master.lookup_service('/set').call(data=True, timeout=TIMEOUT).success
+            one.channels[-1].close()
+        if is_killed:
+            peer.end()
+            create(master, '/peer').stop()  # takes the name, and all that is registered for it
+        two.restart()
+        one.stop()
+        one.start()
+        one.send_to('/soak', data='again')
+        assert heard.next().data == 'again'
+        assert not one.errors and not two.errors
+
+
+@pytest.mark.timeout(120)
+def test_soak_leaves_nothing_behind(mortal):
+    master = Master(mortal.url)
+    come_and_go(master, is_killed=False)  # loads what a process loads once
+    until(lambda: not any(master.system_state()))
+    before, end = in_use(master), time.monotonic() + 25
+    with create(master, '/stays') as stays:
+        stays.interested_in('/t', STRING)
+        for number in itertools.count(1):
+            come_and_go(master, is_killed=number % 2)
+            if number == 2:
+                mortal.end()
+                mortal.come_back()
+                until(lambda: '/t' in registrations(master, '/stays')[1])
+            if time.monotonic() > end and number > 2:
+                break
+    until(lambda: all(now <= then for now, then in zip(in_use(master), before)), what=str(before))

@@ -64,7 +64,7 @@ def _may_connect(channel: 'OutputChannel', name: str) -> bool:
     node = channel.node
     connections = node.master.bus_info(name)
     return connections is not None and not any(
-        node.uri in told and channel.topic in told and SHARED in told
+        str(node.uri) in told and channel.topic in told and SHARED in told
         for told in (str(connection) for connection in connections)
     )
 

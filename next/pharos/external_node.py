@@ -1,0 +1,97 @@
+"""Nodes outside this process."""
+from __future__ import annotations
+
+import urllib.parse
+from typing import TYPE_CHECKING, Any
+
+from pharos.errors import UnknownNodeError
+from pharos.private_rospy.run import UNREACHABLE, ServerProxy
+
+if TYPE_CHECKING:
+    from pharos.master import Master
+
+
+class ExternalNode:
+    """Any node outside this process; made by :meth:`Master.node`.
+
+    To receive from it alone: ``node.interested_in(topic, from_=external)``; to send to it alone:
+    ``node.send_to(topic, block, to=external)``.
+
+    :ivar name: its full name
+    """
+
+    def __init__(self, master: Master, name: str):
+        self.master, self.name = master, name
+
+    @property
+    def uri(self) -> str:
+        """The URI of its XML-RPC server, as the master knows it.
+
+        :raises UnknownNodeError: if it knows no such node any more
+        """
+        uri = self.master.call('lookupNode', self.name)
+        if not uri:
+            raise UnknownNodeError(
+                f'no node {self.name} is known at {self.master.url}: see rosnode list'
+            )
+        return uri
+
+    @property
+    def host(self) -> str | None:
+        """The host in its URI."""
+        return urllib.parse.urlsplit(self.uri).hostname
+
+    def _call(self, method: str, *args: Any) -> Any:
+        try:
+            return getattr(ServerProxy(self.uri), method)('/pharos', *args)[2]
+        except (*UNREACHABLE, TypeError, LookupError) as error:
+            raise UnknownNodeError(
+                f'{self.name} at {self.uri} does not answer: {error}; rosnode cleanup removes the'
+                ' dead'
+            ) from None
+
+    @property
+    def pid(self) -> int:
+        """The number of its process, on its host."""
+        return self._call('getPid')
+
+    def is_alive(self) -> bool:
+        """True if it answers."""
+        try:
+            return self.pid > 0
+        except (UnknownNodeError, TypeError):
+            return False
+
+    @property
+    def publications(self) -> dict[str, str]:
+        """The topics that it publishes on, with their types, as the master knows them."""
+        return self._topics(0)
+
+    @property
+    def subscriptions(self) -> dict[str, str]:
+        """The topics that it receives from, with their types, as the master knows them."""
+        return self._topics(1)
+
+    def _topics(self, kind: int) -> dict[str, str]:
+        types = dict(self.master.call('getTopicTypes'))
+        topics = self.master.system_state()[kind]
+        return {name: types.get(name) for name, nodes in topics.items() if self.name in nodes}
+
+    @property
+    def services(self) -> list[str]:
+        """The names of the services that it offers."""
+        offered = self.master.system_state()[2]
+        return sorted(name for name, nodes in offered.items() if self.name in nodes)
+
+    def shutdown(self) -> None:
+        """Ask it to end, as rosnode kill does."""
+        self._call('shutdown', 'asked by pharos')
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ExternalNode) and vars(self) == vars(other)
+
+    def __hash__(self) -> int:
+        return hash(self.name)
+
+    def __repr__(self) -> str:
+        return f'<ExternalNode {self.name} of {self.master.url}>'

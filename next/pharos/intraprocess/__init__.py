@@ -1,0 +1,1 @@
+"""INTRAPROCESS: hand messages from node to node of one process, without socket or bytes."""

@@ -1,0 +1,223 @@
+"""Copy messages in two halves: the publisher freezes once, each receiver thaws one of its own.
+
+A thawed message equals, in the value and type of every field, what the wire delivers. The functions
+are generated for each class, as genpy generates its serializers. Three rules make them right:
+numbers pass through the struct codes of the wire; only values of the very type that arrives (float,
+str, bytes) are shared; a message with anything else is serialized, and so is every message of a
+class that genpy did not generate in the usual way.
+"""
+from __future__ import annotations
+
+import functools
+import io
+import itertools
+import struct
+from typing import Any, Callable
+
+import genpy
+from genmsg.msgs import parse_type
+from genpy.base import SIMPLE_TYPES_DICT as CODES
+
+_GENERATED = {'__slots__', '_slot_types', 'serialize', 'serialize_numpy'}
+_TIMES = {'time': genpy.Time, 'duration': genpy.Duration}
+
+
+class _UnusualError(Exception):
+    """Only genpy's serializer knows what to make of this."""
+
+
+def serialize(message: genpy.Message) -> bytes:
+    """Return the bytes of a message on the wire, without their length."""
+    buffer = io.BytesIO()
+    message.serialize(buffer)
+    return buffer.getvalue()
+
+
+@functools.lru_cache(None)
+def copier_for(cls: type) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
+    """Return ``freeze(message)``, which raises what ``serialize`` raises, and ``thaw(frozen)``."""
+    try:
+        freeze_fields, thaw_fields = _generate(cls)
+    except Exception:  # a class that is not understood costs time, never a wrong copy
+        return serialize, lambda frozen: cls().deserialize(frozen)
+
+    def freeze(message):
+        if message.__class__ is cls:
+            try:
+                return freeze_fields(message)
+            except Exception:  # the serializer says what is wrong
+                pass
+        return serialize(message)
+
+    def thaw(frozen):
+        return thaw_fields(frozen) if type(frozen) is tuple else cls().deserialize(frozen)
+
+    return freeze, thaw
+
+
+@functools.lru_cache(None)
+def thawer(sent: type, wanted: type) -> Callable[[Any], Any]:
+    """Return the function that thaws a message of one class as one of another, such as AnyMsg."""
+    thaw = copier_for(sent)[1]
+    if sent is wanted:
+        return thaw
+
+    def thaw_as_wanted(frozen):
+        data = frozen if type(frozen) is bytes else serialize(thaw(frozen))
+        return wanted().deserialize(data)
+
+    return thaw_as_wanted
+
+
+def size_of(frozen: Any) -> int:
+    """Estimate the bytes that a message, frozen or not, holds."""
+    if isinstance(frozen, genpy.Message):
+        frozen = tuple(getattr(frozen, name) for name in frozen.__slots__)
+    if type(frozen) in (bytes, str):
+        return len(frozen)
+    if type(frozen) is tuple:
+        sample = frozen[:20]
+        return 8 + sum(map(size_of, sample)) * len(frozen) // (len(sample) or 1)
+    return 8
+
+
+# -- what the generated functions call
+
+
+def _sequence(value):
+    if type(value) not in (list, tuple):
+        raise _UnusualError
+    return tuple(value)
+
+
+def _text(value):
+    if type(value) is not str:
+        raise _UnusualError
+    value.encode()
+    return value
+
+
+def _octets(value):
+    return value if type(value) is bytes else bytes(_sequence(value))
+
+
+def _numbers(code):
+    @functools.lru_cache(128)
+    def structs(count):
+        packer = struct.Struct(f'<{count}{code}')
+        return packer.pack, packer.unpack
+
+    def convert(value):
+        value = _sequence(value)
+        if code == 'd' and set(map(type, value)) == {float}:
+            return value
+        pack, unpack = structs(len(value))
+        return unpack(pack(*value))
+
+    return convert
+
+
+def _booleans(value, convert=_numbers('B')):
+    return tuple(map(bool, convert(value)))
+
+
+_SCOPE = {'new': object.__new__, 'text': _text, 'sequence': _sequence, 'Unusual': _UnusualError}
+_SCOPE.update((f'{base}_array', _numbers(code)) for base, code in CODES.items())
+_SCOPE.update(
+    string_array=lambda value: tuple(map(_text, _sequence(value))),
+    bool_array=_booleans,
+    uint8_array=_octets,
+    char_array=_octets,
+)
+
+
+# -- the generator
+
+
+class _Source:
+    """The lines of the two functions for one class."""
+
+    def __init__(self, cls: type, depth: int):
+        self.scope, self.names = dict(_SCOPE), itertools.count()
+        self.reads: list[str] = []
+        self.builds: list[str] = []
+        self.values: list[str] = []
+        self.numbers: list[tuple[str, str, str]] = []  # base, field, local
+        self.add_fields(cls, 'm', depth)
+        if self.numbers:
+            self.pack_numbers()
+
+    def refer(self, thing: Any) -> str:
+        """Return a name for a thing in the generated code."""
+        name = f'g{next(self.names)}'
+        self.scope[name] = thing
+        return name
+
+    def pack_numbers(self) -> None:
+        """Send all single numbers through one pack and unpack, so that they come out as the wire's."""
+        bases, fields, names = zip(*self.numbers)
+        codes = '<' + ''.join(CODES[base] for base in bases)
+        arriving = '<' + ''.join('?' if base == 'bool' else CODES[base] for base in bases)
+        self.scope.update(pack=struct.Struct(codes).pack, unpack=struct.Struct(arriving).unpack)
+        self.reads.append(f'{", ".join(names)}, = unpack(pack({", ".join(fields)}))')
+
+    def add_fields(self, cls: type, owner: str, depth: int) -> None:
+        if cls in _TIMES.values():
+            base = 'uint32' if cls is genpy.Time else 'int32'
+            fields = [('secs', base), ('nsecs', base)]
+        elif _GENERATED <= vars(cls).keys() and cls.__bases__ == (genpy.Message,):
+            fields = list(zip(cls.__slots__, cls._slot_types))
+        else:
+            raise _UnusualError
+        for name, type_ in fields:
+            self.add_field(cls, f'{owner}.{name}', type_, depth)
+
+    def add_field(self, cls: type, field: str, type_: str, depth: int) -> None:
+        base, is_array, length = parse_type(type_)
+        local = f'v{next(self.names)}'
+        nested = None if base in CODES or base == 'string' else nested_class(base, cls)
+        if nested and not is_array:
+            self.reads.append(f'{local} = {field}')
+            self.builds.append(f'{local} = {field} = new({self.refer(nested)})')
+            self.add_fields(nested, local, depth + 1)
+            if depth == 0 and base in _TIMES:  # genpy does so for top-level fields alone
+                self.builds.append(f'{local}.canon()')
+            return
+        self.values.append(local)
+        fresh = local
+        if nested:
+            freeze, thaw = map(self.refer, _generate(nested, 1))
+            self.reads.append(f'{local} = tuple(map({freeze}, sequence({field})))')
+            fresh = f'list(map({thaw}, {local}))'
+        elif is_array:
+            self.reads.append(f'{local} = {base}_array({field})')
+            fresh = f'list({local})' if base in ('bool', 'string') else local
+        elif base == 'string':
+            self.reads.append(f'{local} = {field}')
+            self.reads.append(f'if type({local}) is not str or not {local}.isascii(): text({local})')
+        else:
+            self.numbers.append((base, field, local))
+        if length is not None:
+            self.reads.append(f'if len({local}) != {length}: raise Unusual')
+        self.builds.append(f'{field} = {fresh}')
+
+
+def nested_class(base: str, cls: type) -> type:
+    """Return the class of a nested field; a class made at run time knows its own."""
+    if base in _TIMES:
+        return _TIMES[base]
+    base = 'std_msgs/Header' if base == 'Header' else base
+    return getattr(cls, '_classes', {}).get(base) or genpy.message.get_message_class(base)
+
+
+@functools.lru_cache(None)
+def _generate(cls: type, depth: int = 0) -> tuple[Callable, Callable]:
+    source = _Source(cls, depth)
+    unpack = [f'{", ".join(source.values)}, = frozen'] if source.values else []
+    frozen = ''.join(f'{value}, ' for value in source.values)
+    lines = ['def freeze_fields(m):', *source.reads, f'return ({frozen})']
+    lines += ['def thaw_fields(frozen):', *unpack, f'm = new({source.refer(cls)})']
+    lines += [*source.builds, 'return m']
+    text = '\n'.join(line if line.startswith('def ') else f'    {line}' for line in lines)
+    exec(compile(text, f'<copier of {cls.__name__}>', 'exec'), source.scope)
+    return source.scope['freeze_fields'], source.scope['thaw_fields']

@@ -1,0 +1,40 @@
+"""The program of an embedded master: ``python3 -m pharos.master_program PORT``.
+
+It prints its URL, or 'busy', and ends when its standard input does.
+"""
+import logging
+import os
+import socket
+import sys
+
+import rosgraph.network
+import rosmaster.master
+
+from pharos import BlockNode, Master
+
+
+def main(port: int) -> None:
+    """Run rosmaster, and a /rosout that passes log lines on to /rosout_agg, as roscore does."""
+    answers, sys.stdout = sys.stdout, sys.stderr
+    for name in 'rosmaster', 'xmlrpc':  # they complain of every node that stops
+        logging.getLogger(name).addHandler(logging.NullHandler())
+    try:  # rosmaster waits for ever if its port is taken
+        socket.create_server((rosgraph.network.get_bind_address(), port)).close()
+    except OSError:
+        print('busy', file=answers, flush=True)
+        return
+    server = rosmaster.master.Master(port=port)
+    server.start()
+    host = os.environ['ROS_HOSTNAME']
+    master = Master(f'http://{host}:{server.master_node.port}/')
+    rosout = master.create(BlockNode, named='/rosout')
+    aggregate = rosout.output_channel('/rosout_agg', 'rosgraph_msgs/Log')
+    rosout.interested_in('/rosout', 'rosgraph_msgs/Log', delegate=lambda log: aggregate.publish(log))
+    master.parameters['/rosdistro'] = os.environ.get('ROS_DISTRO', 'Debian')
+    print(master.url, file=answers, flush=True)
+    sys.stdin.read()
+    os._exit(0)  # nothing of it has to be unregistered
+
+
+if __name__ == '__main__':
+    main(int(sys.argv[1]))

@@ -1,0 +1,141 @@
+"""The program that has nodes: its signals, its end, its forks, and waiting on behalf of a node."""
+from __future__ import annotations
+
+import atexit
+import contextlib
+import os
+import signal
+import sys
+import threading
+import time
+from typing import TYPE_CHECKING, Any, Callable, Iterator
+
+import rospy
+
+from pharos.errors import NodeStoppedError
+from pharos.intraprocess import workers
+from pharos.private_rospy import run
+
+if TYPE_CHECKING:
+    from pharos.node import Node
+
+#: the nodes of this process that run
+nodes: list[Node] = []
+#: those that restart: spin() waits for them, too
+restarting: list[Node] = []
+PATIENCE = 0.1  # seconds until what waits for a socket looks whether its node stops
+POLL = 0.002  # seconds between two looks at what notifies nobody
+_here = threading.local()  # .node: on whose behalf this thread runs
+_signalled = False  # after a signal that ends the program
+_quiet_waits = 0  # of the main thread, which a signal ends without an exception
+
+
+def wait(predicate: Callable[[], Any], timeout: float | None = None, node: Node | None = None) -> Any:
+    """Wait until ``predicate()`` is true.
+
+    :param timeout: seconds, None: without limit
+    :param node: its stop ends the wait, too; default: the node on whose behalf this thread runs
+    :returns: the last value of ``predicate()``, false if the wait ended otherwise
+    """
+    deadline = None if timeout is None else time.monotonic() + timeout
+    node = node or getattr(_here, 'node', None)
+    pause = POLL
+    while not (value := predicate()):
+        if deadline is not None and time.monotonic() >= deadline:
+            return value
+        if node is None:
+            time.sleep(pause)
+        elif not node.is_running or node.run.stopping.wait(pause):
+            return predicate()
+        pause = min(pause * 1.2, 0.02)
+    return value
+
+
+def check_waiting() -> None:
+    """Raise NodeStoppedError if the node on whose behalf this thread runs stops."""
+    node = getattr(_here, 'node', None)
+    if node and not node.is_running:
+        raise NodeStoppedError(f'{node.name} stops, and what it waited for ends')
+
+
+@contextlib.contextmanager
+def on_behalf_of(node: Node) -> Iterator[None]:
+    """Have waits of this thread end when the node stops."""
+    before = getattr(_here, 'node', None)
+    _here.node = node
+    try:
+        yield
+    finally:
+        _here.node = before
+
+
+@contextlib.contextmanager
+def quiet_wait() -> Iterator[None]:
+    """Have signals end what the main thread does by stopping the nodes alone."""
+    global _quiet_waits
+    is_main = threading.current_thread() is threading.main_thread()
+    _quiet_waits += is_main
+    try:
+        yield
+    finally:
+        _quiet_waits -= is_main
+
+
+def stop_all() -> None:
+    """Stop every node of this process, whatever the stop() of a class of its own raises."""
+    for node in nodes[:]:
+        node.end_now()
+
+
+def spin() -> None:
+    """Block until every node of this process has stopped. Ctrl-C, SIGTERM and SIGHUP stop them."""
+    handle_signals()
+    try:
+        with quiet_wait():
+            while nodes or restarting:
+                time.sleep(0.01)
+                if rospy.is_shutdown():  # a signal has ended rospy's own node
+                    stop_all()
+    except KeyboardInterrupt:
+        stop_all()
+
+
+def handle_signals() -> None:
+    """Have signals stop the nodes and end the program, unless somebody else handles them."""
+    if threading.current_thread() is not threading.main_thread():
+        return
+    interrupts = signal.default_int_handler, signal.SIG_DFL, signal.SIG_IGN
+    if signal.getsignal(signal.SIGINT) in interrupts and not hasattr(sys, 'ps1'):
+        signal.signal(signal.SIGINT, _end)
+    for number in signal.SIGTERM, signal.SIGHUP:
+        if signal.getsignal(number) == signal.SIG_DFL:
+            signal.signal(number, _end)
+
+
+def is_signalled() -> bool:
+    """True if an exception of this thread may come from a signal."""
+    by_python = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    is_main = threading.current_thread() is threading.main_thread()
+    return is_main and (_signalled or by_python)
+
+
+def _end(number: int, frame: Any) -> None:
+    global _signalled
+    _signalled = True
+    signal.signal(number, signal.SIG_DFL)  # a second one ends the program at once
+    threading.Thread(target=stop_all, name='pharos end', daemon=True).start()
+    if not _quiet_waits:
+        raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(128 + number)
+
+
+def _forget() -> None:
+    """Have no nodes in a forked child."""
+    for node in nodes:
+        node.abandon()
+    nodes.clear()
+    run.runs.clear()
+    workers.forget()
+
+
+atexit.register(stop_all)
+os.register_at_fork(after_in_child=_forget)

@@ -1,0 +1,159 @@
+"""Programs of ROS as children of this process."""
+from __future__ import annotations
+
+import atexit
+import collections
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import threading
+import tty
+from typing import Any, Callable
+
+import psutil
+import roslib.packages
+import rospkg
+from catkin.find_in_workspaces import find_in_workspaces
+
+from pharos.errors import PharosError, UnknownNodeError
+
+KEPT_LINES = 10_000
+_COLOURS = re.compile(r'\x1b\[[0-9;]*[A-Za-z]|\x1b\]0;[^\x07]*\x07')
+
+
+class RosProcess:
+    """A running program; made by :meth:`Master.run` and :meth:`Master.launch`.
+
+    It has a terminal of its own, so that what it prints comes at once.
+
+    :param on_line: ``on_line(text)`` is called for each line that it prints, in another thread
+    :ivar command: the program and its arguments
+    :ivar pid: the number of its process
+    """
+
+    def __init__(self, command: list[str], master_url: str, on_line: Callable | None = None):
+        self.command, self._on_line = command, on_line
+        self._lines: collections.deque[str] = collections.deque(maxlen=KEPT_LINES)
+        self._terminal, slave = os.openpty()
+        tty.setraw(slave)
+        environ = {**os.environ, 'ROS_MASTER_URI': master_url, 'TERM': 'dumb'}
+        pipes = {'stdin': slave, 'stdout': slave, 'stderr': slave}
+        try:
+            self._process = subprocess.Popen(command, env=environ, start_new_session=True, **pipes)
+        except OSError as error:
+            os.close(self._terminal)
+            raise PharosError(f'{command[0]} cannot be started: {error}') from None
+        finally:
+            os.close(slave)
+        self.pid = self._process.pid
+        self._reader = threading.Thread(target=self._read, name=f'{command[0]}', daemon=True)
+        self._reader.start()
+        atexit.register(self.terminate)
+
+    def _read(self) -> None:
+        with contextlib.suppress(OSError):  # it has closed its terminal
+            with os.fdopen(self._terminal, 'rb', closefd=False) as stream:
+                for line in stream:
+                    text = _COLOURS.sub('', line.decode(errors='replace').rstrip('\r\n'))
+                    self._lines.append(text)
+                    if self._on_line:
+                        self._on_line(text)
+
+    @property
+    def output(self) -> str:
+        """What it has printed so far; the last 10,000 lines."""
+        return '\n'.join(self._lines)
+
+    def send(self, text: str) -> None:
+        """Type a text at its terminal: a line ends with ``'\\n'``.
+
+        :raises PharosError: if it has ended
+        """
+        try:
+            os.write(self._terminal, text.encode())
+        except OSError:
+            raise PharosError(f'{self.command[0]} has ended, and reads nothing') from None
+
+    def poll(self) -> int | None:
+        """Return its exit code, None while it runs."""
+        return self._process.poll()
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait for its end, and return its exit code.
+
+        :raises subprocess.TimeoutExpired: after ``timeout`` seconds
+        """
+        code = self._process.wait(timeout)
+        if self._reader is not threading.current_thread():
+            self._reader.join(1)
+        return code
+
+    def terminate(self, timeout: float = 5.0) -> int:
+        """End it and what it has started, as Ctrl-C does, after ``timeout`` seconds by force.
+
+        :returns: its exit code
+        """
+        atexit.unregister(self.terminate)
+        started: list[Any] = []
+        with contextlib.suppress(psutil.Error):
+            started = psutil.Process(self.pid).children(recursive=True)
+        for number in signal.SIGINT, signal.SIGTERM:
+            if self.poll() is None:
+                with contextlib.suppress(ProcessLookupError, subprocess.TimeoutExpired):
+                    os.killpg(self.pid, number)
+                    self._process.wait(timeout / 2)
+        for process in started:
+            with contextlib.suppress(psutil.Error):
+                process.kill()
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.pid, signal.SIGKILL)
+        return self.wait()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self.terminate()
+
+    def __repr__(self) -> str:
+        code = self.poll()
+        state = f'pid {self.pid}' if code is None else f'ended with {code}'
+        return f'<RosProcess {" ".join(self.command)}, {state}>'
+
+
+def find_program(package: str, executable: str) -> str:
+    """Return the path of a program, as rosrun finds it.
+
+    :raises UnknownNodeError: if there is none
+    """
+    try:
+        paths = roslib.packages.find_node(package, executable)
+    except rospkg.ResourceNotFound:  # some of Debian's have no package.xml
+        folders = find_in_workspaces(['libexec'], project=package)
+        paths = [path for path in (f'{folder}/{executable}' for folder in folders)]
+        paths = [path for path in paths if os.access(path, os.X_OK)]
+    if not paths:
+        raise UnknownNodeError(
+            f'{package} has no program {executable!r}: is it installed, executable, and the'
+            ' workspace sourced?'
+        )
+    return paths[0]
+
+
+def find_launch_file(package: str | None, file: str) -> str:
+    """Return the path of a launch file, as roslaunch finds it; without a package, it is the path.
+
+    :raises UnknownNodeError: if there is none
+    """
+    found = [str(file)] if os.path.isfile(file) else []
+    if package is not None:
+        try:
+            found = roslib.packages.find_resource(package, str(file))
+        except rospkg.ResourceNotFound:
+            found = []
+    if not found:
+        where = f'{package} has' if package else 'there is'
+        raise UnknownNodeError(f'{where} no launch file {str(file)!r}: is it spelt so, and installed?')
+    return str(found[0])

@@ -1,2 +1,0 @@
-"""What the program beside it counts with."""
-COUNT = []

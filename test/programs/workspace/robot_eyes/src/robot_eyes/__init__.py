@@ -1,2 +1,0 @@
-"""A package with messages and code."""
-SEEN = []

@@ -1,0 +1,545 @@
+"""Topics and channels: what a node sends, and what another one hears."""
+import concurrent.futures
+import os
+import signal
+import threading
+import time
+
+import numpy
+import pytest
+import rospy
+from geometry_msgs.msg import Twist, Vector3
+from std_msgs.msg import Int32, String
+
+from helpers import TIMEOUT, Peer, create, registrations
+import pharos
+from pharos import (
+    MasterUnreachableError,
+    MessageTypeError,
+    NodeStoppedError,
+    UnknownNodeError,
+    UnknownTopicError,
+    UnknownTypeError,
+)
+from pharos.testing import Mailbox, until
+
+TWIST, STRING, INT32 = 'geometry_msgs/Twist', 'std_msgs/String', 'std_msgs/Int32'
+BYTES, FLOATS, HEADER = 'std_msgs/UInt8MultiArray', 'std_msgs/Float64MultiArray', 'std_msgs/Header'
+MEGABYTE = 1 << 20
+
+
+@pytest.fixture
+def node(master):
+    return create(master, '/sender')
+
+
+@pytest.fixture
+def other(master):
+    return create(master, '/hearer')
+
+
+@pytest.fixture
+def pool(master):
+    with concurrent.futures.ThreadPoolExecutor() as pool:
+        yield pool
+
+
+class Gate:
+    """A delegate that keeps the first message until it is opened, while the others queue up."""
+
+    def __init__(self):
+        self.entered, self.opened, self.mailbox = threading.Event(), threading.Event(), Mailbox()
+
+    def __call__(self, message, channel):
+        self.entered.set()
+        self.opened.wait(TIMEOUT)
+        self.mailbox(message, channel)
+
+
+def take(mailbox, count):
+    """Take so many messages; returns their data."""
+    return [mailbox.next().data for _ in range(count)]
+
+
+# -- send_to: the type, and what fills the message
+
+
+@pytest.mark.parametrize('type_', [STRING, String], ids=['name', 'class'])
+def test_type_is_name_or_class(node, other, type_):
+    mailbox = Mailbox(other, '/chatter', type_)
+    node.send_to('/chatter', typed_as=type_, data='hello')
+    assert mailbox.next() == String('hello')
+
+
+def test_type_is_what_node_knows(node):
+    node.output_channel('/chatter', STRING)
+    assert node.send_to('/chatter', data='hello') == String('hello')
+
+
+def test_type_is_what_master_knows(node, other):
+    mailbox = Mailbox(other, '/chatter', STRING)
+    node.send_to('/chatter', data='hello')
+    assert mailbox.next() == String('hello')
+    assert node.interested_in('/chatter').type == STRING
+
+
+def test_ready_message_brings_its_type(node, other):
+    mailbox = Mailbox(other, '/chatter', STRING)
+    ready = String('hello')
+    assert node.send_to('/chatter', ready) is ready
+    assert mailbox.next() == ready
+
+
+def set_in_block(message):
+    message.linear.x = 2.0
+    message.angular.z = 1.0
+
+
+@pytest.mark.parametrize(
+    'block, fields',
+    [
+        (set_in_block, {}),
+        (Twist(Vector3(2, 0, 0), Vector3(0, 0, 1)), {}),
+        ({'linear': {'x': 2.0}, 'angular': {'z': 1.0}}, {}),
+        (None, {'linear': {'x': 2.0}, 'angular': {'z': 1.0}}),
+        (None, {'linear': Vector3(2, 0, 0), 'angular': Vector3(0, 0, 1)}),
+        (lambda message: setattr(message.linear, 'x', 2.0), {'angular': {'z': 1.0}}),
+    ],
+)
+def test_message_is_filled_by(node, other, block, fields):
+    mailbox = Mailbox(other, '/velocity', TWIST)
+    channel = node.output_channel('/velocity', TWIST)
+    expected = Twist(Vector3(2, 0, 0), Vector3(0, 0, 1))
+    assert node.send_to('/velocity', block, **fields) == mailbox.next() == expected
+    assert channel.send(block, **fields) == mailbox.next() == expected
+
+
+def test_value_fits_its_field(node, other):
+    table = [
+        (INT32, 7, 7),
+        (INT32, numpy.int32(7), 7),
+        (STRING, 'grün', 'grün'),
+        ('std_msgs/Float64', 2, 2.0),
+        ('std_msgs/Time', rospy.Time(1, 2), rospy.Time(1, 2)),
+        (FLOATS, [1.0, 2.0], (1.0, 2.0)),
+        (BYTES, b'ab', b'ab'),
+        (BYTES, [97, 98], b'ab'),
+    ]
+    for number, (type_, value, came) in enumerate(table):
+        mailbox = Mailbox(other, f'/value{number}', type_)
+        node.send_to(f'/value{number}', typed_as=type_, data=value)
+        assert mailbox.next().data == came
+
+
+def test_unfit_field_is_refused(node, other):
+    """The channel goes on, and the next message arrives."""
+    table = [
+        (INT32, None, {'data': 'seven'}),
+        (INT32, None, {'data': 1 << 40}),
+        (INT32, None, {'no_such_field': 7}),
+        (INT32, {'no_such_field': 7}, {}),
+        (INT32, String('seven'), {}),
+        (STRING, None, {'data': 7}),
+        (TWIST, None, {'linear': 2.0}),
+        (TWIST, None, {'linear': {'no_such_field': 2.0}}),
+        (TWIST, None, {'linear': {'x': 'two'}}),
+        (FLOATS, None, {'data': [1.0, 'two']}),
+        (HEADER, None, {'stamp': 'now'}),
+    ]
+    for number, (type_, block, fields) in enumerate(table):
+        mailbox = Mailbox(other, f'/field{number}', type_)
+        sender = node.output_channel(f'/field{number}', type_)
+        with pytest.raises(MessageTypeError):
+            node.send_to(f'/field{number}', block, **fields)
+        with pytest.raises(MessageTypeError):
+            sender.send(block, **fields)
+        assert sender.sent == 0
+        assert sender.send() == mailbox.next()
+
+
+def test_other_type_leaves_nothing_registered(node, other):
+    node.output_channel('/chatter', STRING)
+    for open_ in node.output_channel, node.interested_in:
+        with pytest.raises(MessageTypeError):
+            open_('/chatter', INT32)
+    with pytest.raises(MessageTypeError):
+        node.send_to('/chatter', typed_as=INT32, data=7)
+    assert len(node.channels) == 1
+    assert '/chatter' not in registrations(node.master, '/sender')[1]
+
+
+@pytest.mark.parametrize('way', ['send_to', 'interested_in', 'output_channel', 'wait_for_message'])
+@pytest.mark.parametrize(
+    'type_, error', [(None, UnknownTopicError), ('no_such_msgs/Type', UnknownTypeError)]
+)
+def test_unknown_topic_leaves_nothing(node, way, type_, error):
+    before = node.master.system_state()
+    with pytest.raises(error):
+        getattr(node, way)('/nobody', typed_as=type_)
+    assert node.channels == []
+    assert node.master.system_state() == before
+
+
+# -- the first message, and latched ones
+
+
+def test_first_message_reaches_peer(node, peer):
+    peer.hear('/chatter', STRING)
+    until(lambda: node.master.topic('/chatter').subscribers, TIMEOUT)
+    node.send_to('/chatter', typed_as=STRING, data='first')
+    node.send_to('/chatter', data='second')
+    assert [message.data for message in peer.heard('/chatter', 2)] == ['first', 'second']
+    assert node.channels[0].connections == [('/peer', 'TCPROS')]
+
+
+@pytest.mark.parametrize('timeout', [0.1, None])
+def test_connect_timeout_bounds_first_wait(mortal, timeout):
+    """The subscriber that the master knows hangs; None: the node's connect_timeout."""
+    node = create(pharos.Master(mortal.url), '/sender')
+    with Peer(mortal.url) as peer:
+        peer.hear('/chatter', STRING)
+        until(lambda: node.master.topic('/chatter').subscribers, TIMEOUT)
+        os.kill(peer.pid, signal.SIGSTOP)
+        node.connect_timeout = 0.1 if timeout is None else TIMEOUT
+        begun = time.monotonic()
+        node.send_to('/chatter', typed_as=STRING, connect_timeout=timeout, data='hello')
+        assert time.monotonic() - begun < TIMEOUT / 2
+
+
+def test_latched_message_reaches_late_subscriber(node, other):
+    channel = node.output_channel('/map', STRING, latch=True)
+    channel.send(data='old')
+    channel.send(data='new')
+    mailbox = Mailbox(other, '/map', STRING)
+    channel.send(data='newest')
+    assert take(mailbox, 2) == ['new', 'newest']
+
+
+def test_latched_message_reaches_late_peer(node, peer):
+    node.output_channel('/map', STRING, latch=True).send(data='new')
+    peer.hear('/map', STRING)
+    assert peer.heard('/map')[0].data == 'new'
+
+
+def test_each_latched_channel_keeps_its_own(node, other):
+    for name in '/map', '/plan':
+        node.output_channel(name, STRING, latch=True).send(data=name)
+    for name in '/map', '/plan':
+        assert take(Mailbox(other, name), 1) == [name]
+
+
+# -- queues, and order
+
+
+@pytest.mark.parametrize('size', [1, 3])
+def test_full_queue_drops_oldest(node, other, size):
+    gate = Gate()
+    channel = other.interested_in('/numbers', INT32, delegate=gate, queue_size=size)
+    sender = node.output_channel('/numbers', INT32)
+    sender.send(data=0)
+    assert gate.entered.wait(TIMEOUT)
+    for number in range(1, 8):
+        sender.send(data=number)
+    gate.opened.set()
+    assert take(gate.mailbox, 1 + size) == [0, *range(8 - size, 8)]
+    assert (channel.received, channel.dropped) == (1 + size, 7 - size)
+
+
+def test_queue_is_bounded_by_bytes(node, other):
+    gate = Gate()
+    other.queue_bytes = 4 * MEGABYTE
+    channel = other.interested_in('/large', BYTES, delegate=gate)
+    sender = node.output_channel('/large', BYTES)
+    sender.send(data=b'')
+    assert gate.entered.wait(TIMEOUT)
+    for number in range(10):
+        sender.send(data=bytes(MEGABYTE - 1000 + number))
+    gate.opened.set()
+    kept = [len(data) for data in take(gate.mailbox, 5)]
+    assert kept == [0, *range(MEGABYTE - 994, MEGABYTE - 990)]
+    assert channel.dropped == 6
+
+
+def test_messages_of_publisher_keep_order(master, other, peer, pool):
+    """One node of this process and one of another publish at once."""
+    mailbox = Mailbox(other, '/numbers', INT32)
+    sender = create(master, '/sender').output_channel('/numbers', INT32)
+    peer.run(
+        'publisher = rospy.Publisher("/numbers", message_class("std_msgs/Int32"), queue_size=0)'
+    )
+    until(lambda: len(mailbox.channel.connections) == 2, TIMEOUT)
+    until(lambda: peer.value('publisher.get_num_connections()'), TIMEOUT)
+    waiting = pool.submit(peer.run, 'for number in range(300): publisher.publish(1000 + number)')
+    for number in range(300):
+        sender.send(data=number)
+    waiting.result(TIMEOUT)
+    came = take(mailbox, 600)
+    assert [number for number in came if number < 1000] == list(range(300))
+    assert [number for number in came if number >= 1000] == list(range(1000, 1300))
+
+
+# -- from_ and to
+
+
+AS_PEER = {
+    'name': lambda node: node.name,
+    'relative': lambda node: node.name.lstrip('/'),
+    'node': lambda node: node,
+}
+
+
+@pytest.mark.parametrize('given', AS_PEER)
+def test_from_hears_that_node_alone(master, node, other, given):
+    mailbox = Mailbox()
+    other.interested_in('/chatter', STRING, delegate=mailbox, from_=AS_PEER[given](node))
+    create(master, '/third').send_to('/chatter', data='of the third')
+    node.send_to('/chatter', data='of the sender')
+    assert take(mailbox, 1) == ['of the sender']
+
+
+@pytest.mark.parametrize('given', AS_PEER)
+def test_to_reaches_that_node_alone(master, node, other, given):
+    third = Mailbox(create(master, '/third'), '/chatter', STRING)
+    mailbox = Mailbox(other, '/chatter', STRING)
+    node.send_to('/chatter', to=AS_PEER[given](other), data='for the hearer')
+    node.send_to('/chatter', data='for all')
+    assert take(mailbox, 2) == ['for the hearer', 'for all']
+    assert take(third, 1) == ['for all']
+
+
+def test_from_and_to_take_external_node(master, node, other, peer):
+    external = master.node('/peer')
+    mailbox, here = Mailbox(), Mailbox(other, '/orders', STRING)
+    other.interested_in('/chatter', STRING, delegate=mailbox, from_=external)
+    peer.hear('/orders', STRING)
+    peer.run(
+        'publisher = rospy.Publisher("/chatter", message_class("std_msgs/String"), latch=True,'
+        ' queue_size=1)'
+    )
+    until(lambda: '/peer' in master.topic('/orders').subscribers, TIMEOUT)
+    node.send_to('/chatter', data='of the sender')
+    peer.run('publisher.publish("of the peer")')
+    assert take(mailbox, 1) == ['of the peer']
+    node.send_to('/orders', to=external, data='for the peer')
+    node.send_to('/orders', data='for all')
+    assert [message.data for message in peer.heard('/orders', 2)] == ['for the peer', 'for all']
+    assert take(here, 1) == ['for all']
+
+
+def test_to_unknown_node_is_an_error(node):
+    channel = node.output_channel('/chatter', STRING)
+    with pytest.raises(UnknownNodeError, match='/nobody'):
+        node.send_to('/chatter', to='/nobody', data='hello')
+    assert channel.sent == 0
+
+
+@pytest.mark.parametrize('name', ['/a b', 'a-b', '/ä'])
+def test_impossible_peer_raises_value_error(node, name):
+    with pytest.raises(ValueError):
+        node.send_to('/chatter', typed_as=STRING, to=name, data='hello')
+    with pytest.raises(ValueError):
+        node.interested_in('/chatter', STRING, from_=name)
+    assert '/chatter' not in registrations(node.master, '/sender')[1]
+
+
+# -- channels
+
+
+def test_input_channel_has_attributes(node, other):
+    mailbox = Mailbox()
+    channel = other.interested_in('/chatter', STRING, delegate=mailbox)
+    assert (channel.received, channel.dropped, channel.connections) == (0, 0, [])
+    node.send_to('/chatter', data='hello')
+    mailbox.next()
+    assert (channel.topic, channel.type, channel.node) == ('/chatter', STRING, other)
+    assert channel.delegate is mailbox
+    assert (channel.received, channel.dropped) == (1, 0)
+    assert channel.connections == [('/sender', 'INTRAPROCESS')]
+    assert other.channels == [channel]
+
+
+def test_output_channel_has_attributes(node, other):
+    other.interested_in('/chatter', STRING)
+    channel = node.output_channel('/chatter', STRING)
+    channel.send(data='one')
+    channel.publish(String('two'))
+    assert (channel.topic, channel.type, channel.node) == ('/chatter', STRING, node)
+    assert channel.sent == 2
+    assert channel.connections == [('/hearer', 'INTRAPROCESS')]
+    assert node.channels == [channel]
+
+
+def test_closed_input_hears_no_more(node, other):
+    closed, mailbox = Mailbox(other, '/chatter', STRING), Mailbox(other, '/chatter', STRING)
+    sender = node.output_channel('/chatter', STRING)
+    sender.send(data='one')
+    assert take(closed, 1) == ['one']
+    closed.channel.close()
+    sender.send(data='two')
+    assert take(mailbox, 2) == ['one', 'two']
+    assert len(closed.all()) == 1
+    assert other.channels == [mailbox.channel]
+
+
+def test_close_unregisters_both_ends(master, node, other):
+    sender, hearer = node.output_channel('/chatter', STRING), other.interested_in('/chatter')
+    for channel in hearer, sender:
+        channel.close()
+        assert channel.connections == []
+    until(lambda: '/chatter' not in [*master.system_state()[0], *master.system_state()[1]], TIMEOUT)
+    assert node.channels == other.channels == []
+
+
+@pytest.mark.parametrize('end', ['close', 'stop'])
+def test_closed_output_refuses_to_send(node, end):
+    channel = node.output_channel('/chatter', STRING)
+    channel.close() if end == 'close' else node.stop()
+    with pytest.raises(NodeStoppedError):
+        channel.publish(String('late'))
+    with pytest.raises(NodeStoppedError):
+        channel.send(data='late')
+
+
+@pytest.mark.parametrize('message', [Int32(7), 'hello', None, {'data': 'hello'}], ids=repr)
+def test_publish_takes_its_type_alone(node, message):
+    with pytest.raises(MessageTypeError):
+        node.output_channel('/chatter', STRING).publish(message)
+
+
+def test_subscribers_are_waited_for(master, node, other, pool):
+    channel = node.output_channel('/chatter', STRING)
+    assert not channel.wait_for_subscribers(timeout=0.05)
+    waiting = pool.submit(channel.wait_for_subscribers, 2, TIMEOUT)
+    other.interested_in('/chatter')
+    assert not channel.wait_for_subscribers(2, 0.05)
+    create(master, '/third').interested_in('/chatter')
+    assert waiting.result(TIMEOUT)
+
+
+def test_channels_delegate_is_replaced(node, other):
+    first, second = Mailbox(), Mailbox()
+    channel = other.interested_in('/chatter', STRING, delegate=first)
+    node.send_to('/chatter', data='one')
+    assert take(first, 1) == ['one']
+    channel.delegate = second
+    node.send_to('/chatter', data='two')
+    assert take(second, 1) == ['two']
+    assert len(first.all()) == 1
+
+
+def test_nodes_delegate_is_default(node, other):
+    default, own = Mailbox(), Mailbox()
+    other.delegate = default
+    other.interested_in('/chatter', STRING)
+    other.interested_in('/orders', STRING, delegate=own)
+    node.send_to('/chatter', data='one')
+    node.send_to('/orders', data='two')
+    assert (take(default, 1), take(own, 1)) == (['one'], ['two'])
+
+
+def test_node_hears_itself(node):
+    mailbox = Mailbox(node, '/chatter', STRING)
+    node.send_to('/chatter', data='hello')
+    assert take(mailbox, 1) == ['hello']
+
+
+# -- Topic
+
+
+def test_topic_hands_out_channels(master, node, other):
+    topic, mailbox = master.topic('/chatter'), Mailbox()
+    hearer = topic.input_channel(other, STRING, delegate=mailbox)
+    sender = topic.output_channel(node)
+    sender.send(data='hello')
+    assert take(mailbox, 1) == ['hello']
+    assert (topic.name, topic.type) == ('/chatter', STRING)
+    assert (topic.publishers, topic.subscribers) == (['/sender'], ['/hearer'])
+    assert set(topic.channels) == {sender, hearer}
+
+
+# -- names
+
+
+@pytest.mark.parametrize(
+    'name, topic',
+    [
+        ('chatter', '/robot/chatter'),
+        ('~chatter', '/robot/talker/chatter'),
+        ('/chatter', '/chatter'),
+        ('a/b', '/robot/a/b'),
+        ('orders', '/kitchen'),
+        ('/robot/orders', '/kitchen'),
+        ('~plan', '/plans'),
+    ],
+)
+def test_topic_name_is_resolved(master, name, topic):
+    argv = ['program', 'orders:=/kitchen', '~plan:=/plans']
+    node = create(master, '/robot/talker', argv=argv)
+    assert node.output_channel(name, STRING).topic == topic
+    assert node.interested_in(name).topic == topic
+    assert master.topic(topic).publishers == ['/robot/talker']
+
+
+def test_impossible_topic_raises_value_error(node):
+    for name in ['', '/a b', 'a-b', '7up', '/ä']:
+        for open_ in node.interested_in, node.output_channel, node.wait_for_message:
+            with pytest.raises(ValueError):
+                open_(name, STRING)
+        with pytest.raises(ValueError):
+            node.send_to(name, typed_as=STRING, data='hello')
+        assert node.channels == []
+
+
+# -- wait_for_message
+
+
+def test_next_message_is_waited_for(node, other, pool):
+    sender = node.output_channel('/chatter', STRING)
+    waiting = pool.submit(other.wait_for_message, '/chatter', timeout=TIMEOUT)
+    assert sender.wait_for_subscribers(1, TIMEOUT)
+    sender.send(data='hello')
+    assert waiting.result(TIMEOUT) == String('hello')
+    assert other.channels == []
+
+
+def test_where_chooses_among_messages(node, other, pool):
+    sender = node.output_channel('/numbers', INT32)
+    waiting = pool.submit(
+        other.wait_for_message, '/numbers', INT32, TIMEOUT, where=lambda m: m.data > 2
+    )
+    assert sender.wait_for_subscribers(1, TIMEOUT)
+    for number in range(5):
+        sender.send(data=number)
+    assert waiting.result(TIMEOUT).data == 3
+
+
+def test_no_message_is_a_timeout(node, other):
+    node.output_channel('/chatter', STRING)
+    with pytest.raises(TimeoutError):
+        other.wait_for_message('/chatter', timeout=0.05)
+    assert other.channels == []
+    until(lambda: node.master.topic('/chatter').subscribers == [], TIMEOUT)
+
+
+def test_delegate_waits_for_message(node, other):
+    node.output_channel('/map', STRING, latch=True).send(data='old')
+    got = Mailbox()
+
+    def look(message, channel):
+        got(channel.node.wait_for_message('/map', timeout=TIMEOUT), channel)
+
+    other.interested_in('/chatter', STRING, delegate=look)
+    node.send_to('/chatter', data='look')
+    assert take(got, 1) == ['old']
+
+
+def test_missing_master_leaves_no_channel(mortal):
+    node = create(pharos.Master(mortal.url), '/sender')
+    mortal.end()
+    for open_ in node.interested_in, node.output_channel:
+        with pytest.raises(MasterUnreachableError):
+            open_('/chatter', STRING)
+    assert node.channels == []
+    mortal.come_back()
+    node.output_channel('/marker', STRING)
+    assert '/chatter' not in str(registrations(node.master, '/sender'))

@@ -1,0 +1,697 @@
+"""Look at what runs, as a user does: graph, top, topics, nodes, messages, plots, the workspace."""
+import contextlib
+import json
+import os
+import re
+import signal
+import subprocess
+import tempfile
+import xml.etree.ElementTree
+
+import numpy
+import pexpect
+import PIL.Image
+import pytest
+
+import helpers
+import pharos
+from helpers import DEFAULT_SIGNALS, TIMEOUT, create
+from pharos import BlockNode, MasterUnreachableError, UnknownTopicError
+from pharos.testing import until
+
+STRING = 'std_msgs/String'
+TEXT = 'x' * 1000
+RATE = 40  # messages a second, of what sends all the time
+REFUSED = 'http://127.0.0.1:1/'  # nobody answers there
+ESCAPES = re.compile(r'\x1b\[[0-9;?]*[A-Za-z]|\x1b[()][A-Z0-9]|\x1b[=>78]|\r')
+
+
+def send_all_the_time(master, topic='/traffic'):
+    """Create a node that publishes texts."""
+    node = create(master, '/sender')
+    channel = node.output_channel(topic, STRING)
+
+    def send(me):
+        for _ in me.every(1 / RATE):
+            channel.send(data=TEXT)
+
+    node.fork(send)
+    return node
+
+
+def is_about(rate, expected=RATE):
+    """True if it is that rate, as far as a busy machine can tell."""
+    return expected / 10 < float(rate) < expected * 2.5
+
+
+@pytest.fixture
+def traffic(master):
+    """A node /sender that sends to /hearer of the same process."""
+    sender = send_all_the_time(master)
+    create(master, '/hearer').interested_in('/traffic', STRING, delegate=lambda *_: None)
+    assert sender.channels[0].wait_for_subscribers(1, TIMEOUT)
+    return sender
+
+
+@pytest.fixture
+def mixed(traffic, peer):
+    """The same with /peer, a rospy node of another process, which hears /traffic, too."""
+    peer.hear('/traffic', STRING)
+    assert traffic.channels[0].wait_for_subscribers(2, TIMEOUT)
+    return peer
+
+
+class Terminal:
+    """A program in a terminal, to type into, and what it has written since the last key."""
+
+    def __init__(self, url, *command):
+        self._folder = tempfile.TemporaryDirectory()
+        environ = {**os.environ, 'TERM': 'xterm', 'PROMPT_TOOLKIT_NO_CPR': '1'}
+        environ.update(ROS_MASTER_URI=url, IPYTHONDIR=self._folder.name)
+        first, *more = [*DEFAULT_SIGNALS, *command]
+        self._process = pexpect.spawn(
+            first, more, env=environ, dimensions=(40, 160), encoding='utf-8', timeout=TIMEOUT
+        )
+        self._written = ''
+
+    @property
+    def text(self):
+        """What it has written, without what moves the cursor or colours the text."""
+        with contextlib.suppress(pexpect.TIMEOUT, pexpect.EOF):
+            self._written += self._process.read_nonblocking(1 << 16, 0.02)
+        return ESCAPES.sub('', self._written)
+
+    def wait_for(self, pattern):
+        """Wait until it has written that regular expression."""
+        try:
+            return until(lambda: re.search(pattern, self.text), TIMEOUT)
+        except TimeoutError:
+            raise AssertionError(f'no {pattern!r} in:\n{self.text}') from None
+
+    def press(self, keys, pattern=''):
+        """Type keys, and wait for what comes of them."""
+        self._written = ''
+        self._process.send(keys)
+        return self.wait_for(pattern)
+
+    def enter(self, line, pattern):
+        """Type a line, and wait for what comes of it and for the next prompt."""
+        self.press(line + '\r', rf'(?s){pattern}.*In \[\d+\]: ')
+
+    def end(self):
+        """Wait for its end; returns its exit status."""
+        with contextlib.suppress(pexpect.EOF):
+            while True:
+                self._written += self._process.read_nonblocking(1 << 16, TIMEOUT)
+        self._process.wait()
+        return self._process.exitstatus
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self._process.close(force=True)
+        self._folder.cleanup()
+
+
+# -- the graph, from Python
+
+
+def layout(graph):
+    """Lay the picture out by graphviz; the last word of an object's name is the node's."""
+    command = ['dot', '-Tdot_json']
+    return json.loads(subprocess.check_output(command, input=graph.dot(), text=True))
+
+
+def frames(graph):
+    """Return ``{name of node or topic: the label of the frame around it}``."""
+    objects = layout(graph)['objects']
+    return {
+        objects[index]['name'].split()[-1]: each['label']
+        for each in objects
+        if each['name'].startswith('cluster')
+        for index in each['nodes']
+    }
+
+
+def looks(graph):
+    """Return ``{(start, end): styles and colours of its arrows}``."""
+    found = layout(graph)
+    names = [each['name'].split()[-1] for each in found['objects']]
+    drawn = {}
+    for edge in found['edges']:
+        look = edge.get('style', 'solid'), edge['color']
+        drawn.setdefault((names[edge['tail']], names[edge['head']]), set()).add(look)
+    return drawn
+
+
+def test_graph_names_nodes_and_topics(master, mixed):
+    graph = master.graph()
+    assert isinstance(graph, pharos.Graph)
+    assert set(graph.nodes) == {'/sender', '/hearer', '/peer'}
+    assert set(graph.topics) == {'/traffic'}
+
+
+def test_graph_edges_name_transports(master, mixed):
+    edges = {(edge.start, edge.end): set(edge.transports) for edge in master.graph().edges}
+    assert edges == {
+        ('/sender', '/traffic'): {'INTRAPROCESS', 'TCPROS'},
+        ('/traffic', '/hearer'): {'INTRAPROCESS'},
+        ('/traffic', '/peer'): {'TCPROS'},
+    }
+
+
+def test_graph_frames_are_processes(master, mixed):
+    found = frames(master.graph())
+    assert str(os.getpid()) in found['/sender']
+    assert found['/hearer'] == found['/sender'] == found['/traffic']
+    assert str(mixed.pid) in found['/peer']
+
+
+def test_graph_arrows_differ_by_transport(master, mixed):
+    drawn = looks(master.graph())
+    (within,), (between,) = drawn['/traffic', '/hearer'], drawn['/traffic', '/peer']
+    assert within[0] != between[0]
+    assert within[1] != between[1]
+    assert drawn['/sender', '/traffic'] == {within, between}
+
+
+def test_graph_rates_need_seconds(master, traffic):
+    assert not master.graph().rates
+    graph = master.graph(seconds=0.5)
+    assert is_about(graph.rates['/traffic'])
+    assert re.search(r'/traffic.* Hz', graph.text())
+    assert ' Hz' in graph.dot()
+
+
+def test_graph_shows_unconnected_topics(master):
+    node = create(master, '/alone')
+    node.output_channel('/unheard', STRING)
+    node.interested_in('/unsent', 'std_msgs/Bool')
+    graph = master.graph()
+    assert {(edge.start, edge.end, *edge.transports) for edge in graph.edges} == {
+        ('/alone', '/unheard'),
+        ('/unsent', '/alone'),
+    }
+
+
+def test_empty_graph_is_drawn(master, tmp_path):
+    master.graph().save(tmp_path / 'graph.svg')
+    assert xml.etree.ElementTree.parse(tmp_path / 'graph.svg').getroot().tag.endswith('svg')
+
+
+def test_thirty_nodes_in_graph(master, tmp_path):
+    names = [f'/many/node_{number}' for number in range(30)]
+    for number, name in enumerate(names):
+        node = create(master, name)
+        node.output_channel(f'/many/topic_{number}', STRING)
+        node.interested_in(f'/many/topic_{(number + 1) % 30}', STRING)
+    graph = master.graph()
+    graph.save(tmp_path / 'graph.svg')
+    assert set(graph.nodes) == set(names)
+    assert len(graph.edges) == 60
+    assert set(names) <= set(re.findall(r'[\w/]+', (tmp_path / 'graph.svg').read_text()))
+
+
+@pytest.mark.parametrize(
+    'suffix, start', [('svg', b'<?xml'), ('png', b'\x89PNG'), ('pdf', b'%PDF'), ('dot', b'digraph')]
+)
+def test_graph_saves_each_format(master, traffic, tmp_path, suffix, start):
+    path = tmp_path / f'graph.{suffix}'
+    master.graph().save(str(path))
+    assert path.read_bytes().startswith(start)
+
+
+def test_notebook_shows_graph_as_svg(master, traffic):
+    picture = xml.etree.ElementTree.fromstring(master.graph()._repr_svg_())
+    assert '/sender' in ''.join(picture.itertext())
+
+
+def test_dead_node_stays_in_graph(mortal):
+    master = mortal.master
+    create(master, '/alive').interested_in('/texts', STRING)
+    with helpers.Peer(master.url) as peer:
+        peer.run(f'rospy.Publisher("/texts", message_class({STRING!r}), queue_size=1)')
+        peer.end()
+        found = master.graph()
+    assert set(found.nodes) == {'/alive', '/peer'}
+    assert ('/peer', '/texts') in [(edge.start, edge.end) for edge in found.edges]
+
+
+def program(command, url):
+    """Start a program of the package."""
+    return helpers.Program(['rosrun', 'pharos', *command.split()], url)
+
+
+def test_frozen_node_delays_graph_little(master, mixed):
+    os.kill(mixed.pid, signal.SIGSTOP)
+    with program('top --once', master.url) as top:
+        graph = master.graph()
+        assert top.wait() == 0
+    os.kill(mixed.pid, signal.SIGCONT)
+    assert set(graph.nodes) == {'/sender', '/hearer', '/peer'}
+    assert re.search('^/sender .*[1-9]', top.output, re.MULTILINE)
+    assert re.search('^/peer ', top.output, re.MULTILINE)
+
+
+def test_frozen_master_ends_questions(mortal):
+    """Each question ends after its limit of 5 s."""
+    pid = mortal.pid
+    os.kill(pid, signal.SIGSTOP)
+    url = mortal.url
+    with program('top --once', url) as top, program('graph', url) as graph:
+        with pytest.raises(MasterUnreachableError):
+            mortal.master.graph()
+        assert (graph.wait(), top.wait()) == (1, 1)
+    os.kill(pid, signal.SIGCONT)
+    assert url in graph.output
+    assert url in top.output
+
+
+@pytest.mark.parametrize('command', ['graph', 'top --once'])
+def test_program_names_missing_master(command):
+    with program(command, REFUSED) as running:
+        assert running.wait() == 1
+    assert REFUSED in running.output
+    assert 'Traceback' not in running.output
+
+
+# -- the programs graph and top: they look at one scene, all at once
+
+COMMANDS = {
+    'graph': 'graph',
+    'graph json': 'graph --json',
+    'everything': 'graph --all --services',
+    'less': 'graph --hide tf --rates 0.5',
+    'top': 'top --once',
+    'top json': 'top --json',
+    'part': 'top --once /send',
+}
+
+
+class Scene:
+    """What the programs print of nodes of this process, and of /peer in another one."""
+
+    def __init__(self, folder):
+        ros_master = helpers.InProcessMaster()
+        master = pharos.Master(ros_master.url)
+        with contextlib.ExitStack() as stack:
+            stack.callback(ros_master.stop)
+            peer = stack.enter_context(helpers.Peer(master.url))
+            stack.callback(helpers.stop_nodes)
+            self._fill(master, peer)
+            self.pids = {'own': os.getpid(), 'peer': peer.pid}
+            self.svg = folder / 'graph.svg'
+            commands = {**COMMANDS, 'picture': f'graph --output {self.svg}'}
+            running = {key: program(command, master.url) for key, command in commands.items()}
+            self.codes = {key: each.wait() for key, each in running.items()}
+            self.output = {key: each.output for key, each in running.items()}
+
+    def _fill(self, master, peer):
+        sender = send_all_the_time(master)
+        sender.output_channel('/tf', 'tf2_msgs/TFMessage')
+        sender.serve('/lamp', 'std_srvs/SetBool', lambda request: (True, ''))
+        hearer = create(master, '/hearer')
+        hearer.interested_in('/traffic', STRING, delegate=lambda *_: None)
+        hearer.interested_in('/wrong', STRING, delegate=lambda *_: 1 / 0)
+        create(master, '/mistaken').send_to('/wrong', data='')
+        until(lambda: hearer.failures, TIMEOUT)
+        peer.hear('/traffic', STRING)
+        assert sender.channels[0].wait_for_subscribers(2, TIMEOUT)
+
+    def row(self, name, key='top'):
+        """The words of a line of the tables of top, by the titles of its columns."""
+        titles = []
+        for line in self.output[key].splitlines():
+            words = line.split()
+            if words and words[0] in ('NODE', 'PID', 'TOPIC'):
+                titles = words
+            elif words and words[0] == name:
+                return dict(zip(titles, words))
+        raise AssertionError(f'no {name} in {self.output[key]}')
+
+    def json_row(self, view, name):
+        """A row of what top --json prints: the one that has the name among its values."""
+        rows = json.loads(self.output['top json'])[view]
+        return next(row for row in rows if name in row.values())
+
+
+@pytest.fixture(scope='module')
+def scene(tmp_path_factory):
+    return Scene(tmp_path_factory.mktemp('scene'))
+
+
+def test_programs_end_well(scene):
+    assert set(scene.codes.values()) == {0}, scene.output
+
+
+@pytest.mark.parametrize(
+    'command, there, left_out',
+    [
+        ('graph', ['process {own}', 'process {peer}', '/tf'], ['/lamp', ' Hz']),
+        ('graph', ['/hearer (INTRAPROCESS)', '/peer (TCPROS)'], ['/rosout']),
+        ('everything', ['/rosout', '/lamp'], []),
+        ('less', ['/sender', ' Hz'], ['/tf']),
+        ('part', ['/sender'], ['/peer']),
+    ],
+)
+def test_program_prints_what_is_asked(scene, command, there, left_out):
+    printed = scene.output[command]
+    assert [text for text in there if text.format(**scene.pids) not in printed] == []
+    assert [text for text in left_out if text in printed] == []
+
+
+def test_graph_program_prints_json(scene):
+    found = json.loads(scene.output['graph json'])
+    assert {'/sender', '/hearer', '/peer'} <= set(found['nodes'])
+    assert '/traffic' in found['topics']
+    assert {'start', 'end', 'transports'} <= set(found['edges'][0])
+
+
+def test_graph_program_saves_picture(scene):
+    texts = ''.join(xml.etree.ElementTree.parse(scene.svg).getroot().itertext())
+    assert all(name in texts for name in ('/sender', '/hearer', '/peer', '/traffic'))
+
+
+def test_top_tells_of_topics(scene):
+    row = scene.row('/traffic')
+    found = [row[column] for column in ('TYPE', 'PUB', 'SUB', 'LOCAL', 'TCP')]
+    assert found == [STRING, '1', '2', '1', '1']
+    assert is_about(row['HZ'])
+
+
+def test_top_json_tells_of_nodes(scene):
+    assert {scene.pids['own'], 'BlockNode'} <= {*scene.json_row('nodes', '/sender').values()}
+    assert scene.pids['peer'] in scene.json_row('nodes', '/peer').values()
+    assert scene.json_row('processes', scene.pids['peer'])
+    assert scene.row(str(scene.pids['peer']))
+
+
+def test_top_json_counts_failures(scene):
+    row = scene.json_row('nodes', '/hearer')
+    assert [value for key, value in row.items() if key.lower().startswith('fail')] == [1]
+
+
+def test_top_json_tells_of_topics(scene):
+    row = scene.json_row('topics', '/traffic')
+    assert STRING in row.values()
+    assert any(isinstance(value, float) and is_about(value) for value in row.values())
+
+
+def test_keys_of_top_sort_and_quit(master, traffic):
+    create(master, '/another').interested_in('/another', 'std_msgs/Bool')
+    with Terminal(master.url, 'rosrun', 'pharos', 'top', '--interval', '0.2') as top:
+        top.wait_for('/sender')
+        top.press('p', rf'PID[^\n]*\n *{os.getpid()} ')
+        top.press('t', r'TOPIC[^\n]*\n/another ')
+        top.press('s', r'TOPIC[^\n]*\n/(?!another)')
+        top.press('s', r'TOPIC[^\n]*\n/traffic ')
+        top.press('q')
+        assert top.end() == 0
+
+
+# -- topics and nodes
+
+PEER_SENDS = f'''
+publisher = rospy.Publisher('/traffic', message_class('{STRING}'), queue_size=9)
+timer = rospy.Timer(rospy.Duration(1 / {RATE}), lambda event: publisher.publish('{TEXT}'))
+'''
+
+
+@pytest.fixture(params=['INTRAPROCESS', 'TCPROS'])
+def busy_topic(request, master):
+    """The topic /traffic, sent by a node of this process, or of another one."""
+    if request.param == 'INTRAPROCESS':
+        send_all_the_time(master)
+    else:
+        request.getfixturevalue('peer').run(PEER_SENDS)
+    return master.topic('/traffic')
+
+
+def test_hz_measures_rate(busy_topic):
+    found = busy_topic.hz(0.5)
+    assert is_about(found.rate)
+    assert re.search(r'\d Hz', repr(found))
+
+
+def test_bw_measures_bytes(busy_topic):
+    found = repr(busy_topic.bw(0.5))
+    number, unit = re.search(r'([\d.]+) ?(k?)B/s', found).groups()
+    assert is_about(float(number) * (1000 if unit else 1), RATE * len(TEXT)), found
+
+
+def test_last_is_next_message(busy_topic):
+    assert busy_topic.last.data == TEXT
+
+
+def test_watch_shows_messages(master, traffic, transcript):
+    master.topic('/traffic').watch(2)
+    assert [TEXT[:9] in line for line in transcript] == [True, True]
+
+
+def test_last_is_latched_message(master):
+    create(master).output_channel('/kept', STRING, latch=True).send(data='kept')
+    assert master.topic('/kept').last.data == 'kept'
+
+
+def test_watch_runs_block(master, traffic):
+    came = []
+    master.topic('/traffic').watch(3, came.append)
+    assert [message.data for message in came] == [TEXT] * 3
+
+
+def test_looks_leave_nothing_behind(master, traffic):
+    before = master.system_state()
+    master.topic('/traffic').hz(0.1)
+    assert master.topic('/traffic').last
+    until(lambda: master.system_state() == before, TIMEOUT)
+
+
+LOOKS = {
+    'hz': lambda topic: topic.hz(0.1),
+    'bw': lambda topic: topic.bw(0.1),
+    'last': lambda topic: topic.last,
+    'watch': lambda topic: topic.watch(1),
+}
+
+
+@pytest.mark.parametrize('look', LOOKS.values(), ids=LOOKS)
+def test_unpublished_topic_is_told(master, look):
+    create(master).interested_in('/unsent', STRING)
+    with pytest.raises(UnknownTopicError, match='/unsent'):
+        look(master.topic('/unsent'))
+
+
+def test_node_describes_itself(master, traffic):
+    traffic.serve('/lamp', 'std_srvs/SetBool', lambda request: (True, ''))
+    told = str(traffic.describe(0.1))
+    expected = (
+        '/sender',
+        'BlockNode',
+        f'pid {os.getpid()}',
+        STRING,
+        '/hearer',
+        'INTRAPROCESS',
+        '/lamp',
+    )
+    assert [text for text in expected if text not in told] == []
+
+
+def test_external_node_is_described(master, mixed):
+    text = str(master.node('/peer').describe(0.1))
+    assert f'pid {mixed.pid}' in text
+    assert re.search(r'/traffic \[std_msgs/String\].*/sender by TCPROS', text)
+
+
+# -- messages as text, and numbers over time
+
+
+def test_messages_are_shown_in_short(master, transcript):
+    for type_, fields, text in [
+        ('geometry_msgs/Twist', {'linear': {'x': 2.5}}, 'x: 2.5'),
+        ('std_msgs/String', {'data': 'x' * 10**6}, 'xxxxxxxx'),
+        ('sensor_msgs/Image', {'data': bytes(10**6)}, '1000000'),
+        ('sensor_msgs/LaserScan', {'ranges': [1.5] * 720}, '720'),
+        ('sensor_msgs/JointState', {'name': ['joint'] * 500}, '500'),
+        ('nav_msgs/OccupancyGrid', {'data': [7] * 10**4}, '10000'),
+        ('sensor_msgs/PointCloud', {'points': [{'x': 1}] * 300}, '300'),
+    ]:
+        create(master).output_channel('/shown', type_, latch=True).send(**fields)
+        master.topic('/shown').watch(1)
+        (shown,) = transcript
+        assert text in shown
+        assert len(shown) < 5000
+
+
+def test_plot_draws_numbers(master, tmp_path):
+    node, hearer = create(master, '/counter'), create(master, '/hearer')
+    numbers = node.output_channel('/numbers', 'geometry_msgs/Twist')
+
+    def count(me):
+        for number in me.every(0.02):
+            numbers.send(linear={'x': number})
+
+    node.fork(count)
+    channel = hearer.interested_in('/numbers', 'geometry_msgs/Twist')
+    plot = channel.plot('linear.x', 'angular.z', seconds=0.3)
+    plot.save(tmp_path / 'plot.png')
+    with PIL.Image.open(tmp_path / 'plot.png') as picture:
+        assert min(picture.size) > 200
+        assert len(picture.convert('RGB').getcolors(1 << 20)) > 2
+
+
+# -- the workspace: one session for all, at a master of its own
+
+
+@pytest.fixture(scope='module')
+def session():
+    with Terminal(REFUSED, 'rosrun', 'pharos', 'workspace') as session:
+        session.wait_for(r'In \[1\]: ')
+        yield session
+
+
+@pytest.fixture(scope='module')
+def session_master(session, tmp_path_factory):
+    """The master of the session, for a node of this process."""
+    path = tmp_path_factory.mktemp('session') / 'url'
+    session.enter(f'print(open({str(path)!r}, "w").write(master.url))', r'\n\d+\n')
+    return pharos.Master(path.read_text())
+
+
+def test_session_has_its_names(session):
+    session.enter(
+        'print(master.is_reachable(), me.is_running, Node.__name__[::-1])', 'True True edoN'
+    )
+    session.enter('me', r'Out\[\d+\]: <BlockNode /workspace')
+
+
+@pytest.mark.parametrize(
+    'typed, completed',
+    [
+        ("me.send_to('/tabb", 'ed_topic'),
+        ("me.send_to('/tabbed_topic', lin", 'ear='),
+        ("master.node('/tab_", 'node'),
+        ("message_class('geometry_msgs/Quat", 'ernion'),
+        ('master.wait_for_n', 'ode'),
+    ],
+)
+def test_tab_completes_what_exists(session, session_master, typed, completed):
+    with session_master.create(BlockNode, named='/tab_node') as node:
+        node.interested_in('/tabbed_topic', 'geometry_msgs/Twist')
+        session.press(typed)
+        session.wait_for(re.escape(typed[-3:]))
+        session.press('\t', completed)
+        session.press('\x03\x03')  # the first may end no more than the choice between several words
+        session.enter('60 * 7', r'Out\[\d+\]: 420')
+
+
+def test_transcript_prints_at_prompt(session, session_master):
+    session.enter('show = lambda message, channel: Transcript.show("told", message.data * 2)', '')
+    session.enter('told = me.interested_in("/told", "std_msgs/Int32", show)', '')
+    session.press('6 * ', r'\*')
+    with session_master.create(BlockNode, named='/teller') as teller:
+        teller.send_to('/told', data=50)
+        session.wait_for('told 100')
+    session.enter('70', r'Out\[\d+\]: 420')
+
+
+def test_failures_are_tabled_and_mended(session):
+    session.enter("bad = master.create(BlockNode, named='/bad', soul=lambda me: 1 / 0)", '')
+    session.enter('bad.execute()', 'ZeroDivisionError')
+    session.enter('print(str(bad.failures).count("ZeroDivisionError"), 6 * 7)', '[1-9] 42')
+    session.enter('bad.soul = lambda me: 6 * 111', '')
+    session.enter('bad.execute()', r'Out\[\d+\]: 666')
+
+
+def test_ctrl_c_ends_one_line(session):
+    session.press('print("be" "gun"); me.sleep(3600)\r', 'begun')
+
+    def is_interrupted():
+        session.press('\x03')
+        return 'KeyboardInterrupt' in session.text
+
+    until(is_interrupted, TIMEOUT)
+    session.enter('print(me.is_running, 6 * 111)', 'True 666')
+
+
+def test_session_leaves_no_registration(master, tmp_path):
+    """It ran a program first, whose names it has."""
+    path = tmp_path / 'robot.py'
+    path.write_text('from pharos import *\nrobot = Master().create(BlockNode, named="/robot")\n')
+    with Terminal(master.url, 'rosrun', 'pharos', 'workspace', str(path)) as session:
+        session.wait_for(r'In \[\d+\]: ')
+        session.enter('print(robot.is_running, me.name)', 'True /workspace')
+        session.press('exit\r')
+        assert session.end() == 0
+    assert not any(master.system_state())
+
+
+# -- pictures of messages in the workspace, as a notebook shows them, too
+
+SHOW = '''
+formatter = get_ipython().display_formatter
+formatter.active_types = formatter.format_types  # as in a notebook
+for name, (type_, fields) in eval(open('{folder}/messages').read()).items():
+    message = me.send_to('/pictures/' + name, fields, typed_as=type_)
+    data, _ = formatter.format(message)
+    if 'image/png' in data:
+        open('{folder}/' + name + '.png', 'wb').write(data['image/png'])
+    open('{folder}/' + name + '.txt', 'w').write(data['text/plain'])
+print('pictures' + ' drawn')
+'''
+WIDTH, HEIGHT = 48, 32
+
+
+def image_of(encoding, kind, *colours):
+    """The fields of an image whose left half has one colour and the right half another."""
+    pixels = numpy.zeros((HEIGHT, WIDTH, numpy.size(colours[0])), kind)
+    pixels[:, : WIDTH // 2], pixels[:, WIDTH // 2 :] = colours
+    shape = {'height': HEIGHT, 'width': WIDTH, 'step': pixels.strides[0]}
+    return 'sensor_msgs/Image', {**shape, 'encoding': encoding, 'data': pixels.tobytes()}
+
+
+FIELDS = [{'name': 'xyz'[at], 'offset': 4 * at, 'datatype': 7, 'count': 1} for at in range(3)]
+CLOUD = {'height': 1, 'width': 100, 'point_step': 12, 'row_step': 1200, 'is_dense': True}
+POINTS = numpy.linspace(0, 1, 300, dtype='f4')
+RANGES = [1.0 + at / 9 for at in range(50)]
+MAP = {'width': 40, 'height': 30, 'resolution': 0.1}
+POSES = [{'pose': {'position': {'x': at, 'y': at**2}}} for at in range(5)]
+PICTURES = {
+    'mono8': image_of('mono8', 'u1', 0, 255),
+    'rgb8': image_of('rgb8', 'u1', (255, 0, 0), (0, 0, 255)),
+    'bgr8': image_of('bgr8', 'u1', (0, 0, 255), (255, 0, 0)),
+    '16UC1': image_of('16UC1', 'u2', 500, 3000),
+    '32FC1': image_of('32FC1', 'f4', 0.5, 3.0),
+    'scan': ('sensor_msgs/LaserScan', {'angle_increment': 0.1, 'range_max': 9.0, 'ranges': RANGES}),
+    'map': ('nav_msgs/OccupancyGrid', {'info': MAP, 'data': [0, 100, -1] * 400}),
+    'cloud': ('sensor_msgs/PointCloud2', {**CLOUD, 'fields': FIELDS, 'data': POINTS.tobytes()}),
+    'path': ('nav_msgs/Path', {'poses': POSES}),
+}
+
+
+@pytest.fixture(scope='module')
+def pictures(session, tmp_path_factory):
+    """The folder of what the session shows of the messages."""
+    folder = tmp_path_factory.mktemp('pictures')
+    others = {'twist': ('geometry_msgs/Twist', {'linear': {'x': 2.5}})}
+    (folder / 'messages').write_text(repr({**PICTURES, **others}))
+    (folder / 'show.py').write_text(SHOW.format(folder=folder))
+    session.enter(f'exec(open("{folder}/show.py").read())', 'pictures drawn')
+    return folder
+
+
+@pytest.mark.parametrize('name', PICTURES)
+def test_message_has_picture(pictures, name):
+    with PIL.Image.open(pictures / f'{name}.png') as picture:
+        colours = {colour for _, colour in picture.convert('RGB').getcolors(1 << 20)}
+        assert picture.format == 'PNG'
+        assert picture.width >= WIDTH or picture.height >= HEIGHT
+    assert len(colours) > 1
+    if name in ('rgb8', 'bgr8'):
+        assert {(255, 0, 0), (0, 0, 255)} <= colours
+
+
+def test_messages_have_short_text(pictures):
+    assert 'x: 2.5' in (pictures / 'twist.txt').read_text()
+    assert not (pictures / 'twist.png').exists()
+    assert max(len(path.read_text()) for path in pictures.glob('*.txt')) < 5000

@@ -1,0 +1,500 @@
+"""Real peers, both ways: rospy, roscpp, ROS's own programs, and the libraries written on rospy."""
+import contextlib
+import os
+import signal
+import subprocess
+import threading
+
+import actionlib.msg
+import genpy
+import pytest
+import rosbag
+import std_msgs.msg
+from geometry_msgs.msg import PointStamped, TransformStamped
+
+from helpers import PYTHON, ROOT, TIMEOUT, InProcessMaster, Peer, Program, create, stop_nodes
+import pharos
+from pharos import Master
+from pharos.testing import Mailbox, until
+
+STRING = 'std_msgs/String'
+IMAGE = 'sensor_msgs/Image'
+RELAY = '/usr/lib/topic_tools/relay'
+NODELET = '/usr/lib/nodelet/nodelet'
+MEGABYTES = 6 << 20
+TWO_FIELDS = 'int32 number\nstring[] words\n'
+
+needs_relay = pytest.mark.skipif(not os.path.exists(RELAY), reason='needs topic-tools')
+needs_nodelet = pytest.mark.skipif(not os.path.exists(NODELET), reason='needs libnodeletlib-tools')
+
+
+@pytest.fixture(scope='module')
+def network():
+    """A ROS master, and one peer for all tests: each test has topics of its own."""
+    ros_master = InProcessMaster()
+    with Peer(ros_master.url) as peer:
+        peer.run('import threading, genpy.dynamic, std_msgs.msg, std_srvs.srv')
+        yield Master(ros_master.url), peer
+        peer.run("rospy.signal_shutdown('the end')")  # ends the threads of its action server
+    ros_master.stop()
+
+
+@pytest.fixture
+def master(network, monkeypatch):
+    """The master of the network, which a test leaves as it was."""
+    master, _ = network
+    monkeypatch.setenv('ROS_MASTER_URI', master.url)
+    yield master
+    stop_nodes(master)
+    until(lambda: [node.name for node in master.nodes()] == ['/peer'], 10, 'the end of all nodes')
+
+
+@pytest.fixture
+def peer(network):
+    return network[1]
+
+
+@pytest.fixture
+def node(master):
+    return create(master)
+
+
+def ros(*command, **options):
+    """Run a program to its end; returns what it printed."""
+    options = {'text': True, 'capture_output': True, 'timeout': 2 * TIMEOUT, **options}
+    ended = subprocess.run(command, **options)
+    assert ended.returncode == 0, ended.stderr
+    return ended.stdout
+
+
+@contextlib.contextmanager
+def running(master, *command):
+    """A program that is ended as by Ctrl-C, so that it unregisters."""
+    with Program(command, master.url) as program:
+        try:
+            yield program
+        finally:
+            program.signal(signal.SIGINT)
+            program.wait()
+
+
+# -- rospy
+
+
+def test_rospy_hears_what_pharos_sends(peer, node):
+    peer.hear('/hears', STRING)
+    for number in range(20):
+        node.send_to('/hears', typed_as=STRING, data=str(number))
+    heard = peer.heard('/hears', 20)
+    assert [message.data for message in heard] == [str(number) for number in range(20)]
+
+
+def test_pharos_hears_what_rospy_sends(peer, node):
+    box = Mailbox(node, '/sends', STRING)
+    peer.run("sends = rospy.Publisher('/sends', std_msgs.msg.String, queue_size=100)")
+    until(lambda: peer.value('sends.get_num_connections()'), TIMEOUT)
+    peer.run('for number in range(20): sends.publish(str(number))')
+    assert [box.next().data for _ in range(20)] == [str(number) for number in range(20)]
+    assert box.channel.connections == [('/peer', 'TCPROS')]
+
+
+def test_pharos_gets_latched_message_of_rospy(peer, node):
+    peer.run(
+        "latched = rospy.Publisher('/latched', std_msgs.msg.String, queue_size=1, latch=True)\n"
+        "latched.publish('kept')"
+    )
+    assert Mailbox(node, '/latched').next().data == 'kept'  # typed as the master says
+
+
+def test_rospy_gets_latched_message_of_pharos(peer, node):
+    node.output_channel('/kept', STRING, latch=True).send(data='kept')
+    assert peer.value(f"rospy.wait_for_message('/kept', std_msgs.msg.String, {TIMEOUT})").data == (
+        'kept'
+    )
+
+
+def test_rospy_calls_service_of_pharos(peer, node):
+    node.serve('/enable', 'std_srvs/SetBool', lambda request: (request.data, 'thanks'))
+    peer.run("proxy = rospy.ServiceProxy('/enable', std_srvs.srv.SetBool, persistent=True)")
+    assert [peer.value(f'proxy({data}).success') for data in (True, False)] == [True, False]
+
+
+def test_pharos_calls_service_of_rospy(peer, node):
+    peer.run(
+        "service = rospy.Service('/add', std_srvs.srv.SetBool,"
+        " lambda request: (not request.data, 'turned'))"
+    )
+    answer = node.wait_for_service('/add', TIMEOUT).call(data=True)
+    assert (answer.success, answer.message) == (False, 'turned')
+
+
+def test_failing_service_tells_rospy(peer, node):
+    node.serve('/fails', 'std_srvs/Empty', lambda request: 1 / 0)
+    with pytest.raises(RuntimeError, match='ServiceException'):
+        peer.run("rospy.ServiceProxy('/fails', std_srvs.srv.Empty)()")
+
+
+def test_failing_rospy_service_raises_here(peer, node):
+    peer.run("failing = rospy.Service('/refuses', std_srvs.srv.Empty, lambda request: 1 / 0)")
+    with pytest.raises(pharos.ServiceCallError):
+        node.wait_for_service('/refuses', TIMEOUT).call()
+
+
+def test_rospy_reads_log_under_nodes_name(peer, node):
+    peer.hear('/rosout', 'rosgraph_msgs/Log')
+    names = "[line.name for line in heard['/rosout'] if line.msg == 'here I am']"
+    until(lambda: node.log('here I am') or peer.value(names), TIMEOUT)
+    assert set(peer.value(names)) == {'/node'}
+
+
+def test_other_type_is_not_delivered(peer, node):
+    box, marker = Mailbox(node, '/typed', STRING), Mailbox(node, '/marker', 'std_msgs/Int32')
+    peer.run(
+        'others = [rospy.Publisher(topic, std_msgs.msg.Int32, queue_size=1, latch=True)\n'
+        "    for topic in ('/typed', '/marker')]\n"
+        'for each in others: each.publish(5)'
+    )
+    assert marker.next().data == 5
+    create(node.master, '/second').send_to('/typed', typed_as=STRING, data='fits')
+    assert box.next().data == 'fits' == box.all()[0].data
+
+
+# -- types that are known to the other side alone
+
+
+def test_unknown_type_comes_by_its_definition(peer, node):
+    peer.run(
+        f"own = genpy.dynamic.generate_dynamic('odd_msgs/Odd', {TWO_FIELDS!r})['odd_msgs/Odd']\n"
+        "odd = rospy.Publisher('/odd', own, queue_size=1, latch=True)\n"
+        "odd.publish(7, ['a', 'b'])"
+    )
+    message = Mailbox(node, '/odd').next()
+    assert (message._type, message.number, message.words) == ('odd_msgs/Odd', 7, ['a', 'b'])
+
+
+def test_defined_type_is_understood_by_rospy(peer, node):
+    pharos.define_message('even_msgs/Even', TWO_FIELDS)
+    peer.run(
+        f"own = genpy.dynamic.generate_dynamic('even_msgs/Even', {TWO_FIELDS!r})\n"
+        'evens, came = [], threading.Event()\n'
+        'def keep_even(message): evens.append((message.number, message.words)); came.set()\n'
+        "even = rospy.Subscriber('/even', own['even_msgs/Even'], keep_even)"
+    )
+    node.send_to('/even', typed_as='even_msgs/Even', number=8, words=['c'])
+    assert peer.value(f'came.wait({TIMEOUT}) and evens') == [(8, ['c'])]
+
+
+# -- large messages
+
+
+def test_large_message_reaches_rospy(peer, node):
+    data = os.urandom(MEGABYTES)
+    peer.hear('/large', IMAGE)
+    node.send_to('/large', typed_as=IMAGE, height=1, data=data)
+    assert (bytes(peer.heard('/large')[0].data) == data) is True  # no difference of 6 MB is shown
+
+
+def test_large_message_comes_from_rospy(peer, node):
+    peer.run(
+        f"image = message_class({IMAGE!r})(height=2, data=bytes(range(256)) * {MEGABYTES // 256})\n"
+        "camera = rospy.Publisher('/camera', type(image), queue_size=1, latch=True)\n"
+        'camera.publish(image)'
+    )
+    data = Mailbox(node, '/camera', IMAGE).next().data
+    assert (bytes(data) == bytes(range(256)) * (MEGABYTES // 256)) is True
+
+
+# -- rostopic, rosservice, rosnode, rosparam
+
+
+@pytest.fixture
+def robot(node):
+    """A node with a topic, a service and a parameter, for ROS's programs to look at."""
+    node.output_channel('/shown', STRING, latch=True).send(data='seen')
+    node.interested_in('/wanted', 'std_msgs/Int32')
+    node.serve('/greet', 'std_srvs/Trigger', lambda request: (True, 'hello'))
+    node.parameter('~speed', initialized=1.5)
+    return node
+
+
+@pytest.mark.parametrize(
+    'command, said',
+    [
+        ('rostopic list', ['/shown', '/wanted']),
+        ('rostopic list -v', ['* /shown [std_msgs/String] 1 publisher']),
+        ('rostopic type /shown', ['std_msgs/String']),
+        ('rostopic info /wanted', ['Type: std_msgs/Int32', '* /node (']),
+        ('rostopic echo -n 1 /shown', ['data: "seen"']),
+        ('rosservice list', ['/greet']),
+        ('rosservice type /greet', ['std_srvs/Trigger']),
+        ('rosservice info /greet', ['Node: /node', 'Type: std_srvs/Trigger', 'URI: rosrpc://']),
+        ('rosservice call /greet', ['success: True', 'message: "hello"']),
+        ('rosnode list', ['/node']),
+        ('rosnode info /node', ['* /shown [std_msgs/String]', '* /wanted [', '* /greet', 'Pid: ']),
+        ('rosnode ping -c 1 /node', ['xmlrpc reply from']),
+        ('rosparam get /node/speed', ['1.5']),
+        ('rosparam list', ['/node/speed']),
+    ],
+)
+def test_program_of_ros_understands_node(robot, command, said):
+    output = ros(*command.split())
+    assert [text for text in said if text not in output] == [], output
+
+
+def test_rosnode_info_shows_pid_and_links(robot):
+    create(robot.master, '/hearer').interested_in('/shown', STRING)
+    output = ros('rosnode', 'info', '/hearer')
+    assert f'Pid: {os.getpid()}\n' in output
+    assert '* topic: /shown\n    * to: /node' in output
+
+
+def test_rostopic_pub_reaches_waiting_node(master, node):
+    box = Mailbox(node, '/published', STRING)
+    with running(master, 'rostopic', 'pub', '/published', STRING, 'data: from outside'):
+        assert box.next().data == 'from outside'
+
+
+def test_rostopic_hz_measures_node(master, node):
+    channel = node.output_channel('/rated', STRING)
+    node.fork(lambda me: [channel.send(data='x') for _ in me.every(0.01)])
+    with running(master, 'rostopic', 'hz', '/rated') as program:
+        program.expect('average rate: ')
+
+
+def test_rosparam_set_runs_on_change(node):
+    parameter, changed = node.parameter('~limit', initialized=1), threading.Event()
+    parameter.on_change(lambda value: changed.set())
+    ros('rosparam', 'set', '/node/limit', '5')
+    assert changed.wait(TIMEOUT)
+    assert parameter.value == 5
+
+
+def test_rosnode_kill_stops_one_node(master, node):
+    other = create(master, '/other')
+    assert 'killed' in ros('rosnode', 'kill', '/node')
+    until(lambda: not node.is_running, TIMEOUT)
+    assert other.is_running
+
+
+def test_rosnode_cleanup_removes_dead_alone(master, node):
+    node.output_channel('/living', STRING)
+    with Peer(master.url, name='dead') as dead:
+        dead.end()
+    assert '* /dead' in ros('rosnode', 'cleanup', input='y\n')
+    assert master.topic('/living').publishers == ['/node']
+    assert '/dead' not in [found.name for found in master.nodes()]
+
+
+def test_roswtf_finds_no_fault(robot, tmp_path):
+    online = ros('roswtf', cwd=tmp_path).split('Online checks summary:')[1]
+    assert 'ERROR' not in online, online
+
+
+# -- rosbag
+
+
+def test_rosbag_records_what_pharos_sends(master, node, tmp_path):
+    path = tmp_path / 'said.bag'
+    channels = [node.output_channel(f'/bag_{side}', STRING) for side in 'ab']
+    command = 'rosbag', 'record', '--limit=10', '-O', str(path), '/bag_a', '/bag_b'
+    with Program(command, master.url) as program:
+        for channel in channels:
+            assert channel.wait_for_subscribers(1, TIMEOUT)
+        for number in range(10):
+            for channel in channels:
+                channel.send(data=f'{channel.topic} {number}')
+        assert program.wait() == 0, program.output
+    with rosbag.Bag(str(path)) as bag:
+        found = [message.data for topic, message, _ in bag.read_messages('/bag_a')]
+        assert found == [f'/bag_a {number}' for number in range(10)]
+        assert bag.get_message_count('/bag_b') == 10
+
+
+def test_rosbag_plays_to_pharos(node, tmp_path):
+    path = tmp_path / 'played.bag'
+    with rosbag.Bag(str(path), 'w') as bag:
+        for number in range(10):
+            bag.write('/played', std_msgs.msg.String(str(number)), genpy.Time(100, number))
+    box = Mailbox(node, '/played', STRING)
+    ros('rosbag', 'play', '--quiet', '--wait-for-subscribers', str(path))
+    assert [box.next().data for _ in range(10)] == [str(number) for number in range(10)]
+
+
+# -- roscpp
+
+
+@needs_relay
+@pytest.mark.parametrize('type_', [STRING, IMAGE])
+def test_relay_passes_messages_both_ways(master, node, type_):
+    source, target = f'/from_{type_[-5:]}', f'/to_{type_[-5:]}'
+    channel = node.output_channel(source, type_)
+    box = Mailbox(create(master, '/hearer'), target, type_)
+    with running(master, RELAY, source, target, '__name:=relay'):
+        assert channel.wait_for_subscribers(1, TIMEOUT)
+        # relay advertises when the first message comes
+        through_relay = [('/relay', 'TCPROS')]
+        until(lambda: channel.send() and box.channel.connections == through_relay, TIMEOUT)
+        assert channel.connections == through_relay
+        for number in range(5):
+            data = str(number) if type_ == STRING else bytes([number]) * 1000000
+            channel.send(data=data)
+            box.wait_for(lambda message, data=data: message.data == data)
+
+
+@needs_relay
+def test_relay_passes_latched_message(master, node):
+    node.output_channel('/latched_in', STRING, latch=True).send(data='kept')
+    with running(master, RELAY, '/latched_in', '/latched_out'):
+        assert Mailbox(create(master, '/late'), '/latched_out', STRING).next().data == 'kept'
+
+
+@needs_nodelet
+def test_service_of_nodelet_manager_is_called(master, node):
+    with running(master, NODELET, 'manager', '__name:=manager'):
+        listing = node.wait_for_service('/manager/list', TIMEOUT)
+        assert listing.type == 'nodelet/NodeletList'
+        assert list(listing.call().nodelets) == []
+
+
+PACKAGE = """<package format="2"><name>small_robot</name><version>0.0.0</version>
+<description>d</description><maintainer email="a@b.org">m</maintainer><license>BSD</license>
+</package>"""
+TALKER = """#!/usr/bin/python3
+import rospy, std_msgs.msg
+rospy.init_node('talker')
+sent = rospy.Publisher('chatter', std_msgs.msg.String, queue_size=1, latch=True)
+sent.publish(rospy.get_param('~text', 'nothing'))
+rospy.spin()
+"""
+
+
+@needs_nodelet
+def test_nodelet_load_starts_program_in_compose(master, node, tmp_path, monkeypatch):
+    """It ends with its loader, as a nodelet does."""
+    program = tmp_path / 'small_robot' / 'scripts' / 'talker'
+    program.parent.mkdir(parents=True)
+    program.write_text(TALKER)
+    program.chmod(0o755)
+    (tmp_path / 'small_robot' / 'package.xml').write_text(PACKAGE)
+    monkeypatch.setenv('ROS_PACKAGE_PATH', f'{tmp_path}:/usr/share')
+    box = Mailbox(node, '/said', STRING)
+    load = 'load', 'small_robot/talker', 'compose', '__name:=talker', 'chatter:=said', '_text:=here'
+    with running(master, PYTHON, str(ROOT / 'scripts' / 'compose')):
+        node.wait_for_service('/compose/list', TIMEOUT)
+        with running(master, NODELET, *load):
+            assert box.next().data == 'here'
+        until(lambda: '/talker' not in [each.name for each in master.nodes()], TIMEOUT)
+
+
+# -- libraries written on rospy
+
+
+def transform(child):
+    message = TransformStamped(child_frame_id=child)
+    message.header.frame_id = 'map'
+    message.transform.translation.x, message.transform.rotation.w = 2.0, 1.0
+    return message
+
+
+LOOKED_UP = "buffer.lookup_transform('map', 'here', rospy.Time(0), rospy.Duration(30)).transform"
+BROADCASTS = """
+import tf2_ros
+frame = message_class('geometry_msgs/TransformStamped')()
+frame.header.frame_id, frame.child_frame_id = 'map', 'there'
+frame.transform.translation.x = frame.transform.rotation.w = 1.0
+broadcaster = tf2_ros.StaticTransformBroadcaster()
+broadcaster.sendTransform(frame)
+"""
+
+
+def looked_up(node, child):
+    """Listen to tf in a node; returns how far the frame is from the map."""
+    tf2 = node.ros_import('tf2_ros')
+    buffer = tf2.Buffer()
+    tf2.TransformListener(buffer)
+    found = buffer.lookup_transform('map', child, node.ros.Time(0), node.ros.Duration(TIMEOUT))
+    return found.transform.translation.x
+
+
+def test_transform_reaches_other_node(master, node):
+    node.ros_import('tf2_ros').StaticTransformBroadcaster().sendTransform(transform('base'))
+    assert looked_up(create(master, '/listener'), 'base') == 2.0
+
+
+def test_transform_reaches_rospy(peer, node):
+    node.ros_import('tf2_ros').StaticTransformBroadcaster().sendTransform(transform('here'))
+    peer.run(
+        'import tf2_ros\nbuffer = tf2_ros.Buffer()\nlistener = tf2_ros.TransformListener(buffer)'
+    )
+    assert peer.value(LOOKED_UP).translation.x == 2.0
+    peer.run('listener.unregister()')
+
+
+def test_transform_comes_from_rospy(peer, node):
+    peer.run(BROADCASTS)
+    assert looked_up(node, 'there') == 1.0
+
+
+def start_count_server(actionlib_of_node, name):
+    """An action server; a client may find it a moment before it knows of the client."""
+
+    def execute(goal):
+        server.publish_feedback(actionlib.msg.TestFeedback(feedback=goal.goal))
+        server.set_succeeded(actionlib.msg.TestResult(result=goal.goal + 1))
+
+    server = actionlib_of_node.SimpleActionServer(
+        name, actionlib.msg.TestAction, execute, auto_start=False
+    )
+    server.start()
+    return server
+
+
+def test_action_runs_between_two_nodes(master, node):
+    server = start_count_server(node.ros_import('actionlib'), '/near')
+    asking = create(master, '/asking')
+    client = asking.ros_import('actionlib').SimpleActionClient('/near', actionlib.msg.TestAction)
+    assert client.wait_for_server(asking.ros.Duration(TIMEOUT))
+    until(server.action_server.result_pub.get_num_connections, TIMEOUT)
+    client.send_goal_and_wait(actionlib.msg.TestGoal(goal=3), asking.ros.Duration(TIMEOUT))
+    assert client.get_result().result == 4
+
+
+def test_rospy_sends_goal_to_pharos(peer, node):
+    server = start_count_server(node.ros_import('actionlib'), '/count')
+    peer.run(
+        'import actionlib, actionlib.msg\n'
+        "client = actionlib.SimpleActionClient('/count', actionlib.msg.TestAction)\n"
+        f'assert client.wait_for_server(rospy.Duration({TIMEOUT}))'
+    )
+    until(server.action_server.result_pub.get_num_connections, TIMEOUT)
+    peer.run(
+        f'client.send_goal_and_wait(actionlib.msg.TestGoal(goal=3), rospy.Duration({TIMEOUT}))'
+    )
+    assert peer.value('client.get_result().result') == 4
+
+
+def test_pharos_sends_goal_to_rospy(peer, node):
+    peer.run(
+        'import actionlib, actionlib.msg\n'
+        'def count(goal): server.set_succeeded(actionlib.msg.TestResult(result=goal.goal + 2))\n'
+        "server = actionlib.SimpleActionServer('/remote', actionlib.msg.TestAction, count, False)\n"
+        'server.start()'
+    )
+    library = node.ros_import('actionlib')
+    client = library.SimpleActionClient('/remote', actionlib.msg.TestAction)
+    assert client.wait_for_server(node.ros.Duration(TIMEOUT))
+    until(lambda: peer.value('server.action_server.result_pub.get_num_connections()'), TIMEOUT)
+    client.send_goal_and_wait(actionlib.msg.TestGoal(goal=3), node.ros.Duration(TIMEOUT))
+    assert client.get_result().result == 5
+
+
+def test_message_filters_match_messages_of_one_time(master, node):
+    filters, matched = node.ros_import('message_filters'), Mailbox()
+    sides = [filters.Subscriber(topic, PointStamped) for topic in ('/left', '/right')]
+    filters.TimeSynchronizer(sides, 10).registerCallback(matched)
+    sender = create(master, '/sender')
+    for topic, seconds in ('/left', 1), ('/left', 2), ('/right', 2):
+        header = std_msgs.msg.Header(stamp=genpy.Time(seconds), frame_id=topic)
+        sender.send_to(topic, typed_as='geometry_msgs/PointStamped', header=header)
+    left = matched.next()
+    assert (left.header.frame_id, left.header.stamp) == ('/left', genpy.Time(2))
