@@ -149,7 +149,7 @@ class MasterCalls:
             return answer and list(answer[2])
         except ConnectionRefusedError:
             return None
-        except (*COMMUNICATION_ERRORS, xmlrpc.client.Fault, TypeError, LookupError):
+        except (*COMMUNICATION_ERRORS, TypeError, LookupError):
             return []
 
     def _ask_node(self, name: str, method: str) -> Any:
