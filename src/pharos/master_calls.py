@@ -3,7 +3,6 @@ import contextlib
 import threading
 import time
 import urllib.parse
-import xmlrpc.client
 from typing import (
     TYPE_CHECKING,
     Any,
