@@ -198,13 +198,13 @@ def test_reachable_master_is_waited_for(master):
     assert master.is_reachable()
 
 
-def test_wait_lasts_until_master_comes(mortal_master):
-    mortal_master.end()
-    master, waited = Master(mortal_master.url), threading.Event()
+def test_wait_lasts_until_master_comes(mortal):
+    mortal.end()
+    master, waited = Master(mortal.url), threading.Event()
     assert not master.is_reachable()
     thread = threading.Thread(target=lambda: (master.wait(TIMEOUT), waited.set()))
     thread.start()
-    mortal_master.come_back()
+    mortal.come_back()
     assert waited.wait(TIMEOUT)
     thread.join(TIMEOUT)
 

@@ -50,16 +50,6 @@ class Channel:
         """True if it receives or sends: the node runs, and it was not closed."""
         return not self.closed
 
-    def _check_class(self) -> None:
-        """Raise if the node has the topic open with another type: rospy has one for all."""
-        known = self.end.impl.data_class
-        if known._md5sum != self.message_class._md5sum:
-            self.end.unregister()
-            self.node.forget(self)
-            raise MessageTypeError(
-                f'{self.node.name} has {self.topic} open as {known._type}, not as {self.type}'
-            )
-
     def _connections(self) -> list[Any]:
         impl = self.end and self.end.impl
         if not impl or impl.closed:
@@ -115,7 +105,6 @@ class InputChannel(Channel, Inbox):
         node, topic = self.node, self.topic
         self.turns, self.closed = node.run.turns, False
         self.end = node.ros.Subscriber(topic, self.message_class, self)
-        self._check_class()
 
     def __call__(self, message):
         """Take a message; rospy calls this if nobody has made it an Inbox."""
@@ -175,7 +164,6 @@ class OutputChannel(Channel):
         self.end = node.ros.Publisher(
             topic, self.message_class, latch=self.latch, queue_size=self.queue_size
         )
-        self._check_class()
         self._impl, self.closed = self.end.impl, False
         self._key = self if self.latch else False
         if self._latched is not None:

@@ -503,7 +503,8 @@ class Node:
         :raises ValueError: if it cannot be a name
         """
         self.check_running()
-        if not isinstance(name, str) or not name or not rosgraph.names.is_legal_name(name):
+        is_text = isinstance(name, str) and name.isascii() and name
+        if not is_text or not rosgraph.names.is_legal_name(name):
             raise ValueError(f'{name!r} cannot be a name of ROS: give one such as /robot1/pose or ~pose')
         return self.run.ros.resolve_name('~' + name[2:] if name.startswith('~/') else name)
 
@@ -610,10 +611,17 @@ class Node:
         return channel
 
     def _class_of(self, topic: str, typed_as: Any, from_publisher: bool = False) -> type:
-        if typed_as is None:
-            known = [each.message_class for each in self.channels if each.topic == topic]
-            if known:
-                return known[0]
+        known = [each.message_class for each in self.channels if each.topic == topic]
+        if typed_as is None and known:
+            return known[0]
+        cls = self._find_class(topic, typed_as, from_publisher)
+        if known and known[0]._md5sum != cls._md5sum:
+            raise MessageTypeError(
+                f'{self.name} has {topic} open as {known[0]._type}, not as {cls._type}'
+            )
+        return cls
+
+    def _find_class(self, topic: str, typed_as: Any, from_publisher: bool) -> type:
         type_ = typed_as or self.master.topic_type(topic)
         if type_ in (None, '*'):
             raise UnknownTopicError(

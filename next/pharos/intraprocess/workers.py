@@ -119,23 +119,28 @@ class _Worker:
 
     def _rest(self) -> bool:
         """Wait until there is work; False if there are more workers than nodes."""
-        with _guard:
-            if len(_workers) > len(_turns):
-                _workers.discard(self)
-                if len(_workers) > len(_turns) and _idle:
-                    _idle.pop().wake()
-                return False
         _idle.append(self)
-        if _ready:
+        if _ready or len(_workers) > len(_turns):
             try:
                 _idle.remove(self)
-                return True
             except ValueError:
-                pass  # somebody has woken it
+                pass  # somebody wakes it
+            else:
+                return self._is_needed()
         self._wake.acquire()
         if self._awake.locked():
             self._awake.release()
         return True
+
+    def _is_needed(self) -> bool:
+        with _guard:
+            if _ready or len(_workers) <= len(_turns):
+                return True
+            _workers.discard(self)
+            is_surplus = len(_workers) > len(_turns)
+        if is_surplus:
+            _wake_worker()
+        return False
 
 
 def _wake_worker() -> _Worker | None:

@@ -340,17 +340,20 @@ def receive(original, run, module):
 
     def robust_connect_subscriber(connection, address, port, uri, callback, topic):
         subscription = callback.__self__
+        cls = subscription.data_class
         try:
             transport.receive(connection, address, port, uri, subscription, run)
             run.told.discard((topic, uri))
         except Exception as error:
             if 'remote error reported' in str(error):
                 connection.close()
+                transport.end_share(topic, uri, cls, run)
                 return run.on_refused(topic, str(error))
             if not subscription.closed and (topic, uri) not in run.told:
                 run.told.add((topic, uri))
                 run.ros.logwarn(f'{topic}: no connection to {uri}, it is tried again: {error}')
         connection.close()
+        transport.end_share(topic, uri, cls, run)
         if not subscription.closed:
             run.connect_again(topic, uri)
 

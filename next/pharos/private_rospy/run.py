@@ -114,7 +114,8 @@ class Run:
             registration.get_topic_manager(),
             registration.get_service_manager(),
         )
-        self.Link = transport.link_class(self.modules.load('rospy.impl.transport'))
+        classes = transport.link_classes(self.modules.load('rospy.impl.transport'))
+        self.Link, self.Follower = classes
 
     def _substitutes(self) -> dict[str, Any]:
         run = self
@@ -269,7 +270,10 @@ class Run:
                 refusal = transport.connect(runs[uri], self, topic)
                 if refusal:
                     self.on_refused(topic, refusal)
-            elif not self.handler.done and self.handler._connect_topic(topic, uri)[0] != 1:
+                return
+            if self.shares_connections and transport.follow(self, topic, uri, subscription):
+                return
+            if not self.handler.done and self.handler._connect_topic(topic, uri)[0] != 1:
                 self.start_thread(lambda: self.connect_again(topic, uri), f'connect {topic}')
         finally:
             self.connecting.discard((topic, uri))

@@ -25,8 +25,8 @@ RETRY_DELAY = 1.0  # seconds until the next one
 _length = struct.Struct('<I')
 
 
-def link_class(transport: Any) -> type:
-    """Make the class of a link's ends, a transport of one node's rospy."""
+def link_classes(transport: Any) -> tuple[type, type]:
+    """Make the classes of a link's ends and of followers, transports of one node's rospy."""
 
     class Link(transport.Transport):
         """One end of a link; ``subscription`` is at the other one, if this is the publisher's."""
@@ -70,7 +70,68 @@ def link_class(transport: Any) -> type:
                 }
             return self.header
 
-    return Link
+    class Follower(transport.Transport):
+        """The share of a subscription in the connection of another node."""
+
+        transport_type, header, latch = 'TCPROS', {}, None
+
+        def get_transport_info(self):
+            return f'TCPROS connection of {self.share.leader.name}'
+
+        def close(self):
+            if not self.done:
+                self.done = True
+                self.share.followers = [each for each in self.share.followers if each is not self]
+                self.cleanup_cb(self)
+
+    return Link, Follower
+
+
+class Share:
+    """A connection to an external publisher that several nodes of this process share.
+
+    The first that connects has it, and hands its messages to the ``followers``; when it ends, these
+    connect anew.
+    """
+
+    def __init__(self, leader: Any):
+        self.leader, self.followers = leader, []
+
+
+_shares: dict[tuple, Share] = {}
+_share_guard = threading.Lock()
+
+
+def follow(run: Any, topic: str, uri: str, subscription: Any) -> bool:
+    """True if another node of this process has the connection, which the subscription now shares.
+
+    If nobody has, this one is the first.
+    """
+    key = topic, uri, subscription.data_class
+    with _share_guard:
+        share = _shares.get(key)
+        if share is None or share.leader in (None, run):
+            _shares[key] = Share(run)
+            return False
+        follower = run.Follower('i', topic)
+        follower.endpoint_id, follower.share, follower.run = uri, share, run
+        follower.subscription = subscription
+        subscription.add_connection(follower)
+        share.followers = [*share.followers, follower]
+    return True
+
+
+def end_share(topic: str, uri: str, cls: type, run: Any) -> None:
+    """Have those that share a connection that has ended connect anew."""
+    with _share_guard:
+        share = _shares.get((topic, uri, cls))
+        if share is None or share.leader is not run:
+            return
+        del _shares[topic, uri, cls]
+    for follower in share.followers:
+        follower.close()
+        if not follower.run.stopping.is_set():
+            follower.run.start_thread(lambda run=follower.run: run.connect(topic, uri), 'connect')
 
 
 def connect(sender: Any, receiver: Any, topic: str) -> str | None:
@@ -268,6 +329,7 @@ def receive(connection: Any, address: str, port: int, uri: str, subscription: An
     run.sockets.add(sock)
     sock.settimeout(None)
     cls, header = subscription.data_class, connection.header
+    share = _shares.get((subscription.resolved_name, uri, cls))
     with sock.makefile('rb', 1 << 16) as stream:
         while not connection.done:
             head = stream.read(4)
@@ -282,7 +344,11 @@ def receive(connection: Any, address: str, port: int, uri: str, subscription: An
             connection.stat_bytes += size + 4
             connection.stat_num_msg += 1
             message = None
-            for inbox in subscription.inboxes():
+            inboxes = subscription.inboxes()
+            for follower in share.followers if share else ():
+                follower.header, follower.callerid_pub = header, connection.callerid_pub
+                inboxes = [*inboxes, *follower.subscription.inboxes()]
+            for inbox in inboxes:
                 message = cls().deserialize(data)
                 message._connection_header = header
                 inbox.receive(message, size)
