@@ -179,7 +179,7 @@ class Session:
         command = [*DEFAULT_SIGNALS, 'rosrun', 'pharos', 'workspace']
         environ = {
             **dict(TERM='xterm', PROMPT_TOOLKIT_NO_CPR='1', IPYTHONDIR=str(folder / 'ipython')),
-            'ROS_MASTER_URI': url,
+            **dict(ROS_MASTER_URI=url, COLUMNS='300'),
         }
         self._process = pexpect.spawn(
             'env',

@@ -4,14 +4,13 @@ from __future__ import annotations
 import socket
 import time
 import urllib.parse
-from typing import TYPE_CHECKING, Any, Callable
+from typing import TYPE_CHECKING, Any
 
 import genpy
 
 from pharos import messages
-from pharos.blocks import Block, name_of, rebound, taking
+from pharos.blocks import Block, rebound, taking
 from pharos.errors import (
-    MasterUnreachableError,
     MessageTypeError,
     NodeStoppedError,
     UnknownNodeError,

@@ -32,7 +32,12 @@ class Failure:
         self._frames = error.__traceback__
         last = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(self._frames, -1)]
         #: is equal for failures of one kind
-        self.place = getattr(block, '__qualname__', id(block)), type(error), tuple(last), id(channel)
+        self.place = (
+            getattr(block, '__qualname__', id(block)),
+            type(error),
+            tuple(last),
+            id(channel),
+        )
 
     def let_go(self) -> None:
         """Keep neither message nor frames, which may be large."""

@@ -18,7 +18,6 @@ from pharos.blocks import Block
 from pharos.channels import Topic, refuses
 from pharos.errors import (
     MasterUnreachableError,
-    PharosError,
     PortInUseError,
     UnknownNodeError,
     UnknownServiceError,
@@ -26,7 +25,7 @@ from pharos.errors import (
 from pharos.external_node import ExternalNode
 from pharos.node import Node
 from pharos.parameter import check_value
-from pharos.private_rospy.run import MASTER_LIMIT, UNREACHABLE, ServerProxy
+from pharos.private_rospy.run import UNREACHABLE, ServerProxy
 from pharos.ros_process import RosProcess, find_launch_file, find_program
 from pharos.service import Service
 
@@ -87,7 +86,13 @@ class Master:
             host, port = parts.hostname, parts.port
         except (ValueError, TypeError, AttributeError):
             host = port = None
-        if not host or ' ' in host or not port or parts.scheme != 'http' or parts.path not in ('', '/'):
+        if (
+            not host
+            or ' ' in host
+            or not port
+            or parts.scheme != 'http'
+            or parts.path not in ('', '/')
+        ):
             raise ValueError(
                 f"{url!r} cannot be the URL of a master: give one such as 'http://127.0.0.1:11311/'"
             )
@@ -253,8 +258,12 @@ class Master:
 
         :raises ValueError: if it cannot
         """
-        if not (isinstance(name, str) and re.fullmatch(r'/?[A-Za-z]\w*(/[A-Za-z]\w*)*', name, re.A)):
-            raise ValueError(f'{name!r} cannot be the name of a node: give one such as /robot1/driver')
+        if not (
+            isinstance(name, str) and re.fullmatch(r'/?[A-Za-z]\w*(/[A-Za-z]\w*)*', name, re.A)
+        ):
+            raise ValueError(
+                f'{name!r} cannot be the name of a node: give one such as /robot1/driver'
+            )
         return name
 
     def _named(self, name: str, mappings: list[str]) -> tuple[str, list[str]]:
@@ -267,7 +276,9 @@ class Master:
         elif '__ns' in given:
             namespace = rosgraph.names.make_global_ns(given['__ns'])
         first = _first_with.get(tuple(mappings))
-        if '__name' in given and (first is None or first.master.url != self.url or not first.is_running):
+        if '__name' in given and (
+            first is None or first.master.url != self.url or not first.is_running
+        ):
             base = self.node_name(given['__name'])
         rest = [arg for arg in mappings if not arg.startswith(('__name:=', '__ns:='))]
         return f'{namespace.rstrip("/")}/{base}', rest
@@ -356,7 +367,9 @@ class Master:
         path = find_program(package, executable)
         return RosProcess([path, *map(str, args)], self.url, on_line)
 
-    def launch(self, package: str | None, file: str, on_line: Any = None, **args: Any) -> RosProcess:
+    def launch(
+        self, package: str | None, file: str, on_line: Any = None, **args: Any
+    ) -> RosProcess:
         """Run a launch file at this master, as roslaunch does; ``package`` None: it is a path."""
         path = find_launch_file(package, file)
         arguments = [f'{name}:={value}' for name, value in args.items()]

@@ -29,7 +29,9 @@ def main(port: int) -> None:
     master = Master(f'http://{host}:{server.master_node.port}/')
     rosout = master.create(BlockNode, named='/rosout')
     aggregate = rosout.output_channel('/rosout_agg', 'rosgraph_msgs/Log')
-    rosout.interested_in('/rosout', 'rosgraph_msgs/Log', delegate=lambda log: aggregate.publish(log))
+    rosout.interested_in(
+        '/rosout', 'rosgraph_msgs/Log', delegate=lambda log: aggregate.publish(log)
+    )
     master.parameters['/rosdistro'] = os.environ.get('ROS_DISTRO', 'Debian')
     print(master.url, file=answers, flush=True)
     sys.stdin.read()

@@ -7,7 +7,6 @@ import enum
 import re
 import sys
 import threading
-import time
 from typing import TYPE_CHECKING, Any, Callable, Iterator, NamedTuple
 
 import genpy
@@ -273,7 +272,9 @@ class Node:
         if self.lifecycle in (Lifecycle.RUNNING, Lifecycle.STOPPING):
             return
         state = self.lifecycle.value
-        raise NodeStoppedError(f'{self.name} is {state}: start() it, by super() in a class of your own')
+        raise NodeStoppedError(
+            f'{self.name} is {state}: start() it, by super() in a class of your own'
+        )
 
     def remember(self, opened: Any) -> None:
         """Have a channel, service or parameter come back at the next start."""
@@ -505,7 +506,9 @@ class Node:
         self.check_running()
         is_text = isinstance(name, str) and name.isascii() and name
         if not is_text or not rosgraph.names.is_legal_name(name):
-            raise ValueError(f'{name!r} cannot be a name of ROS: give one such as /robot1/pose or ~pose')
+            raise ValueError(
+                f'{name!r} cannot be a name of ROS: give one such as /robot1/pose or ~pose'
+            )
         return self.run.ros.resolve_name('~' + name[2:] if name.startswith('~/') else name)
 
     def peer_name(self, peer: Any) -> str:
@@ -640,7 +643,9 @@ class Node:
         end = self.run.ros.Subscriber(topic, self.run.ros.AnyMsg)
 
         def definition():
-            headers = [each.header for each in end.impl.connections if getattr(each, 'header', None)]
+            headers = [
+                each.header for each in end.impl.connections if getattr(each, 'header', None)
+            ]
             return [h['message_definition'] for h in headers if h.get('type') == type_]
 
         try:

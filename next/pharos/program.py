@@ -30,7 +30,9 @@ _signalled = False  # after a signal that ends the program
 _quiet_waits = 0  # of the main thread, which a signal ends without an exception
 
 
-def wait(predicate: Callable[[], Any], timeout: float | None = None, node: Node | None = None) -> Any:
+def wait(
+    predicate: Callable[[], Any], timeout: float | None = None, node: Node | None = None
+) -> Any:
     """Wait until ``predicate()`` is true.
 
     :param timeout: seconds, None: without limit

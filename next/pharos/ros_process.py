@@ -155,5 +155,7 @@ def find_launch_file(package: str | None, file: str) -> str:
             found = []
     if not found:
         where = f'{package} has' if package else 'there is'
-        raise UnknownNodeError(f'{where} no launch file {str(file)!r}: is it spelt so, and installed?')
+        raise UnknownNodeError(
+            f'{where} no launch file {str(file)!r}: is it spelt so, and installed?'
+        )
     return str(found[0])

@@ -138,7 +138,9 @@ class Service:
         cls = messages.service_class(self.type)
         request = messages.build(cls._request_class, block, fields)
         if request._md5sum != cls._request_class._md5sum:
-            raise MessageTypeError(f'{self.name} takes {cls._request_class._type}, not {request._type}')
+            raise MessageTypeError(
+                f'{self.name} takes {cls._request_class._type}, not {request._type}'
+            )
         freeze, thaw = copier_for(cls._request_class)
         try:
             frozen = freeze(request)

@@ -61,7 +61,9 @@ class Mailbox:
             return self._waiting.get(timeout=max(0.0, timeout))
         except queue.Empty:
             count = len(self._came)
-            raise TimeoutError(f'no message came within {timeout:g} s, after {count} others') from None
+            raise TimeoutError(
+                f'no message came within {timeout:g} s, after {count} others'
+            ) from None
 
     def take(self, count: int) -> list[Any]:
         """Take the next messages."""

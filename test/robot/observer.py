@@ -48,7 +48,8 @@ def act(goal, is_cancelled=False):
     if is_cancelled:
         client.cancel_goal()
     assert client.wait_for_result(rospy.Duration(LIMIT))
-    return client.get_state(), is_cancelled or client.get_result().result
+    # of a goal that is cancelled, rospy's client may lose the last state
+    return is_cancelled or (client.get_state(), client.get_result().result)
 
 
 def logged(text):

@@ -194,7 +194,9 @@ class _Source:
             fresh = f'list({local})' if base in ('bool', 'string') else local
         elif base == 'string':
             self.reads.append(f'{local} = {field}')
-            self.reads.append(f'if type({local}) is not str or not {local}.isascii(): text({local})')
+            self.reads.append(
+                f'if type({local}) is not str or not {local}.isascii(): text({local})'
+            )
         else:
             self.numbers.append((base, field, local))
         if length is not None:

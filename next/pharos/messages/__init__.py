@@ -9,6 +9,14 @@ from pharos.messages.types import (
 )
 
 __all__ = [
-    *('build', 'convert_numpy', 'response', 'class_from_definition', 'define_message', 'define_service', 'describe'),
-    *('explain', 'message_class', 'service_class'),
+    'build',
+    'class_from_definition',
+    'convert_numpy',
+    'define_message',
+    'define_service',
+    'describe',
+    'explain',
+    'message_class',
+    'response',
+    'service_class',
 ]

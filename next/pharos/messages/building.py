@@ -99,7 +99,9 @@ def _type_of(cls: type, name: str) -> str:
 
 def _from_numpy(value: Any, type_: str) -> Any:
     if type_.startswith(_OCTETS):
-        return value.astype('uint8', casting='same_kind' if value.dtype != bool else 'safe').tobytes()
+        return value.astype(
+            'uint8', casting='same_kind' if value.dtype != bool else 'safe'
+        ).tobytes()
     return value.ravel().tolist() if type_.endswith(']') else value.tolist()
 
 

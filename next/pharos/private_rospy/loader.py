@@ -71,7 +71,9 @@ def _reaches_rospy(top: str, above: tuple[str, ...] = ()) -> bool:
     files = _files_of(top)
     if any(b'rospy' in text for text in files):
         return True
-    imports = {name for text in files for name in re.findall(rb'^\s*(?:from|import) (\w+)', text, re.M)}
+    imports = {
+        name for text in files for name in re.findall(rb'^\s*(?:from|import) (\w+)', text, re.M)
+    }
     return any(_reaches_rospy(name.decode(), (*above, top)) for name in sorted(imports))
 
 

@@ -183,7 +183,9 @@ def start_xmlrpc(original, run, module):
     def start(self):
         module.print = lambda text: None
         self._run_init()
-        self.thread = run.start_thread(lambda: self.server.serve_forever(poll_interval=60), 'xmlrpc')
+        self.thread = run.start_thread(
+            lambda: self.server.serve_forever(poll_interval=60), 'xmlrpc'
+        )
 
     return start
 
@@ -480,7 +482,9 @@ def call_service(original, run, module):
         found = local_service(run.master_url, self.resolved_name)
         if not found or found[1].service_class._md5sum != self.service_class._md5sum:
             return original(self, *args, **kwargs)
-        request = run.modules.load('rospy.msg').args_kwds_to_message(self.request_class, args, kwargs)
+        request = run.modules.load('rospy.msg').args_kwds_to_message(
+            self.request_class, args, kwargs
+        )
         freeze, thaw = copier_for(type(request))
         return answer(*found, thaw(freeze(request)), run.name)
 

@@ -18,7 +18,6 @@ import xmlrpc.client
 from typing import Any, Callable, Iterable
 
 import _thread
-import rosgraph.names
 
 from pharos.errors import MasterUnreachableError, NodeNameInUseError, PortInUseError
 from pharos.intraprocess.workers import Turns
@@ -106,7 +105,9 @@ class Run:
             self.environ.pop('ROS_IP', None)
             self.environ['ROS_HOSTNAME'] = domain
         self.argv = [self.base, *remappings]
-        self.modules = PrivateModules(self._substitutes(), lambda module: patches.apply(module, self))
+        self.modules = PrivateModules(
+            self._substitutes(), lambda module: patches.apply(module, self)
+        )
         self.ros = self.modules.load('rospy')
         self.core = self.modules.load('rospy.core')
         registration = self.modules.load('rospy.impl.registration')
@@ -125,8 +126,8 @@ class Run:
 
             def start(self):
                 self.daemon = True
-                run.threads.add(self)
                 super().start()
+                run.threads.add(self)
 
         class Proxy(ServerProxy):
             limit = property(lambda self: STOP_LIMIT if run.stopping.is_set() else MASTER_LIMIT)
@@ -275,6 +276,9 @@ class Run:
                 return
             if not self.handler.done and self.handler._connect_topic(topic, uri)[0] != 1:
                 self.start_thread(lambda: self.connect_again(topic, uri), f'connect {topic}')
+        except AttributeError:
+            if topic in self.topics.subs:
+                raise  # else it was closed meanwhile, for which rospy does not look
         finally:
             self.connecting.discard((topic, uri))
 
@@ -297,7 +301,9 @@ class Run:
                     continue
                 forgotten = True
                 with lock:  # what is closed meanwhile stays closed
-                    if not self.stopping.is_set() and [name, data] in [list(each) for each in own()]:
+                    if not self.stopping.is_set() and [name, data] in [
+                        list(each) for each in own()
+                    ]:
                         self.register(kind, name, data)
             self.known[kind] = {name for name, _ in own()}
         if forgotten and not self.stopping.is_set():

@@ -73,7 +73,9 @@ def link_classes(transport: Any) -> tuple[type, type]:
     class Follower(transport.Transport):
         """The share of a subscription in the connection of another node."""
 
-        transport_type, header, latch = 'TCPROS', {}, None
+        transport_type, latch = 'TCPROS', None
+        header = property(lambda self: self.share.header)
+        callerid_pub = property(lambda self: self.header['callerid'])
 
         def get_transport_info(self):
             return f'TCPROS connection of {self.share.leader.name}'
@@ -95,7 +97,7 @@ class Share:
     """
 
     def __init__(self, leader: Any):
-        self.leader, self.followers = leader, []
+        self.leader, self.followers, self.header = leader, [], {}
 
 
 _shares: dict[tuple, Share] = {}
@@ -320,7 +322,9 @@ def keep_alive(sock: socket.socket) -> None:
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 4)
 
 
-def receive(connection: Any, address: str, port: int, uri: str, subscription: Any, run: Any) -> None:
+def receive(
+    connection: Any, address: str, port: int, uri: str, subscription: Any, run: Any
+) -> None:
     """Connect to a publisher and receive its messages until the connection ends."""
     connection.connect(address, port, uri, timeout=CONNECT_LIMIT)
     sock = connection.socket
@@ -330,6 +334,8 @@ def receive(connection: Any, address: str, port: int, uri: str, subscription: An
     sock.settimeout(None)
     cls, header = subscription.data_class, connection.header
     share = _shares.get((subscription.resolved_name, uri, cls))
+    if share:
+        share.header = header
     with sock.makefile('rb', 1 << 16) as stream:
         while not connection.done:
             head = stream.read(4)
@@ -346,7 +352,6 @@ def receive(connection: Any, address: str, port: int, uri: str, subscription: An
             message = None
             inboxes = subscription.inboxes()
             for follower in share.followers if share else ():
-                follower.header, follower.callerid_pub = header, connection.callerid_pub
                 inboxes = [*inboxes, *follower.subscription.inboxes()]
             for inbox in inboxes:
                 message = cls().deserialize(data)
