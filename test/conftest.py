@@ -46,7 +46,10 @@ def master(ros_master, monkeypatch):
     yield master
     helpers.stop_nodes(master)
     until(lambda: not any(master.system_state()), 10, 'the end of all registrations')
-    until(lambda: not left_threads(threads), 10, 'the end of all threads')
+    try:
+        until(lambda: not left_threads(threads), 10)
+    except TimeoutError:
+        pytest.fail(f'left behind: {left_threads(threads)}')
     ros_master.forget()
 
 

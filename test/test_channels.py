@@ -325,6 +325,20 @@ def test_from_and_to_take_external_node(master, node, other, peer):
     assert take(here, 1) == ['for all']
 
 
+def test_from_drops_what_others_send(node, other, peer):
+    """A second channel shows that the peer's message has come."""
+    mailbox, everything = Mailbox(), Mailbox(other, '/chatter', STRING)
+    other.interested_in('/chatter', STRING, delegate=mailbox, from_=node)
+    peer.run(
+        'publisher = rospy.Publisher("/chatter", message_class("std_msgs/String"), queue_size=1)'
+    )
+    until(lambda: peer.value('publisher.get_num_connections()'), TIMEOUT)
+    peer.run('publisher.publish("of the peer")')
+    assert take(everything, 1) == ['of the peer']
+    node.send_to('/chatter', data='of the sender')
+    assert take(mailbox, 1) == ['of the sender']
+
+
 def test_to_unknown_node_is_an_error(node):
     channel = node.output_channel('/chatter', STRING)
     with pytest.raises(UnknownNodeError, match='/nobody'):

@@ -248,7 +248,7 @@ def test_missing_script_is_an_error(master, error, arguments):
 
 
 @pytest.mark.parametrize('text, cause', [('1 / 0', ZeroDivisionError), ('return 1', SyntaxError)])
-def test_script_that_fails_early_is_an_error(load, text, cause):
+def test_early_failure_is_an_error(load, text, cause):
     with pytest.raises(PharosError) as error:
         load(text)
     assert isinstance(error.value.__cause__, cause)

@@ -231,7 +231,7 @@ def test_publisher_does_not_wait_for_delegate(sender, hearer):
     assert [box.next().data for _ in range(10)] == [str(number) for number in range(10)]
 
 
-def test_blocked_delegate_holds_up_its_node_alone(master, sender, hearer):
+def test_blocked_delegate_holds_up_no_other(master, sender, hearer):
     leave = threading.Event()
     create(master, '/slow').interested_in(
         '/a', STRING, delegate=lambda message, channel: leave.wait(TIMEOUT)

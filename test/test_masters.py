@@ -137,7 +137,7 @@ def test_masters_of_one_address_are_equal():
         assert (len({master, Master(other)}) == 1) is are_one
 
 
-def test_own_node_is_own_under_other_spelling(master):
+def test_own_node_keeps_under_other_spelling(master):
     node = create(master, '/own')
     assert Master(master.url.replace('127.0.0.1', 'localhost')).node('/own') is node
 
@@ -238,7 +238,7 @@ def test_wait_for_node_finds_own_node(master):
     assert master.wait_for_node('/n', TIMEOUT) is node
 
 
-def test_wait_for_node_lasts_until_it_comes(master):
+def test_wait_for_node_until_it_comes(master):
     found = []
     thread = threading.Thread(target=lambda: found.append(master.wait_for_node('/late', TIMEOUT)))
     thread.start()
@@ -255,7 +255,7 @@ def test_wait_for_node_ends_after_timeout(master):
 # -- several masters
 
 
-def test_nodes_of_one_name_live_on_two_masters(masters):
+def test_two_masters_have_one_name(masters):
     nodes = [create(master, '/same') for master in masters]
     assert [master.node('/same') for master in masters] == nodes
     nodes[0].stop()
@@ -263,7 +263,7 @@ def test_nodes_of_one_name_live_on_two_masters(masters):
     assert masters[1].nodes() == [nodes[1]]
 
 
-def test_topics_of_two_masters_do_not_mix(masters):
+def test_topics_of_masters_stay_apart(masters):
     boxes = [Mailbox(create(master, '/hearer'), '/t', STRING) for master in masters]
     speakers = [create(master, '/speaker') for master in masters]
     for text in 'said', 'end':
@@ -274,7 +274,7 @@ def test_topics_of_two_masters_do_not_mix(masters):
         assert [message.data for message in box.all()] == [f'said {number}', f'end {number}']
 
 
-def test_services_of_two_masters_do_not_mix(masters):
+def test_services_of_masters_stay_apart(masters):
     for master, text in zip(masters, ('one', 'two')):
         create(master, '/n').serve('/who', 'std_srvs/Trigger', lambda _, text=text: (True, text))
     answers = [master.lookup_service('/who').call().message for master in masters]

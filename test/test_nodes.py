@@ -205,7 +205,7 @@ def test_unknown_keyword_is_a_type_error(master):
     assert registrations(master, '/driver') == [[], [], []]
 
 
-def test_class_that_is_no_node_is_refused(master):
+def test_class_must_be_a_node(master):
     with pytest.raises(TypeError):
         create(master, '/node', dict)
 
@@ -372,7 +372,7 @@ def test_stubborn_soul_is_left_behind(master):
     thread.join(TIMEOUT)
 
 
-def test_opening_soul_does_not_hold_stop_up(master, peer):
+def test_opening_soul_holds_no_stop(master, peer):
     """Opening a channel is nobody's last word, though its subscriber does not connect."""
 
     class Patient(BlockNode):

@@ -488,7 +488,7 @@ def test_pharos_sends_goal_to_rospy(peer, node):
     assert client.get_result().result == 5
 
 
-def test_message_filters_match_messages_of_one_time(master, node):
+def test_message_filters_match_equal_times(master, node):
     filters, matched = node.ros_import('message_filters'), Mailbox()
     sides = [filters.Subscriber(topic, PointStamped) for topic in ('/left', '/right')]
     filters.TimeSynchronizer(sides, 10).registerCallback(matched)

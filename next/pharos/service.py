@@ -1,6 +1,7 @@
 """Services: offered by a node, or called by name alone."""
 from __future__ import annotations
 
+import contextlib
 import socket
 import struct
 import time
@@ -27,7 +28,8 @@ if TYPE_CHECKING:
     from pharos.master import Master
     from pharos.node import Node
 
-PROBE_LIMIT = 5.0  # seconds in which a provider says its type
+PROBE_LIMIT = 5.0  # seconds in which a provider that is called must say its type
+PATIENCE = 0.25  # seconds that a look-up waits for that; a call asks again
 
 
 class OfferedService:
@@ -105,6 +107,8 @@ class Service:
 
     def __init__(self, master: Master, name: str, caller_id: str):
         self.master, self.name, self.caller_id, self.response = master, name, caller_id, None
+        self.type: str | None = None
+        self.md5sum: str | None = None
         self.look_up()
 
     def look_up(self) -> None:
@@ -121,9 +125,14 @@ class Service:
         if local:
             self.type, self.md5sum = local[1].service_class._type, local[1].service_class._md5sum
             return
-        with self._connect('*', PROBE_LIMIT, probe='1') as sock:
-            header = self._read_header(sock, time.monotonic() + PROBE_LIMIT)
-        self.type, self.md5sum = header.get('type', ''), header.get('md5sum', '')
+        with contextlib.suppress(OSError):
+            self._ask(PATIENCE)
+
+    def _ask(self, limit: float) -> None:
+        """Ask the provider for its type."""
+        with self._connect('*', limit, probe='1') as sock:
+            header = self._read_header(sock, time.monotonic() + limit)
+        self.type, self.md5sum = header.get('type'), header.get('md5sum')
 
     def call(self, block: Any = None, *, timeout: float | None = None, **fields: Any) -> Any:
         """Call it, with a request that ``block(request)``, a dict or keywords fill, or a ready one.
@@ -135,6 +144,13 @@ class Service:
         :raises MessageTypeError: if the request cannot be sent
         """
         self.response = None
+        if self.type is None:
+            try:
+                self._ask(PROBE_LIMIT if timeout is None else min(timeout, PROBE_LIMIT))
+            except OSError as error:
+                raise ServiceCallError(
+                    f'{self.name} at {self.uri} does not say its type: {error}'
+                ) from error
         cls = messages.service_class(self.type)
         request = messages.build(cls._request_class, block, fields)
         if request._md5sum != cls._request_class._md5sum:

@@ -213,7 +213,9 @@ def process_request(original, run, module):
         def answer():
             _client.address = address
             self.process_request_thread(request, address)
+            run.deadlines.pop(request, None)
 
+        run.deadlines[request] = time.monotonic() + run.client_timeout
         request.settimeout(run.client_timeout)
         run.sockets.add(request)
         run.start_thread(answer, 'request')
@@ -229,7 +231,8 @@ def limit_request(original, run, module):
         if int(self.headers.get('content-length', 0)) > REQUEST_SIZE:
             self.close_connection = True
             return self.send_error(413)
-        return original(self)
+        original(self)
+        run.deadlines[self.connection] = time.monotonic() + run.client_timeout
 
     return do_POST
 

@@ -91,6 +91,7 @@ class Run:
         self.stopping = threading.Event()
         self.threads: weakref.WeakSet[threading.Thread] = weakref.WeakSet()
         self.sockets: weakref.WeakSet[socket.socket] = weakref.WeakSet()
+        self.deadlines: dict[socket.socket, float] = {}  # of clients that are to say something
         self.publishers: dict[str, list[str]] = {}  # topic -> URIs, as the master last said
         self.connecting: set[tuple[str, str]] = set()  # topic, URI
         self.told: set[tuple[str, str]] = set()  # likewise: of whose loss the log knows
@@ -168,10 +169,10 @@ class Run:
         :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: and nothing is left
         """
         global _end_of_watch
-        self._check_name(timeout)
         base = self.modules.load('rospy.impl.tcpros_base')
         port, xmlrpc_port = self.ports
         try:
+            self._check_name(timeout)
             server = base.init_tcpros_server(port)
             server.tcp_ros_server = base.TCPServer(server._tcp_server_callback, port)
             server.tcp_ros_server.start()
@@ -309,6 +310,13 @@ class Run:
         if forgotten and not self.stopping.is_set():
             self.on_forgotten()
 
+    def close_late_clients(self) -> None:
+        """Close the clients that take too long to say what they want."""
+        for sock, deadline in list(self.deadlines.items()):
+            if time.monotonic() > deadline:
+                self.deadlines.pop(sock, None)
+                shut(sock)
+
     # -- stop
 
     def stop(self, timeout: float, left: list[threading.Thread]) -> list[str]:
@@ -332,8 +340,7 @@ class Run:
         impls = [*self.topics.pubs.values(), *self.topics.subs.values()]
         self.end_rospy('stop')
         for sock in list(self.sockets):
-            with contextlib.suppress(OSError):
-                sock.shutdown(socket.SHUT_RDWR)
+            shut(sock)
         for impl in impls:
             impl.connection_poll.poller.close()
         for proxy in self.core._xmlrpc_cache.values():
@@ -342,6 +349,12 @@ class Run:
         self.modules.close_logging()
         gc.collect(2 if next(_stops) % 20 == 0 else 1)
         return [thread.name for thread in left_threads] + ([] if ended else ['a delegate'])
+
+
+def shut(sock: socket.socket) -> None:
+    """Have whoever reads from a socket find it closed."""
+    with contextlib.suppress(OSError):
+        sock.shutdown(socket.SHUT_RDWR)
 
 
 def join(threads: Iterable[threading.Thread], timeout: float) -> list[threading.Thread]:
@@ -367,6 +380,7 @@ def _watch(end: threading.Event) -> None:
     while not end.wait(WATCH_PERIOD):
         nodes = list(runs.values())
         for run in nodes:
+            run.close_late_clients()
             run.topics.check_all()  # rospy looks twice a second who has left (ros_comm #927)
         for url in {run.master_url for run in nodes}:
             with contextlib.suppress(*UNREACHABLE):
