@@ -7,12 +7,12 @@ than 2 s, every second one. It goes on until Ctrl-C; meanwhile, in other termina
   rostopic echo /countdown/feedback
   rostopic pub -1 /countdown/goal actionlib/TestActionGoal '{goal: {goal: 4}}'    # takes its place
 """
+import contextlib
 import itertools
-import sys
 
 from actionlib.msg import TestAction, TestFeedback, TestGoal, TestResult
 
-from pharos import BlockNode, Master, Node, program, spin
+from pharos import BlockNode, Master, Node, spin
 
 
 class Server(Node):
@@ -55,4 +55,5 @@ def main():
 
 
 if __name__ == '__main__':
-    sys.exit(program.run('action', main, about=__doc__))
+    with contextlib.suppress(KeyboardInterrupt):
+        main()

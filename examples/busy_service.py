@@ -8,11 +8,11 @@ goes on until Ctrl-C; meanwhile, in other terminals:
   rostopic echo /arm/progress
   rosservice call /arm/pick     # tells when it has picked, or at once that the arm is busy
 """
+import contextlib
 import itertools
-import sys
 import threading
 
-from pharos import BlockNode, Master, Node, ServiceCallError, program, spin
+from pharos import BlockNode, Master, Node, ServiceCallError, spin
 
 
 class Arm(Node):
@@ -53,4 +53,5 @@ def main():
 
 
 if __name__ == '__main__':
-    sys.exit(program.run('busy_service', main, about=__doc__))
+    with contextlib.suppress(KeyboardInterrupt):
+        main()

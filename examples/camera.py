@@ -7,12 +7,12 @@ A ball swings before the camera; the robot turns towards it, until Ctrl-C. In ot
   rosparam set /controller/gain 3.0     # the robot turns three times as fast, at once
   rosrun pharos top                     # how often messages come, and by which transport
 """
+import contextlib
 import math
-import sys
 
 import numpy
 
-from pharos import BlockNode, Master, Node, Transcript, program, spin
+from pharos import BlockNode, Master, Node, Transcript, spin
 
 HEIGHT, WIDTH = 480, 640
 SIZE = {'height': HEIGHT, 'width': WIDTH, 'step': WIDTH, 'encoding': 'mono8'}
@@ -55,4 +55,5 @@ def main():
 
 
 if __name__ == '__main__':
-    sys.exit(program.run('camera', main, about=__doc__))
+    with contextlib.suppress(KeyboardInterrupt):
+        main()

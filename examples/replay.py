@@ -5,13 +5,13 @@ Each replay jumps back in time, which neither the node's loop nor rospy's Timer 
 needed: all nodes of a master have one time, so this has a master of its own. It goes on until
 Ctrl-C; what to type meanwhile, in another terminal, it says itself.
 """
+import contextlib
 import itertools
 import math
 import pathlib
-import sys
 import tempfile
 
-from pharos import BlockNode, Master, Node, Transcript, program
+from pharos import BlockNode, Master, Node, Transcript
 
 
 def drive(robot):
@@ -50,8 +50,9 @@ def main():
         master.create(Listener, named='listener')
         for count in itertools.count(1):
             Transcript.show(f'replay {count}')
-            master.run('rosbag', 'play', '--clock', bag, name='player').wait()
+            master.run('rosbag', 'play', '--clock', bag, '__name:=player').wait()
 
 
 if __name__ == '__main__':
-    sys.exit(program.run('replay', main, about=__doc__))
+    with contextlib.suppress(KeyboardInterrupt):
+        main()

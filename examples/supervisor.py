@@ -8,10 +8,10 @@ terminals:
   rosnode kill /left        # the supervisor starts it again
   rostopic echo /diagnostics
 """
+import contextlib
 import random
-import sys
 
-from pharos import BlockNode, Master, MasterUnreachableError, Node, NodeStoppedError, program, spin
+from pharos import BlockNode, Master, MasterUnreachableError, Node, NodeStoppedError, spin
 
 
 class Worker(Node):
@@ -54,4 +54,5 @@ def main():
 
 
 if __name__ == '__main__':
-    sys.exit(program.run('supervisor', main, about=__doc__))
+    with contextlib.suppress(KeyboardInterrupt):
+        main()

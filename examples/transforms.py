@@ -7,12 +7,12 @@ the two together. It goes on until Ctrl-C; meanwhile, in other terminals:
   rostopic echo /camera/position
   rostopic echo /tf
 """
+import contextlib
 import math
-import sys
 
 from geometry_msgs.msg import TransformStamped
 
-from pharos import BlockNode, Master, program, spin
+from pharos import BlockNode, Master, spin
 
 
 def transform(stamp, parent, child, x, y, yaw=0.0):
@@ -53,4 +53,5 @@ def main():
 
 
 if __name__ == '__main__':
-    sys.exit(program.run('transforms', main, about=__doc__))
+    with contextlib.suppress(KeyboardInterrupt):
+        main()

@@ -5,10 +5,10 @@ Both have a node /robot, and neither sees the other's: of their topics only /lea
 master to the other, over `rosrun pharos bridge`. No roscore is needed. It goes on until Ctrl-C;
 what to type meanwhile, in other terminals, it says itself.
 """
+import contextlib
 import math
-import sys
 
-from pharos import BlockNode, Master, Transcript, program, spin
+from pharos import BlockNode, Master, Transcript, spin
 
 
 def lead(robot):
@@ -35,4 +35,5 @@ def main():
 
 
 if __name__ == '__main__':
-    sys.exit(program.run('two_robots', main, about=__doc__))
+    with contextlib.suppress(KeyboardInterrupt):
+        main()

@@ -14,7 +14,7 @@ atexit.register(shutil.rmtree, os.environ['ROS_LOG_DIR'], ignore_errors=True)
 for name in ('ROS_IP', 'ROS_NAMESPACE', 'ROS_MASTER_URI'):
     os.environ.pop(name, None)
 ROOT = pathlib.Path(__file__).resolve().parent.parent
-SRC = str(ROOT / os.environ.get('PHAROS_SOURCE', 'src'))  # the tests can try another source
+SRC = str(ROOT / 'src')
 sys.path.insert(0, SRC)
 os.environ['PYTHONPATH'] = f'{SRC}:{os.environ.get("PYTHONPATH", "")}'.rstrip(':')
 

@@ -238,6 +238,17 @@ def test_dead_node_stays_in_graph(mortal):
     assert ('/peer', '/texts') in [(edge.start, edge.end) for edge in found.edges]
 
 
+def test_roscpp_node_is_no_problem(master):
+    """roscpp's getBusStats lacks the code, and a value of each topic that it publishes."""
+    sender = send_all_the_time(master)
+    with master.run('topic_tools', 'relay', '/traffic', '/relayed', '__name:=relay'):
+        create(master, '/hearer').interested_in('/relayed', STRING, delegate=lambda *_: None)
+        assert sender.channels[0].wait_for_subscribers(1, TIMEOUT)
+        graph = until(lambda: (found := master.graph(0.5)).rates.get('/relayed') and found, TIMEOUT)
+    assert graph.nodes['/relay'].problem == ''
+    assert ('/traffic', '/relay', True, ('TCPROS',)) in graph.edges
+
+
 def program(command, url):
     """Start a program of the package."""
     return helpers.Program(['rosrun', 'pharos', *command.split()], url)
@@ -526,7 +537,7 @@ def test_messages_are_shown_in_short(master, transcript):
 
 
 def test_plot_draws_numbers(master, tmp_path):
-    node, hearer = create(master, '/counter'), create(master, '/hearer')
+    node = create(master, '/counter')
     numbers = node.output_channel('/numbers', 'geometry_msgs/Twist')
 
     def count(me):
@@ -534,9 +545,8 @@ def test_plot_draws_numbers(master, tmp_path):
             numbers.send(linear={'x': number})
 
     node.fork(count)
-    channel = hearer.interested_in('/numbers', 'geometry_msgs/Twist')
-    plot = channel.plot('linear.x', 'angular.z', seconds=0.3)
-    plot.save(tmp_path / 'plot.png')
+    plot = master.topic('/numbers').plot('linear.x', 'angular.z', seconds=0.3)
+    plot.savefig(tmp_path / 'plot.png')
     with PIL.Image.open(tmp_path / 'plot.png') as picture:
         assert min(picture.size) > 200
         assert len(picture.convert('RGB').getcolors(1 << 20)) > 2

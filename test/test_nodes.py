@@ -1,6 +1,5 @@
 """Nodes: their names, addresses and arguments, souls and time, starts, stops and changes."""
 import contextlib
-import re
 import socket
 import threading
 import urllib.parse
@@ -256,10 +255,12 @@ def test_new_delegate_takes_next_message(master, node):
     assert len(first.all()) == 1
 
 
-@pytest.mark.parametrize('attribute', ['soul', 'delegate'])
-def test_block_must_be_callable(node, attribute):
+def test_block_must_be_callable(node):
     with pytest.raises(TypeError):
-        setattr(node, attribute, 'no block')
+        node.delegate = 'no block'
+    node.soul = 'no block'
+    with pytest.raises(TypeError):
+        node.execute()
 
 
 def test_delegates_run_one_at_a_time(master, node):
@@ -695,7 +696,7 @@ def test_health_tells_about_node(master, node, peer):
     assert health.connections['TCPROS'] >= 1
     assert (health.dropped, health.errors) == (0, 0)
     assert health.threads > 0
-    assert re.match('registered', str(health))
+    assert 'registered=True' in str(health)
 
 
 def test_other_process_sees_service_of_node(master, node, peer):

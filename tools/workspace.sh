@@ -83,7 +83,7 @@ build_workspace() {
     printf '%s\n' "$devel" >"$ws/devel.key"
   fi
   if [[ $1 == install ]]; then
-    install=$(cd "$root" && find src scripts launch examples -type f ! -name '*.pyc' -exec cksum {} + | sort | cksum)
+    install=$(cd "$root" && find src scripts launch examples template -type f ! -name '*.pyc' -exec cksum {} + | sort | cksum)
     if [[ $install != "$(cat "$ws/install.key" 2>/dev/null)" ]]; then
       say "installing the package into the workspace"
       rm -rf "$ws"/{install,install.key}

@@ -1,7 +1,10 @@
 """PhaROS for Python: many ROS nodes in one process, written with blocks."""
-from typing import TYPE_CHECKING
+from __future__ import annotations
 
-from pharos.channel import InputChannel
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from pharos.channels import InputChannel, OutputChannel, Topic
 from pharos.errors import (
     MasterUnreachableError,
     MessageTypeError,
@@ -18,22 +21,13 @@ from pharos.errors import (
 )
 from pharos.external_node import ExternalNode
 from pharos.failures import Failure
-from pharos.lifecycle import Lifecycle
-from pharos.output_channel import OutputChannel
 from pharos.master import Master
-from pharos.messages import (
-    define_message,
-    define_service,
-    message_class,
-    service_class,
-)
-from pharos.node import BlockNode, Node
+from pharos.messages import define_message, define_service, message_class, service_class
+from pharos.node import BlockNode, Lifecycle, Node
 from pharos.parameter import Parameter
+from pharos.program import spin
 from pharos.ros_process import RosProcess
-from pharos.node_registry import spin
-from pharos.on_demand import __dir__, __getattr__  # noqa: F401  # PEP 562
 from pharos.service import Service
-from pharos.topic import Topic
 from pharos.transcript import Transcript
 
 if TYPE_CHECKING:
@@ -47,8 +41,8 @@ __all__ = [
     'Node',
     'BlockNode',
     'ScriptNode',
-    'Lifecycle',
     'ExternalNode',
+    'Lifecycle',
     'Topic',
     'InputChannel',
     'OutputChannel',
@@ -56,14 +50,14 @@ __all__ = [
     'Parameter',
     'Transcript',
     'RosProcess',
+    'Failure',
     'Composition',
     'Graph',
-    'Failure',
+    'spin',
     'message_class',
     'service_class',
     'define_message',
     'define_service',
-    'spin',
     '__version__',
     'PharosError',
     'MasterUnreachableError',
@@ -78,3 +72,19 @@ __all__ = [
     'ServiceCallError',
     'NodeStoppedError',
 ]
+_EXTRAS = {
+    'Composition': 'compose.composition',
+    'Graph': 'live.graph',
+    'ScriptNode': 'compose.script',
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Load extras when they are used."""
+    if name in _EXTRAS:
+        return getattr(importlib.import_module(f'pharos.{_EXTRAS[name]}'), name)
+    raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,399 +1,407 @@
-"""The proxy of a ROS master."""
+"""The Master: the proxy of a ROS master, which creates nodes and finds those of others."""
+from __future__ import annotations
+
+import atexit
+import collections.abc
+import contextlib
+import os
+import re
+import socket
 import subprocess
-from typing import (
-    TYPE_CHECKING,
-    Any,
-    Callable,
-    Collection,
-    Dict,
-    Iterable,
-    List,
-    Optional,
-    TypeVar,
-    Union,
+import sys
+import urllib.parse
+from typing import Any, Callable, Iterator, Sequence
+
+import rosgraph.names
+
+from pharos import program
+from pharos.blocks import Block
+from pharos.channels import Topic
+from pharos.errors import (
+    MasterUnreachableError,
+    PharosError,
+    PortInUseError,
+    UnknownNodeError,
 )
-
-import rosgraph
-from rosgraph.rosenv import ROS_MASTER_URI
-
-from pharos import attributes, embedded_master, node_registry, on_demand, ros_process, starts
-from pharos.blocks import check_block, check_flag
-from pharos.errors import PharosError, UnknownNodeError, suggest
 from pharos.external_node import ExternalNode
-from pharos.master_services import MasterServices
+from pharos.names import full_name, node_name
 from pharos.node import Node
-from pharos.parameters import Parameters
-from pharos.private_rospy.addresses import check_port, check_url
-from pharos.private_rospy.deadlines import MARGIN, time_limit
-from pharos.program_files import AnyPath
-from pharos.ros_process import RosProcess
-from pharos.seconds import check_limit
-from pharos.topic import Topic
-from pharos.watcher import watcher_of
-from pharos.wrong_guesses import names_its_methods, tells_keywords
+from pharos.parameter import check_value
+from pharos.private_rospy.run import UNREACHABLE, ServerProxy
+from pharos.ros_process import RosProcess, find_launch_file, find_program
+from pharos.service import Service
 
-if TYPE_CHECKING:
-    from typing_extensions import ParamSpec  # part of typing since Python 3.10
-
-    from pharos.compose.composition import Composition
-    from pharos.compose.script import ScriptNode
-
-    Init = ParamSpec('Init')
-NodeType = TypeVar('NodeType', bound=Node)
-AnyNode = Union[Node, ExternalNode]
+CALLER_ID = '/pharos'
+_first_with = {}  # argv -> the first node that was created with it
 
 
-@names_its_methods
-class Master(MasterServices):
-    """The proxy of a ROS master: creates nodes, and finds others.
+class Parameters(collections.abc.MutableMapping):
+    """The parameter server as a mapping: names to values."""
 
-    The report (listing 3.2)::
+    def __init__(self, call: Callable[..., Any]):
+        self._call = call
 
-        master := PhaROSMaster url: 'http://127.0.0.1:11311/'
+    def __getitem__(self, name: str) -> Any:
+        value = self._call('getParam', full_name(name))
+        if value is None:
+            raise KeyError(name)
+        return value
+
+    def __setitem__(self, name: str, value: Any) -> None:
+        check_value(name, value)
+        self._call('setParam', full_name(name), value)
+
+    def __delitem__(self, name: str) -> None:
+        self[name]
+        self._call('deleteParam', name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(sorted(self._call('getParamNames')))
+
+    def __len__(self) -> int:
+        return len(self._call('getParamNames'))
+
+
+class Master:
+    """A ROS master, by its URL. Makes no connection yet.
+
+    The report: ``PhaROSMaster url: 'http://127.0.0.1:11311/'``::
+
         master = Master('http://127.0.0.1:11311/')
 
-    Masters whose URLs mean one address ('localhost' and '127.0.0.1') are equal; a host name is
-    looked up where two are compared.
-
-    :ivar url: its URL
-    :ivar share_connections: whether its nodes share connections, as below
-    :param url: URL of the ROS master; None: ROS_MASTER_URI, else ROS's default. Makes no connection
-        yet.
-    :param share_connections: the nodes that it creates, and others of this process that do so, share
-        one TCPROS connection to each publisher elsewhere, which sends to one of them alone, and
-        whose messages are read once
-    :raises ValueError: if it is no URL
+    :param url: default: ROS_MASTER_URI, else ROS's default
+    :param share_connections: nodes of this process that receive from one external publisher on one
+        topic share a connection
+    :raises ValueError: if the URL is malformed
     """
 
-    def __init__(self, url: Optional[str] = None, *, share_connections: bool = False) -> None:
-        self.share_connections = check_flag('share_connections', share_connections)
-        self.url: str = (
-            check_url(rosgraph.get_master_uri(), ROS_MASTER_URI) if url is None else check_url(url)
-        )
-        # the process of an embedded master
-        self._child: Optional['subprocess.Popen[str]'] = None
+    def __init__(self, url: str | None = None, share_connections: bool = False):
+        url = url or os.environ.get('ROS_MASTER_URI') or 'http://localhost:11311/'
+        parts = re.fullmatch(r'http://(\[[\w:]+\]|[\w.-]+):(\d{1,5})/?', str(url).lower())
+        if not parts or not 0 < int(parts[2]) < 65536:
+            raise ValueError(
+                f"{url!r} cannot be the URL of a master: give one such as 'http://127.0.0.1:11311/'"
+            )
+        host = parts[1].replace('localhost', '127.0.0.1')
+        self.url, self.share_connections = f'http://{host}:{parts[2]}/', share_connections
+        self.parameters = Parameters(self.call)
+        self._process = None
+        program.handle_signals()
+
+    # -- a master of one's own
 
     @classmethod
-    def embedded(cls, port: int = 0) -> 'Master':
-        """A ROS master of one's own, with /rosout, as a child of this process; ``roscore`` is not
-        needed.
+    def embedded(cls, port: int = 0) -> Master:
+        """Start a ROS master as a child of this process.
 
-        It ends with :meth:`stop`, its ``with`` block, or this process, however that ends. It is for
-        this host alone unless ROS_IP or ROS_HOSTNAME say otherwise.
+        :meth:`stop`, the end of its ``with`` block, or that of this process ends it.
 
-        :param port: its port, 0 for any free one
+        :param port: 0: any free one
         :raises PortInUseError: if the port is taken
         """
-        child, url = embedded_master.start(check_port('port', port))
+        environ = dict(os.environ, PYTHONPATH=os.pathsep.join(filter(None, sys.path)))
+        environ.setdefault('ROS_HOSTNAME', environ.pop('ROS_IP', '127.0.0.1'))
+        pipes = {'stdin': subprocess.PIPE, 'stdout': subprocess.PIPE, 'text': True}
+        command = [sys.executable, '-m', 'pharos.master_program', str(port)]
+        process = subprocess.Popen(command, env=environ, start_new_session=True, **pipes)  # type: ignore
+        url = process.stdout.readline().strip()
+        if not url:
+            process.communicate()
+            raise PortInUseError(
+                f'no master starts at port {port}: choose another one, or 0 for any free one'
+            )
         master = cls(url)
-        master._child = child
-        node_registry.at_end(master.stop)  # the child would end by itself, but perhaps after us
+        master._process = process
+        atexit.register(master.stop)
         return master
 
     def stop(self) -> None:
-        """Stop this process's nodes at an embedded master, and end it. Harmless when done twice.
+        """End an embedded master, and do nothing to another."""
+        atexit.unregister(self.stop)
+        process, self._process = self._process, None
+        if process:
+            for node in self.own_nodes():
+                node.end_now()
+            with process:  # waits for it
+                process.stdin.close()
 
-        :raises PharosError: if it is not embedded: other nodes need it
-        """
-        if self._child is None:
-            raise PharosError(
-                f'{self} is not embedded in this program: stop it where it was started'
-            )
-        node_registry.not_at_end(self.stop)
-        for node in self.local_nodes():
-            node_registry.stop(node)
-        if self._child.returncode is None:
-            embedded_master.end(self._child)
-
-    def __enter__(self) -> 'Master':
+    def __enter__(self) -> Master:
         return self
 
-    def __exit__(self, *error: object) -> None:
-        if self._child is not None:
-            self.stop()
+    def __exit__(self, *error: Any) -> None:
+        self.stop()
 
-    @tells_keywords
-    def create(
-        self,
-        node_class: 'Callable[Init, NodeType]',
-        named: str,
-        domain: Optional[str] = None,
-        tcp_port: int = 0,
-        xmlrpc_port: int = 0,
-        soul: Optional[Callable[..., Any]] = None,
-        delegate: Optional[Callable[..., Any]] = None,
-        argv: Optional[List[str]] = None,
-        *args: 'Init.args',
-        **kwargs: 'Init.kwargs',
-    ) -> NodeType:
-        """Create, register and start a node; returns it.
+    # -- asking
 
-        The report (listing 3.7)::
+    def call(self, method: str, *args: Any, caller_id: str = CALLER_ID) -> Any:
+        """Call a method of the master's API; returns its value, None if it says no.
 
-            master create: PhaROSBlockNode named: '/myNode' domain: '127.0.0.1'
-                tcpPort: 9999 xmlRpcPort: 6123 soul: [...]
-            master.create(BlockNode, named='/myNode', domain='127.0.0.1',
-                          tcp_port=9999, xmlrpc_port=6123, soul=...)
-
-        :param node_class: Node, BlockNode or a subclass
-        :param named: the node's name, which may carry a namespace: '/robot1/driver'
-        :param domain: the address that the node advertises and, if it is loopback, the only one it
-            listens on; None: what ROS_HOSTNAME, ROS_IP or the host's name say
-        :param tcp_port: TCPROS port, 0 for any free one
-        :param xmlrpc_port: XML-RPC port, 0 for any free one
-        :param soul: block that says what the node does, called as ``soul(node)``
-        :param delegate: block run for each message, called as ``delegate(message, channel)``
-        :param argv: ROS remappings and private parameters (a script passes ``sys.argv``). Of
-            several nodes with the same ``argv`` the first takes the ``__name`` in it, for good; the
-            others keep ``named``, in the namespace of ``__ns``; all else holds for all.
-            ``eye:image:=/camera/image``, ``eye:__name:=left`` and ``eye:_rate:=5`` are for the one
-            whose ``named`` ends in 'eye'.
-        :param args, kwargs: for the node's ``__init__``
-        :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: and nothing is left
-            behind
-        :raises ValueError: if a name, port or address cannot be one, also an address in
-            ROS_HOSTNAME or ROS_IP
+        :raises MasterUnreachableError: if it does not answer within 5 s
         """
-        node = attributes.make(
-            node_class,
-            self,
-            named,
-            soul,
-            delegate,
-            args,
-            kwargs,
-            domain=domain,
-            tcp_port=tcp_port,
-            xmlrpc_port=xmlrpc_port,
-            argv=argv,
-        )
-        starts.start_made(node)
-        return node
-
-    @tells_keywords
-    def run(
-        self,
-        package: str,
-        executable: str,
-        *args: object,
-        name: Optional[str] = None,
-        remap: Optional[Dict[str, str]] = None,
-        params: Optional[Dict[str, object]] = None,
-        on_line: Optional[Callable[[str], Any]] = None,
-    ) -> RosProcess:
-        """Start a ROS program at this master, as ``rosrun`` does; returns the :class:`RosProcess`.
-
-        :param args: its further arguments
-        :param name: the name of its node, for ``__name:=``
-        :param remap: ``{name: name}`` of remappings
-        :param params: ``{name: value}`` of private parameters, called 'rate' or '~rate', which keep
-            their types: with ``name``, they are set on the parameter server, else by the program
-        :param on_line: block called as ``on_line(text)`` for each line of its output, in a thread
-            of its own
-        :raises UnknownNodeError: if there is no such package or program
-        :raises TypeError, ValueError: if an argument, name or parameter cannot be one
-        """
-        return ros_process.run(self, package, executable, args, name, remap, params, on_line)
-
-    def launch(
-        self,
-        package: Optional[AnyPath],
-        file: Optional[AnyPath] = None,
-        on_line: Optional[Callable[[str], Any]] = None,
-        **args: object,
-    ) -> RosProcess:
-        """Start a launch file at this master, as ``roslaunch`` does; returns the
-        :class:`RosProcess`.
-
-        ``master.launch('my_robot', 'robot.launch')``, or by its path: ``master.launch(path)``.
-
-        :param package: a ROS package; None: ``file`` is a path
-        :param file: the name of the launch file in it; None: ``package`` is its path
-        :param args: the launch file's arguments
-        :param on_line: block called as ``on_line(text)`` for each line of its output, in a thread
-            of its own
-        :raises UnknownNodeError: if there is no such package or launch file
-        :raises TypeError, ValueError: if what is given can be none, or an argument is None
-        """
-        return ros_process.launch(self, package, file, args, on_line)
-
-    @tells_keywords
-    def load(
-        self,
-        package: AnyPath,
-        executable: Optional[str] = None,
-        *args: object,
-        name: Optional[str] = None,
-        namespace: Optional[str] = None,
-        remap: Optional[Dict[str, str]] = None,
-        params: Optional[Dict[str, object]] = None,
-        output: Optional[str] = None,
-    ) -> 'ScriptNode':
-        """Run a rospy program, unmodified, as a node of this process; returns the
-        :class:`~pharos.ScriptNode`.
-
-        It returns when the program's ``rospy.init_node`` has registered the node; see
-        :meth:`ScriptNode.start`.
-
-        :param package: where ``executable`` is, as ``rosrun`` looks it up; without that, the path
-            of the program
-        :param args: its further arguments
-        :param name: the name of its node, for ``__name:=``; None: the one that it gives to
-            ``init_node``
-        :param namespace: the namespace of its node, for ``__ns:=``
-        :param remap: ``{name: name}`` of remappings
-        :param params: as of :meth:`run`
-        :param output: 'screen': what it prints has the name of its node before each line; a path:
-            it goes to that file, but for its errors; None: it goes where this program prints
-        :raises UnknownNodeError: if there is no such package or program
-        :raises NodeNameInUseError: if another node has its name
-        :raises PharosError: if it is no Python program, or raised an exception before it was a node
-        """
-        node: 'ScriptNode' = on_demand.module('compose.script').load(
-            self,
-            package,
-            executable,
-            args,
-            name,
-            namespace,
-            remap,
-            params=params,
-            output=output,
-        )
-        return node
-
-    @tells_keywords
-    def compose(
-        self,
-        package: Optional[AnyPath],
-        file: Optional[AnyPath] = None,
-        *,
-        only: Collection[str] = (),
-        apart: Collection[str] = (),
-        share_connections: bool = False,
-        **args: object,
-    ) -> 'Composition':
-        """Start a launch file whose Python nodes all run in this process, unmodified; returns the
-        :class:`~pharos.Composition`.
-
-        What else is in it (C++, nodes of other machines, those with a launch-prefix) runs as
-        ``roslaunch`` starts it, in processes of their own. A node that cannot be started is told,
-        and the others go on.
-
-        :param package: a ROS package; None: ``file`` is a path
-        :param file: the name of the launch file in it; None: ``package`` is its path
-        :param only: the names of the nodes that are wanted; all, if there are none
-        :param apart: the names of Python nodes that are to have processes of their own
-        :param share_connections: the nodes share connections, as those of :class:`Master` with that
-        :param args: the launch file's arguments
-        :raises UnknownNodeError: if there is no such package, launch file, argument or node in it
-        :raises PharosError: if roslaunch cannot read the file
-        :raises MasterUnreachableError: if the master does not answer
-        """
-        composition: 'Composition' = on_demand.module('compose.composition').compose(
-            self, package, file, only, apart, share_connections, args
-        )
-        return composition
-
-    # -- what is there
-
-    def nodes(self) -> List[AnyNode]:
-        """All nodes: a Node where it runs in this process, an ExternalNode elsewhere."""
-        local = {node.name: node for node in self.local_nodes()}
-        names = {name for kind in self.system_state() for users in kind.values() for name in users}
-        local.update((node.name, node) for node in self.local_nodes())  # one may just have started
-        return [
-            local[name] if name in local else ExternalNode(self, name) for name in sorted(names)
-        ]
-
-    def node(self, name: str) -> AnyNode:
-        """The node of that name.
-
-        :raises UnknownNodeError: if the master knows none
-        """
-        name = self.name_of(name, 'node')
-        known = {node.name: node for node in self.nodes()}
-        if name not in known:
-            raise self._unknown(name, known)
-        return known[name]
-
-    def uri_of(self, name: str) -> str:
-        """The URI of the XML-RPC server of the node of that name.
-
-        :raises UnknownNodeError: if the master knows none
-        :raises ValueError: if it is no text
-        """
-        if not isinstance(name, str):
-            raise ValueError(f'a node name is a string, not {name!r}')
         try:
-            return str(self.call('lookupNode', name))
-        except rosgraph.MasterError:
-            raise self._unknown(name, [node.name for node in self.nodes()]) from None
+            code, _, value = getattr(ServerProxy(self.url), method)(caller_id, *args)
+        except UNREACHABLE as error:
+            raise MasterUnreachableError(
+                f'no ROS master answers at {self.url} ({error}): start roscore, or give the right URL'
+            ) from None
+        return value if code == 1 else None
 
-    def _unknown(self, name: str, known: Iterable[str]) -> UnknownNodeError:
-        return UnknownNodeError(
-            f'no node {name} at {self.url}{suggest(name, known)}: see rosnode list'
-        )
+    def is_reachable(self) -> bool:
+        """True if it answers."""
+        try:
+            return bool(self.pid)
+        except MasterUnreachableError:
+            return False
 
-    def wait_for_node(self, name: str, timeout: Optional[float] = None) -> AnyNode:
-        """Wait until a node of that name is there, which means registered and not dead; returns it.
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait until it answers, and return True.
 
-        :param timeout: seconds, None: without limit, 0: whether it is there now
-        :raises UnknownNodeError: if it does not come in time
-        :raises MasterUnreachableError: if the master has not answered in that time either
+        :param timeout: seconds, None: without limit
+        :raises MasterUnreachableError: if it does not answer in time
         """
-        name, timeout = self.name_of(name, 'node'), check_limit('timeout', timeout)
-        with time_limit(timeout):
-            node: Optional[AnyNode] = self.look_until_found(
-                lambda: self.live_node(name), timeout, name
-            )
-        if node is None:  # there was no time to look
-            with time_limit(MARGIN):
-                node = self.live_node(name)
-        if node is None:
-            self.call('getPid', timeout=MARGIN)
-            raise UnknownNodeError(
-                f'no node {name} came to {self.url} within {timeout:g} s: is it started, with that'
-                ' master, and under that name?'
-            )
-        return node
-
-    def live_node(self, name: str) -> Optional[AnyNode]:
-        """The node of that name, if it is there; one that only starts, has died or is unknown is
-        not: None."""
-        for node in self.local_nodes():
-            if node.name == name:
-                return node if node.is_running and node.uri else None
-        return ExternalNode(self, name) if self.is_node_alive(name, or_busy=True) else None
-
-    def on_change(self, block: Callable[[str, str, bool], Any]) -> Callable[[], None]:
-        """Run ``block(kind, name, is_there)`` for each node, topic and service that comes or goes.
-
-        ``kind`` is 'node', 'topic' or 'service'. It runs in the thread that watches the master,
-        within a second, and may raise: that ends nothing. Returns a function that ends it. What is
-        there by now has not come; a master that is away is taken for one that has nothing yet.
-        """
-        if block is None:
-            raise TypeError('on_change needs a block to run, called as block(kind, name, is_there)')
-        return watcher_of(self).listen(check_block(block, 'block', ('kind', 'name', 'is_there')))
+        return bool(_wait_for(self.call, timeout, 'getPid'))
 
     @property
-    def parameters(self) -> Parameters:
-        """The parameter server as a mapping: ``master.parameters['/rosdistro']``."""
-        return Parameters(self)
+    def pid(self) -> int:
+        """The number of its process, on its host."""
+        return self.call('getPid')
 
-    def local_nodes(self) -> List[Node]:
-        """The nodes of this process at this master."""
-        return [node for node in node_registry.nodes() if node.master == self]
+    def system_state(self) -> tuple[dict[str, list[str]], ...]:
+        """Return ``(publishers, subscribers, services)``, each ``{name: [node names]}``."""
+        return tuple(map(dict, self.call('getSystemState')))
 
-    def topics(self) -> List[Topic]:
-        """All topics that somebody publishes on or is interested in."""
+    def topic_type(self, name: str) -> str | None:
+        """Return the type of a topic, None if the master knows none."""
+        return dict(self.call('getTopicTypes')).get(name)
+
+    def topics(self) -> list[Topic]:
+        """Return all topics."""
         publishers, subscribers, _ = self.system_state()
-        return [Topic(self, name) for name in sorted({*publishers, *subscribers})]
+        return [Topic(self, name) for name in sorted({**publishers, **subscribers})]
 
     def topic(self, name: str) -> Topic:
-        """The topic of that name, whether anybody uses it yet or not."""
-        return Topic(self, self.name_of(name, 'topic'))
+        """Return the topic of that name, which need not exist yet."""
+        return Topic(self, full_name(name))
+
+    # -- nodes
+
+    def create(
+        self,
+        node_class: type[Node],
+        named: str,
+        domain: str | None = None,
+        tcp_port: int = 0,
+        xmlrpc_port: int = 0,
+        soul: Block | None = None,
+        delegate: Block | None = None,
+        argv: Sequence[str] | None = None,
+        **kwargs: Any,
+    ) -> Any:
+        """Create a node, register and start it, and return it.
+
+        The report: ``master create: Driver named: '/driver' domain: '127.0.0.1' tcpPort: 8080
+        xmlRpcPort: 8081``.
+
+        :param named: its name, perhaps with a namespace: '/robot1/driver'
+        :param domain: the address that it advertises; if it is loopback, the only one that it
+            listens on; default: what ROS_HOSTNAME, ROS_IP or the host say
+        :param tcp_port: 0: any free one, as ``xmlrpc_port``
+        :param argv: ROS's remappings and private parameters; a script passes ``sys.argv``
+        :param kwargs: what the ``__init__`` of the class takes
+        :raises NodeNameInUseError, PortInUseError, MasterUnreachableError: and nothing is left
+        """
+        if not (isinstance(node_class, type) and issubclass(node_class, Node)):
+            raise TypeError(f'a node is made of a subclass of Node, not {node_class!r}')
+        if not (domain is None or isinstance(domain, str) and re.fullmatch(r'[\w.:-]+', domain)):
+            raise ValueError(f'{domain!r} cannot be an address: give one such as 127.0.0.1')
+        for port in tcp_port, xmlrpc_port:
+            if not (isinstance(port, int) and 0 <= port < 65536):
+                raise ValueError(f'{port!r} cannot be a port: give 0 to 65535')
+        mappings = [arg for arg in argv or () if rosgraph.names.is_legal_remap(arg)]
+        node = node_class.__new__(node_class)
+        name = self._full_name(node, node_name(named), tuple(mappings))
+        mappings = [arg for arg in mappings if not arg.startswith(('__name:=', '__ns:='))]
+        node._configure(self, name, soul, delegate, domain, (tcp_port, xmlrpc_port), mappings)
+        node.__init__(**kwargs)  # type: ignore[misc]
+        try:
+            node.start()
+        except BaseException:
+            node.end_now()
+            raise
+        return node
+
+    def _full_name(self, node, name, mappings):
+        """Return the full name of a new node; of those with equal mappings, one has ``__name``."""
+        given = dict(arg.split(':=', 1) for arg in mappings)
+        first = _first_with.get(mappings)
+        if '__name' in given and not (first and first.is_running and first.master == self):
+            _first_with[mappings] = node
+            name = name[: name.rfind('/') + 1] + node_name(given['__name'])
+        if '__ns' in given and name.startswith('/'):
+            name = name[name.rfind('/') + 1 :]
+        outer = given.get('__ns') or os.environ.get('ROS_NAMESPACE', '/')
+        return rosgraph.names.ns_join(rosgraph.names.make_global_ns(outer), name)
+
+    def own_nodes(self) -> list[Node]:
+        """Return the nodes of this process that run at this master, or start or stop."""
+        return [node for node in program.nodes if node.master == self]
+
+    def nodes(self) -> list[Node | ExternalNode]:
+        """Return all nodes, of this process and others."""
+        names = {name for kind in self.system_state() for users in kind.values() for name in users}
+        found = []
+        for name in sorted(names):
+            with contextlib.suppress(UnknownNodeError):  # it has gone meanwhile
+                found.append(self.node(name))
+        return found
+
+    def node(self, name: str) -> Node | ExternalNode:
+        """Return the node of that name.
+
+        :raises UnknownNodeError: if there is none
+        """
+        name = full_name(node_name(name))
+        for node in self.own_nodes():
+            if node.name == name:
+                return node
+        external = ExternalNode(self, name)
+        external.uri  # raises if there is none
+        return external
+
+    def may_live(self, name: str) -> bool:
+        """False if the node of that name refuses connections, or is not registered."""
+        uri = self.call('lookupNode', name)
+        parts = urllib.parse.urlsplit(uri or '')
+        try:
+            socket.create_connection((parts.hostname, parts.port or 0), 0.5).close()
+        except ConnectionRefusedError:
+            return False
+        except OSError:
+            pass
+        return bool(uri)
+
+    def wait_for_node(self, name: str, timeout: float | None = None) -> Node | ExternalNode:
+        """Wait until a node of that name is there, and return it.
+
+        :raises UnknownNodeError: if it does not come in time
+        """
+        return _wait_for(self.node, timeout, name)
+
+    # -- services
+
+    def services(self) -> list[str]:
+        """Return the names of all services."""
+        return sorted(self.system_state()[2])
+
+    def lookup_service(self, name: str, caller_id: str = CALLER_ID) -> Service:
+        """Return the service of that name, to be called.
+
+        The report: ``master lookupService: '/clear' with: '/myID'``.
+
+        :raises UnknownServiceError: if nobody offers it
+        """
+        return Service(self, full_name(name), caller_id)
+
+    def wait_for_service(
+        self, name: str, timeout: float | None = None, caller_id: str = CALLER_ID
+    ) -> Service:
+        """Wait until a service is offered, and return it.
+
+        :raises UnknownServiceError: if it is not in time
+        """
+        return _wait_for(self.lookup_service, timeout, name, caller_id)
+
+    # -- programs
+
+    def run(self, package: str, executable: str, *args: Any, on_line: Any = None) -> RosProcess:
+        """Run a program of ROS at this master, as rosrun does.
+
+        :param on_line: ``on_line(text)`` is called for each line that it prints
+        """
+        path = find_program(package, executable)
+        return RosProcess([path, *map(str, args)], self.url, on_line)
+
+    def launch(
+        self, package: str | None, file: str, on_line: Any = None, **args: Any
+    ) -> RosProcess:
+        """Run a launch file at this master, as roslaunch does; ``package`` None: it is a path."""
+        path = find_launch_file(package, file)
+        arguments = [f'{name}:={value}' for name, value in args.items()]
+        roslaunch = [sys.executable, '-c', 'import roslaunch; roslaunch.main()', '--skip-log-check']
+        return RosProcess([*roslaunch, path, *arguments], self.url, on_line)
+
+    def load(
+        self,
+        package: str,
+        executable: str | None = None,
+        *args: Any,
+        name: str | None = None,
+        namespace: str | None = None,
+        remap: dict[str, str] | None = None,
+        params: dict[str, Any] | None = None,
+    ) -> Any:
+        """Run a program of rospy, unmodified, as a node of this process: a :class:`ScriptNode`.
+
+        :param package: without ``executable``, the path of the program
+        :param args: its arguments
+        :param name: default: the one that it gives to ``init_node``
+        :raises UnknownNodeError: if there is no such program
+        :raises PharosError: if it cannot run here, or failed before it was a node
+        """
+        from pharos.compose.script import load
+
+        return load(self, package, executable, args, name, namespace, remap, params)
+
+    def compose(
+        self,
+        package: str | None,
+        file: str,
+        *,
+        only: Sequence[str] = (),
+        apart: Sequence[str] = (),
+        share_connections: bool = False,
+        **args: Any,
+    ) -> Any:
+        """Run the Python nodes of a launch file in this process: a :class:`Composition`.
+
+        The rest (C++, other machines, with a launch-prefix or cwd) runs as roslaunch starts it.
+
+        :param package: None: ``file`` is a path
+        :param only: the names of the nodes that are wanted; none: all
+        :param apart: the names of nodes that are to run in processes of their own
+        :param args: the arguments of the launch file
+        :raises UnknownNodeError: if there is no such file, argument or node
+        :raises PharosError: if roslaunch cannot read it
+        """
+        from pharos.compose.composition import Composition
+        from pharos.compose.launch_file import LaunchFile
+
+        launch_file = LaunchFile(self.url, package, file, args, only, apart)
+        composition = Composition(Master(self.url, share_connections or self.share_connections))
+        composition.launch(launch_file)
+        return composition
+
+    def graph(self, seconds: float = 0) -> Any:
+        """Return the :class:`Graph` of all nodes and topics, with rates if it looks for a while."""
+        from pharos.live.graph import graph_of
+
+        return graph_of(self, seconds)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Master) and self.url == other.url
+
+    def __hash__(self) -> int:
+        return hash(self.url)
 
     def __repr__(self) -> str:
         return f'<Master {self.url}>'
+
+
+def _wait_for(find, timeout, *args):
+    """Return ``find(*args)``, tried again while it raises errors of ours."""
+
+    def attempt():
+        with contextlib.suppress(PharosError):
+            return find(*args)
+
+    return program.wait(attempt, timeout) or find(*args)

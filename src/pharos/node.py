@@ -1,291 +1,653 @@
 """Nodes: real ROS nodes of this process, written with blocks."""
-from typing import TYPE_CHECKING, Any, Callable, Optional, TypeVar, Union
+from __future__ import annotations
 
-from pharos import node_registry, on_demand
-from pharos.becoming import become
-from pharos.counts import counted
-from pharos.health import Health, health_of
-from pharos.node_topics import NodeWithTopics
-from pharos.offered_service import OfferedService
+import collections
+import contextlib
+import enum
+import threading
+import types
+from typing import TYPE_CHECKING, Any, Callable, Iterator
+
+import genpy
+import rosgraph.names
+import rospy
+
+from pharos import messages, program
+from pharos.blocks import Block, name_of, rebound, taking
+from pharos.channels import QUEUE_SIZE, Channel, InputChannel, OutputChannel
+from pharos.errors import (
+    MasterUnreachableError,
+    MessageTypeError,
+    NodeStoppedError,
+    PharosError,
+    UnknownTopicError,
+)
+from pharos.failures import Failures
+from pharos.names import legal_name, node_name
 from pharos.parameter import Parameter
-from pharos.restarts import restart
-from pharos.run import Run
-from pharos.seconds import check_seconds
-from pharos.service import Service
-from pharos.starts import of_one_run
-from pharos.wrong_guesses import names_its_methods, tells_keywords
+from pharos.private_rospy.run import Run
+from pharos.service import OfferedService, Service
+from pharos.transcript import Transcript
+
+if TYPE_CHECKING:
+    from pharos.master import Master
+
+_LEVELS = {'warn': 'warning', 'err': 'error', 'fatal': 'critical'}
 
 
-Self = TypeVar('Self', bound='Node')
+class Lifecycle(enum.Enum):
+    """The states of a node; see :attr:`Node.lifecycle`."""
+
+    NEW = 'new'
+    STARTING = 'starting'
+    RUNNING = 'running'
+    STOPPING = 'stopping'
+    STOPPED = 'stopped'
 
 
-@names_its_methods
-class Node(NodeWithTopics, is_base=True):
-    """A ROS node of this process: made by :meth:`Master.create`, subclassed to override
-    :meth:`start` and :meth:`stop`.
+class Node:
+    """A ROS node of this process, made by :meth:`Master.create`.
 
-    The report (listing 3.1), a subclass of PhaROSNode, is in Python::
+    The report: a subclass of PhaROSNode. A class of your own overrides :meth:`start` and
+    :meth:`stop`, and calls ``super()``::
 
-        class TurtleDriver(Node):
+        class Driver(Node):
             def start(self):
                 super().start()
-                self.fork(TurtleDriver.publishing_loop)
+                self.interested_in('/pose', 'turtlesim/Pose', delegate=self.on_pose)
 
-    A node is configured before its ``__init__`` runs, which gets only the further keywords of
-    ``create``.
+            def on_pose(self, pose):
+                self.send_to('/cmd_vel', typed_as='turtlesim/Velocity', linear=1.0)
 
-    :ivar name: its name, as the master knows it: '/robot1/driver'
-    :ivar master: the :class:`Master` that created it
-    :ivar is_running: whether it is started, and no stop has begun; :attr:`lifecycle` says more
-    :ivar soul: the block that says what it does, called as ``soul(node)``; may be set
-    :ivar delegate: the block run for each message, called as ``delegate(message, channel)``; may be
-        set
-    :ivar channels: the channels that it has open
-    :ivar errors: the exceptions that its blocks raised, the newest last
-    :ivar failures: a :class:`Failure` for each of these: block, message, count, ``retry()`` ...
-    :ivar ros: its own rospy, whole
-    :ivar uri: the URI of its XML-RPC server
-    :ivar domain: the address that it advertises
-    :ivar tcp_port: its TCPROS port
-    :ivar xmlrpc_port: its XML-RPC port
-    :ivar connect_timeout: seconds that a topic's first message waits for subscribers; may be set
-    :ivar stop_timeout: seconds that a stop waits for souls and messages; may be set
-    :ivar queue_bytes: bytes of messages that wait for a slow receiver; may be set
-    :ivar allow_remote_shutdown: whether any host may stop it, not only this one and the master's;
-        may be set
-    :ivar latest_run: what its present start, or the last one, has made; None before the first
+    All methods may be called from any thread. A node's delegates run one at a time.
+
+    :ivar name: the full name, as the master knows it: '/robot1/driver'
+    :ivar master: its :class:`Master`
+    :ivar soul: the block that says what the node does, called as ``soul(node)``, or None
+    :ivar lifecycle: its state, a :class:`Lifecycle`
+    :ivar uri: the URI of its XML-RPC server, None before the first start
+    :ivar domain: the address that it advertises; likewise, unless it was given
+    :ivar tcp_port: the TCPROS port; the one asked for, before the first start
+    :ivar xmlrpc_port: the XML-RPC port, likewise
+    :ivar failures: for each of :attr:`errors` a :class:`Failure`: what failed, on what, how often
     """
 
-    #: whether its class has a start() of its own, which opens and forks all that the node has
-    _starts_itself = False
-    #: what starts and stops in its own way
-    _kind = 'a node'
+    #: seconds that a start waits for the master, and a topic's first message for subscribers
+    connect_timeout = 2.0
+    #: seconds that a stop waits for souls, and as long for messages under way
+    stop_timeout = 2.0
+    #: seconds that a client may be silent before it is closed
+    client_timeout = 5.0
+    #: bytes of messages that wait for a slow receiver, or one message
+    queue_bytes = 64 << 20
+    #: True if any host may end the node by ROS's shutdown call, not only this one and the master's
+    allow_remote_shutdown = False
 
-    if TYPE_CHECKING:
+    lifecycle = Lifecycle.NEW
+    master: Master
+    run: Run
 
-        def __init__(self) -> None:
-            ...
+    def __init__(self) -> None:
+        """Take nothing; a class of your own may take what :meth:`Master.create` passes on."""
 
-    else:
-
-        def __init__(self, *args, **kwargs):
-            if args or kwargs:
-                given = [*map(repr, args), *(f'{name}={kwargs[name]!r}' for name in kwargs)]
-                raise TypeError(
-                    f'Node.__init__ takes nothing, and got {", ".join(given)}: a name, soul and so'
-                    ' on are given to create(), and what else is, to the __init__ of a class of'
-                    f' your own, which calls super().__init__(); see help(Master.create)'
-                )
-
-    def __init_subclass__(cls, **kwargs: Any) -> None:
-        super().__init_subclass__(**kwargs)
-        cls._starts_itself = cls.start is not Node.start
-        if 'start' in vars(cls):
-            cls.start = of_one_run(cls.start)  # type: ignore[assignment]
-        cls.stop = node_registry.one_stop_at_a_time(cls.stop)  # type: ignore[assignment]
+    def _configure(self, master, name, soul, delegate, domain, ports, remappings):
+        taking(soul, 'soul', 1, 0)
+        self.master, self.name = master, name
+        self.soul, self.delegate, self.remappings = soul, delegate, remappings
+        self.uri, self.domain = None, domain
+        self.tcp_port, self.xmlrpc_port = ports
+        self.failures = Failures(self._tell_failure)
+        self._life = threading.RLock()  # held by a start, stop or restart
+        self._opening = threading.RLock()  # of two threads that send first, one opens the channel
+        self.opened = []  # channels, services and parameters, also while it is stopped
+        self._senders = {}  # (topic, type) as given to send_to
+        self.souls = {}
 
     # -- life
 
     def start(self) -> None:
-        """Register with the master. A subclass overrides this, calls ``super().start()``, then
-        makes its channels.
+        """Register with the master.
 
-        Runs in the thread that creates the node. A stopped node starts again, under the same name
-        and ports. Where a class has no ``start`` of its own, the channels, services and parameters
-        that it had come back too, also where a start in between was interrupted.
+        A stopped node starts again, under the same name and ports. Its channels, services and
+        parameters come back, unless its class has a start() of its own, which opens them.
 
-        :raises PharosError: if the node is running already
-        :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: and the node is then as
-            it was
-        :raises NodeStoppedError: if :meth:`stop` was called meanwhile, and the node is then as it
-            was
+        :raises PharosError: if the node runs already
+        :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: and nothing is left
         """
-        Run(self, self._settings).start(reopens=not self._starts_itself)
+        with self._life:
+            if self.lifecycle not in (Lifecycle.NEW, Lifecycle.STOPPED):
+                raise PharosError(f'{self.name} is {self.lifecycle.value} already')
+            self.failures, self.souls = Failures(self._tell_failure), {}
+            self.lifecycle, self.run = Lifecycle.STARTING, Run(self)
+            program.nodes.append(self)
+            try:
+                self.run.start()
+                self.lifecycle = Lifecycle.RUNNING
+            except BaseException:
+                self.run.stop(0)
+                self.lifecycle = Lifecycle.STOPPED
+                program.nodes.remove(self)
+                raise
+            opened, self.opened = self.opened, []
+            try:
+                for each in () if self._opens_itself else opened:
+                    each.open()
+            except Exception:
+                self.stop()
+                self.opened = opened
+                raise
 
-    @node_registry.one_stop_at_a_time
+    @property
+    def _opens_itself(self):
+        return type(self).start is not Node.start
+
     def stop(self) -> None:
-        """End the souls, send what is under way, unregister, close the ports, end the threads.
+        """End the souls, send what is under way, unregister, free ports and threads.
 
-        A subclass overrides this and calls ``super().stop()``. It runs once for each start, to its
-        end, in the thread that was the first to ask for it: the program (here, a signal, its end)
-        or ROS (``rosnode kill``). Who asks meanwhile, from any thread, waits until it has ended, as
-        does the end of the program, but only until 30 s after its beginning. Called in a thread of
-        the node's own, it does not wait for what that thread runs. A node that is still starting is
-        stopped, too: its start raises NodeStoppedError.
+        Does nothing if the node is stopped. Waits up to :attr:`stop_timeout` for souls, and as long
+        for messages under way; what goes on then is left behind, and named in the log.
         """
-        self.current_run.end()
+        if self._is_stopped_here():
+            return
+        with self._life:
+            if self.is_running:
+                self.lifecycle = Lifecycle.STOPPING
+                self.run.stop(self.stop_timeout)
+                for each in self.opened:
+                    each.node_stopped()
+                self._senders, self.lifecycle = {}, Lifecycle.STOPPED
+                program.nodes.remove(self)
+
+    def _is_stopped_here(self):
+        """True if a thread of the node asks, and another one stops it, which waits for this one."""
+        return self.lifecycle is Lifecycle.STOPPING and (
+            threading.current_thread() in self.run.threads
+            or self.run.turns.runner == threading.get_ident()
+        )
+
+    def end_now(self) -> None:
+        """Stop the node, whatever the stop() of its class raises; two threads may ask for it."""
+        if self._is_stopped_here():
+            return
+        with self._life:
+            try:
+                if self.is_running:
+                    self.stop()
+            except Exception as error:
+                self.report(error, self.stop, 'method')
+            finally:
+                Node.stop(self)
 
     def restart(self) -> None:
-        """Stop the node and start it again, under its name and ports; returns when it runs.
+        """Stop the node and start it again, under its name and ports, with its channels and souls.
 
-        What it had comes back as after :meth:`start`, and the souls that were forked and had not
-        ended run from their beginnings, each by the block and name that :meth:`fork` got; what a
-        ``start()`` of the class's own forks, that forks again. A node that has stopped starts, with
-        the souls that its stop has ended. Of several threads that ask at once, one does it, and the
-        others wait.
+        Souls that were forked and had not ended run again from their first lines.
 
-        It may be called in a block of the node: a soul is ended by it; a delegate, or the block of
-        a service or parameter, goes on to its end, but no connection of the former run carries what
-        it answers.
-
-        :raises MasterUnreachableError: if the master does not answer, and the node then runs on; or
-            if it has gone since, and the node is then stopped
-        :raises NodeStoppedError: if another thread stops the node meanwhile, or all nodes are
-        :raises NodeNameInUseError, PortInUseError: and the node is then stopped
+        :raises MasterUnreachableError: if the master does not answer, and the node runs on
         """
-        restart(self, forks_itself=self._starts_itself)
+        with self._life:
+            self.master.call('getPid')
+            souls = {soul: block for soul, block in self.souls.items() if soul.is_alive()}
+            program.nodes.append(self)  # spin() waits for it meanwhile
+            try:
+                self.stop()
+                self.start()
+            finally:
+                program.nodes.remove(self)
+            for soul, block in {} if self._opens_itself else souls.items():
+                self.fork(block, soul.name)
 
-    def become(self, node_class: type) -> None:
-        """Be a node of another class from now on, such as the one that a reload of its module has
-        made of its own: its behaviour changes, its name, ports, connections, queues, counts and
-        attributes stay::
+    def become(self, node_class: type[Node]) -> None:
+        """Be a node of another class from now on; name, ports, connections and attributes stay.
 
-            importlib.reload(turtles)
-            driver.become(turtles.TurtleDriver)
+        It happens between two delegates. Blocks that are methods of the node are looked up anew.
+        Neither ``__init__`` nor ``start`` of the new class runs.
 
-        It happens when no delegate of the node runs, for which this waits: no message is lost, or
-        comes twice. What are methods of the present class become those of the same names: the
-        soul, delegates, blocks of services and parameters, and souls that are forked, which begin
-        anew at their next turn of :meth:`every` (see :meth:`renew`). What runs goes on to its end
-        as it was. What others were given, such as rospy's Timer, stays as it is.
-
-        IPython's ``%autoreload 2`` does the same by itself when a module was edited, but for souls
-        that loop, which :meth:`renew` has begin anew.
-
-        Neither ``__init__`` nor ``start`` of the new class runs: attributes that only it has are to
-        be set before, or have their values in the class.
-
-        :raises PharosError: if the new class lacks one of those methods; or if this waits in a
-            delegate of another node, and one of this node's waits for that delegate; nothing has
-            changed then, nor after the others
-        :raises TypeError: if it is no subclass of Node, one of scripts (where this is none, or the
-            other way round), has other ``__slots__``, or a method that cannot be called as the
-            former
+        :raises TypeError: if it is no subclass of Node
         """
         if not (isinstance(node_class, type) and issubclass(node_class, Node)):
-            raise TypeError(
-                f'{self.name} becomes a node of another subclass of Node, not {node_class!r}'
-            )
-        if node_class._kind != self._kind:
-            raise TypeError(
-                f'{self.name} is {self._kind}, and {node_class.__name__} is the class of'
-                f' {node_class._kind}, which starts in another way: create() one'
-            )
-        become(self, node_class)
+            raise TypeError(f'{self.name} can become a subclass of Node, not {node_class!r}')
+        self.check_running()
+        self.run.turns.call(lambda: self._become(node_class))
 
-    def __enter__(self: Self) -> Self:
+    def _become(self, node_class):
+        before, self.__class__ = self.__class__, node_class
+        try:
+            blocks = [rebound(each.delegate, self) for each in (self, *self.opened)]
+            self.soul = rebound(self.soul, self)
+        except AttributeError as error:
+            self.__class__ = before
+            raise PharosError(f'{node_class.__name__} lacks a method in use: {error}') from error
+        for each, block in zip((self, *self.opened), blocks):
+            each.delegate = block
+
+    def abandon(self) -> None:
+        """Be stopped in a forked child: the node runs in the parent."""
+        self.lifecycle = Lifecycle.STOPPED
+        for each in self.opened:
+            each.closed = True
+
+    def __enter__(self):
         return self
 
     def __exit__(self, *error: Any) -> None:
         self.stop()
 
-    # -- services, parameters, log
+    def check_running(self) -> None:
+        """Raise NodeStoppedError if the node has not started, or has stopped."""
+        if self.lifecycle not in (Lifecycle.RUNNING, Lifecycle.STOPPING):
+            raise NodeStoppedError(
+                f'{self.name} is {self.lifecycle.value}: start() it, by super() in a class of your own'
+            )
 
-    @tells_keywords
-    def serve(
-        self,
-        name: str,
-        typed_as: Union[str, type],
-        block: Callable[[Any], Any],
-        only_nearby: bool = False,
-    ) -> OfferedService:
-        """Offer a service; returns a handle with ``close()``.
+    @property
+    def is_running(self) -> bool:
+        """True if the node is started and no stop has begun."""
+        return self.lifecycle is Lifecycle.RUNNING
 
-        ``block(request)`` runs in a thread of the caller's connection and returns a response, a
-        dict, tuple or list of its fields, or its only field. An exception in it goes to the caller,
-        and is reported as a delegate's.
-
-        :param typed_as: service type name, such as 'std_srvs/Empty', or class
-        :param only_nearby: answer only calls from this host and the master's
-        :raises MasterUnreachableError: if the master does not answer; nothing is left behind then
-        """
-        name = self.current_run.resolve(name, 'service')
-        return OfferedService(self, name, typed_as, block, only_nearby)
-
-    @tells_keywords
-    def lookup_service(
-        self, name: str, persistent: bool = False, wait: Optional[float] = 0
-    ) -> Service:
-        """The :class:`Service` of that name, to be called in the name of this node.
-
-        Its name is resolved as the node's other names are: in its namespace, remapped, '~reset' for
-        one of its own. All else is as in :meth:`Master.lookup_service`, which knows full names
-        alone.
-        """
-        name = self.current_run.resolve(name, 'service')
-        return self.master.lookup_service(name, self.name, persistent, wait)
-
-    @tells_keywords
-    def wait_for_service(self, name: str, timeout: Optional[float] = None) -> Service:
-        """Wait until a service of that name, resolved as in :meth:`lookup_service`, is offered, and
-        return it; see :meth:`Master.wait_for_service`."""
-        name = self.current_run.resolve(name, 'service')
-        return self.master.wait_for_service(name, timeout, self.name)
-
-    @tells_keywords
-    def parameter(self, name: str, initialized: Any = None) -> Parameter:
-        """The :class:`Parameter` of that name ('~rate' is private); set to ``initialized`` where it
-        has no value."""
-        return Parameter(self, self.current_run.resolve(name, 'parameter'), initialized)
-
-    # -- what rospy offers beyond
+    @property
+    def channels(self) -> list[Channel]:
+        """The channels that are open."""
+        return [each for each in self.opened if isinstance(each, Channel) and not each.closed]
 
     @property
     def ros(self) -> Any:
-        """The node's own rospy, whole: ``node.ros.Timer``, ``node.ros.Time.now()``. It is for this
-        run of the node."""
-        return self.current_run.rospy.module
+        """The node's own rospy, whole: ``node.ros.Timer``, ``node.ros.Time.now()``.
+
+        It belongs to this run of the node.
+        """
+        self.check_running()
+        return self.run.ros
 
     def ros_import(self, name: str) -> Any:
-        """A library written on rospy ('actionlib', 'message_filters', 'tf2_ros'), bound to this run
-        of the node."""
-        if not (isinstance(name, str) and all(map(str.isidentifier, name.split('.')))):
-            raise TypeError(f"a library is given by its name, such as 'actionlib', not as {name!r}")
-        return self.current_run.rospy.import_library(name)
+        """Return a library written on rospy, such as 'actionlib', bound to this run of the node."""
+        self.check_running()
+        return self.run.modules.load(name)
 
-    @property
-    def uri(self) -> Optional[str]:
-        """The URI of the node's XML-RPC server, None before the first start."""
-        return self.latest_run.rospy.uri if self.latest_run else None
+    def health(self) -> types.SimpleNamespace:
+        """Return how the node is doing; asks the master.
 
-    @property
-    def domain(self) -> Optional[str]:
-        """The address that the node advertises, None before the first start."""
-        return self.latest_run.rospy.domain if self.latest_run else None
-
-    def health(self) -> Health:
-        """How the node is doing: ``registered, reachable_since, connections, dropped, errors,
-        threads``, a named tuple.
-
-        Asks the master, for up to 5 s; ``str()`` of it is one line, which ``repr(node)`` shows too.
+        :returns: an object with ``registered`` (True if the master has the node at its URI, None if
+            the master does not answer), ``connections`` ({transport: how many}), ``dropped`` (how
+            many messages), ``errors`` (how often blocks failed), ``threads``, ``souls`` (how many
+            run in threads of their own), ``ended_souls`` (names of those that were forked)
         """
-        return health_of(self, ask=True)
+        impls = [*self.run.topics.pubs.values(), *self.run.topics.subs.values()]
+        kinds = [each.transport_type for impl in impls for each in impl.connections]
+        ended = [soul.name for soul in self.souls if not soul.is_alive()]
+        registered = None
+        with contextlib.suppress(MasterUnreachableError):
+            registered = self.master.call('lookupNode', self.name) == self.uri
+        return types.SimpleNamespace(
+            registered=registered,
+            connections=dict(collections.Counter(kinds)),
+            dropped=sum(getattr(channel, 'dropped', 0) for channel in self.channels),
+            errors=self.failures.total,
+            threads=sum(thread.is_alive() for thread in list(self.run.threads)),
+            souls=len(self.souls) - len(ended),
+            ended_souls=ended,
+        )
+
+    def told(self) -> dict[str, Any]:
+        """Return what top and graph ask for, by XML-RPC."""
+        dropped = {each.topic: each.dropped for each in self.channels if hasattr(each, 'dropped')}
+        kind, failures = type(self).__name__, self.failures.total
+        return {'class': kind, 'failures': failures, 'dropped': dropped}
 
     def describe(self, seconds: float = 1.0) -> str:
-        """The node in words: where it runs, its souls, topics with type, rate, counts and peers,
-        services, parameters and failures. A master that hangs is waited for, for its time limit.
+        """Return what it publishes, receives and offers, to whom and how often, as text."""
+        from pharos.live.words import describe
 
-        :param seconds: for which messages are counted, for the rates; 0: no rates are told
-        """
-        seconds = check_seconds('seconds', seconds, least=0)
-        text: str = on_demand.module('live.description').describe(self, seconds)
-        return text
+        return describe(self, seconds)
 
     def __repr__(self) -> str:
-        health = f': {health_of(self, ask=False)}' if self.is_running else ''
-        return f'<{type(self).__name__} {self.name} {self.lifecycle.value}{self._size()}{health}>'
+        return f'<{type(self).__name__} {self.name} {self.lifecycle.value}>'
 
-    def _size(self) -> str:
-        return f', {counted(len(self.channels), "channel")}'
+    # -- souls
+
+    @property
+    def delegate(self) -> Block | None:
+        """The block run for each message, as ``block(message, channel)`` or ``block(message)``.
+
+        The report: ``self receiverDelegate: [:message :channel | ...]``.
+        """
+        return self._delegate
+
+    @delegate.setter
+    def delegate(self, block: Block | None) -> None:
+        self.delegate_runs = taking(block, 'delegate', 2, 1)
+        self._delegate = block
+
+    def execute(self) -> Any:
+        """Run the soul once, in the calling thread, and return its value.
+
+        The report (listing 3.7): ``node execute``. What the soul raises goes to :attr:`failures`.
+        """
+        return self._run_soul(self._soul_or(None))
+
+    def fork(self, block: Block | None = None, name: str | None = None) -> threading.Thread:
+        """Run the soul, or ``block(node)``, in a thread of its own, and return the thread.
+
+        The report (listing 3.8): ``[node execute] fork``. :meth:`stop` ends it at its next
+        :meth:`sleep` or turn of :meth:`every`.
+        """
+        runs = self._soul_or(block)
+        soul = self.run.Thread(target=self._run_soul, args=[runs], name=name or name_of(runs))
+        self.souls[soul] = block
+        soul.start()
+        return soul
+
+    def _soul_or(self, block):
+        self.check_running()
+        if taking(block or self.soul, 'soul', 1, 0) is None:
+            raise PharosError(f'{self.name} has no soul to run: give it one, node.soul = block')
+        return block or self.soul
+
+    def _run_soul(self, block):
+        before, program.here.node = program.here.node, self
+        try:
+            return taking(block, 'soul', 1, 0)(self)
+        except BaseException as error:
+            is_stop = isinstance(error, (NodeStoppedError, rospy.ROSInterruptException))
+            if self.is_running or not is_stop:
+                self.report(error, block, 'soul', again=lambda nothing: self._run_soul(self.soul))
+        finally:
+            program.here.node = before
+        return None
+
+    def sleep(self, seconds: float) -> None:
+        """Sleep for some seconds of ROS time; the stop of the node ends it, and its soul.
+
+        The report: ``(Delay forSeconds: 1) wait``.
+        """
+        self._sleep(lambda: self.ros.sleep(seconds))
+        if not self.is_running and program.here.node is self:
+            raise NodeStoppedError(f'{self.name} stops, and this soul with it')
+
+    def every(self, seconds: float) -> Iterator[int]:
+        """Return an iterator that turns every so many seconds of ROS time, until the node stops.
+
+        It counts its turns. A turn that takes longer delays the next.
+
+        :raises ValueError: if ``seconds`` is not above 0
+        """
+        if not seconds > 0:
+            raise ValueError(f'a period is a number of seconds above 0, not {seconds!r}')
+        rate, stopping = self.ros.Rate(1 / seconds, reset=True), self.run.stopping
+
+        def turns():
+            turn = 0
+            while not stopping.is_set():
+                yield turn
+                turn += 1
+                self._sleep(rate.sleep)
+
+        return turns()
+
+    def _sleep(self, sleep):
+        with program.quiet_wait(), contextlib.suppress(rospy.ROSInterruptException):
+            sleep()
+
+    # -- failures
+
+    @property
+    def errors(self) -> list[BaseException]:
+        """What blocks raised in this run of the node, the newest last; 100 kinds at most."""
+        return [failure.error for failure in self.failures]
+
+    def report(self, error, block, what: str, message=None, channel=None, again=None) -> None:
+        """Keep and tell what a block raised. Ctrl-C in the main thread goes on.
+
+        :param what: 'soul', 'delegate' and so on
+        """
+        if isinstance(error, (KeyboardInterrupt, SystemExit)) and program.is_signalled():
+            raise error
+        where = f'{what} {name_of(block)} of {self.name}'
+        where += f' on {channel.topic}' if channel else ''
+        self.failures.report(error, block, where, message, channel, again)
+
+    def _tell_failure(self, line, details):
+        try:
+            self.log(f'{line}\n{details}', 'error')
+        finally:
+            Transcript.show(line)
+
+    def refused(self, topic: str, reason: str) -> None:
+        """Take note that a publisher sends another type."""
+        error = MessageTypeError(f'{self.name} does not receive from {topic}: {reason}')
+        self.report(error, topic, 'connection')
+
+    def log(self, text: Any, level: str = 'info') -> None:
+        """Log a line to the screen, the log file and /rosout.
+
+        :param level: 'debug', 'info', 'warning' (or 'warn'), 'error' or 'fatal'
+        """
+        level = _LEVELS.get(level, level)
+        if level not in ('debug', 'info', *_LEVELS.values()):
+            raise ValueError(f'there is no log level {level!r}: give debug, info, warn or fatal')
+        if self.lifecycle not in (Lifecycle.RUNNING, Lifecycle.STOPPING):
+            return Transcript.show(f'[{level.upper()}] {self.name}: {text}')
+        # no wrapper between: rospy looks for the caller of this method
+        self.run.core._base_logger('%s', (text,), {}, level=level)
+
+    # -- topics
+
+    def resolve(self, name: str) -> str:
+        """Return the full name of a topic, service or parameter, remapped as the node's are.
+
+        :raises ValueError: if it cannot be a name
+        """
+        self.check_running()
+        name = legal_name(name)
+        return self.run.ros.resolve_name('~' + name[2:] if name.startswith('~/') else name)
+
+    def peer_name(self, peer: Any) -> str:
+        """Return the full name of a Node, an ExternalNode, or a node given by its name."""
+        if hasattr(peer, 'name'):
+            return peer.name
+        return rosgraph.names.resolve_name(node_name(peer), self.name)
+
+    def interested_in(
+        self,
+        topic: str,
+        typed_as: str | type | None = None,
+        delegate: Block | None = None,
+        queue_size: int = QUEUE_SIZE,
+        inline: bool = False,
+        shared: bool = False,
+        from_: Any = None,
+    ) -> InputChannel:
+        """Receive the messages of a topic from now on.
+
+        The report: ``self interestedIn: '/pose' typedAs: 'turtlesim/Pose'``.
+
+        :param typed_as: type name or message class; default: what the node or the master knows
+        :param delegate: for this channel only; default: :attr:`delegate`
+        :param queue_size: messages that wait at most; the oldest are dropped, and counted
+        :param inline: the delegate runs in the thread of a publisher of this process
+        :param shared: hand out the published object, which nobody may change
+        :param from_: receive from that node alone: its name, Node or ExternalNode
+        :raises UnknownTopicError, UnknownTypeError: if the type is not known
+        :raises MasterUnreachableError: if the master does not answer; nothing is left behind
+        """
+        topic = self.resolve(topic)
+        peer = None if from_ is None else self.peer_name(from_)
+        cls = self._class_of(topic, typed_as, is_receiver=True)
+        return InputChannel(self, topic, cls, delegate, queue_size, inline, shared, peer)
+
+    def output_channel(
+        self,
+        topic: str,
+        typed_as: str | type | None = None,
+        latch: bool = False,
+        queue_size: int = QUEUE_SIZE,
+    ) -> OutputChannel:
+        """Open a channel to send to a topic; returns when the known subscribers are connected.
+
+        :param latch: the last message goes to subscribers that come later, too
+        :param queue_size: messages that wait for each subscriber at most
+        """
+        topic = self.resolve(topic)
+        return OutputChannel(self, topic, self._class_of(topic, typed_as), latch, queue_size)
+
+    def send_to(
+        self,
+        topic: str,
+        block: Any = None,
+        fill: Block | None = None,
+        *,
+        typed_as: str | type | None = None,
+        to: Any = None,
+        **fields: Any,
+    ) -> genpy.Message:
+        """Send a message, and return it.
+
+        The report: ``self sendTo: '/cmd_vel' a: [:msg | msg linear: 2.0]``::
+
+            node.send_to('/cmd_vel', typed_as='turtlesim/Velocity', linear=2.0)
+            node.send_to('/cmd_vel', Velocity, linear=2.0)
+            node.send_to('/cmd_vel', lambda msg: setattr(msg, 'linear', 2.0))
+
+        :param block: ``block(message)`` fills a new message; or a ready message, a dict of fields,
+            or a message class, which is the type
+        :param typed_as: the type; default: what the node or the master knows of the topic
+        :param to: the node that alone gets it: a name, Node or ExternalNode
+        :param fields: fill the message by name
+        """
+        if isinstance(block, type) and issubclass(block, genpy.Message):
+            typed_as, block = block, fill
+        channel = self._senders.get((topic, typed_as))
+        if channel and not channel.closed:
+            return channel.send(block, to=to, **fields)
+        with self._opening:
+            name = self.resolve(topic)
+            given = type(block) if isinstance(block, genpy.Message) else None
+            cls = self._class_of(name, typed_as or given)
+            senders = (each for each in self.channels if isinstance(each, OutputChannel))
+            known = [each for each in senders if each.topic == name]
+            channel = known[0] if known else OutputChannel(self, name, cls, False, QUEUE_SIZE)
+            self._senders[topic, typed_as] = channel
+        try:
+            return channel.send(block, to=to, **fields)
+        except Exception:
+            if not known:
+                channel.close()
+            raise
+
+    def _class_of(self, topic, typed_as, is_receiver=False):
+        known = [each.message_class for each in self.channels if each.topic == topic]
+        if typed_as is None and known:
+            return known[0]
+        type_ = typed_as or self.master.topic_type(topic)
+        if type_ in (None, '*'):
+            raise UnknownTopicError(
+                f'the master knows no type of {topic}: give typed_as=, such as "std_msgs/String"'
+            )
+        text = None
+        if is_receiver and not messages.is_installed(type_):
+            text = self._definition_of_publisher(topic, type_)
+        cls = messages.class_from_definition(type_, text) if text else messages.message_class(type_)
+        if known and known[0]._md5sum != cls._md5sum:
+            raise MessageTypeError(
+                f'{self.name} has {topic} open as {known[0]._type}, not as {cls._type}'
+            )
+        return cls
+
+    def _definition_of_publisher(self, topic, type_):
+        """Return the definition that a publisher sends when it is connected."""
+        if not self.master.topic(topic).publishers:
+            return None
+        end = self.ros.Subscriber(topic, self.ros.AnyMsg)
+
+        def find():
+            headers = [each.header or {} for each in end.impl.connections]
+            return [each['message_definition'] for each in headers if each.get('type') == type_]
+
+        try:
+            return (program.wait(find, self.connect_timeout, self) or [None])[0]
+        finally:
+            end.unregister()
+
+    def wait_for_message(
+        self,
+        topic: str,
+        typed_as: str | type | None = None,
+        timeout: float | None = None,
+        where: Callable[[Any], Any] | None = None,
+    ) -> genpy.Message:
+        """Return the next message of a topic, for which ``where(message)`` is true.
+
+        :param timeout: seconds until its type is known, and as long for the message; None: without
+            limit, for a topic of a known type
+        :raises UnknownTopicError, TimeoutError: if none comes in time
+        :raises NodeStoppedError: if the node stops meanwhile
+        """
+        came, topic = [], self.resolve(topic)
+
+        def find():
+            while came and where and not where(came[0]):
+                del came[0]
+            return came
+
+        self.master.call('getPid')  # raises if it does not answer
+        if timeout and not typed_as:
+            typed_as = program.wait(lambda: self.master.topic_type(topic), timeout, self)
+        cls = self._class_of(topic, typed_as, True)
+        # not through a channel: this may be called by a delegate, whose turn it is
+        end = self.ros.Subscriber(topic, cls, came.append)
+        try:
+            if program.wait(find, timeout, self):
+                return came[0]
+        finally:
+            end.unregister()
+        if self.is_running:
+            raise TimeoutError(f'no message on {topic} came within {timeout:g} s: is it published?')
+        raise NodeStoppedError(f'{self.name} stopped while it waited for {topic}')
+
+    # -- services and parameters
+
+    def serve(self, name: str, typed_as: str | type, block: Block) -> OfferedService:
+        """Offer a service; returns a handle with ``close()``.
+
+        ``block(request)`` runs in a thread of the caller's connection. It returns a response, a
+        dict, tuple or list of its fields, or its only field; None for an empty response.
+        """
+        return OfferedService(self, self.resolve(name), messages.service_class(typed_as), block)
+
+    def lookup_service(self, name: str) -> Service:
+        """Return the service of that name, resolved as the node's names are."""
+        return self.master.lookup_service(self.resolve(name), self.name)
+
+    def wait_for_service(self, name: str, timeout: float | None = None) -> Service:
+        """Wait until a service of that name is offered, and return it."""
+        return self.master.wait_for_service(self.resolve(name), timeout, self.name)
+
+    def parameter(self, name: str, initialized: Any = None) -> Parameter:
+        """Return a parameter of the server, bound both ways; '~rate' is private.
+
+        :param initialized: the value that it gets if it has none
+        """
+        name = self.resolve(name)
+        known = [each for each in self.parameters if each.name == name]
+        return known[0] if known else Parameter(self, name, initialized)
+
+    @property
+    def parameters(self) -> list[Parameter]:
+        """The parameters that :meth:`parameter` has returned."""
+        return [each for each in self.opened if isinstance(each, Parameter)]
+
+    def parameter_changed(self, name: str) -> None:
+        """Have the parameters read their values that a change may concern."""
+        for each in self.parameters:
+            if each.overlaps(name):
+                each.read()
 
 
 class BlockNode(Node):
-    """A node made of blocks alone, for tests and prototypes; ``help(Node)`` tells what it has.
+    """A node made of blocks alone, for tests and prototypes.
 
     The report (listing 3.7)::
 
         node := master create: PhaROSBlockNode named: '/myNode' ... soul: [:myNode | ...].
-        node execute
         node = master.create(BlockNode, named='/myNode', soul=lambda me: ...)
-        node.execute()
     """

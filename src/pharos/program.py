@@ -1,61 +1,115 @@
-"""What programs have in common: how they end."""
+"""The program that has nodes: its signals, its end, its forks, and waiting on behalf of a node."""
+from __future__ import annotations
+
+import atexit
+import contextlib
 import os
+import signal
 import sys
-from typing import Any, Callable, Optional
+import threading
+import time
+from typing import TYPE_CHECKING, Any, Callable, Iterator
 
-from pharos.errors import PharosError
+import rospy
+
+from pharos.intraprocess import workers
+from pharos.private_rospy.transport import runs
+
+if TYPE_CHECKING:
+    from pharos.node import Node
 
 
-def run(name: str, main: Callable[[], Optional[int]], about: Optional[str] = None) -> int:
-    """Run the ``main`` of a program; returns its exit status, 0 after Ctrl-C.
+class _Here(threading.local):
+    node: Node | None = None  #: on whose behalf this thread runs
 
-    What is wrong is told in one line; who reads its output may stop early, or read no UTF-8::
 
-        if __name__ == '__main__':
-            sys.exit(program.run('camera', main, about=__doc__))
+here = _Here()
+#: the nodes of this process that run or restart
+nodes = []
+signalled = False  # after a signal that ends the program
+_quiet_waits = 0  # of the main thread, which a signal ends without an exception
 
-    :param name: the program's, for that line
-    :param main: returns the exit status; None: 0
-    :param about: what is printed instead where the program was called with ``--help``; None: that
-        is left to ``main``
+
+def wait(
+    predicate: Callable[[], Any], timeout: float | None = None, node: Node | None = None
+) -> Any:
+    """Wait until ``predicate()`` is true.
+
+    :param timeout: seconds, None: without limit
+    :param node: its stop ends the wait, too; default: the node on whose behalf this thread runs
+    :returns: the last value of ``predicate()``, false if the wait ended otherwise
     """
-    if not callable(main):
-        raise TypeError(f"program.run('name', main) runs a function, and {main!r} is none")
-    output: Any = sys.stdout  # None where the program was started without one
+    end = float('inf') if timeout is None else time.monotonic() + timeout
+    node, pause = node or here.node, 0.002
+    stopping = node.run.stopping if node else threading.Event()
+    while not (value := predicate()) and time.monotonic() < end and not stopping.wait(pause):
+        pause = min(pause * 1.2, 0.02)
+    return value
+
+
+@contextlib.contextmanager
+def quiet_wait() -> Iterator[None]:
+    """Have signals end what the main thread does by stopping the nodes alone."""
+    global _quiet_waits
+    is_main = threading.current_thread() is threading.main_thread()
+    _quiet_waits += is_main
     try:
-        if output is not None:
-            output.reconfigure(errors='replace')
-        if about is not None and {'-h', '--help'} & {*sys.argv[1:]}:
-            status: Optional[int] = print(about.strip())
-        else:
-            status = main()
-        if output is not None:
-            output.flush()
-        return status or 0
-    except KeyboardInterrupt:
-        return 0
-    except BrokenPipeError:  # who reads it has enough
-        _print_to_nobody()
-        return 0
-    except OSError as error:  # such as a full disk
-        _print_to_nobody()
-        problem: Any = error
-    except (PharosError, ValueError) as error:
-        problem = error
-    print(f'{name}: {problem}', file=sys.stderr)
-    return 1
+        yield
+    finally:
+        _quiet_waits -= is_main
 
 
-def check_output() -> None:
-    """For a program that is there to print.
-
-    :raises PharosError: if it was started without a standard output
-    """
-    if sys.stdout is None:
-        raise PharosError('its standard output is closed: give it a file or a terminal')
+def stop_all() -> None:
+    """Stop every node of this process, whatever the stop() of a class of its own raises."""
+    for node in nodes[:]:
+        node.end_now()
 
 
-def _print_to_nobody() -> None:
-    """What Python still has to print at its end would fail again."""
-    if sys.stdout is not None:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+def spin() -> None:
+    """Block until every node of this process has stopped. Ctrl-C, SIGTERM and SIGHUP stop them."""
+    handle_signals()
+    with contextlib.suppress(KeyboardInterrupt), quiet_wait():
+        while nodes and not rospy.is_shutdown():  # a signal has ended rospy's own node
+            time.sleep(0.01)
+    stop_all()
+
+
+def handle_signals() -> None:
+    """Have signals stop the nodes and end the program, unless somebody else handles them."""
+    if threading.current_thread() is not threading.main_thread():
+        return
+    interrupts = signal.default_int_handler, signal.SIG_DFL, signal.SIG_IGN
+    if signal.getsignal(signal.SIGINT) in interrupts and not hasattr(sys, 'ps1'):
+        signal.signal(signal.SIGINT, _end)
+    for number in signal.SIGTERM, signal.SIGHUP:
+        if signal.getsignal(number) == signal.SIG_DFL:
+            signal.signal(number, _end)
+
+
+def is_signalled() -> bool:
+    """True if an exception of this thread may come from a signal."""
+    by_python = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    is_main = threading.current_thread() is threading.main_thread()
+    return is_main and (signalled or by_python)
+
+
+def _end(number, frame):
+    global signalled
+    signalled = True
+    signal.signal(number, signal.SIG_DFL)  # a second one ends the program at once
+    threading.Thread(target=stop_all, name='pharos end').start()
+    if not _quiet_waits:
+        raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(128 + number)
+
+
+def _forget():
+    """Have no nodes in a forked child."""
+    for node in nodes:
+        node.abandon()
+    nodes.clear()
+    runs.clear()
+    workers.forget()
+
+
+atexit.register(stop_all)
+os.register_at_fork(after_in_child=_forget)

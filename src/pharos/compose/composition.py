@@ -1,241 +1,154 @@
 """Compositions: launch files whose Python nodes run in this process."""
-import copy
-import dataclasses
+from __future__ import annotations
+
+import contextlib
 import os
+import pickle
 import sys
+import tempfile
 import threading
-import time
-from typing import TYPE_CHECKING, Collection, Dict, Iterator, List, Optional, Tuple, Union
+from typing import TYPE_CHECKING, Any
 
 import roslaunch.core
-import rospkg
 
-from pharos import node_registry, signals
-from pharos.blocks import check_flag
-from pharos.compose.apart import Apart, ApartNodes
-from pharos.compose.kept_node import KeptNode
-from pharos.compose.launch_file import LaunchedNode, LaunchFile, Problem
-from pharos.compose.output import SCREEN
-from pharos.compose.programs import MAKES_NODES
-from pharos.compose.progress import Progress
+from pharos import program
+from pharos.compose import apart_program
+from pharos.compose.launch_file import LaunchedNode, LaunchFile, log_folder
 from pharos.compose.script import ScriptNode
-from pharos.counts import counted
-from pharos.program_files import AnyPath
+from pharos.errors import PharosError
+from pharos.node import Lifecycle
 from pharos.ros_process import RosProcess
+from pharos.transcript import Transcript
 
 if TYPE_CHECKING:
     from pharos.master import Master
 
 PATIENCE = 2.0  # seconds that a node may take to start before the next one does
+POLL = 0.02  # seconds between two looks at what has ended
 
 
 class Composition:
-    """Programs of Python that run in this process, unmodified, and the rest of their launch file;
-    made by :meth:`Master.compose`. Ends with its ``with`` block.
+    """Programs that run in this process, unmodified, and the rest of their launch file.
 
-    :param master: the :class:`Master` of its nodes
-    :param progress: what tells of them
+    Made by :meth:`Master.compose`; ends with its ``with`` block.
+
+    :ivar nodes: the ScriptNodes of this process, in the order of the launch file
+    :ivar process: the RosProcess in which roslaunch runs the others, or None
     """
 
-    def __init__(self, master: 'Master', progress: Optional[Progress] = None) -> None:
-        self.master = master
-        self.progress = progress or Progress()
-        #: why it has ended by itself, before all of its nodes had
-        self.reason: Optional[str] = None
-        #: whether it ends, or has ended
-        self.is_ending = False
-        #: why nodes of it were not even tried to start
-        self.problems: List[Problem] = []
-        #: what was started in this process, whether it has come to be a node or not; replaced when
-        #: it changes
-        self.kept: List[KeptNode] = []
-        self._apart: List[Apart] = []
-        self._stopping = threading.RLock()
-        node_registry.before_stop_all(self._begin_end)
-
-    @property
-    def nodes(self) -> List[ScriptNode]:
-        """The nodes of this process, in the order of the launch file."""
-        return [kept.node for kept in self.kept if kept.node is not None]
-
-    @property
-    def process(self) -> Optional[RosProcess]:
-        """The process in which roslaunch runs the nodes apart; None: there are none."""
-        return self._apart[0].process if self._apart else None
-
-    # -- start
+    def __init__(self, master: Master):
+        self.master, self.process = master, None
+        self.nodes: list[ScriptNode] = []
+        self._ending, self._status = threading.Event(), 0
 
     def launch(self, file: LaunchFile) -> None:
         """Set the parameters of a launch file, and start its nodes.
 
-        :raises MasterUnreachableError: if the master does not answer
-        :raises PharosError: if it refuses a parameter
+        :raises PharosError: if the master does not answer, or refuses a parameter
         """
-        run_id = self._run_id()
+        run_id = self.master.parameters.setdefault('/run_id', roslaunch.core.generate_run_id())
+        log_folder(run_id)
         file.set_parameters(run_id)
         for text in file.config.config_errors:
-            self.progress.tell(str(text))
-        for problem in file.problems:
-            self.refuse(problem)
-        for problem in file.problems:
-            if problem.ends_all:
-                return self.end_because(f'{problem.name}, which is required, cannot be started')
+            Transcript.show(text)
+        for name, why in file.problems.items():
+            Transcript.show(f'{name} is not started: {why}')
         if file.apart:
-            self.progress.apart(file.reasons)
-            self._apart.append(ApartNodes(self, file.config_apart()))
-        logs = os.path.join(rospkg.get_log_dir(env=os.environ), run_id)
-        for folder in logs, rospkg.get_ros_home():  # roslaunch makes them, too
-            os.makedirs(folder, exist_ok=True)
-        self.start(
-            [_with_log(launched, logs, number) for number, launched in enumerate(file.here, 1)]
-        )
+            with tempfile.NamedTemporaryFile('wb', suffix='.launch', delete=False) as pickled:
+                pickle.dump(file.config_apart(), pickled)
+            command = [sys.executable, apart_program.__file__, pickled.name, str(os.getpid())]
+            self.process = RosProcess(command, self.master.url, Transcript.show)
+        for launched in file.here:
+            with self.telling(launched.name):
+                self.start(launched)
+        threading.Thread(target=self._watch, name='composition', daemon=True).start()
 
-    def refuse(self, problem: Problem) -> None:
-        """Keep and tell why a node cannot be started; the others go on."""
-        self.problems.append(problem)
-        self.progress.tell(str(problem))
+    @contextlib.contextmanager
+    def telling(self, name: str) -> Any:
+        """Show why a program is not started, and go on with the others."""
+        try:
+            yield
+        except PharosError as error:
+            self._status = 1
+            Transcript.show(f'{name} is not started: {error}')
 
-    def start(self, nodes: List[LaunchedNode]) -> List[KeptNode]:
-        """Start nodes, one after the other; one that takes long does not keep the next from it."""
-        started = [KeptNode(self, launched) for launched in nodes]
-        with node_registry.changed:
-            self.kept = [*self.kept, *started]
-        for number, kept in enumerate(started, 1):
-            if self.is_ending:
-                kept.is_over = True
-                kept.settled.set()
-                continue
-            self.progress.starts(kept.name, number, len(started))
-            kept.start()
-            if not kept.settled.wait(PATIENCE):
-                self.progress.hangs(kept.name, PATIENCE)
-        self.progress.all_begun([kept.name for kept in started if not kept.settled.is_set()])
-        return started
-
-    def run_apart(self, launched: LaunchedNode) -> None:
-        """Run a program that makes its nodes itself in a process of its own."""
-        self.progress.apart({MAKES_NODES: [launched.program]})
-        command = [sys.executable, launched.path, *launched.args]
-        self._apart.append(Apart(self, [launched.program], command))
-
-    def _run_id(self) -> str:
-        """The identifier that all launches at a master have in common, and their folder of logs."""
-        parameters = self.master.parameters
-        if '/run_id' not in parameters:
-            parameters['/run_id'] = roslaunch.core.generate_run_id()
-        return str(parameters['/run_id'])
-
-    # -- end
+    def start(self, launched: LaunchedNode) -> ScriptNode:
+        """Start a node, and return it."""
+        node = ScriptNode.__new__(ScriptNode)
+        node._configure(self.master, launched.name, None, None, None, (0, 0), ())
+        node.__init__(launched.path, launched.args, None, launched.env)
+        node.init_timeout = PATIENCE
+        self.nodes.append(node)
+        node.launched = launched
+        node.start()
+        self._status = 0
+        return node
 
     @property
     def is_over(self) -> bool:
-        """Whether all that it has started has ended."""
-        return all(started.is_over for started in self._started)
+        """True if all that it started has ended."""
+        goes_on = [
+            node.lifecycle is not Lifecycle.STOPPED
+            or (node.launched and node.launched.respawn_delay is not None)
+            for node in self.nodes
+        ]
+        return not any(goes_on) and (self.process is None or self.process.poll() is not None)
 
-    @property
-    def _started(self) -> List[Union[KeptNode, Apart]]:
-        return [*self.kept, *self._apart]
+    def _watch(self):
+        """Start again what respawns, and end all if a required node has ended."""
+        while not self._ending.wait(POLL) and not self.is_over:
+            self.look()
+        self.look()
 
-    def outcomes(self) -> Iterator[Tuple[str, str]]:
-        """What has become of each node, in a few words: ``(name, outcome)``."""
-        for kept in self.kept:
-            yield kept.name, kept.outcome
-        for apart in self._apart:
-            yield from apart.outcomes()
-        for problem in self.problems:
-            yield problem.name, 'did not start'
+    def look(self) -> None:
+        """Look once what has ended."""
+        for node in [node for node in self.nodes if node.lifecycle is Lifecycle.STOPPED]:
+            launched = node.launched
+            if self._ending.is_set() or not launched:
+                return
+            if launched.is_required:
+                return self._end(launched.name)
+            if launched.respawn_delay is not None and not self._ending.wait(launched.respawn_delay):
+                with self.telling(launched.name):
+                    node.start()
+        if self.process and self.process.poll() == apart_program.REQUIRED_ENDED:
+            self._end('a node in a process of its own')
 
-    def wait(self, timeout: Optional[float] = None) -> int:
-        """Wait until all nodes have ended, of themselves or by a signal; returns 0, or 1 where a
-        required one has, or none of them could be started.
+    def _end(self, name):
+        if not self._ending.is_set():
+            Transcript.show(f'{name}, which is required, has ended: all others end')
+            self._status = 1
+            self.stop()
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait until all nodes have ended; returns 0, or 1 if a required one has, or none started.
 
         :param timeout: seconds, None: without limit
         :raises TimeoutError: if they have not in that time
         """
-        with signals.interruptible_wait():
-            if not node_registry.wait_until(lambda: self.is_over or self.is_ending, timeout):
-                names = [kept.name for kept in self.kept if not kept.is_over]
-                for apart in self._apart:
-                    names += [] if apart.is_over else apart.names
-                left = ', '.join(names)
-                raise TimeoutError(f'not ended within {timeout:g} s: {left}; stop() ends all')
+        with program.quiet_wait():
+            if not program.wait(self._is_to_end, timeout):
+                raise TimeoutError(f'it has not ended within {timeout:g} s; stop() ends all')
+        self.look()
         self.stop()
-        has_failed = [kept.problem is not None for kept in self.kept]
-        is_nothing_started = all(has_failed) and not self._apart
-        is_failure = is_nothing_started and bool(has_failed or self.problems)
-        return 1 if is_failure or self.reason is not None else 0
+        return self._status
 
-    def end_because(self, reason: str) -> None:
-        """End all of it, in a thread of its own, for a reason that is told."""
-        with node_registry.changed:
-            if self.is_ending:
-                return
-            self.reason = reason
-            self._begin_end()
-        self.progress.tell(f'{reason}: all others end')
-        threading.Thread(target=self.stop, name='end of a composition', daemon=True).start()
-
-    def _begin_end(self) -> None:
-        """Start nothing any more."""
-        with node_registry.changed:
-            self.is_ending = True
-            for kept in self.kept:
-                kept.begin_end()
-        node_registry.notify()
+    def _is_to_end(self):
+        return self.is_over or self._ending.is_set() or program.signalled
 
     def stop(self) -> None:
-        """End all nodes, those apart too, side by side. Harmless when done twice."""
-        self._begin_end()
-        with signals.held(), self._stopping:
-            threads = [threading.Thread(target=each.stop, daemon=True) for each in self._started]
-            for thread in threads:
-                thread.start()
-            deadline = time.monotonic() + node_registry.STOP_LIMIT
-            for thread in threads:
-                thread.join(max(0.0, deadline - time.monotonic()))
-            node_registry.not_before_stop_all(self._begin_end)
+        """End all nodes, those apart, too."""
+        self._ending.set()
+        threads = [threading.Thread(target=node.end_now) for node in self.nodes]
+        for thread in threads:
+            thread.start()
+        if self.process:
+            self.process.terminate()
+        for thread in threads:
+            thread.join()
 
-    def __enter__(self) -> 'Composition':
+    def __enter__(self) -> Composition:
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, *error: Any) -> None:
         self.stop()
-
-    def __repr__(self) -> str:
-        apart = '' if self.process is None else f', {self.process!r} apart'
-        nodes = counted(len(self.kept), 'node')
-        return f'<Composition of {nodes} at {self.master.url}{apart}>'
-
-
-def _with_log(launched: LaunchedNode, folder: str, number: int) -> LaunchedNode:
-    """The same, with the log files that roslaunch would give it."""
-    name = launched.name[1:].replace('/', '-')
-    log = os.path.join(folder, f'{name}-{number}.log')
-    output = launched.output
-    if output != SCREEN:
-        output = os.path.join(folder, f'{name}-{number}-stdout.log')
-    return dataclasses.replace(launched, args=[*launched.args, f'__log:={log}'], output=output)
-
-
-def compose(
-    master: 'Master',
-    package: Optional[AnyPath],
-    file: Optional[AnyPath],
-    only: Collection[str],
-    apart: Collection[str],
-    share_connections: bool,
-    args: Dict[str, object],
-    progress: Optional[Progress] = None,
-) -> Composition:
-    """What :meth:`Master.compose` does."""
-    if check_flag('share_connections', share_connections):
-        master = copy.copy(master)
-        master.share_connections = True
-    launch_file = LaunchFile(master.url, package, file, args, only, apart)
-    composition = Composition(master, progress)
-    try:
-        composition.launch(launch_file)
-    except BaseException:
-        composition.stop()
-        raise
-    return composition

@@ -1,276 +1,233 @@
-"""The graph of a ROS master: who sends what to whom, from which process, and how; as a picture."""
+"""Show the graph of a master: who sends what to whom, from which process, and how."""
+from __future__ import annotations
+
+import collections
 import dataclasses
-import itertools
-import os
+import json
+import pathlib
 import re
-from typing import Any, Collection, Dict, Iterable, Iterator, List, Set, Tuple, Union
+import subprocess
+import time
+from typing import Any, Iterator, NamedTuple
+from xml.sax.saxutils import escape
 
-import rosgraph.names
-
-from pharos.counts import counted
-from pharos.errors import PharosError, suggest
-from pharos.live import graphviz, snapshot
-from pharos.live.answers import ALIVE
-from pharos.live.dot import dot_of, sorry
-from pharos.live.edges import HEARS, OFFERS, PUBLISHES, SENDS, Edge
-from pharos.live.graph_text import text_of_graph
-from pharos.live.snapshot import Host, Process, SeenNode, SeenService, SeenTopic, Snapshot
-from pharos.live.traffic import Traffic
-from pharos.lookers import is_looker
+from pharos import live
+from pharos.errors import PharosError
+from pharos.live import snapshot
+from pharos.live.words import number
 from pharos.master import Master
-from pharos.probe import Look
-from pharos.seconds import check_seconds
 
-GROUPS = 'process', 'namespace', 'none'
-#: what may be hidden -> what that is
-HIDEABLE = {
-    'leaf': 'topics that one node alone uses',
-    'unheard': 'topics that nobody hears',
-    'idle': 'topics of which nothing is connected',
-    'tf': 'the topics of tf',
-    'images': 'images, and what comes with them',
-    'unreachable': 'nodes that do not answer',
-}
-#: what every node has, and says nothing of what it is for
-_DEBUG_TOPICS = re.compile(
-    r'/(rosout|rosout_agg|statistics|clock)|.*/(parameter_updates|parameter_descriptions)'
+FORMATS = '.svg', '.png', '.pdf', '.dot'
+#: what every node has
+COMMON = re.compile(
+    r'/(rosout|rosout_agg|statistics|clock)|.*/(parameter_updates|parameter_descriptions|get_loggers'
+    r'|set_logger_level|set_parameters|pharos_looks_.*)'
 )
-_DEBUG_SERVICES = re.compile(r'.*/(get_loggers|set_logger_level|set_parameters)')
-_DEBUG_NODES = {'/rosout'}
-_TF = re.compile(r'.*/tf(_static)?')
-_IMAGES = {'Image', 'CompressedImage', 'CameraInfo', 'Packet'}  # theora's
+#: transport -> how its arrows look
+ARROWS = {
+    'INTRAPROCESS': 'color="#0072B2", penwidth=2.6',
+    'TCPROS': 'color="#D55E00", penwidth=1.2, style=dashed',
+    'UDPROS': 'color="#009E73", penwidth=1.2, style=dotted',
+    '': 'color="#8A8A8A", style=dotted, arrowhead=empty',
+}
+LEGEND = 'blue: INTRAPROCESS, no socket; red: TCPROS; grey: not connected; frames: processes'
+NODE = 'shape=box, style="rounded,filled", fillcolor="{}"'
+TOPIC = 'shape=box, style=filled, fillcolor="#FFF6D5"'
+SERVICE = 'shape=cds, style=filled, fillcolor="#DDF3E8"'
+GRAY = 'style="rounded,filled"; color="#9AA5B1"; fillcolor="#F5F7F9"'
+
+
+class Edge(NamedTuple):
+    """An arrow from a node to a topic, or from a topic to a node."""
+
+    start: str
+    end: str
+    is_incoming: bool  # True if it ends at a node
+    transports: tuple[str, ...]  # none if nothing is connected
 
 
 class Graph:
-    """What :meth:`Master.graph <pharos.Master.graph>` returns: a picture of a
-    :class:`~pharos.live.snapshot.Snapshot`.
+    """A graph; made by :meth:`Master.graph`.
 
-    :ivar nodes: ``{name: what was seen of it}``, of those that the picture shows
-    :ivar topics: the same of topics
-    :ivar services: the same of services
-    :ivar edges: the arrows, each an :class:`~pharos.live.edges.Edge`
-    :ivar rates: ``{topic: messages a second}``, where that was measured
-    :ivar snapshot: all that was seen
-    :ivar nodes_only: whether arrows go from node to node, instead of topics
-    :ivar group: what the frames are: 'process', 'namespace' or 'none'
-    :ivar namespaces: those of the nodes that it shows
-    :param snapshot: what was seen
-    :param rates: ``{topic: messages a second}``
-    :param options: as of :meth:`Master.graph <pharos.Master.graph>`
-    :raises TypeError, ValueError: if there is no such option
+    :ivar nodes: ``{name: what was seen of it}``
+    :ivar topics: ``{name: type}``
+    :ivar edges: the arrows, each an :class:`Edge`
+    :ivar rates: ``{topic: messages a second}``, if that was measured
     """
 
-    def __init__(
-        self,
-        snapshot: Snapshot,
-        rates: Union[Dict[str, float], None] = None,
-        show_all: bool = False,
-        services: bool = False,
-        nodes_only: bool = False,
-        namespace: Union[str, Collection[str]] = '/',
-        hide: Union[str, Collection[str]] = (),
-        group: str = 'process',
-    ) -> None:
-        self.snapshot = snapshot
-        self.rates = {} if rates is None else rates
-        self.nodes_only = nodes_only
-        self.group = _check_choice('group', group, GROUPS)
-        self.namespaces = _check_namespaces(namespace)
-        hidden = set(_names('what is to be hidden', hide, "'leaf'"))
-        connected = {each.topic for each in snapshot.connections}
-        for each in hidden:
-            _check_choice('hide', each, HIDEABLE)
-        self.nodes: Dict[str, SeenNode] = {
-            name: node
-            for name, node in snapshot.nodes.items()
-            if _is_in(name, self.namespaces)
-            and (show_all or not (name in _DEBUG_NODES or is_looker(name)))
-            and (node.state == ALIVE or 'unreachable' not in hidden)
+    def __init__(self, seen, rates, show_all=False, services=False, only='', hide='(?!)'):
+        def is_shown(name):
+            is_wanted = re.search(only, name) and not re.search(hide, name)
+            return bool(is_wanted and (show_all or not COMMON.fullmatch(name)))
+
+        self.snapshot, self.rates = seen, rates
+        self.nodes = {name: node for name, node in seen.nodes.items() if is_shown(name)}
+        self.edges: list[Edge] = []
+        carried = collections.defaultdict(set)
+        for link in seen.links:
+            carried[link.topic, link.publisher, False].add(link.transport)
+            carried[link.topic, link.subscriber, True].add(link.transport)
+        for name, node in self.nodes.items():
+            for topics, is_incoming in (node.publishes, False), (node.subscribes, True):
+                for topic in filter(is_shown, topics):
+                    ends = (topic, name) if is_incoming else (name, topic)
+                    by = tuple(sorted(carried[topic, name, is_incoming]))
+                    self.edges.append(Edge(*ends, is_incoming, by))
+        used = {edge.start if edge.is_incoming else edge.end for edge in self.edges}
+        self.topics = {name: kind for name, kind in seen.topics.items() if name in used}
+        shown = self.nodes.items() if services else ()
+        self.services = {
+            each: name for name, node in shown for each in filter(is_shown, node.offers)
         }
-        self.topics: Dict[str, SeenTopic] = {
-            name: topic
-            for name, topic in snapshot.topics.items()
-            if (show_all or not _DEBUG_TOPICS.fullmatch(name))
-            and {*topic.publishers, *topic.subscribers} & {*self.nodes}
-            and not _is_hidden(topic, topic.name in connected, hidden)
-        }
-        self.services: Dict[str, SeenService] = {
-            name: service
-            for name, service in snapshot.services.items()
-            if services
-            and (show_all or not _DEBUG_SERVICES.fullmatch(name))
-            and {*service.providers} & {*self.nodes}
-        }
-        self.edges: List[Edge] = list(self._sends() if nodes_only else self._uses())
-        if nodes_only:
-            self.topics = {}
 
-    def _uses(self) -> Iterator[Edge]:
-        """Who publishes and hears each topic, and what carries its messages."""
-        transports = self._transports()
-        for name, topic in self.topics.items():
-            for node in topic.publishers:
-                if node in self.nodes:
-                    used = transports.get((name, node), ())
-                    yield Edge(PUBLISHES, node, name, tuple(sorted(used)), (name,))
-            for node in topic.subscribers:
-                if node in self.nodes:
-                    used = transports.get((name, node), ())
-                    yield Edge(HEARS, name, node, tuple(sorted(used)), (name,))
-        yield from self._offers()
+    def processes(self) -> dict[tuple[str, Any], list[str]]:
+        """Return ``{(host, process id): the names of its nodes}``."""
+        found = collections.defaultdict(list)
+        for name, node in self.nodes.items():
+            found[node.host, node.pid or f'of {name}'].append(name)
+        return found
 
-    def _transports(self) -> Dict[Tuple[str, str], Set[str]]:
-        """``{(topic, node): the transports that carry its messages}``; a node's with itself only
-        where there is no other."""
-        alone: Dict[Tuple[str, str], Set[str]] = {}
-        with_others: Dict[Tuple[str, str], Set[str]] = {}
-        for (topic, publisher, subscriber), transports in self.snapshot.transports.items():
-            found = alone if publisher == subscriber else with_others
-            for node in publisher, subscriber:
-                found.setdefault((topic, node), set()).update(transports)
-        return {**alone, **with_others}
-
-    def _sends(self) -> Iterator[Edge]:
-        """Who sends to whom, whatever the topic."""
-        sent: Dict[Tuple[str, str], Tuple[Set[str], Set[str]]] = {}
-        for name, topic in self.topics.items():
-            publishers = [node for node in topic.publishers if node in self.nodes]
-            subscribers = [node for node in topic.subscribers if node in self.nodes]
-            for publisher, subscriber in itertools.product(publishers, subscribers):
-                if publisher != subscriber:
-                    _, topics = sent.setdefault((publisher, subscriber), (set(), set()))
-                    topics.add(name)
-        for link, used in self.snapshot.transports.items():
-            if link[0] in self.topics and link[1:] in sent:
-                sent[link[1:]][0].update(used)
-        for ends, (transports, topics) in sorted(sent.items()):
-            yield Edge(SENDS, *ends, tuple(sorted(transports)), tuple(sorted(topics)))
-        yield from self._offers()
-
-    def _offers(self) -> Iterator[Edge]:
-        for name, service in self.services.items():
-            for node in service.providers:
-                if node in self.nodes:
-                    yield Edge(OFFERS, node, name, (), ())
-
-    @property
-    def hosts(self) -> List[Host]:
-        """The hosts and processes of the nodes."""
-        hosts = []
-        for host in self.snapshot.hosts:
-            processes = [
-                Process(process.pid, [name for name in process.nodes if name in self.nodes])
-                for process in host.processes
-                if {*process.nodes} & {*self.nodes}
-            ]
-            if processes:
-                hosts.append(Host(host.name, host.is_here, processes))
-        return hosts
-
-    # -- as a picture
-
-    def dot(self) -> str:
-        """The graph in graphviz's language."""
-        return dot_of(self)
+    def _about(self, topic):
+        rate = self.rates.get(topic)
+        return (self.topics[topic] or 'type unknown') + (f', {number(rate)} Hz' if rate else '')
 
     def text(self) -> str:
-        """The graph for a terminal: each node with what it sends, hears and offers."""
-        return text_of_graph(self)
+        """Return the graph for a terminal: each node with what it sends, receives and offers."""
+        return '\n'.join(self._lines())
 
-    def save(self, path: Union[str, 'os.PathLike[str]']) -> None:
-        """Write the picture to a file, all at once, so that who looks at it sees no half of one.
+    def _lines(self) -> Iterator[str]:
+        yield f'{self.snapshot.master}: {len(self.nodes)} nodes, {len(self.topics)} topics'
+        for (host, pid), names in self.processes().items():
+            yield f'process {pid}, {host}'
+            for name in names:
+                yield f'  {name}  {self.nodes[name].problem}'
+                for edge in self.edges:
+                    if name in edge[:2]:
+                        yield self._line(edge, name)
+                offered = (service for service, node in self.services.items() if node == name)
+                yield from (f'    offers {service}' for service in offered)
 
-        :param path: its suffix says how: .svg, .png, .pdf or .dot
+    def _line(self, edge, name):
+        topic, own, peer = (edge.start, 2, 1) if edge.is_incoming else (edge.end, 1, 2)
+        links = [each for each in self.snapshot.links if each.topic == topic and each[own] == name]
+        peers = ', '.join(f'{link[peer]} ({link.transport})' for link in links) or 'not connected'
+        return f'    {"<-" if edge.is_incoming else "->"} {topic}  {self._about(topic)}  {peers}'
+
+    def dot(self) -> str:
+        """Return the graph in graphviz's language."""
+        return '\n'.join(self._dot())
+
+    def _dot(self) -> Iterator[str]:
+        at = time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(self.snapshot.time))
+        yield 'digraph pharos { rankdir=LR; newrank=true; ranksep=0.4; nodesep=0.14; nslimit=2'
+        yield 'node [fontname="Helvetica", fontsize=11, height=0.3]; edge [arrowsize=0.7]'
+        yield f'label="{self.snapshot.master}, {at}\\n{LEGEND}"; labeljust=l; fontsize=10'
+        homes = {name: home for home, names in self.processes().items() for name in names}
+        inside = collections.defaultdict(list)
+        for name, node in self.nodes.items():
+            look = NODE.format('#EEEEEE' if node.problem else '#D9EAF7')
+            about = 'does not answer' if node.problem else ''
+            inside[homes[name]].append(_box('n', name, about, look))
+        for topic in self.topics:  # beside its publishers, or else its subscribers
+            edges = [edge for edge in self.edges if topic in edge[:2]]
+            senders = {homes[edge.start] for edge in edges if not edge.is_incoming}
+            own = senders or {homes[edge.end] for edge in edges}
+            home = own.pop() if len(own) == 1 else None
+            inside[home].append(_box('t', topic, self._about(topic), TOPIC))
+        for service, name in self.services.items():
+            inside[homes[name]].append(_box('s', service, '', SERVICE))
+            inside[None].append(f'{_id("n", name)} -> {_id("s", service)} [arrowhead=none]')
+        yield from inside.pop(None, ())
+        for home, lines in inside.items():
+            yield f'subgraph {_id("cluster", str(home))} {{ label="process {home[1]}, {home[0]}"'
+            yield from (f'labeljust=l; fontsize=10; {GRAY}', *lines, '}')
+        for edge in self.edges:
+            kinds = ('t', 'n') if edge.is_incoming else ('n', 't')
+            for transport in edge.transports or ('',):
+                arrow = ARROWS[transport]
+                yield f'{_id(kinds[0], edge.start)} -> {_id(kinds[1], edge.end)} [{arrow}]'
+        yield '}'
+
+    def save(self, path: Any) -> None:
+        """Write the picture to a file, whose suffix says how: .svg, .png, .pdf or .dot.
+
         :raises ValueError: if it has another suffix
-        :raises PharosError: if it cannot be written, or graphviz is not there, which all but .dot
-            need
+        :raises PharosError: if graphviz is not installed, or does not draw it
         """
-        graphviz.save(self.dot(), path)
+        path = pathlib.Path(path)
+        if path.suffix not in FORMATS:
+            raise ValueError(f'{path} is no picture: its name ends in one of {", ".join(FORMATS)}')
+        is_dot = path.suffix == '.dot'
+        path.write_bytes(self.dot().encode() if is_dot else self._draw(path.suffix[1:]))
+
+    def _draw(self, kind):
+        options = {'input': self.dot().encode(), 'stdout': subprocess.PIPE, 'timeout': 60}
+        try:
+            return subprocess.run(['dot', f'-T{kind}'], check=True, **options).stdout
+        except (OSError, subprocess.SubprocessError) as error:
+            raise PharosError(f'{error}: apt install graphviz, or leave out nodes') from error
 
     def _repr_svg_(self) -> str:
-        """The picture in Jupyter, or why there is none."""
-        try:
-            return graphviz.render(self.dot(), 'svg').decode()
-        except PharosError as error:
-            return sorry(str(error))
+        return self._draw('svg').decode()
 
-    def is_like(self, other: 'Graph') -> bool:
-        """Whether its picture says the same as another's, rates and what is counted aside."""
-        return self._gist() == other._gist()
-
-    def _gist(self) -> Tuple[Any, ...]:
-        return self.nodes, self.topics, self.services, self.edges, self.group
-
-    def as_dict(self) -> Dict[str, Any]:
-        """What it shows, as plain values, ready for JSON."""
-        return {
-            'master': self.snapshot.master,
-            'hosts': [dataclasses.asdict(host) for host in self.hosts],
-            'nodes': {name: dataclasses.asdict(node) for name, node in self.nodes.items()},
-            'topics': {
-                name: {**dataclasses.asdict(topic), 'rate': self.rates.get(name)}
-                for name, topic in self.topics.items()
-            },
-            'services': {name: dataclasses.asdict(each) for name, each in self.services.items()},
-            'edges': [dataclasses.asdict(edge) for edge in self.edges],
-        }
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as plain values, for JSON."""
+        nodes = {name: dataclasses.asdict(node) for name, node in self.nodes.items()}
+        for node in nodes.values():
+            del node['ends']
+        edges = [edge._asdict() for edge in self.edges]
+        return {'nodes': nodes, 'topics': self.topics, 'edges': edges, 'rates': self.rates}
 
     def __repr__(self) -> str:
-        return (
-            f'<Graph of {self.snapshot.master}:'
-            f" {counted(len(self.nodes), 'node')},"
-            f" {counted(len(self.topics), 'topic')},"
-            f" {counted(len(self.edges), 'edge')};"
-            " print(graph.text()) shows it, graph.save('graph.svg') draws it>"
-        )
+        return f'<Graph of {len(self.nodes)} nodes: see text() and save()>'
+
+
+def _id(kind, name):
+    return f'"{kind} {name}"'
+
+
+def _box(kind, name, about, look):
+    """Return a node, topic or service: its name, and something about it in small letters."""
+    small = f'<br/><font point-size="9" color="#505050">{escape(about)}</font>' if about else ''
+    bold = f'<b>{escape(name)}</b>' if kind == 'n' else escape(name)
+    return f'{_id(kind, name)} [{look}, label=<{bold}{small}>]'
 
 
 def graph_of(master: Master, seconds: float = 0, **options: Any) -> Graph:
-    """The graph of a master as it is; see :meth:`Master.graph <pharos.Master.graph>`."""
-    seconds = check_seconds('seconds', seconds, least=0)
-    if not seconds:
-        return Graph(snapshot.take(master), **options)
-    look = Look()  # from here on: a node that stops while others are asked ends the wait, too
-    before = snapshot.take(master, counts=True)
-    Graph(before, **options)  # complains of an option before all the time is spent
-    look.pause(seconds)
-    after = snapshot.take(master, counts=True)
-    return Graph(after, Traffic(before.connections, after.connections).of_topic, **options)
+    """Do what :meth:`Master.graph` does."""
+    before = seen = snapshot.take(master)
+    if seconds:
+        time.sleep(seconds)
+        seen = snapshot.take(master)
+    return Graph(seen, snapshot.topic_rates(before, seen), **options)
 
 
-def _check_choice(what: str, given: str, choices: Iterable[str]) -> str:
-    if given not in choices:
-        raise ValueError(
-            f'{what} may be {", ".join(map(repr, choices))}, not {given!r}'
-            f'{suggest(str(given), choices)}'
-        )
-    return given
+def graph(words: list[str]) -> None:
+    """Show the graph of the ROS master: processes, nodes, topics, and how messages go.
+
+    graph                            as text
+    graph --output graph.svg         as a picture: .svg, .png, .pdf (by graphviz) or .dot
+    graph --rates 2 --hide '/tf'     with how often messages come, and without some names
+    watch -n1 rosrun pharos graph    again and again
+    """
+    read = live.parser(graph.__doc__)
+    read.add_argument('-o', '--output', metavar='FILE', help='a picture, instead of text')
+    read.add_argument('--json', action='store_true', help='JSON, instead of text')
+    read.add_argument('--all', action='store_true', help='also what all have, such as /rosout')
+    read.add_argument('--services', action='store_true', help='services, too')
+    read.add_argument('--only', default='', metavar='REGEX', help='of the names, those alone')
+    read.add_argument('--hide', default='(?!)', metavar='REGEX', help='of the names, not those')
+    read.add_argument('--rates', type=float, default=0, metavar='S', help='count messages so long')
+    chosen = read.parse_args(words)
+    names = {'only': chosen.only, 'hide': chosen.hide}
+    options = {'show_all': chosen.all, 'services': chosen.services, **names}
+    found = graph_of(Master(), chosen.rates, **options)
+    if chosen.output:
+        found.save(chosen.output)
+    else:
+        print(json.dumps(found.as_dict()) if chosen.json else found.text())
 
 
-def _check_namespaces(given: Union[str, Collection[str]]) -> List[str]:
-    names = _names('a namespace', given, '/robot')
-    return [rosgraph.names.make_global_ns(name) for name in names]
-
-
-def _names(what: str, given: Union[str, Collection[str]], example: str) -> List[str]:
-    """One name, or several, as a list."""
-    names = [given] if not isinstance(given, Iterable) or isinstance(given, str) else list(given)
-    if not all(isinstance(name, str) for name in names):
-        raise TypeError(f'{what} is given by its name, such as {example}, not as {given!r}')
-    return names
-
-
-def _is_in(name: str, namespaces: Iterable[str]) -> bool:
-    return any((name + '/').startswith(namespace) for namespace in namespaces)
-
-
-def _is_hidden(topic: SeenTopic, is_connected: bool, hidden: Collection[str]) -> bool:
-    """Whether a topic is of those that are not wanted."""
-    kind = (topic.type or '').rpartition('/')[2]
-    return (
-        ('leaf' in hidden and len({*topic.publishers, *topic.subscribers}) < 2)
-        or ('unheard' in hidden and not topic.subscribers)
-        or ('idle' in hidden and not is_connected)
-        or ('tf' in hidden and _TF.fullmatch(topic.name) is not None)
-        or ('images' in hidden and kind in _IMAGES)
-    )
+def main() -> int:
+    """Run the command."""
+    return live.run(graph)

@@ -1,126 +1,99 @@
-"""Messages of which a picture says more: images, scans, paths, maps, clouds of points."""
-import importlib
+"""Draw messages by matplotlib: images, scans, clouds, paths, maps."""
+from __future__ import annotations
+
 import io
-from typing import TYPE_CHECKING, Any, Dict, Optional, Tuple
+from typing import Any
 
-import genpy
+import numpy
 
-from pharos.errors import MessageTypeError, PharosError, missing
-from pharos.live.message_text import text_of_message
+#: encoding -> numpy's type, and the order of its channels as red, green, blue
+ENCODINGS = {
+    'mono8': ('u1', [0]),
+    'rgb8': ('u1', [0, 1, 2]),
+    'bgr8': ('u1', [2, 1, 0]),
+    'rgba8': ('u1', [0, 1, 2, 3]),
+    'bgra8': ('u1', [2, 1, 0, 3]),
+    'mono16': ('u2', [0]),
+    '16UC1': ('u2', [0]),
+    '32FC1': ('f4', [0]),
+}
+COLUMNS = {7: 'f4', 8: 'f8'}  # datatypes of the fields of clouds
 
-if TYPE_CHECKING:
-    from PIL.Image import Image
 
-SHOWN = 800, 600  # pixels that a picture has at the most in Jupyter
+def _image(axes, message):
+    kind, order = ENCODINGS[message.encoding]
+    rows = numpy.frombuffer(message.data, 'u1').reshape(message.height, message.step)
+    size = numpy.dtype(kind).itemsize * len(order) * message.width
+    pixels = rows[:, :size].copy().view(('>' if message.is_bigendian else '<') + kind)
+    pixels = pixels.reshape(message.height, message.width, len(order))[:, :, order]
+    # Without a vmax the greatest depth is white.
+    axes.imshow(numpy.squeeze(pixels), cmap='gray', vmin=0, vmax=255 if kind == 'u1' else None)
 
-#: (package, message) -> the module and function that make a picture of it, loaded when one is made
-_PICTURES: Dict[Tuple[str, str], Tuple[str, str]] = {
-    ('sensor_msgs', 'Image'): ('images', 'image_picture'),
-    ('sensor_msgs', 'CompressedImage'): ('images', 'compressed_picture'),
-    ('sensor_msgs', 'LaserScan'): ('from_above', 'scan_picture'),
-    ('sensor_msgs', 'PointCloud2'): ('from_above', 'cloud_picture'),
-    ('nav_msgs', 'Path'): ('from_above', 'path_picture'),
-    ('nav_msgs', 'OccupancyGrid'): ('from_above', 'map_picture'),
+
+def _compressed(axes, message):
+    from PIL import Image
+
+    axes.imshow(Image.open(io.BytesIO(message.data)))
+
+
+def _scan(axes, message):
+    ranges = numpy.array(message.ranges)
+    angles = message.angle_min + message.angle_increment * numpy.arange(len(ranges))
+    ranges[(ranges < message.range_min) | (ranges > message.range_max)] = numpy.nan
+    axes.scatter(ranges * numpy.cos(angles), ranges * numpy.sin(angles), s=4)
+    axes.plot(0, 0, 'r>')
+
+
+def _path(axes, message):
+    places = [pose.pose.position for pose in message.poses]
+    axes.plot([place.x for place in places], [place.y for place in places])
+
+
+def _map(axes, message):
+    cells = numpy.array(message.data).reshape(message.info.height, message.info.width)
+    axes.set_facecolor('lightblue')  # of what is unknown
+    axes.imshow(numpy.ma.masked_less(cells, 0), cmap='gray_r', origin='lower', vmin=0, vmax=100)
+
+
+def _cloud(axes, message):
+    fields = {field.name: field for field in message.fields}
+    layout = {
+        'names': list('xyz'),
+        'formats': [COLUMNS[fields[name].datatype] for name in 'xyz'],
+        'offsets': [fields[name].offset for name in 'xyz'],
+        'itemsize': message.point_step,
+    }
+    points = numpy.frombuffer(message.data, numpy.dtype(layout))
+    axes.scatter(points['x'], points['y'], s=1, c=points['z'])
+
+
+DRAWN = {
+    'sensor_msgs/Image': _image,
+    'sensor_msgs/CompressedImage': _compressed,
+    'sensor_msgs/LaserScan': _scan,
+    'sensor_msgs/PointCloud2': _cloud,
+    'nav_msgs/Path': _path,
+    'nav_msgs/OccupancyGrid': _map,
 }
 
 
-#: what reading and drawing raise where the values of a message are no picture's
-_UNFIT = (
-    ArithmeticError,
-    AttributeError,
-    LookupError,
-    MemoryError,
-    OSError,
-    TypeError,
-    ValueError,
-)
-
-
-def picture(message: genpy.Message) -> 'Image':
-    """A picture of a message, as of the Python Imaging Library: ``picture(scan).save('scan.png')``.
-
-    Of sensor_msgs' Image, CompressedImage, LaserScan and PointCloud2 (from above), and of nav_msgs'
-    Path and OccupancyGrid.
-
-    :raises MessageTypeError: if a message of its type has no picture, or its values make none
-    :raises PharosError: if Pillow or NumPy is not installed
-    """
-    key = _key(message)
-    if key not in _PICTURES:
-        types = ', '.join('/'.join(key) for key in _PICTURES)
-        raise MessageTypeError(
-            f'no picture is made of {getattr(message, "_type", None) or repr(message)}: there are'
-            f' those of {types}'
-        )
-    module, name = _PICTURES[key]
-    try:
-        draw = getattr(importlib.import_module(f'pharos.live.{module}'), name)
-        with importlib.import_module('numpy').errstate(all='ignore'):  # numbers may be anything
-            drawing: 'Image' = draw(message)
-    except ImportError as error:
-        raise PharosError(
-            missing(
-                'Pillow and NumPy draw pictures of messages', error, 'python3-pil python3-numpy'
-            )
-        ) from error
-    except _UNFIT as error:  # of another definition by this name, or values that make no picture
-        raise MessageTypeError(
-            f'no picture can be made of this {message._type}: {error or type(error).__name__}'
-        ) from error
-    return drawing
-
-
-def has_picture(message: Any) -> bool:
-    """Whether pictures are made of messages of its type."""
-    return _key(message) in _PICTURES
-
-
-def _key(message: Any) -> Tuple[str, str]:
-    package, _, name = str(getattr(message, '_type', '')).partition('/')
-    return package, name
-
-
-# -- in Jupyter
-
-
-def register(ipython: Any) -> None:
-    """Have an IPython show pictures of messages, and other messages, too, without endless arrays.
-
-    The classes of messages stay as they are; those that are made later are among them.
-
-    :param ipython: what ``get_ipython()`` returns
-    """
-    formatters = ipython.display_formatter.formatters
-    formatters['image/png'].for_type(genpy.Message, _png)
-    formatters['text/plain'].for_type(genpy.Message, _text)
-
-
-def _as_png_takes_it(shown: 'Image') -> 'Image':
-    if shown.mode in ('1', 'L', 'LA', 'P', 'RGB', 'RGBA'):
-        return shown
-    if shown.mode == 'F' or shown.mode.startswith('I'):  # measured values
-        images = importlib.import_module('pharos.live.images')
-        drawn: 'Image' = images.values_picture(importlib.import_module('numpy').asarray(shown))
-        return drawn
-    return shown.convert('RGBA' if shown.mode == 'PA' else 'RGB')
-
-
-def _png(message: genpy.Message) -> Optional[bytes]:
-    """A picture of the size that is shown; None where there is none."""
-    if not has_picture(message):
+def png_of(message: Any) -> bytes | None:
+    """Return the picture of a message, None if it cannot be drawn."""
+    if message._type not in DRAWN:
         return None
+    from matplotlib.figure import Figure
+
+    made = Figure(layout='constrained')
+    axes = made.add_subplot(title=message.header.frame_id, aspect='equal')
     try:
-        shown = picture(message)
-    except PharosError:  # its text is shown all the same
+        DRAWN[message._type](axes, message)
+        return png(made)
+    except (LookupError, ValueError, OSError):  # empty, malformed, or of an encoding not drawn
         return None
-    shown = _as_png_takes_it(shown)
-    if shown.width > SHOWN[0] or shown.height > SHOWN[1]:
-        shown = shown.copy()
-        shown.thumbnail(SHOWN)
+
+
+def png(figure: Any) -> bytes:
+    """Return a matplotlib Figure as a notebook shows it."""
     file = io.BytesIO()
-    shown.save(file, 'PNG')
+    figure.savefig(file, format='png')
     return file.getvalue()
-
-
-def _text(message: genpy.Message, printer: Any, cycle: bool) -> None:
-    printer.text(text_of_message(message))

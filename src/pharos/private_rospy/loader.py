@@ -1,333 +1,150 @@
-"""Loads rospy's modules once more, with globals of their own.
+"""Load rospy once more, with globals of its own: one process, many nodes.
 
-``sys.modules`` stays untouched and no other thread notices: every module of the private set gets a
-``__builtins__`` whose ``__import__`` resolves the private packages to the set and everything else
-as usual, also for imports that rospy does inside functions later on.
+``sys.modules`` stays untouched. Each private module has a ``__builtins__`` whose ``__import__`` finds
+rospy, rosgraph and what is written on rospy in the private set, and all else as usual.
 """
 import builtins
-import collections
-import contextlib
+import functools
 import importlib.util
-import os
-import pickle
+import itertools
+import pathlib
+import re
 import sys
 import threading
-import types
-from importlib.machinery import SourceFileLoader
-from typing import Any, Dict, Tuple
+from importlib.machinery import PathFinder
 
-from pharos.private_rospy import ownership
-from pharos.private_rospy.module_proxy import ModuleProxy, twin
-from pharos.private_rospy.process_rospy import rospy
+import rospy.exceptions
 
-# so that ``except rospy.ROSException`` catches every node's
-_SHARED = {'rospy.exceptions': rospy.exceptions}
-# Those of Python's modules with functions that look modules up by name, and what each set has of
-# them. An own copy of what they import would have other classes.
-_TWINS: Dict[str, Dict[str, Any]] = {
-    'dataclasses': {},
-    'doctest': {},
-    'inspect': {'modulesbyfile': {}, '_filesbymodname': {}},
-    'pkgutil': {},
-    'typing': {},
+SHARED = set(sys.stdlib_module_names) | {
+    *('genpy', 'genmsg', 'roslib', 'rospkg', 'rosmaster', 'catkin', 'catkin_pkg', 'pharos'),
+    *('numpy', 'yaml', 'matplotlib', 'cv2', 'PIL'),
 }
-# Modules of Python's of which a node's program has its own, and rospy does with the process's: those
-# would slow the start of each node down.
-_OWN_OF_PROGRAMS = 'pickle', 'traceback'
-_ROSPYS = 'rospy', 'rosgraph', 'logging'
-# file -> (its time of modification, code), the same for all sets
-_codes: Dict[str, Tuple[Any, Any]] = {}
+#: rospy's configuration strips the log of handlers; the others use sys.argv, sys.path, os.environ or threads
+PRIVATE = 'logging', 'argparse', 'optparse', 'subprocess', 'concurrent', 'pkgutil'
+MOST_FILES = 300  # of a package that could be written on rospy
 
 
-class PrivateImports:
-    """A set of private modules: rospy, rosgraph, and whatever they, a program or :meth:`load`
-    import that is a node's own, as :mod:`.ownership` says.
+class Shim:
+    """Looks like a module, with some names of our own."""
 
-    ``sys``, ``os`` and others stand in for Python's from the beginning: see :mod:`.own_process`.
+    def __init__(self, real, **own):
+        self.__dict__.update(own, _real=real)
 
-    :param patch: ``patch(module)``, called right after the code of every private module, before any
-        other module can import names from it
+    def __getattr__(self, name):
+        return getattr(self._real, name)
+
+
+@functools.lru_cache(None)
+def _find(name, path):
+    spec = PathFinder.find_spec(name, path)
+    if spec is None:
+        raise ModuleNotFoundError(f'No module named {name!r}', name=name)
+    return spec, spec.loader.get_code(name) if spec.has_location else None
+
+
+@functools.lru_cache(None)
+def _imports_of(top):
+    """Return what a module or package of Python imports; nothing of a large one or one in C."""
+    spec = PathFinder.find_spec(top)
+    if top in SHARED or spec is None or not str(spec.origin).endswith('.py'):
+        return set()
+    init = pathlib.Path(spec.origin).read_bytes()
+    folders = list(spec.submodule_search_locations or ())
+    # catkin's devel space leads to the source
+    source = re.search(r'__extended_path = [\'"]([^\'"]*)', init.decode(errors='replace'))
+    folders += [f'{source[1]}/{top}'] if source else []
+    found = (file for folder in folders for file in pathlib.Path(folder).rglob('*.py'))
+    files = [file.read_bytes() for file in itertools.islice(found, MOST_FILES + 1)]
+    text = b'\n'.join([init, *files]) if len(files) <= MOST_FILES else b''
+    names = re.findall(r'^\s*(?:from|import) (\w+)', text.decode(errors='replace'), re.M)
+    return {'rospy', *names} if b'rospy' in text else set(names)
+
+
+@functools.lru_cache(None)
+def _reaches_rospy(top):
+    """True if the code of a package says rospy, or imports a package that does, and so on."""
+    names, new = set(), {top}
+    while new:
+        names |= new
+        new = set().union(*map(_imports_of, new)) - names
+    return not names.isdisjoint(('rospy', 'rosgraph'))
+
+
+def is_private(name):
+    """True if each node has a copy of the module. Generated messages are shared."""
+    top, *rest = name.split('.')
+    is_generated = rest[:1] in (['msg'], ['srv']) and top not in ('rospy', 'rosgraph')
+    return top in PRIVATE or not is_generated and _reaches_rospy(top)
+
+
+class PrivateModules:
+    """A set of private modules.
+
+    :param substitutes: what private modules import under some names of Python's modules
+    :param patch: ``patch(module)`` is called right after the code of each private module
     """
 
-    def __init__(self, patch):
-        #: name -> module: what private modules import under that name
-        self.modules = {}
-        self._patch = patch
-        self._changed = threading.Condition()  # guards these
-        self._loading = {}  # name of a module -> the thread that loads it
-        self._awaited = {}  # thread -> name of the module that it waits for
-        self._folder = None  # the program's
-        own_builtins = types.ModuleType('builtins', builtins.__doc__)
-        self.builtins = vars(own_builtins)
-        self.builtins.update(
-            vars(builtins), __import__=self._import, print=self._print, exit=_exit, quit=_exit
-        )
-        self.system = ModuleProxy(
-            sys, path=list(sys.path), modules=collections.ChainMap(self.modules, sys.modules)
-        )
-        # pickle without this is written in Python, and looks modules up in the set
-        accelerator = types.ModuleType('_pickle')
-        accelerator.PickleBuffer = pickle.PickleBuffer
-        util = ModuleProxy(
-            importlib.util,
-            module_from_spec=self._module_from_spec,
-            find_spec=self._find_spec,
-        )
-        self.modules.update(
-            builtins=own_builtins,
-            sys=self.system,
-            _pickle=accelerator,
-            importlib=ModuleProxy(
-                importlib, import_module=self._import_module, reload=self._reload, util=util
-            ),
-        )
-        self.modules['importlib.util'] = util
+    def __init__(self, substitutes, patch):
+        # one rospy.exceptions for all, so that ``except rospy.ROSException`` catches every node's
+        self.modules = {**substitutes, 'rospy.exceptions': rospy.exceptions}
+        self.modules['importlib'] = Shim(importlib, import_module=self._import_module)
+        self._patch, self._lock = patch, threading.RLock()
+        self.path = None  # a program's sys.path, which begins with its own folder
+        self.builtins = {**vars(builtins), '__import__': self._import}
 
-    def import_library(self, name):
-        """The module ``name`` as private modules import it."""
-        path = self.system.path
-        path += [folder for folder in sys.path if folder not in path]
-        ownership.look_again()
-        return self.load(name)
-
-    def run_main(self, path, argv):
-        """Run the file as a program of the set, in this thread: what it raises, SystemExit too, comes
-        through.
-
-        :param argv: its ``sys.argv``, whole
-        """
-        self._folder = os.path.dirname(os.path.realpath(path))
-        self.system.argv, self.system.path = argv, [self._folder, *sys.path]
-        ownership.look_again()
-        loader = SourceFileLoader('__main__', path)
-        main = types.ModuleType('__main__')
-        vars(main).update(
-            __file__=path,
-            __loader__=loader,
-            __cached__=None,
-            __builtins__=self.modules['builtins'],
-        )
-        self.modules['__main__'] = main
-        exec(loader.source_to_code(loader.get_data(path), path), vars(main))
-
-    def twin(self, real, **own):
-        """A copy of one of Python's modules that has other objects under some names, and whose
-        functions see these, and the private modules."""
-        imported = {
-            name: self._own(value)
-            for name, value in vars(real).items()
-            if isinstance(value, types.ModuleType)
-        }
-        return twin(real, **{**imported, '__builtins__': self.builtins, **own})
-
-    def load_single(self, name, path):
-        """A private copy of one module of a package that is otherwise shared."""
-        return self._run(*_find(name, tuple(path)))
+    def _is_private(self, name):
+        """True also for what lies in the folder of the program."""
+        top = name.partition('.')[0]
+        return is_private(name) or self.path and PathFinder.find_spec(top, self.path[:1])
 
     def load(self, name):
-        """The module of that full name, for private modules."""
-        me = threading.get_ident()
-        if name not in self.modules or self._loading.get(name, me) != me:
-            if name in _TWINS:
-                own = {name: value.copy() for name, value in _TWINS[name].items()}
-                self.modules[name] = self.twin(importlib.import_module(name), **own)
-            elif not self._is_private(name.partition('.')[0]):
-                return importlib.import_module(name)
-            else:
-                self._load(name)
-        if self.modules[name] is None:
-            raise ModuleNotFoundError(f'{name!r} is None in sys.modules', name=name)
-        return self.modules[name]
+        """Return the module of that name, as private modules import it."""
+        if name not in self.modules and not self._is_private(name):
+            return importlib.import_module(name)
+        parent, _, leaf = name.rpartition('.')
+        with self._lock:  # or another thread would see a module that is half loaded
+            if name not in self.modules:
+                path = self.load(parent).__path__ if parent else self.path
+                if name not in self.modules:  # the parent may have imported it
+                    self._execute(name, path and tuple(path))
+            if parent in self.modules:
+                setattr(self.modules[parent], leaf, self.modules[name])
+            return self.modules[name]
 
-    def _is_private(self, top):
-        return ownership.is_own(top, tuple(self.system.path), self._folder)
-
-    def _load(self, name):
-        parent_name, _, leaf = name.rpartition('.')
-        parent = self.load(parent_name) if parent_name else None
-        if parent and not hasattr(parent, '__path__'):
-            raise ModuleNotFoundError(
-                f'No module named {name!r}; {parent_name!r} is not a package', name=name
-            )
-        self._claim(name)
+    def _execute(self, name, path):
+        spec, code = _find(name, path)
+        self.modules[name] = module = importlib.util.module_from_spec(spec)
+        vars(module)['__builtins__'] = self.builtins
         try:
-            if name in self.modules:  # another thread loaded it, or the parent's code imported it
-                return
-            spec, code = _find(name, tuple(parent.__path__ if parent else self.system.path))
-            module = _SHARED.get(name) or _shared(spec)
-            if module:
-                self.modules[name] = module
-            else:
-                self._run(spec, code, parent)
-            if parent:
-                setattr(parent, leaf, self.modules[name])
-        finally:
-            with self._changed:
-                if self._loading.get(name) == threading.get_ident():
-                    del self._loading[name]
-                self._changed.notify_all()
-
-    def _claim(self, name):
-        """Have this thread load the module, after another one that does already.
-
-        Where threads wait for each other in a circle, this goes on with a module half loaded, as in
-        Python.
-        """
-        me = threading.get_ident()
-        with self._changed:
-            while self._loading.setdefault(name, me) != me:
-                thread = self._loading[name]
-                while thread in self._awaited:
-                    thread = self._loading.get(self._awaited[thread])
-                if thread == me:
-                    return
-                self._awaited[me] = name
-                self._changed.wait()
-                del self._awaited[me]
-
-    def _run(self, spec, code, parent=None):
-        """Run the code of a module, which is found before: rospy's import each other in circles."""
-        name = spec.name
-        module = self.modules[name] = self._module_from_spec(spec)
-        if parent:
-            setattr(parent, name.rpartition('.')[2], module)
-        try:
-            if code:
-                exec(code, vars(module))
-            elif spec.loader:
+            if code is None and spec.loader and spec.has_location:
                 spec.loader.exec_module(module)
-            if name.partition('.')[0] in ownership.OWN_OF_PYTHONS:
-                _join_kinds(module)
-            self._patch(module)
+            else:
+                exec(code or '', vars(module))
         except BaseException:
             del self.modules[name]
             raise
+        self._patch(module)
         return module
-
-    def _import(self, name, globals=None, locals=None, fromlist=(), level=0):
-        """What an import statement of a private module calls."""
-        absolute = name
-        if level:
-            absolute = importlib.util.resolve_name('.' * level + name, globals['__package__'])
-        top = absolute.partition('.')[0]
-        user = (globals or {}).get('__name__', '').partition('.')[0]
-        if top in _OWN_OF_PROGRAMS and user in _ROSPYS:
-            return builtins.__import__(name, globals, locals, fromlist, level)
-        module = self.load(absolute)
-        if not fromlist:
-            return module if level else self.load(top)
-        if hasattr(module, '__path__'):
-            for item in fromlist:
-                for each in getattr(module, '__all__', ()) if item == '*' else (item,):
-                    self._load_item(module, f'{absolute}.{each}', each)
-        is_private = vars(module).get('__builtins__') is self.builtins
-        return self._starred(module) if '*' in fromlist and not is_private else module
-
-    def _load_item(self, package, name, item):
-        if not hasattr(package, item):
-            try:
-                module = self.load(name)
-            except ModuleNotFoundError as error:
-                if error.name != name:
-                    raise
-                # the import statement itself says what is missing
-            else:
-                vars(package).setdefault(item, module)
-
-    def _starred(self, module):
-        """What a star import takes its names from: with them come modules that the other one
-        imported."""
-        names = getattr(module, '__all__', None)
-        if names is None:
-            names = [name for name in vars(module) if not name.startswith('_')]
-        view = types.ModuleType(module.__name__)
-        vars(view).update({name: self._own(getattr(module, name)) for name in names})
-        view.__all__ = list(names)
-        return view
-
-    def _own(self, value):
-        """The set's module instead of Python's."""
-        if isinstance(value, types.ModuleType):
-            return self.modules.get(value.__name__, value)
-        return value
-
-    # -- functions of Python's, as private modules have them
 
     def _import_module(self, name, package=None):
-        """``importlib.import_module``."""
         return self.load(importlib.util.resolve_name(name, package))
 
-    def _find_spec(self, name, package=None):
-        """``importlib.util.find_spec``."""
-        name = importlib.util.resolve_name(name, package)
-        if self.modules.get(name) is not None:
-            return self.modules[name].__spec__
-        parent = name.rpartition('.')[0]
-        path = self.load(parent).__path__ if parent else self.system.path
-        return ownership.find_spec(name, tuple(path)) or importlib.util.find_spec(name)
-
-    def _module_from_spec(self, spec):
-        """``importlib.util.module_from_spec``."""
-        module = importlib.util.module_from_spec(spec)
-        vars(module)['__builtins__'] = self.builtins
+    def _import(self, name, globals=None, locals=None, fromlist=(), level=0):
+        full = name
+        if level:
+            full = importlib.util.resolve_name('.' * level + name, globals['__package__'])
+        top = full.partition('.')[0]
+        if full not in self.modules and not self._is_private(full):
+            module = builtins.__import__(name, globals, locals, fromlist, level)
+            return module if fromlist else self.modules.get(top, module)
+        module = self.load(full)
+        if not fromlist:
+            return module if level else self.load(top)
+        for item in fromlist if hasattr(module, '__path__') else ():
+            for each in getattr(module, '__all__', ()) if item == '*' else (item,):
+                if not hasattr(module, each):
+                    try:
+                        setattr(module, each, self.load(f'{full}.{each}'))
+                    except ModuleNotFoundError:
+                        pass  # the import statement itself says so
         return module
-
-    def _reload(self, module):
-        """``importlib.reload``; what stands in for one of Python's modules stays as it is."""
-        spec = getattr(module, '__spec__', None)
-        if spec is not None and self.modules.get(spec.name) is module:
-            exec(_code(spec), vars(module))
-        return module
-
-    def _print(self, *values, file=None, **options):
-        """``print``, to the ``sys.stdout`` of the set."""
-        print(*values, file=self.system.stdout if file is None else file, **options)
-
-
-def _exit(code=None):
-    """``exit()``; Python's closes standard input, which nodes share."""
-    raise SystemExit(code)
-
-
-def _find(name, path):
-    """The spec and the compiled code of a module."""
-    spec = ownership.find_spec(name, path)
-    if spec is None:
-        raise ModuleNotFoundError(f'No module named {name!r}', name=name)
-    return spec, _code(spec)
-
-
-def _code(spec):
-    """The compiled code of a module, read once per process, and when its file has changed; None for
-    a C extension, and a package without a file."""
-    if not spec.has_location:
-        return None
-    try:
-        modified = os.stat(spec.origin).st_mtime_ns
-    except OSError:
-        modified = None  # it is in an archive
-    if _codes.get(spec.origin, ('',))[0] != modified:
-        _codes[spec.origin] = modified, spec.loader.get_code(spec.name)
-    return _codes[spec.origin][1]
-
-
-def _shared(spec):
-    """The process's own module, for what there is one of; None for all else, and where Python finds
-    another one."""
-    if ownership.is_one_for_all(spec):
-        with contextlib.suppress(ModuleNotFoundError):
-            module = importlib.import_module(spec.name)
-            if module.__spec__.origin == spec.origin:
-                return module
-    return None
-
-
-def _join_kinds(module):
-    """Have a copy of one of Python's modules raise and catch the same as the others, and its
-    executors be such for asyncio."""
-    real = importlib.import_module(module.__name__)
-    for name, value in vars(real).items():
-        if isinstance(value, type) and issubclass(value, BaseException):
-            vars(module)[name] = value
-    if module.__name__ == 'concurrent.futures.thread':
-        module.ThreadPoolExecutor.__bases__ = (real.ThreadPoolExecutor,)

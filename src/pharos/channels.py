@@ -1,0 +1,323 @@
+"""Channels, the ends of a topic at which a node receives and sends; topics, which hand them out."""
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+import genpy
+
+from pharos import messages
+from pharos.blocks import Block, taking
+from pharos.errors import MessageTypeError, NodeStoppedError, UnknownNodeError
+from pharos.intraprocess.workers import Inbox
+from pharos.program import wait
+
+if TYPE_CHECKING:
+    from pharos.master import Master
+    from pharos.node import Node
+
+QUEUE_SIZE = 1000
+
+
+class Opened:
+    """A thing that a node has opened: its stop closes it, its next start opens it again.
+
+    :ivar node: the node
+    :ivar closed: True if it was closed, or the node is stopped
+    """
+
+    node: Node
+    closed = True
+    delegate: Any = None  # its block or blocks
+    end: Any = None  # rospy's Publisher, Subscriber or Service
+
+    def open(self) -> None:
+        """Be opened by the node."""
+        self.node.opened = [*self.node.opened, self]
+        self.closed = False
+
+    def node_stopped(self) -> None:
+        """Take note that rospy has closed it."""
+        self.closed = True
+
+    def close(self) -> None:
+        """Receive, send or offer no more, and unregister."""
+        self.node.opened = [each for each in self.node.opened if each is not self]
+        if not self.closed:
+            self.closed = True
+            (getattr(self.end, 'unregister', None) or self.end.shutdown)()
+
+
+class Channel(Opened):
+    """Either kind of channel.
+
+    :ivar topic: the full name of the topic
+    :ivar type: the name of its message type
+    """
+
+    def _begin(self, node, topic, message_class):
+        self.node, self.topic = node, topic
+        self.message_class, self.type = message_class, message_class._type
+        self.open()
+
+    def _connections(self):
+        impl = self.end and self.end.impl
+        if not impl or impl.closed:
+            return []
+        impl.check()  # rospy looks now and then who has left (ros_comm #927)
+        return impl.connections
+
+    def __repr__(self) -> str:
+        state = 'closed ' if self.closed else ''
+        return f'<{state}{type(self).__name__} {self.topic} ({self.type}) of {self.node.name}>'
+
+
+class InputChannel(Channel, Inbox):
+    """The end of a topic at which a node receives; see :meth:`Node.interested_in`.
+
+    :ivar received: how many messages the delegate was run on
+    :ivar dropped: how many were dropped since the queue was full
+    """
+
+    def __init__(self, node, topic, message_class, delegate, queue_size, inline, shared, from_):
+        Inbox.__init__(self, node.run.turns, self._deliver, queue_size, inline, shared)
+        self.queue_bytes, self.received, self.from_ = node.queue_bytes, 0, from_
+        self.delegate = delegate
+        self._begin(node, topic, message_class)
+
+    @property
+    def delegate(self) -> Block | None:
+        """The block run for each message, as ``block(message, channel)`` or ``block(message)``.
+
+        None: the node's. One that is set takes effect with the next message.
+        """
+        return self._delegate
+
+    @delegate.setter
+    def delegate(self, block: Block | None) -> None:
+        self._runs = taking(block, 'delegate', 2, 1)
+        self._delegate = block
+
+    def open(self) -> None:
+        """Subscribe. Called again after the node was stopped and started."""
+        self.node.master.call('getPid')  # raises if it does not answer
+        self.turns, self.closed = self.node.run.turns, False
+        self.end = self.node.ros.Subscriber(self.topic, self.message_class, self)
+        super().open()
+
+    def __call__(self, message):
+        """Take a message; rospy calls this if nobody has made it an Inbox."""
+        self.receive(message, 0)
+
+    def _deliver(self, message):
+        if self.closed or self.from_ and message._connection_header['callerid'] != self.from_:
+            return
+        self.received += 1
+        block = self._runs or self.node.delegate_runs
+        if block is None:
+            return
+        try:
+            block(message, self)
+        except BaseException as error:
+            given = self._delegate or self.node.delegate
+            self.node.report(error, given, 'delegate', message, self, self._retry)
+
+    def _retry(self, message):
+        """Run the delegate on a message once more, in the node's turn."""
+        self.node.check_running()
+        self.turns.call(lambda: self._deliver(message))
+
+    @property
+    def connections(self) -> list[tuple[str, str]]:
+        """The peers: ``(name of the node, 'INTRAPROCESS' or 'TCPROS')``."""
+        found = [each for each in self._connections() if each.header]
+        return [(each.header['callerid'], each.transport_type) for each in found]
+
+
+class OutputChannel(Channel):
+    """The end of a topic at which a node sends; see :meth:`Node.output_channel`.
+
+    :ivar sent: how many messages were sent
+    """
+
+    def __init__(self, node, topic, message_class, latch, queue_size):
+        self.latch, self.queue_size, self.sent, self._latched = latch, queue_size, 0, None
+        self._key = latch and self  # under which rospy's publisher keeps what is latched
+        self._begin(node, topic, message_class)
+
+    def open(self) -> None:
+        """Advertise, and wait for the subscribers that the master knows."""
+        known = set(self.node.master.system_state()[1].get(self.topic, ()))
+        options = {'latch': self.latch, 'queue_size': self.queue_size}
+        self.end = self.node.ros.Publisher(self.topic, self.message_class, **options)
+        self._impl = self.end.impl
+        super().open()
+        if self._latched is not None:
+            self._impl.publish(self._latched, None, self)
+        self._wait_for(known)
+
+    def _wait_for(self, names):
+        """Wait until these subscribers are connected: rospy loses what is sent before (#176).
+
+        Who refuses a connection is dead. Who does not connect in time is named in the log.
+        """
+        node = self.node
+
+        def missing():
+            return names - {each.endpoint_id for each in self._impl.connections}
+
+        if not wait(lambda: not missing(), min(0.2, node.connect_timeout), node):
+            names = {name for name in missing() if node.master.may_live(name)}
+            wait(lambda: not missing(), node.connect_timeout, node)
+        if missing() and node.connect_timeout and node.is_running:
+            node.log(
+                f'{self.topic}: {", ".join(sorted(missing()))} did not connect within'
+                f' {node.connect_timeout:g} s, and may miss the first messages: can they reach'
+                ' this host, and are they of the same type? A longer connect_timeout waits longer',
+                'warning',
+            )
+
+    def publish(self, message: genpy.Message) -> None:
+        """Send a message.
+
+        :raises MessageTypeError: if it is of another type, or cannot be serialized
+        :raises NodeStoppedError: if the channel is closed
+        """
+        self._publish(message, None)
+
+    def _publish(self, message, connection):
+        if message.__class__ is not self.message_class:
+            self._check_type(message)
+        if self.closed:
+            raise NodeStoppedError(f'{self!r} cannot send: open another one, or start the node')
+        try:
+            self._impl.publish(message, connection, self._key)
+        except Exception as error:
+            if self.closed:
+                raise NodeStoppedError(f'{self!r} was closed while it sent') from error
+            if not messages.convert_numpy(message):
+                raise messages.explain(message, error) from error
+            return self._publish(message, connection)
+        self.sent += 1
+
+    def _check_type(self, message):
+        found = getattr(message, '_type', repr(message)[:80])
+        if getattr(message, '_md5sum', None) not in (self.message_class._md5sum, '*'):
+            raise MessageTypeError(f'{self.topic} carries {self.type}, not {found}')
+
+    def send(self, block: Any = None, *, to: Any = None, **fields: Any) -> genpy.Message:
+        """Fill a new message by ``block(message)`` and keywords, or take a ready one; send it.
+
+        :param to: the node that alone gets it: a name, Node or ExternalNode
+        :returns: the message
+        """
+        message = messages.build(self.message_class, block, fields)
+        if to is not None:
+            self._publish(message, self._connection_to(self.node.peer_name(to)))
+            return message
+        self.publish(message)
+        return message
+
+    def _connection_to(self, peer):
+        def find():
+            return next((each for each in self._connections() if each.endpoint_id == peer), None)
+
+        is_known = peer in Topic(self.node.master, self.topic).subscribers
+        found = wait(find, self.node.connect_timeout if is_known else 0, self.node)
+        if found is None:
+            raise UnknownNodeError(
+                f'{peer} is not interested in {self.topic}: rostopic info {self.topic} tells who is'
+            )
+        return found
+
+    def close(self) -> None:
+        """Send no more, once what was published is with the sockets; unregister."""
+        if not self.closed:
+            self._impl.latches.pop(self, None)
+            if self._impl.ref_count == 1:
+                self._impl.flush(self.node.stop_timeout)
+        super().close()
+
+    def node_stopped(self) -> None:
+        super().node_stopped()
+        frozen = self._impl.latches.get(self)
+        self._latched = None if frozen is None else self._impl.thaw(frozen)
+
+    @property
+    def connections(self) -> list[tuple[str, str]]:
+        """The peers: ``(name of the node, 'INTRAPROCESS' or 'TCPROS')``."""
+        return [(each.endpoint_id, each.transport_type) for each in self._connections()]
+
+    def wait_for_subscribers(self, count: int = 1, timeout: float | None = None) -> bool:
+        """Wait until so many subscribers are connected; True if they are.
+
+        :param timeout: seconds, None: without limit
+        """
+        return bool(wait(lambda: len(self.connections) >= count, timeout, self.node))
+
+
+@dataclasses.dataclass(frozen=True)
+class Topic:
+    """A topic of a master: the named bus, which hands nodes their channels.
+
+    :ivar name: its full name
+    """
+
+    master: Master
+    name: str
+
+    @property
+    def type(self) -> str | None:
+        """The name of its message type, None if the master knows none."""
+        return self.master.topic_type(self.name)
+
+    @property
+    def publishers(self) -> list[str]:
+        """The names of the nodes that publish on it."""
+        return self.master.system_state()[0].get(self.name, [])
+
+    @property
+    def subscribers(self) -> list[str]:
+        """The names of the nodes that receive from it."""
+        return self.master.system_state()[1].get(self.name, [])
+
+    @property
+    def channels(self) -> list[Channel]:
+        """The channels of nodes of this process."""
+        nodes = self.master.own_nodes()
+        return [each for node in nodes for each in node.channels if each.topic == self.name]
+
+    def hz(self, seconds: float = 1.0) -> Any:
+        """Measure for some seconds how often messages come, and how large they are."""
+        from pharos.live import watching
+
+        return watching.measure(self, seconds)
+
+    bw = hz
+
+    @property
+    def last(self) -> genpy.Message:
+        """The latched or else the next message; TimeoutError if none comes within 3 s."""
+        from pharos.live import watching
+
+        return watching.last(self)
+
+    def watch(self, count: int | None = None, block: Block | None = None) -> None:
+        """Show the next messages, or run ``block(message)`` on them; None: until Ctrl-C."""
+        from pharos.live import watching
+
+        watching.watch(self, count, block)
+
+    def plot(self, *fields: str, seconds: float = 5.0) -> Any:
+        """Return a matplotlib Figure of fields such as 'linear.x' over some seconds."""
+        from pharos.live import watching
+
+        return watching.plot(self, fields, seconds)
+
+    def input_channel(self, node: Node, typed_as: Any = None, **options: Any) -> InputChannel:
+        """Hand a node its end to receive at; see :meth:`Node.interested_in`."""
+        return node.interested_in(self.name, typed_as, **options)
+
+    def output_channel(self, node: Node, typed_as: Any = None, **options: Any) -> OutputChannel:
+        """Hand a node its end to send at; see :meth:`Node.output_channel`."""
+        return node.output_channel(self.name, typed_as, **options)

@@ -1,0 +1,85 @@
+"""Run the Python nodes of a launch file, or several programs, unmodified, in one process.
+
+  compose PKG FILE.launch [arg:=value ...]     as roslaunch; what is not Python runs apart, as there
+  compose FILE.launch [arg:=value ...]         the same, by its path
+  compose --script PKG/EXECUTABLE ...          programs, as rosrun finds them
+  compose                                      none at first
+
+Programs that use pharos themselves run apart. It is a node, /compose by default (__name:= names it
+otherwise), with the services of a nodelet manager: `rosrun nodelet nodelet load PKG/EXECUTABLE
+compose __name:=talker` loads one more. It ends when all nodes have ended, or by Ctrl-C.
+"""
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import sys
+
+import rosgraph.names
+
+from pharos import Master, NodeNameInUseError, PharosError, spin
+from pharos.compose.composition import Composition
+from pharos.compose.container import Container
+from pharos.compose.launch_file import LaunchFile
+from pharos.compose.script import load
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Start, wait, and return the exit status."""
+    parser = argparse.ArgumentParser(
+        'compose', description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument('file', nargs='*', help='PKG FILE.launch, or its path alone')
+    parser.add_argument('--script', nargs='+', default=[], help='programs to run')
+    parser.add_argument('--only', nargs='+', default=[], help='of the file, these nodes alone')
+    parser.add_argument('--apart', nargs='+', default=[], help='these in processes of their own')
+    parser.add_argument(
+        '--share-connections', action='store_true', help='one connection to each other publisher'
+    )
+    words = sys.argv[1:] if argv is None else argv
+    options = parser.parse_args([word for word in words if ':=' not in word])
+    mappings = [word for word in words if ':=' in word]
+    if len(options.file) > 2 or options.file and options.script:
+        parser.error('give one launch file, by package and name or by its path, or --script')
+    with contextlib.ExitStack() as stack:
+        try:
+            return _run(stack, options, mappings)
+        except (PharosError, ValueError) as error:
+            print(f'compose: {error}', file=sys.stderr)
+            return 1
+        except KeyboardInterrupt:
+            return 0
+
+
+def _run(stack, options, mappings):
+    master = Master(share_connections=options.share_connections)
+    if not master.is_reachable():
+        port = int(master.url.rstrip('/').rpartition(':')[2])
+        print(f'no ROS master at {master.url}: it is started here', file=sys.stderr)
+        os.environ['ROS_MASTER_URI'] = stack.enter_context(Master.embedded(port)).url
+    composition = Composition(master)
+    ros_arguments = [word for word in mappings if word.startswith('_') or not options.file]
+    settings = {'argv': ros_arguments, 'composition': composition}
+    try:
+        stack.enter_context(master.create(Container, 'compose', **settings))
+    except NodeNameInUseError:
+        name = rosgraph.names.anonymous_name('compose')
+        stack.enter_context(master.create(Container, name, **settings))
+    stack.enter_context(composition)
+    if options.file:
+        args = dict(word.split(':=', 1) for word in mappings if not word.startswith('_'))
+        package = options.file[0] if len(options.file) == 2 else None
+        names = options.only, options.apart
+        composition.launch(LaunchFile(master.url, package, options.file[-1], args, *names))
+        return composition.wait()
+    for text in options.script:
+        package, _, executable = text.partition('/')
+        is_file = os.path.isfile(text)
+        with composition.telling(text):
+            script = load(master, text if is_file else package, None if is_file else executable, ())
+            composition.nodes.append(script)
+    if options.script:
+        return composition.wait()
+    spin()
+    return 0

@@ -1,0 +1,250 @@
+"""Run the callbacks of all nodes in a pool of threads, those of one node one at a time.
+
+A publisher puts a message into the Inbox of each receiver and wakes a worker. A worker takes the
+next node that has something to run; there are at most as many workers as nodes, so that a callback
+that blocks holds up its own node alone. They end with the last node. Inline inboxes are run by the publisher's thread.
+"""
+from __future__ import annotations
+
+import collections
+import threading
+import time
+from _thread import allocate_lock
+
+from pharos.intraprocess.copier import size_of
+
+BURST = 100e-6  # seconds; a publisher that comes again within them does not wait for a receiver
+YIELD_LIMIT = 1e-3  # seconds that a publisher waits at most until the receiver's thread runs
+YIELD_PAUSE = 0.02  # seconds without such a wait after one that was in vain
+FAST = 50e-6  # seconds; a callback that takes less may run in the thread that reads the socket
+QUEUE_BYTES = 64 << 20
+
+_ready = collections.deque()
+_idle = []
+_workers = set()
+_turns = set()
+_guard = allocate_lock()  # of _workers and _turns
+_no_yield_before = 0.0
+
+
+class Turns:
+    """Whatever takes turns: the callbacks of one node, or those of one subscription of plain rospy."""
+
+    def __init__(self, name):
+        self.name = name
+        self.jobs = collections.deque()
+        self.scheduled = False
+        self.runner = None  # the identifier of the thread that runs it
+        self._running = allocate_lock()
+        with _guard:
+            _turns.add(self)
+
+    def run(self):
+        """Run what waits, unless another thread does so; that one then runs this, too."""
+        while self.jobs and self._running.acquire(False):
+            self.runner = threading.get_ident()
+            try:
+                while self.jobs:
+                    self.jobs.popleft().run()
+            finally:
+                self.runner = None
+                self._running.release()
+
+    def call(self, block, timeout=-1):
+        """Run ``block()`` between two callbacks; raises TimeoutError if none ends in time."""
+        if self.runner == threading.get_ident():
+            return block()
+        if not self._running.acquire(True, timeout):
+            raise TimeoutError(f'a callback of {self.name} goes on')
+        self.runner = threading.get_ident()
+        try:
+            return block()
+        finally:
+            self.runner = None
+            self._running.release()
+            self.wake()
+
+    def schedule(self):
+        """Have a worker take it; True if none is about to."""
+        if self.scheduled or not self.jobs:
+            return False
+        self.scheduled = True
+        _ready.append(self)
+        return True
+
+    def wake(self):
+        """Have a worker run it."""
+        if self.schedule():
+            _wake_worker()
+
+    def close(self, timeout):
+        """Forget what has not run, and wait for the callback that runs; True if it ended in time."""
+        with _guard:
+            _turns.discard(self)
+        self.jobs.clear()
+        ended = self.runner == threading.get_ident() or self._running.acquire(True, timeout)
+        self.jobs.clear()
+        if not _turns:
+            _wake_worker()
+        return ended
+
+
+class _Worker:
+    """A thread of the pool."""
+
+    def __init__(self):
+        self._wake, self._awake = allocate_lock(), allocate_lock()
+        self._wake.acquire()
+        threading.Thread(target=self._loop, name='pharos worker', daemon=True).start()
+
+    def wake(self):
+        self._awake.acquire(False)
+        self._wake.release()
+
+    def wait_until_awake(self):
+        """Let the woken thread have the interpreter, which takes 5 ms if this one keeps busy."""
+        global _no_yield_before
+        if time.monotonic() > _no_yield_before and not self._awake.acquire(True, YIELD_LIMIT):
+            _no_yield_before = time.monotonic() + YIELD_PAUSE
+
+    def _loop(self):
+        while True:
+            try:
+                turns = _ready.popleft()
+            except IndexError:
+                with _guard:
+                    if not _turns:
+                        _workers.discard(self)
+                        break
+                _idle.append(self)
+                if _ready or not _turns:  # since then; nobody may have seen this one
+                    _wake_worker()
+                self._wake.acquire()
+                if self._awake.locked():
+                    self._awake.release()
+                continue
+            if _ready:
+                _wake_worker()
+            turns.scheduled = False
+            turns.run()
+        _wake_worker()
+
+
+def _wake_worker():
+    """Wake an idle worker, or start one if there are fewer than nodes."""
+    try:
+        worker = _idle.pop()
+    except IndexError:
+        with _guard:
+            if len(_workers) < len(_turns):
+                _workers.add(_Worker())
+        return None
+    worker.wake()
+    return worker
+
+
+class Inbox:
+    """The messages that wait for one callback; a full one drops the oldest.
+
+    :param callback: called as ``callback(message)``; raises nothing
+    :param queue_size: number of messages; None or 0: as many as ``queue_bytes`` hold
+    """
+
+    queue_bytes = QUEUE_BYTES
+
+    def __init__(self, turns, callback, queue_size=None, inline=False, shared=False):
+        self.turns, self.callback, self.inline, self.shared = turns, callback, inline, shared
+        self.queue = collections.deque()
+        self.limit = self.queue_size = queue_size or float('inf')
+        self.dropped = self.taken = 0
+        self._scheduled, self._taken_at_yield, self._fast = False, -1, 0
+
+    def put(self, value, thaw=None, header=None, size=0):
+        """Add a message, or what ``thaw`` makes one of; ``turns`` are to be woken or run then.
+
+        :param size: the bytes of it, if they are known
+        """
+        queue = self.queue
+        waiting = len(queue)
+        if waiting:
+            is_by_bytes = waiting >= self.limit < self.queue_size
+            if size or is_by_bytes or waiting in (2, 7) or not waiting & 63:
+                size = size or size_of(value)
+                self.limit = min(self.queue_size, max(1, self.queue_bytes // size))
+            if waiting >= self.limit:
+                self._let_receiver_run()
+                while len(queue) >= self.limit:
+                    try:
+                        queue.popleft()
+                    except IndexError:
+                        break
+                    self.dropped += 1
+        queue.append((value, thaw, header))
+        if not self._scheduled:
+            self._scheduled = True
+            self.turns.jobs.append(self)
+
+    def _let_receiver_run(self):
+        """Sleep if the receiver got on since: a publisher that never sleeps would starve it."""
+        if self.taken != self._taken_at_yield:
+            self._taken_at_yield = self.taken
+            time.sleep(1e-6)
+
+    def run(self):
+        """Run the callback on the oldest message."""
+        self._scheduled = False
+        try:
+            value, thaw, header = self.queue.popleft()
+        except IndexError:
+            return
+        self.taken += 1
+        if self.queue and not self._scheduled:
+            self._scheduled = True
+            self.turns.jobs.append(self)
+        if thaw is not None:
+            value = thaw(value)
+            value._connection_header = header
+            self.callback(value)
+            return
+        began = time.perf_counter()
+        self.callback(value)
+        self._fast = self._fast + 1 if time.perf_counter() - began < FAST else 0
+
+    def receive(self, message, size):
+        """Take a message from the thread that reads a socket.
+
+        That thread runs the callback, too, if it was fast ten times running: waking another takes
+        longer.
+        """
+        self.put(message, None, None, size)
+        if self.inline or self._fast >= 10:
+            self.turns.run()
+        else:
+            self.turns.wake()
+
+
+def hand_over(inboxes, last):
+    """Have the callbacks of filled inboxes run: here the inline ones, all others in workers.
+
+    :param last: when the same publisher last did so
+    :returns: the time, if a worker was woken, else ``last``
+    """
+    is_due = False
+    for inbox in inboxes:
+        if inbox.inline:
+            inbox.turns.run()
+        else:
+            is_due |= inbox.turns.schedule()
+    woken = _wake_worker() if is_due else None  # which wakes another one, if there is more
+    if woken is None:
+        return last
+    now = time.perf_counter()
+    if now - last > BURST:
+        woken.wait_until_awake()
+    return now
+
+
+def forget():
+    """Have no workers in a forked child."""
+    for known in _ready, _idle, _workers, _turns:
+        known.clear()

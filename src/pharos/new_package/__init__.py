@@ -1,1 +1,0 @@
-"""Making a catkin package that is built on this one; loaded only when used."""

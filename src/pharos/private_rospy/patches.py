@@ -1,0 +1,392 @@
+"""What is mended in rospy: a table of patches, applied to each node's own copy.
+
+Over ``def f(original, run, *args)``, ``@patch(module, target)`` has ``f`` called instead of the
+target; ``run`` is the Run whose copy is patched. Over ``def f(original, run)``, ``@replace(module,
+target)`` puts what it returns in the target's place. The docstring says what is wrong with rospy's.
+"""
+from __future__ import annotations
+
+import contextlib
+import functools
+import socket
+import threading
+
+import rospy
+
+from pharos.intraprocess.copier import copied
+from pharos.private_rospy import transport
+from pharos.private_rospy.loader import Shim
+
+LARGEST = 1 << 20  # bytes of a connection header, and of an XML-RPC request
+#: module -> [(target, function that makes the replacement)]
+TABLE = {}
+_client = threading.local()  # .address: of the client whose request this thread answers
+
+
+def replace(module, target):
+    """Enter a function that makes a replacement into the table."""
+
+    def enter(make):
+        TABLE.setdefault(module, []).append((target, make))
+        return make
+
+    return enter
+
+
+def patch(module, target):
+    """Enter a function that is called instead of another one into the table."""
+
+    def enter(function):
+        def make(original, run):
+            @functools.wraps(original)
+            def patched(*args, **kwargs):
+                return function(original, run, *args, **kwargs)
+
+            return patched
+
+        make.__doc__ = function.__doc__
+        replace(module, target)(make)
+        return function
+
+    return enter
+
+
+def apply(module, run):
+    """Patch a private module, right after its code has run; a missing target is an AttributeError."""
+    for target, make in TABLE.get(module.__name__, ()):
+        owner, _, name = target.rpartition('.')
+        owner = getattr(module, owner) if owner else module
+        setattr(owner, name, make(getattr(owner, name), run))
+
+
+def overlay(cls, methods):
+    """Set the methods of a plain class on a private class; ``rospy_NAME`` is what was there."""
+    for name, method in vars(methods).items():
+        if callable(method):
+            setattr(cls, f'rospy_{name}', getattr(cls, name, None))
+            setattr(cls, name, method)
+    return cls
+
+
+def close_listener(sock):
+    """Close a listening socket; the shutdown wakes whoever waits for it."""
+    transport.shut(sock)
+    sock.close()
+
+
+# -- servers
+
+
+@patch('rosgraph.network', 'read_ros_handshake_header')
+def read_handshake(original, run, sock, *buffer):
+    """Wait for ever for a peer that says nothing, too little, or announces 4 GiB."""
+    network = run.modules.load('rosgraph.network')
+    run.limit(sock)
+    sock.setblocking(True)
+    head = sock.recv(4, socket.MSG_WAITALL)
+    size = int.from_bytes(head, 'little')
+    if size > LARGEST:
+        raise network.ROSHandshakeException(f'it announces a header of {size} bytes')
+    body = sock.recv(size, socket.MSG_WAITALL)
+    run.deadlines.pop(sock, None)
+    if len(head + body) < 4 + size or not size:
+        raise network.ROSHandshakeException('it sent no connection header in time')
+    return network.decode_ros_handshake_header(head + body)
+
+
+@patch('rospy.impl.tcpros_base', 'TCPROSServer._tcp_server_callback')
+def accept(original, run, self, sock, address):
+    """Shakes hands in the thread that accepts: one silent client keeps out all others."""
+
+    def shake_hands():
+        _client.address = address
+        transport.keep_alive(sock)
+        original(self, sock, address)
+
+    run.sockets.add(sock)
+    run.start_thread(shake_hands, 'client')
+
+
+@patch('rospy.impl.tcpros_base', 'logwarn')
+def name_client(original, run, text, *args):
+    """Does not say which client it refused."""
+    host, port = getattr(_client, 'address', ('', 0))
+    original(f'{host}:{port}: {text}', *args)
+
+
+@patch('rospy.impl.tcpros_base', 'rospyerr')
+@patch('rospy.impl.tcpros_base', 'rospywarn')
+def log_no_traceback(original, run, *args):
+    """Log a traceback for each client that says nonsense; a line says so already."""
+
+
+@patch('rospy.impl.tcpros_base', 'TCPServer._create_server_sock')
+def listen(original, run, self):
+    """Lets five clients wait."""
+    sock = original(self)
+    sock.listen(128)
+    return sock
+
+
+@patch('rospy.impl.tcpros_base', 'TCPServer.shutdown')
+def shutdown_server(original, run, self):
+    """Closes the socket, which does not wake accept(), and the port stays taken."""
+    self.is_shutdown = True
+    close_listener(self.server_sock)
+
+
+@patch('rospy.impl.tcpros_base', '_is_use_tcp_keepalive')
+def use_keepalive(original, run):
+    """Asks the master before each first connection."""
+
+
+@patch('rospy.impl.tcpros_pubsub', '_configure_pub_socket')
+def no_delay(original, run, sock, is_tcp_nodelay):
+    """Sends some messages 40 ms late, unless the subscriber asks for tcp_nodelay."""
+    original(sock, True)
+
+
+@patch('rosgraph.xmlrpc', 'XmlRpcNode.start')
+def start_xmlrpc(original, run, self):
+    """Binds its port in another thread, where an error is printed and cannot be raised."""
+    original.__globals__['print'] = lambda text: None
+    self._run_init()
+    self.thread = run.start_thread(lambda: self.server.serve_forever(poll_interval=60), 'xmlrpc')
+
+
+@patch('rosgraph.xmlrpc', 'XmlRpcNode.shutdown')
+def shutdown_xmlrpc(original, run, self, reason):
+    """Only closes the socket, on which its thread then spins (ros_comm #2238)."""
+    self.is_shutdown = True
+    server, self.server = self.server, None
+    if server:
+        self.handler._shutdown(reason)
+        server._BaseServer__shutdown_request = True
+        close_listener(server.socket)
+
+
+@patch('rosgraph.xmlrpc', 'ThreadingXMLRPCServer.process_request')
+def process_request(original, run, self, request, address):
+    """Has threads and sockets that outlive it, and waits for silent clients."""
+
+    def answer():
+        _client.address = address
+        self.process_request_thread(request, address)
+        run.deadlines.pop(request, None)
+
+    run.limit(request)
+    run.sockets.add(request)
+    if run.stopping.is_set():
+        transport.shut(request)
+    run.start_thread(answer, 'request')
+
+
+@patch('rosgraph.xmlrpc', 'SilenceableXMLRPCRequestHandler.do_POST')
+def limit_request(original, run, self):
+    """Reads requests of any size."""
+    if int(self.headers.get('content-length', 0)) > LARGEST:
+        self.close_connection = True
+        return self.send_error(413)
+    original(self)
+    run.limit(self.connection)
+
+
+# -- life
+
+
+@patch('rospy.core', 'signal_shutdown')
+def signal_shutdown(original, run, reason):
+    """Ends rospy alone: rosnode kill and the like are to stop the node as its user would."""
+    run.end_node()
+
+
+@patch('rospy.core', 'is_shutdown')
+def is_shutdown(original, run):
+    """Holds at the end of a stop, which waits for loops that ask it."""
+    return run.stopping.is_set() or original()
+
+
+@replace('rospy.impl.init', 'time')
+def poll_often(original, run):
+    """Looks every 0.1 s whether the node is registered."""
+    return Shim(original, sleep=lambda seconds: original.sleep(min(seconds, 0.001)))
+
+
+@patch('rospy.impl.masterslave', 'ROSHandler._ready')
+def ready(original, run, self, uri):
+    """Starts a thread that then looks twice a second for departed subscribers."""
+    self.uri = uri
+    run.ready(self, uri)
+    self.reg_man.start(uri, self.masterUri)
+
+
+@patch('rospy.impl.registration', 'RegManager.run')
+def run_registration(original, run, self):
+    """Is that thread's loop; the watcher does its work for all nodes."""
+
+
+@patch('rospy.impl.masterslave', 'ROSHandler._shutdown')
+def shut_down(original, run, self, reason=''):
+    """Closes what the stop closes later."""
+    self.done = True
+
+
+@patch('rospy.impl.masterslave', 'ROSHandler.shutdown')
+def shut_down_from_outside(original, run, self, caller_id, msg=''):
+    """Obeys everybody, also if an earlier node at its URI is meant (ros_comm #2241)."""
+    if caller_id == '/master' and f'[{self.name}]' not in str(msg):
+        return 1, 'an earlier node at this address was meant', 0
+    host = _client.address[0]
+    near = run.modules.load('rosgraph.network').get_local_addresses()
+    with contextlib.suppress(OSError):
+        near = [*near, socket.gethostbyname(self.masterUri.split('/')[2].rpartition(':')[0])]
+    if host.startswith('127.') or host in near or run.node.allow_remote_shutdown:
+        run.end_node()
+        return 1, 'shutdown', 0
+    run.ros.logwarn(f'refused to stop for {caller_id} at {host}')
+    return 0, 'only this host and the master may do that', 0
+
+
+# -- topics
+
+
+@replace('rospy.topics', '_PublisherImpl')
+def publisher(original, run):
+    """See PublisherOverlay."""
+    return overlay(original, transport.PublisherOverlay)
+
+
+@replace('rospy.topics', '_SubscriberImpl')
+def subscription(original, run):
+    """See SubscriptionOverlay."""
+    return overlay(original, transport.SubscriptionOverlay)
+
+
+@patch('rospy.topics', 'QueuedConnection')
+def queued(original, run, connection, queue_size):
+    """See Sender."""
+    is_link = connection.transport_type == 'INTRAPROCESS'
+    return connection if is_link else transport.Sender(connection, queue_size, run)
+
+
+@patch('rospy.impl.tcpros_pubsub', 'robust_connect_subscriber')
+def receive(original, run, connection, address, port, uri, callback, topic):
+    """Gives up silently, or tries ever more rarely."""
+    subscription, error = callback.__self__, None
+    try:
+        transport.receive(connection, address, port, uri, subscription, run)
+        run.told.discard((topic, uri))
+    except Exception as problem:
+        error = str(problem)
+    connection.close()
+    transport.end_share(topic, uri, subscription.data_class, run)
+    if error and 'md5sum' in error:
+        run.node.refused(topic, error)
+    elif not subscription.closed:
+        run.connect_again(topic, uri, error)
+
+
+@patch('rospy.impl.registration', 'RegManager.reg_added')
+def reg_added(original, run, self, name, data, kind):
+    """Tries for ever with the lock of all topics held: one attempt, then the watcher repairs."""
+    run.register(kind, name, data)
+
+
+@patch('rospy.impl.registration', 'RegManager.publisher_update')
+def publisher_update(original, run, self, name, uris):
+    """Leaves it to its thread."""
+    run.update_publishers(name, uris)
+
+
+@patch('rospy.impl.masterslave', 'ROSHandler.publisherUpdate')
+def publishers_changed(original, run, self, caller_id, topic, publishers):
+    """Does so once for each publisher, and does not hear that there is none."""
+    if not (isinstance(publishers, list) and all(isinstance(uri, str) for uri in publishers)):
+        return -1, 'publishers are a list of URIs', 0
+    run.update_publishers(topic, publishers)
+    return 1, '', 0
+
+
+@patch('rospy.impl.registration', 'RegManager.cleanup')
+def cleanup(original, run, self, reason):
+    """Trips over a time-out, and then closes nothing."""
+    try:
+        original(self, reason)
+    finally:
+        run.topics.close_all()
+
+
+# -- parameters, log, services
+
+
+@patch('rospy.impl.masterslave', 'ROSHandler.paramUpdate')
+def parameter_changed(original, run, self, caller_id, key, value):
+    """Tells its own cache alone."""
+    run.node.parameter_changed('/' + str(key).strip('/'))
+    return original(self, caller_id, key, value)
+
+
+@patch('rospy.msproxy', 'MasterProxy.__setitem__')
+@patch('rospy.msproxy', 'MasterProxy.__delitem__')
+def set_parameter(original, run, self, key, *value):
+    """Tells others of the change, and not the node itself."""
+    original(self, key, *value)
+    run.node.parameter_changed(run.ros.resolve_name(key))
+
+
+@patch('subprocess', 'Popen.__init__')
+def start_child(original, run, self, *args, env=None, **kwargs):
+    """Gives a child the environment of this process."""
+    original(self, *args, env=run.environ if env is None else env, **kwargs)
+
+
+@replace('rospy.impl.rosout', 'rospy')
+def rosout(original, run):
+    """Asks the master for each line, which registers anew a node that stops."""
+    return Shim(original, get_param_cached=lambda name, default=None: default)
+
+
+@replace('rospy.service', 'ServiceException')
+def service_exception(original, run):
+    """Is another one for each node, which others could not catch."""
+    return rospy.ServiceException
+
+
+@patch('rospy.impl.tcpros_service', 'ServiceImpl.handle')
+def handle_call(original, run, self, connection, header):
+    """Lets its thread end with an exception if the client has gone."""
+    try:
+        original(self, connection, header)
+    except (rospy.exceptions.TransportException, OSError):
+        connection.close()
+
+
+@patch('rospy.impl.tcpros_service', 'ServiceImpl.error_handler')
+def service_failed(original, run, self, error, *about):
+    """Takes it for an error of the service if the client has gone."""
+    if not isinstance(error, rospy.exceptions.TransportException):
+        original(self, error, *about)
+
+
+@patch('rospy.impl.tcpros_service', 'ServiceProxy.call')
+def call_service(original, run, self, *args, **kwargs):
+    """Has no way to a provider of the same process but a socket."""
+    found = transport.local_service(run.node.master.url, self.resolved_name)
+    if not found or found[1].service_class._md5sum != self.service_class._md5sum:
+        return original(self, *args, **kwargs)
+    fill = run.modules.load('rospy.msg').args_kwds_to_message
+    request = fill(self.request_class, args, kwargs)
+    return answer(*found, request, run.name)
+
+
+def answer(run, service, request, caller_id):
+    """Have a rospy.Service of this process answer a request, in this thread."""
+    request = copied(request)
+    request._connection_header = {'callerid': caller_id, 'service': service.resolved_name}
+    convert = run.modules.load('rospy.impl.tcpros_service').convert_return_to_response
+    try:
+        return copied(convert(service.handler(request), service.response_class))
+    except rospy.ServiceException as error:
+        raise rospy.ServiceException(f'service cannot process request: {error}') from error
+    except Exception as error:
+        raise rospy.ServiceException(f'error processing request: {error}') from error

@@ -1,0 +1,319 @@
+"""One run of one node: a rospy of its own, started and stopped."""
+import atexit
+import contextlib
+import errno
+import functools
+import gc
+import http.client
+import os
+import socket
+import sys
+import threading
+import time
+import urllib.parse
+import weakref
+import xml.parsers.expat
+import xmlrpc.client
+
+from pharos.errors import MasterUnreachableError, NodeNameInUseError, PortInUseError
+from pharos.intraprocess.workers import Turns
+from pharos.private_rospy import patches, transport
+from pharos.private_rospy.loader import PrivateModules, Shim
+from pharos.private_rospy.transport import runs
+
+MASTER_LIMIT = 5.0  # seconds for each question to a master or node
+STOP_LIMIT = 2.0  # seconds that a stop waits for threads of rospy
+WATCH_PERIOD = 1.0  # seconds between two looks at a master
+UNREACHABLE = (
+    OSError,
+    xmlrpc.client.Error,
+    http.client.HTTPException,
+    xml.parsers.expat.ExpatError,
+)
+_METHODS = {'pub': 'registerPublisher', 'sub': 'registerSubscriber', 'srv': 'registerService'}
+_watch_guard = threading.Lock()
+_end_of_watch = threading.Event()
+
+
+class ServerProxy(xmlrpc.client.ServerProxy):
+    """One that gives up after ``limit`` seconds."""
+
+    def __init__(self, uri, limit=MASTER_LIMIT, **options):
+        class Transport(xmlrpc.client.Transport):
+            def make_connection(self, host):
+                connection = super().make_connection(host)
+                connection.timeout = limit
+                return connection
+
+        super().__init__(uri, **{'transport': Transport(), **options})
+
+
+class Run:
+    """A rospy with a node.
+
+    :param node: a Node, with a name, ports, settings, and methods that are called: ``end_now()`` if
+        ROS ends it, ``parameter_changed(name)``, ``refused(topic, reason)``
+    """
+
+    def __init__(self, node):
+        self.node, self.name = node, node.name
+        self.master_url = node.master.url
+        self.stopping = threading.Event()
+        self.threads = weakref.WeakSet()
+        self.sockets, self.calls = weakref.WeakSet(), weakref.WeakSet()
+        self.deadlines = {}  # socket of a client that is to say something -> until when
+        self.publishers = {}  # topic -> URIs, as the master last said
+        self.connecting, self.told = (
+            set(),
+            set(),
+        )  # (topic, URI ...); told: whose loss the log knows
+        self.known = {kind: set() for kind in _METHODS}  # names that are registered
+        self.uri, self.turns = '', Turns(node.name)
+        namespace, _, self.base = node.name.rpartition('/')
+        self.environ = {'ROSCONSOLE_FORMAT': '[${severity}] [${time}]: ${node}: ${message}'}
+        self.environ.update(os.environ, ROS_MASTER_URI=node.master.url)
+        self.environ['ROS_NAMESPACE'] = namespace or '/'
+        if node.domain:  # it comes before ROS_IP
+            self.environ['ROS_HOSTNAME'] = node.domain
+        self.argv = [self.base, *node.remappings]
+        patch = functools.partial(patches.apply, run=self)
+        self.modules = PrivateModules(self.substitutes(), patch)
+        self.ros = self.modules.load('rospy')
+        self.core = self.modules.load('rospy.core')
+        registration = self.modules.load('rospy.impl.registration')
+        self.topics = registration.get_topic_manager()
+        self.services = registration.get_service_manager()
+
+    def substitutes(self):
+        """Return what the node's modules import instead of some modules of Python."""
+        run = self
+
+        class Thread(threading.Thread):
+            """A daemon thread of the node's, which its stop waits for."""
+
+            def start(self):
+                self.daemon = True
+                super().start()
+                run.threads.add(self)
+
+        def sleep(seconds):
+            if seconds <= 0 or not run.stopping.wait(seconds):
+                time.sleep(0)
+
+        self.Thread = Thread
+        client = Shim(xmlrpc.client, ServerProxy=ServerProxy)
+        return {
+            'os': Shim(os, environ=self.environ, register_at_fork=lambda **hooks: None),
+            'sys': Shim(sys, argv=self.argv),
+            'atexit': Shim(atexit, register=lambda function, *args, **kwargs: function),
+            'threading': Shim(threading, Thread=Thread),
+            'time': Shim(time, sleep=sleep),
+            'socket': Shim(socket, setdefaulttimeout=lambda seconds: None),
+            'xmlrpc': Shim(xmlrpc, client=client),
+            'xmlrpc.client': client,
+        }
+
+    def start_thread(self, target, name=None):
+        """Start a thread of the node's."""
+        thread = self.Thread(target=target, name=name)
+        thread.start()
+        return thread
+
+    # -- start
+
+    def start(self, **options):
+        """Bind the ports, then register; tell the node its address.
+
+        :param options: more of those of ``rospy.init_node``
+
+        :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: stop() undoes the rest
+        """
+        base, port = self.modules.load('rospy.impl.tcpros_base'), self.node.tcp_port
+        self._check_name()
+        try:
+            server = base.init_tcpros_server(port)
+            server.tcp_ros_server = base.TCPServer(server._tcp_server_callback, port)
+            server.tcp_ros_server.start()
+            self.tcp_port, port = server.tcp_ros_server.port, self.node.xmlrpc_port
+            options.update(xmlrpc_port=port, tcpros_port=self.tcp_port, disable_signals=True)
+            self.modules.load('rospy.client').init_node(self.base, self.argv, **options)
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise
+            raise PortInUseError(
+                f'{self.name}: port {port} is in use: choose another one, or 0 for any'
+            ) from None
+        address = urllib.parse.urlsplit(self.uri)
+        node = self.node
+        node.uri, node.tcp_port, node.xmlrpc_port = self.uri, self.tcp_port, address.port
+        node.domain = node.domain or address.hostname
+
+    def ready(self, handler, uri):
+        """Be found and watched: the servers run, and nothing is registered yet."""
+        global _end_of_watch
+        self.handler, self.uri = handler, uri
+        handler.pharosHealth = lambda caller_id: (1, '', self.node.told())
+        with _watch_guard:
+            if not runs:
+                _end_of_watch = threading.Event()
+                threading.Thread(target=_watch, args=[_end_of_watch], daemon=True).start()
+            runs[uri] = self
+
+    def _check_name(self):
+        url, limit = self.master_url, max(self.node.connect_timeout, 1.0)
+        try:
+            code, _, uri = ServerProxy(url, limit).lookupNode('/pharos', self.name)
+        except UNREACHABLE as error:
+            raise MasterUnreachableError(
+                f'{self.name} cannot start: no ROS master answers at {url} ({error}):'
+                ' start roscore, or give the right URL'
+            ) from None
+        if code != 1:
+            return
+        with contextlib.suppress(*UNREACHABLE):
+            if ServerProxy(uri, 1.0).getPid('/pharos'):
+                raise NodeNameInUseError(
+                    f'{self.name} is running already, at {uri}: choose another name, or end that one'
+                )
+
+    # -- registration and connections
+
+    def register(self, kind, name, data):
+        """Tell the master of a topic or service; the watcher repairs what it does not hear of."""
+        method = getattr(self.core.xmlrpcapi(self.master_url), _METHODS[kind])
+        with contextlib.suppress(*UNREACHABLE):
+            code, _, value = method(self.name, name, data, self.uri)
+            if kind == 'sub' and code == 1:
+                self.update_publishers(name, value)
+        for other in list(runs.values()) if kind == 'pub' else ():  # the master takes 0.1 s
+            if other.master_url == self.master_url and name in other.topics.subs:
+                other.connect(name, self.uri)
+
+    def update_publishers(self, topic, uris):
+        """Connect to the publishers of a topic that the master names."""
+        self.publishers[topic] = uris
+        for uri in uris:
+            if uri in runs:
+                self.connect(topic, uri)
+            else:
+                self.start_thread(lambda uri=uri: self.connect(topic, uri), f'connect {topic}')
+
+    def connect(self, topic, uri):
+        """Connect a subscription to a publisher, unless it is or is about to be."""
+        subscription, key = self.topics.subs.get(topic), (topic, uri)
+        if self.stopping.is_set() or not subscription or subscription.has_connection(uri):
+            return
+        attempt = *key, id(subscription)
+        if attempt in self.connecting:
+            return
+        self.connecting.add(attempt)
+        try:
+            if uri in runs:
+                refusal = transport.connect(runs[uri], self, topic)
+                if refusal:
+                    self.node.refused(topic, refusal)
+            elif self.node.master.share_connections and transport.follow(self, *key, subscription):
+                pass
+            elif not self.handler.done and self.handler._connect_topic(*key)[0] != 1:
+                self.start_thread(lambda: self.connect_again(*key), f'connect {topic}')
+        except AttributeError:
+            if topic in self.topics.subs:
+                raise  # else it was closed meanwhile, for which rospy does not look
+        finally:
+            self.connecting.discard(attempt)
+
+    def connect_again(self, topic, uri, error=None):
+        """Connect once more after a while, if the master still names the publisher."""
+        if not self.stopping.wait(transport.RETRY_DELAY) and uri in self.publishers.get(topic, ()):
+            if error and (topic, uri) not in self.told:
+                self.told.add((topic, uri))
+                self.ros.logwarn(f'{topic}: no connection to {uri}, it is tried again: {error}')
+            self.connect(topic, uri)
+
+    def register_missing(self, state):
+        """Register what is not in the master's system state."""
+        topics, services, is_forgotten = self.topics, self.services, False
+        ours = topics.get_publications, topics.get_subscriptions, services.get_services
+        for kind, own, theirs in zip(_METHODS, ours, map(dict, state)):
+            known = {name for name, nodes in theirs.items() if self.name in nodes}
+            with topics.lock, services.lock:  # what is closed meanwhile stays closed
+                for name, data in own():
+                    if name in self.known[kind] - known and not self.stopping.is_set():
+                        is_forgotten = True
+                        self.register(kind, name, data)
+                self.known[kind] = {name for name, _ in own()}
+        if is_forgotten and not self.stopping.is_set():
+            self.modules.load('rospy.client')._init_node_params(self.argv, self.name)
+            for parameter in self.node.parameters:
+                parameter.subscribe()
+
+    def limit(self, sock):
+        """Close a client's socket if it says nothing within the node's client_timeout."""
+        self.deadlines[sock] = time.monotonic() + self.node.client_timeout
+
+    # -- stop
+
+    def end_node(self):
+        """Stop the node, in another thread."""
+        threading.Thread(target=self.node.end_now, name=f'stop {self.name}', daemon=True).start()
+
+    def stop(self, timeout):
+        """Send what is under way, unregister, free ports and threads; log what is left behind.
+
+        :param timeout: seconds for souls, and as long for what is under way
+        """
+        self.stopping.set()
+        with _watch_guard:
+            runs.pop(self.uri, None)
+            if not runs:
+                _end_of_watch.set()
+        for sock in list(self.calls):
+            transport.shut(sock)
+        left = [thread.name for thread in join(self.node.souls, timeout)]
+        if not self.turns.close(timeout):
+            left.append('a delegate')
+        if left:
+            self.ros.logwarn(f'left behind, since they did not end in time: {", ".join(left)}')
+        for publisher in list(self.topics.pubs.values()):
+            publisher.flush(timeout)
+        self._close_calls()  # Ctrl-C may have ended one in its middle
+        self.core.signal_shutdown.__wrapped__('stop')
+        self._close_calls()
+        for sock in list(self.sockets):
+            transport.shut(sock)
+        join(set(self.threads) - set(self.node.souls), STOP_LIMIT)
+        self.modules.load('logging').shutdown()
+        for sock in list(self.sockets):
+            sock.close()
+        gc.collect(1)
+
+    def _close_calls(self):
+        for proxy in self.core._xmlrpc_cache.values():
+            proxy('close')()
+
+
+def join(threads, timeout):
+    """Wait for the end of threads other than this one; returns those that go on."""
+    deadline = time.monotonic() + timeout
+    others = [thread for thread in threads if thread is not threading.current_thread()]
+    for thread in others:
+        thread.join(max(0.0, deadline - time.monotonic()))
+    return [thread for thread in others if thread.is_alive()]
+
+
+def _watch(end):
+    """Ask each master once a second what it knows of our nodes: it may have been started again."""
+    while not end.wait(WATCH_PERIOD):
+        nodes = list(runs.values())
+        for run in nodes:
+            run.topics.check_all()  # rospy looks twice a second who has left (ros_comm #927)
+            for sock, deadline in list(run.deadlines.items()):
+                if time.monotonic() > deadline:
+                    run.deadlines.pop(sock, None)
+                    transport.shut(sock)
+        for url in {run.master_url for run in nodes}:
+            with contextlib.suppress(*UNREACHABLE):
+                state = ServerProxy(url).getSystemState('/pharos')[2]
+                for run in nodes:
+                    if run.master_url == url and not run.stopping.is_set():
+                        run.register_missing(state)

@@ -1,0 +1,431 @@
+"""What a topic's connections do here: INTRAPROCESS links, publishing, and receiving from sockets.
+
+A link is two ends, one in the list of connections of rospy's publisher and one in that of its
+subscription, so that rosnode info, closing and duplicates are rospy's own matter.
+"""
+import collections
+import contextlib
+import socket
+import struct
+import threading
+import time
+
+import rospy
+from rospy.impl.transport import Transport
+from rospy.names import TOPIC_ANYTYPE
+
+from pharos.intraprocess.copier import copied, copier_for, serialize, thawer
+from pharos.intraprocess.workers import Inbox, Turns, hand_over
+
+LARGEST_MESSAGE = 1_000_000_000  # bytes, as roscpp has it
+AT_ONCE = 1 << 16  # bytes; copying more into the socket would hold up the publisher
+CONNECT_LIMIT = 10.0  # seconds for one attempt to connect
+RETRY_DELAY = 1.0  # seconds until the next one
+_length = struct.Struct('<I')
+#: the runs of this process by the URI of their node
+runs = {}
+
+
+class Link(Transport):
+    """One end of a link; ``subscription`` is at the other one, if this is the publisher's."""
+
+    transport_type = 'INTRAPROCESS'
+    is_latched = subscription = latch = None
+
+    def get_transport_info(self):
+        return f'INTRAPROCESS connection to [{self.endpoint_id}]'
+
+    def close(self):
+        """Close both ends; rospy never drops a link because of a publisherUpdate."""
+        if not self.done:
+            self.done = self.other.done = True
+            for end in self, self.other:
+                if end.cleanup_cb:
+                    end.cleanup_cb(end)
+
+    def latched(self):
+        """Return the latched messages, for a callback that comes later."""
+        messages = [self.thaw(frozen) for frozen in list(self.publisher.latches.values())]
+        for message in messages:
+            message._connection_header = self.header
+        return messages
+
+
+class Follower(Transport):
+    """The share of a subscription in the connection of another node."""
+
+    transport_type = 'TCPROS'
+    header = property(lambda self: self.share.header)
+    latch = property(lambda self: self.share.latch)
+
+    def get_transport_info(self):
+        return f'TCPROS connection of {self.share.leader.name}'
+
+    def close(self):
+        if not self.done:
+            self.done = True
+            self.share.followers = [each for each in self.share.followers if each is not self]
+            self.cleanup_cb(self)
+
+
+class Share:
+    """A connection to an external publisher that several nodes of this process share.
+
+    The first that connects has it, and hands its messages to the ``followers``; when it ends, these
+    connect anew.
+    """
+
+    def __init__(self, leader):
+        self.leader, self.followers, self.header, self.latch = leader, [], {}, None
+
+
+_shares = {}  # (topic, URI, message class) -> Share
+_share_guard = threading.Lock()
+
+
+def follow(run, topic, uri, subscription):
+    """True if another node of this process has the connection, which the subscription now shares.
+
+    If nobody has, this one is the first.
+    """
+    key = topic, uri, subscription.data_class
+    with _share_guard:
+        share = _shares.get(key)
+        if share is None or share.leader is run:
+            _shares[key] = Share(run)
+            return False
+        follower = Follower('i', topic)
+        follower.endpoint_id, follower.share, follower.run = uri, share, run
+        follower.subscription = subscription
+        subscription.add_connection(follower)
+        share.followers = [*share.followers, follower]
+    for inbox in subscription.inboxes() if share.latch else ():
+        inbox.receive(copied(share.latch), 0)
+    return True
+
+
+def end_share(topic, uri, cls, run):
+    """Have those that share a connection that has ended connect anew."""
+    with _share_guard:
+        share = _shares.get((topic, uri, cls))
+        if share is None or share.leader is not run:
+            return
+        del _shares[topic, uri, cls]
+    for follower in share.followers:
+        follower.close()
+        follower.run.start_thread(lambda run=follower.run: run.connect(topic, uri), 'connect')
+
+
+def connect(sender, receiver, topic):
+    """Link the publisher and the subscription of a topic of two runs of this process.
+
+    :returns: why not, if their types differ
+    """
+    publisher, subscription = sender.topics.pubs.get(topic), receiver.topics.subs.get(topic)
+    if not publisher or not subscription:
+        return None
+    sent, wanted = publisher.data_class, subscription.data_class
+    if wanted._md5sum not in (sent._md5sum, TOPIC_ANYTYPE):
+        return f'{sender.name} publishes {sent._type}, not {wanted._type}'
+    protocol = sender.modules.load('rospy.impl.tcpros_pubsub').TCPROSPub
+    header = protocol(topic, sent, publisher.is_latch, publisher.headers).get_header_fields()
+    with publisher.lock:
+        out, end = Link('o', topic), Link('i', topic)
+        out.endpoint_id, end.endpoint_id = receiver.name, sender.uri
+        out.other, end.other, out.subscription = end, out, subscription
+        for each in out, end:
+            each.publisher, each.thaw, each.header = publisher, thawer(sent, wanted), header
+            each.callerid_pub = sender.name
+        with subscription.c_lock:
+            if subscription.closed or publisher.closed or subscription.has_connection(sender.uri):
+                return None
+            subscription.add_connection(end)
+            inboxes = subscription.inboxes()
+        publisher.rospy_add_connection(out)
+        for inbox in inboxes if publisher.latches else ():
+            for frozen in publisher.latches.values():
+                inbox.put(frozen, out.thaw, header)
+    for inbox in inboxes:
+        inbox.turns.wake()
+
+
+def local_service(master_url, name, uri=None):
+    """Return the run of this process that offers a service, and its rospy.Service, or None."""
+    for run in list(runs.values()):
+        service = run.services.get_service(name)
+        if service and run.master_url == master_url and uri in (None, service.uri):
+            return run, service
+
+
+def shut(sock):
+    """Have whoever reads from a socket find it closed."""
+    with contextlib.suppress(OSError):
+        sock.shutdown(socket.SHUT_RDWR)
+
+
+class PublisherOverlay:
+    """What is set on a node's own rospy.topics._PublisherImpl; ``rospy_NAME`` is rospy's method.
+
+    rospy serializes for all, latches the user's object, one for all Publishers of a topic, and keeps
+    what did not serialize in its buffer, which corrupts the next message.
+    """
+
+    def __init__(self, name, data_class):
+        self.rospy___init__(name, data_class)
+        self.lock, self.latches, self.last_wake = self.publock, {}, 0.0
+        self.freeze, self.thaw = copier_for(data_class)
+        self.has_header = getattr(data_class, '_has_header', False)
+        self.seen, self.links, self.remote = None, (), ()
+
+    def acquire(self):
+        """Do nothing: publish() locks, but not while it runs inline delegates."""
+
+    release = acquire
+
+    def enable_latch(self):  # rospy calls it when its first links are made
+        self.is_latch = True
+        for link in by_kind(self.connections)[0]:
+            link.header['latching'] = '1'
+
+    def add_connection(self, connection):
+        with self.lock:
+            self.rospy_add_connection(connection)
+            for frozen in list(self.latches.values()):
+                self.write(self.thaw(frozen), self.connections[-1:])
+        return True
+
+    def publish(self, message, connection_override=None, latch_key=None):
+        """Publish to the links, then to the sockets.
+
+        :param latch_key: whose latch it is, if the topic latches; False: nobody's
+        """
+        inboxes = []
+        with self.lock:
+            if self.closed:
+                raise rospy.ROSException('publish() to a closed topic')
+            if connection_override is None:
+                self.seq += 1
+                if self.has_header:
+                    message.header.seq = self.seq
+                    if message.header.frame_id is None:
+                        message.header.frame_id = '0'
+                if self.connections is not self.seen:
+                    self.seen = self.connections
+                    self.links, self.remote = by_kind(self.seen)
+                links, remote = self.links, self.remote
+            else:
+                links, remote = by_kind([connection_override])
+            is_latched = self.is_latch and latch_key is not False and connection_override is None
+            if links or is_latched or not remote:  # then it is checked alone
+                frozen = self.freeze(message)
+                if is_latched:
+                    self.latches[latch_key] = frozen
+                for link in links:
+                    link.stat_num_msg += 1
+                    thaw, header = link.thaw, link.header
+                    received = link.subscription.inboxes()
+                    for inbox in received:
+                        if inbox.shared:
+                            inbox.put(message)
+                        else:
+                            inbox.put(frozen, thaw, header)
+                    inboxes = [*inboxes, *received] if inboxes else received
+            if remote:
+                self.write(message, remote)
+        if inboxes:
+            self.last_wake = hand_over(inboxes, self.last_wake)
+        return True
+
+    def write(self, message, connections):
+        data = serialize(message)
+        data = _length.pack(len(data)) + data
+        self.message_data_sent += len(data)
+        for connection in connections:
+            try:
+                connection.write_data(data)
+            except Exception:  # its peer has gone
+                connection.close()
+
+    def flush(self, timeout):
+        """Wait until all is with the sockets."""
+        deadline = time.monotonic() + timeout
+        for sender in self.connections:
+            if isinstance(sender, Sender):  # there is none without a queue_size
+                sender.flush(deadline)
+
+    def close(self):
+        close(self)
+        self.headers = {}
+
+
+class SubscriptionOverlay:
+    """What is set on a node's own rospy.topics._SubscriberImpl.
+
+    Callbacks that are an Inbox get messages directly. All others of a topic share one, which takes
+    turns by itself, for they may wait for each other.
+    """
+
+    def __init__(self, name, data_class):
+        self.rospy___init__(name, data_class)
+        self.tcp_nodelay, self.seen, self.known, self.plain = True, None, [], None
+
+    def inboxes(self):
+        """Return the inboxes of all callbacks; rospy makes another list if these change."""
+        callbacks = self.callbacks
+        if callbacks is not self.seen:
+            known = [callback for callback, _ in callbacks or () if isinstance(callback, Inbox)]
+            if callbacks and len(known) < len(callbacks):
+                if self.plain is None:
+                    self.plain = Inbox(Turns(self.name), self.call_plain, self.queue_size)
+                known.append(self.plain)
+            self.seen, self.known = callbacks, known
+        return self.known
+
+    def call_plain(self, message):
+        for callback, args in self.callbacks or ():
+            if not isinstance(callback, Inbox):
+                self._invoke_callback(message, callback, args)
+
+    def add_callback(self, callback, args):
+        self.rospy_add_callback(callback, args)
+        for link in by_kind(self.connections)[0]:
+            for message in link.latched():
+                self._invoke_callback(message, callback, args)
+
+    def close(self):
+        close(self)
+        if self.plain:
+            self.plain.turns.close(0)
+
+
+def by_kind(connections):
+    """Return the links and the others of some connections."""
+    links = [each for each in connections if each.transport_type == 'INTRAPROCESS']
+    return links, [each for each in connections if each not in links]
+
+
+def close(impl):
+    """Close a publisher or subscription: its links before rospy holds the lock, and rospy's epoll."""
+    for link in by_kind(impl.connections or [])[0]:
+        link.close()
+    impl.rospy_close()
+    impl.connection_poll.poller.close()
+
+
+def keep_alive(sock):
+    """Have a connection break within 30 s if the other host has silently gone."""
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 10)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 5)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 4)
+
+
+def receive(connection, address, port, uri, subscription, run):
+    """Connect to a publisher and receive its messages until the connection ends."""
+    connection.connect(address, port, uri, timeout=CONNECT_LIMIT)
+    sock = connection.socket
+    if sock is None:
+        return
+    run.sockets.add(sock)
+    sock.settimeout(None)
+    cls, header = subscription.data_class, connection.header
+    share = _shares.get((subscription.resolved_name, uri, cls))
+    if share:
+        share.header = header
+    with sock.makefile('rb', 1 << 16) as stream:
+        while not connection.done:
+            head = stream.read(4)
+            if len(head) < 4:
+                return
+            (size,) = _length.unpack(head)
+            if size > LARGEST_MESSAGE:
+                raise ValueError(f'it announces a message of {size} bytes')
+            data = stream.read(size)
+            if len(data) < size:
+                return
+            connection.stat_bytes += size + 4
+            connection.stat_num_msg += 1
+            message = None
+            inboxes = subscription.inboxes()
+            for follower in share.followers if share else ():
+                inboxes = [*inboxes, *follower.subscription.inboxes()]
+            for inbox in inboxes:
+                message = cls().deserialize(data)
+                message._connection_header = header
+                inbox.receive(message, size)
+            if connection.is_latched:
+                connection.latch = message or cls().deserialize(data)
+                if share:
+                    share.latch = connection.latch
+
+
+class Sender:
+    """A bounded queue before a connection. A thread writes what the socket does not take at once.
+
+    Stands in for rospy's QueuedConnection, whose thread writes everything, and takes all out of its
+    queue at once, so that it neither bounds nor flushes it.
+    """
+
+    def __init__(self, connection, queue_size, run):
+        self._connection, self._limit = connection, queue_size or float('inf')
+        self._queue, self.busy = collections.deque(), False
+        self._rest = b''  # of a message whose beginning the socket has
+        self._changed = threading.Condition()
+        run.start_thread(self._send_all, f'sender of {connection.name}')
+
+    def __getattr__(self, name):
+        return getattr(self._connection, name)
+
+    def set_cleanup_callback(self, callback):
+        def closed(connection):
+            callback(connection)
+            with self._changed:
+                self._changed.notify_all()
+
+        self._connection.set_cleanup_callback(closed)
+
+    def write_data(self, data):
+        """Send a message with its length; never waits for the subscriber."""
+        connection = self._connection
+        with self._changed:
+            if not self.busy and len(data) <= AT_ONCE:
+                try:
+                    sent = connection.socket.send(data, socket.MSG_DONTWAIT)
+                except BlockingIOError:
+                    sent = 0
+                connection.stat_bytes += sent
+                if sent == len(data):
+                    connection.stat_num_msg += 1
+                    return
+                self._rest = data[sent:]
+            else:
+                self._queue.append(data)
+                limit = min(self._limit, max(1, Inbox.queue_bytes // len(data)))
+                while len(self._queue) > limit:
+                    self._queue.popleft()
+            self.busy = True
+            self._changed.notify_all()
+        time.sleep(0)  # or a busy publisher keeps the interpreter for 5 ms
+
+    def _send_all(self):
+        connection = self._connection
+        while True:
+            with self._changed:
+                while not (self._rest or self._queue or connection.done):
+                    self.busy = False
+                    self._changed.notify_all()
+                    self._changed.wait()
+                if connection.done:
+                    self.busy = False
+                    return
+                data, self._rest = self._rest or self._queue.popleft(), b''
+            try:
+                connection.write_data(data)
+            except Exception:  # its peer has gone
+                connection.close()
+
+    def flush(self, deadline):
+        """Wait until all is with the socket."""
+        with self._changed:
+            left = deadline - time.monotonic()
+            self._changed.wait_for(lambda: not self.busy or self._connection.done, max(left, 0))
