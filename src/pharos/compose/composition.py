@@ -111,6 +111,8 @@ class Composition:
             if launched.respawn_delay is not None and not self._ending.wait(launched.respawn_delay):
                 with self.telling(launched.name):
                     node.start()
+                if self._ending.is_set():  # since it looked
+                    node.end_now()
         if self.process and self.process.poll() == apart_program.REQUIRED_ENDED:
             self._end('a node in a process of its own')
 

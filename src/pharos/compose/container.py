@@ -1,6 +1,7 @@
 """The node that a composition is for others: it loads and unloads programs by nodelet's services."""
 from __future__ import annotations
 
+import contextlib
 from typing import Any
 
 import rosgraph.names
@@ -8,7 +9,7 @@ import rosgraph.names
 from pharos.compose.composition import Composition
 from pharos.compose.launch_file import LaunchedNode, can_run_here
 from pharos.compose.script import ScriptNode, source_of
-from pharos.errors import PharosError, UnknownNodeError
+from pharos.errors import PharosError, UnknownNodeError, UnknownTypeError
 from pharos.node import Node
 from pharos.ros_process import find_program
 
@@ -25,14 +26,12 @@ class Container(Node):
         self._bonds: dict[str, Any] = {}
 
     def start(self) -> None:
-        """Offer the services.
-
-        :raises UnknownTypeError: if nodelet is not installed
-        """
+        """Offer the services, if nodelet is installed."""
         super().start()
-        self.serve('~load_nodelet', 'nodelet/NodeletLoad', self._load)
-        self.serve('~unload_nodelet', 'nodelet/NodeletUnload', self._unload)
-        self.serve('~list', 'nodelet/NodeletList', lambda request: [*self._running()])
+        with contextlib.suppress(UnknownTypeError):
+            self.serve('~load_nodelet', 'nodelet/NodeletLoad', self._load)
+            self.serve('~unload_nodelet', 'nodelet/NodeletUnload', self._unload)
+            self.serve('~list', 'nodelet/NodeletList', lambda request: [*self._running()])
 
     def _running(self):
         return {name: node for name, node in self.loaded.items() if node.is_running}
