@@ -27,6 +27,7 @@ from pharos.master import Master
 
 VIEWS = 'nodes', 'processes', 'topics'
 KEYS = 'n nodes  p processes  t topics  s sort by the next column  q quit'
+WHOLE = 'NODE', 'TOPIC', 'PID'  # columns that are shown whole, however narrow the terminal is
 BAD = 'DROP', 'FAIL', 'PROBLEM'  # columns in which all but 0 is red
 SUMS = 'IN/S', 'OUT/S', 'IN B/S', 'OUT B/S', 'DROP', 'FAIL'
 
@@ -133,7 +134,8 @@ def table(rows: list[dict[str, Any]], sort: int = 0) -> Table:
     for column in columns:
         is_text = any(isinstance(row[column], str) for row in rows)
         title = f'[reverse]{column}[/]' if column == by else column
-        made.add_column(title, justify='left' if is_text else 'right', no_wrap=is_text)
+        no_wrap = column in WHOLE
+        made.add_column(title, justify='left' if is_text else 'right', no_wrap=no_wrap)
     for row in sorted(rows, key=order):
         made.add_row(*(_cell(column, value) for column, value in row.items()))
     return made

@@ -6,10 +6,10 @@ target)`` puts what it returns in the target's place. The docstring says what is
 """
 from __future__ import annotations
 
-import contextlib
 import functools
 import socket
 import threading
+import urllib.parse
 
 import rospy
 
@@ -68,12 +68,6 @@ def overlay(cls, methods):
     return cls
 
 
-def close_listener(sock):
-    """Close a listening socket; the shutdown wakes whoever waits for it."""
-    transport.shut(sock)
-    sock.close()
-
-
 # -- servers
 
 
@@ -82,16 +76,13 @@ def read_handshake(original, run, sock, *buffer):
     """Wait for ever for a peer that says nothing, too little, or announces 4 GiB."""
     network = run.modules.load('rosgraph.network')
     run.limit(sock)
-    sock.setblocking(True)
     head = sock.recv(4, socket.MSG_WAITALL)
     size = int.from_bytes(head, 'little')
-    if size > LARGEST:
-        raise network.ROSHandshakeException(f'it announces a header of {size} bytes')
-    body = sock.recv(size, socket.MSG_WAITALL)
+    data = head + sock.recv(size, socket.MSG_WAITALL) if size <= LARGEST else b''
     run.deadlines.pop(sock, None)
-    if len(head + body) < 4 + size or not size:
-        raise network.ROSHandshakeException('it sent no connection header in time')
-    return network.decode_ros_handshake_header(head + body)
+    if len(data) < 4 + size:
+        raise network.ROSHandshakeException(f'it sent no connection header of {size} bytes in time')
+    return network.decode_ros_handshake_header(data)
 
 
 @patch('rospy.impl.tcpros_base', 'TCPROSServer._tcp_server_callback')
@@ -132,7 +123,8 @@ def listen(original, run, self):
 def shutdown_server(original, run, self):
     """Closes the socket, which does not wake accept(), and the port stays taken."""
     self.is_shutdown = True
-    close_listener(self.server_sock)
+    transport.shut(self.server_sock)
+    self.server_sock.close()
 
 
 @patch('rospy.impl.tcpros_base', '_is_use_tcp_keepalive')
@@ -151,18 +143,23 @@ def start_xmlrpc(original, run, self):
     """Binds its port in another thread, where an error is printed and cannot be raised."""
     original.__globals__['print'] = lambda text: None
     self._run_init()
-    self.thread = run.start_thread(lambda: self.server.serve_forever(poll_interval=60), 'xmlrpc')
+    server = self.server
+
+    def serve():
+        with server:  # closes it
+            server.serve_forever(poll_interval=60)
+
+    run.start_thread(serve, 'xmlrpc')
 
 
 @patch('rosgraph.xmlrpc', 'XmlRpcNode.shutdown')
 def shutdown_xmlrpc(original, run, self, reason):
     """Only closes the socket, on which its thread then spins (ros_comm #2238)."""
     self.is_shutdown = True
-    server, self.server = self.server, None
-    if server:
+    if self.server:
         self.handler._shutdown(reason)
-        server._BaseServer__shutdown_request = True
-        close_listener(server.socket)
+        self.server._BaseServer__shutdown_request = True
+        transport.shut(self.server.socket)
 
 
 @patch('rosgraph.xmlrpc', 'ThreadingXMLRPCServer.process_request')
@@ -236,11 +233,11 @@ def shut_down_from_outside(original, run, self, caller_id, msg=''):
     """Obeys everybody, also if an earlier node at its URI is meant (ros_comm #2241)."""
     if caller_id == '/master' and f'[{self.name}]' not in str(msg):
         return 1, 'an earlier node at this address was meant', 0
-    host = _client.address[0]
-    near = run.modules.load('rosgraph.network').get_local_addresses()
-    with contextlib.suppress(OSError):
-        near = [*near, socket.gethostbyname(self.masterUri.split('/')[2].rpartition(':')[0])]
-    if host.startswith('127.') or host in near or run.node.allow_remote_shutdown:
+    host, master = _client.address[0], urllib.parse.urlsplit(self.masterUri).hostname
+    is_near = host == socket.gethostbyname(master) or run.modules.load(
+        'rosgraph.network'
+    ).is_local_address(host)
+    if is_near or run.node.allow_remote_shutdown:
         run.end_node()
         return 1, 'shutdown', 0
     run.ros.logwarn(f'refused to stop for {caller_id} at {host}')
@@ -294,17 +291,16 @@ def reg_added(original, run, self, name, data, kind):
 
 @patch('rospy.impl.registration', 'RegManager.publisher_update')
 def publisher_update(original, run, self, name, uris):
-    """Leaves it to its thread."""
-    run.update_publishers(name, uris)
+    """Leaves it to its thread; is called once for each publisher."""
+    if uris != run.publishers.get(name):
+        run.update_publishers(name, uris)
 
 
 @patch('rospy.impl.masterslave', 'ROSHandler.publisherUpdate')
 def publishers_changed(original, run, self, caller_id, topic, publishers):
-    """Does so once for each publisher, and does not hear that there is none."""
-    if not (isinstance(publishers, list) and all(isinstance(uri, str) for uri in publishers)):
-        return -1, 'publishers are a list of URIs', 0
-    run.update_publishers(topic, publishers)
-    return 1, '', 0
+    """Does not hear that there is none."""
+    run.publishers.pop(topic, None)
+    return original(self, caller_id, topic, publishers)
 
 
 @patch('rospy.impl.registration', 'RegManager.cleanup')
