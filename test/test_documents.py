@@ -107,7 +107,8 @@ def folder(tmp_path, monkeypatch):
     """The folder of a page's reader, who has the package my_robot and tests with pharos."""
     robot = tmp_path / 'my_robot'
     robot.mkdir()
-    (robot / 'package.xml').write_text('<package><name>my_robot</name></package>')
+    manifest = (ROOT / 'test' / 'robot' / 'package.xml').read_text()
+    (robot / 'package.xml').write_text(manifest.replace('>robot<', '>my_robot<'))
     nodes = [f'<node name="{name}" pkg="my_robot" type="{name}" />' for name in ROBOT_NODES]
     (robot / 'robot.launch').write_text(f'<launch><arg name="speed" />{"".join(nodes)}</launch>')
     for name in ROBOT_NODES:
