@@ -4,6 +4,7 @@ A block is used as its fence says. ``python`` is a program, a test, or a file if
 one. ``console`` is commands, and ``text`` what the block before prints, with ``...`` for anything.
 In the tutorial, ``python`` and ``debugger`` are typed into a session, which ``console`` opens.
 """
+import contextlib
 import re
 import signal
 from typing import NamedTuple
@@ -139,7 +140,10 @@ def commands_of(block, folder):
 def run(command, master, expected='.'):
     """Run a program until it prints what is expected; end it by Ctrl-C if it goes on."""
     with helpers.Program(command, master.url) as program:
-        until(lambda: program.poll() is not None or re.search(expected, program.output), TIMEOUT)
+        with contextlib.suppress(TimeoutError):  # what it printed says more
+            until(
+                lambda: program.poll() is not None or re.search(expected, program.output), TIMEOUT
+            )
         if program.poll() is None:
             program.signal(signal.SIGINT)
         assert program.wait() in (0, -signal.SIGINT), program.output  # that is before spin()
