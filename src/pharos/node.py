@@ -13,7 +13,7 @@ import rosgraph.names
 import rospy
 
 from pharos import messages, program
-from pharos.blocks import Block, name_of, rebound, taking
+from pharos.blocks import Block, Receiver, name_of, rebound, taking
 from pharos.channels import QUEUE_SIZE, Channel, InputChannel, OutputChannel
 from pharos.errors import (
     MasterUnreachableError,
@@ -22,6 +22,7 @@ from pharos.errors import (
     PharosError,
     UnknownTopicError,
 )
+from pharos.external_node import ExternalNode
 from pharos.failures import Failures
 from pharos.names import legal_name, node_name
 from pharos.parameter import Parameter
@@ -45,7 +46,7 @@ class Lifecycle(enum.Enum):
     STOPPED = 'stopped'
 
 
-class Node:
+class Node(Receiver):
     """A ROS node of this process, made by :meth:`Master.create`.
 
     The report: a subclass of PhaROSNode. A class of your own overrides :meth:`start` and
@@ -211,15 +212,15 @@ class Node:
         self.run.turns.call(lambda: self._become(node_class))
 
     def _become(self, node_class):
-        before, self.__class__ = self.__class__, node_class
+        receivers = self, *self.opened
         try:
-            blocks = [rebound(each.delegate, self) for each in (self, *self.opened)]
-            self.soul = rebound(self.soul, self)
+            soul = rebound(self.soul, self, node_class)
+            blocks = [rebound(each.delegate, self, node_class) for each in receivers]
         except AttributeError as error:
-            self.__class__ = before
             raise PharosError(f'{node_class.__name__} lacks a method in use: {error}') from error
-        for each, block in zip((self, *self.opened), blocks):
-            each.delegate = block
+        self.__class__, self.soul = node_class, soul
+        for receiver, block in zip(receivers, blocks):
+            receiver.delegate = block
 
     def abandon(self) -> None:
         """Be stopped in a forked child: the node runs in the parent."""
@@ -294,29 +295,12 @@ class Node:
         kind, failures = type(self).__name__, self.failures.total
         return {'class': kind, 'failures': failures, 'dropped': dropped}
 
-    def describe(self, seconds: float = 1.0) -> str:
-        """Return what it publishes, receives and offers, to whom and how often, as text."""
-        from pharos.live.words import describe
-
-        return describe(self, seconds)
+    describe = ExternalNode.describe
 
     def __repr__(self) -> str:
         return f'<{type(self).__name__} {self.name} {self.lifecycle.value}>'
 
     # -- souls
-
-    @property
-    def delegate(self) -> Block | None:
-        """The block run for each message, as ``block(message, channel)`` or ``block(message)``.
-
-        The report: ``self receiverDelegate: [:message :channel | ...]``.
-        """
-        return self._delegate
-
-    @delegate.setter
-    def delegate(self, block: Block | None) -> None:
-        self.delegate_runs = taking(block, 'delegate', 2, 1)
-        self._delegate = block
 
     def execute(self) -> Any:
         """Run the soul once, in the calling thread, and return its value.

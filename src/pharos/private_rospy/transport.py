@@ -298,6 +298,13 @@ class SubscriptionOverlay:
             self.plain.turns.close(0)
 
 
+def peer_of(connection):
+    """Return the name of the node at the other end; None if it has not said it yet."""
+    if connection.direction == 'o':
+        return connection.endpoint_id
+    return connection.header and connection.header['callerid']
+
+
 def by_kind(connections):
     """Return the links and the others of some connections."""
     links = [each for each in connections if each.transport_type == 'INTRAPROCESS']
