@@ -73,7 +73,7 @@ class Node(Receiver):
     :ivar failures: for each of :attr:`errors` a :class:`Failure`: what failed, on what, how often
     """
 
-    #: seconds that a start waits for the master, and a topic's first message for subscribers
+    #: seconds that a topic's first message waits for subscribers
     connect_timeout = 2.0
     #: seconds that a stop waits for souls, and as long for messages under way
     stop_timeout = 2.0
@@ -93,9 +93,8 @@ class Node(Receiver):
 
     def _configure(self, master, name, soul, delegate, domain, ports, remappings):
         taking(soul, 'soul', 1, 0)
-        self.master, self.name = master, name
+        self.master, self.name, self.uri, self.domain = master, name, None, domain
         self.soul, self.delegate, self.remappings = soul, delegate, remappings
-        self.uri, self.domain = None, domain
         self.tcp_port, self.xmlrpc_port = ports
         self.failures = Failures(self._tell_failure)
         self._life = threading.RLock()  # held by a start, stop or restart
@@ -121,26 +120,27 @@ class Node(Receiver):
             self.failures, self.souls = Failures(self._tell_failure), {}
             self.lifecycle, self.run = Lifecycle.STARTING, Run(self)
             program.nodes.append(self)
+            opened, self.opened = self.opened, []
             try:
                 self.run.start()
                 self.lifecycle = Lifecycle.RUNNING
-            except BaseException:
-                self.run.stop(0)
-                self.lifecycle = Lifecycle.STOPPED
-                program.nodes.remove(self)
-                raise
-            opened, self.opened = self.opened, []
-            try:
                 for each in () if self._opens_itself else opened:
                     each.open()
-            except Exception:
-                self.stop()
+            except BaseException:
+                self._end(0)
                 self.opened = opened
                 raise
 
     @property
     def _opens_itself(self):
         return type(self).start is not Node.start
+
+    def _end(self, timeout):
+        self.run.stop(timeout)
+        for each in self.opened:
+            each.node_stopped()
+        self._senders, self.lifecycle = {}, Lifecycle.STOPPED
+        program.nodes.remove(self)
 
     def stop(self) -> None:
         """End the souls, send what is under way, unregister, free ports and threads.
@@ -153,11 +153,7 @@ class Node(Receiver):
         with self._life:
             if self.is_running:
                 self.lifecycle = Lifecycle.STOPPING
-                self.run.stop(self.stop_timeout)
-                for each in self.opened:
-                    each.node_stopped()
-                self._senders, self.lifecycle = {}, Lifecycle.STOPPED
-                program.nodes.remove(self)
+                self._end(self.stop_timeout)
 
     def _is_stopped_here(self):
         """True if a thread of the node asks, and another one stops it, which waits for this one."""
@@ -541,14 +537,19 @@ class Node(Receiver):
         """Return the definition that a publisher sends when it is connected."""
         if not self.master.topic(topic).publishers:
             return None
-        end = self.ros.Subscriber(topic, self.ros.AnyMsg)
 
-        def find():
+        def find(end):
             headers = [each.header or {} for each in end.impl.connections]
             return [each['message_definition'] for each in headers if each.get('type') == type_]
 
+        return (self._subscribed(find, self.connect_timeout, topic, self.ros.AnyMsg) or [None])[0]
+
+    def _subscribed(self, find, timeout, *options):
+        """Wait until ``find(subscriber)`` is true of a subscriber of rospy, and return what it is."""
+        # not through a channel: a delegate may call this, whose turn it is
+        end = self.ros.Subscriber(*options)
         try:
-            return (program.wait(find, self.connect_timeout, self) or [None])[0]
+            return program.wait(lambda: find(end), timeout, self)
         finally:
             end.unregister()
 
@@ -568,7 +569,7 @@ class Node(Receiver):
         """
         came, topic = [], self.resolve(topic)
 
-        def find():
+        def find(end):
             while came and where and not where(came[0]):
                 del came[0]
             return came
@@ -577,13 +578,8 @@ class Node(Receiver):
         if timeout and not typed_as:
             typed_as = program.wait(lambda: self.master.topic_type(topic), timeout, self)
         cls = self._class_of(topic, typed_as, True)
-        # not through a channel: this may be called by a delegate, whose turn it is
-        end = self.ros.Subscriber(topic, cls, came.append)
-        try:
-            if program.wait(find, timeout, self):
-                return came[0]
-        finally:
-            end.unregister()
+        if self._subscribed(find, timeout, topic, cls, came.append):
+            return came[0]
         if self.is_running:
             raise TimeoutError(f'no message on {topic} came within {timeout:g} s: is it published?')
         raise NodeStoppedError(f'{self.name} stopped while it waited for {topic}')

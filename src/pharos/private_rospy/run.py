@@ -15,7 +15,7 @@ import weakref
 import xml.parsers.expat
 import xmlrpc.client
 
-from pharos.errors import MasterUnreachableError, NodeNameInUseError, PortInUseError
+from pharos.errors import NodeNameInUseError, PortInUseError
 from pharos.intraprocess.workers import Turns
 from pharos.private_rospy import patches, transport
 from pharos.private_rospy.loader import PrivateModules, Shim
@@ -35,17 +35,22 @@ _watch_guard = threading.Lock()
 _end_of_watch = threading.Event()
 
 
+class _Transport(xmlrpc.client.Transport):
+    limit = MASTER_LIMIT
+
+    def make_connection(self, host):
+        connection = super().make_connection(host)
+        connection.timeout = self.limit
+        return connection
+
+
 class ServerProxy(xmlrpc.client.ServerProxy):
     """One that gives up after ``limit`` seconds."""
 
-    def __init__(self, uri, limit=MASTER_LIMIT, **options):
-        class Transport(xmlrpc.client.Transport):
-            def make_connection(self, host):
-                connection = super().make_connection(host)
-                connection.timeout = limit
-                return connection
-
-        super().__init__(uri, **{'transport': Transport(), **options})
+    def __init__(self, uri, limit=MASTER_LIMIT):
+        transport = _Transport()
+        transport.limit = limit
+        super().__init__(uri, transport)
 
 
 class Run:
@@ -63,10 +68,8 @@ class Run:
         self.sockets, self.calls = weakref.WeakSet(), weakref.WeakSet()
         self.deadlines = {}  # socket of a client that is to say something -> until when
         self.publishers = {}  # topic -> URIs, as the master last said
-        self.connecting, self.told = (
-            set(),
-            set(),
-        )  # (topic, URI ...); told: whose loss the log knows
+        self.connecting = set()  # (topic, URI, ...)
+        self.told = set()  # (topic, URI) that the log knows to be lost
         self.known = {kind: set() for kind in _METHODS}  # names that are registered
         self.uri, self.turns = '', Turns(node.name)
         namespace, _, self.base = node.name.rpartition('/')
@@ -134,8 +137,8 @@ class Run:
             server = base.init_tcpros_server(port)
             server.tcp_ros_server = base.TCPServer(server._tcp_server_callback, port)
             server.tcp_ros_server.start()
-            self.tcp_port, port = server.tcp_ros_server.port, self.node.xmlrpc_port
-            options.update(xmlrpc_port=port, tcpros_port=self.tcp_port, disable_signals=True)
+            port_taken, port = server.tcp_ros_server.port, self.node.xmlrpc_port
+            options.update(xmlrpc_port=port, tcpros_port=port_taken, disable_signals=True)
             self.modules.load('rospy.client').init_node(self.base, self.argv, **options)
         except OSError as error:
             if error.errno != errno.EADDRINUSE:
@@ -143,9 +146,8 @@ class Run:
             raise PortInUseError(
                 f'{self.name}: port {port} is in use: choose another one, or 0 for any'
             ) from None
-        address = urllib.parse.urlsplit(self.uri)
-        node = self.node
-        node.uri, node.tcp_port, node.xmlrpc_port = self.uri, self.tcp_port, address.port
+        node, address = self.node, urllib.parse.urlsplit(self.uri)
+        node.uri, node.tcp_port, node.xmlrpc_port = self.uri, port_taken, address.port
         node.domain = node.domain or address.hostname
 
     def ready(self, handler, uri):
@@ -160,18 +162,9 @@ class Run:
             runs[uri] = self
 
     def _check_name(self):
-        url, limit = self.master_url, max(self.node.connect_timeout, 1.0)
-        try:
-            code, _, uri = ServerProxy(url, limit).lookupNode('/pharos', self.name)
-        except UNREACHABLE as error:
-            raise MasterUnreachableError(
-                f'{self.name} cannot start: no ROS master answers at {url} ({error}):'
-                ' start roscore, or give the right URL'
-            ) from None
-        if code != 1:
-            return
+        uri = self.node.master.call('lookupNode', self.name)
         with contextlib.suppress(*UNREACHABLE):
-            if ServerProxy(uri, 1.0).getPid('/pharos'):
+            if uri and ServerProxy(uri, 1.0).getPid('/pharos'):
                 raise NodeNameInUseError(
                     f'{self.name} is running already, at {uri}: choose another name, or end that one'
                 )
