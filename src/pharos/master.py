@@ -330,17 +330,10 @@ class Master:
         roslaunch = [sys.executable, '-c', 'import roslaunch; roslaunch.main()', '--skip-log-check']
         return RosProcess([*roslaunch, path, *arguments], self.url, on_line)
 
-    def load(
-        self,
-        package: str,
-        executable: str | None = None,
-        *args: Any,
-        name: str | None = None,
-        namespace: str | None = None,
-        remap: dict[str, str] | None = None,
-        params: dict[str, Any] | None = None,
-    ) -> Any:
+    def load(self, *args: Any, **options: Any) -> Any:
         """Run a program of rospy, unmodified, as a node of this process: a :class:`ScriptNode`.
+
+        ``load(package, executable=None, *args, name=None, namespace=None, remap=None, params=None)``
 
         :param package: without ``executable``, the path of the program
         :param args: its arguments
@@ -350,19 +343,12 @@ class Master:
         """
         from pharos.compose.script import load
 
-        return load(self, package, executable, args, name, namespace, remap, params)
+        return load(self, *args, **options)
 
-    def compose(
-        self,
-        package: str | None,
-        file: str,
-        *,
-        only: Sequence[str] = (),
-        apart: Sequence[str] = (),
-        share_connections: bool = False,
-        **args: Any,
-    ) -> Any:
+    def compose(self, package: str | None, file: str, **options: Any) -> Any:
         """Run the Python nodes of a launch file in this process: a :class:`Composition`.
+
+        ``compose(package, file, only=(), apart=(), share_connections=False, **args)``
 
         The rest (C++, other machines, with a launch-prefix or cwd) runs as roslaunch starts it.
 
@@ -373,13 +359,9 @@ class Master:
         :raises UnknownNodeError: if there is no such file, argument or node
         :raises PharosError: if roslaunch cannot read it
         """
-        from pharos.compose.composition import Composition
-        from pharos.compose.launch_file import LaunchFile
+        from pharos.compose.composition import compose
 
-        launch_file = LaunchFile(self.url, package, file, args, only, apart)
-        composition = Composition(Master(self.url, share_connections or self.share_connections))
-        composition.launch(launch_file)
-        return composition
+        return compose(self, package, file, **options)
 
     def graph(self, seconds: float = 0) -> Any:
         """Return the :class:`Graph` of all nodes and topics, with rates if it looks for a while."""

@@ -275,8 +275,8 @@ def response(cls: Any, value: Any) -> genpy.Message:
     names = cls.__slots__
     if value is None and not names:
         value = {}
-    elif len(names) == 1 and cls._slot_types[0].endswith(']') and type(value) in (list, tuple):
-        if not (len(value) == 1 and type(value[0]) in (list, tuple)):
+    elif len(names) == 1 and type(value) is list and cls._slot_types[0].endswith(']'):
+        if not (value and type(value[0]) is list):
             value = {names[0]: value}
     return check(_fill(cls(), value) if type(value) is dict else as_rospy(value, cls))
 

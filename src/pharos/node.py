@@ -616,11 +616,10 @@ class Node(Receiver):
         """The parameters that :meth:`parameter` has returned."""
         return [each for each in self.opened if isinstance(each, Parameter)]
 
-    def parameter_changed(self, name: str) -> None:
-        """Have the parameters read their values that a change may concern."""
+    def read_parameters(self) -> None:
+        """Have the parameters read their values: one has changed."""
         for each in self.parameters:
-            if each.overlaps(name):
-                each.read()
+            each.read()
 
 
 class BlockNode(Node):

@@ -22,8 +22,6 @@ class _Transcript:
 
     def on_show(self, receiver: Callable[[str], Any] | None) -> Callable[[str], Any] | None:
         """Have ``receiver(line)`` take the lines, None: standard output; returns the former one."""
-        if not (receiver is None or callable(receiver)):
-            raise TypeError(f'a receiver is called as receiver(line), not {receiver!r}')
         with self._lock:
             former, self._receiver = self._receiver, receiver
         return former

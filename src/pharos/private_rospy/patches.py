@@ -318,7 +318,7 @@ def cleanup(original, run, self, reason):
 @patch('rospy.impl.masterslave', 'ROSHandler.paramUpdate')
 def parameter_changed(original, run, self, caller_id, key, value):
     """Tells its own cache alone."""
-    run.node.parameter_changed('/' + str(key).strip('/'))
+    run.node.read_parameters()
     return original(self, caller_id, key, value)
 
 
@@ -327,7 +327,7 @@ def parameter_changed(original, run, self, caller_id, key, value):
 def set_parameter(original, run, self, key, *value):
     """Tells others of the change, and not the node itself."""
     original(self, key, *value)
-    run.node.parameter_changed(run.ros.resolve_name(key))
+    run.node.read_parameters()
 
 
 @patch('subprocess', 'Popen.__init__')

@@ -57,7 +57,7 @@ class Run:
     """A rospy with a node.
 
     :param node: a Node, with a name, ports, settings, and methods that are called: ``end_now()`` if
-        ROS ends it, ``parameter_changed(name)``, ``refused(topic, reason)``
+        ROS ends it, ``read_parameters()``, ``refused(topic, reason)``
     """
 
     def __init__(self, node):
@@ -70,7 +70,7 @@ class Run:
         self.publishers = {}  # topic -> URIs, as the master last said
         self.connecting = set()  # (topic, URI, ...)
         self.told = set()  # (topic, URI) that the log knows to be lost
-        self.known = {kind: set() for kind in _METHODS}  # names that are registered
+        self.known = set()  # (kind, name) of what is registered
         self.uri, self.turns = '', Turns(node.name)
         namespace, _, self.base = node.name.rpartition('/')
         self.environ = {'ROSCONSOLE_FORMAT': '[${severity}] [${time}]: ${node}: ${message}'}
@@ -225,17 +225,22 @@ class Run:
 
     def register_missing(self, state):
         """Register what is not in the master's system state."""
-        topics, services, is_forgotten = self.topics, self.services, False
+        topics, services = self.topics, self.services
+        known = {
+            (kind, name)
+            for kind, names in zip(_METHODS, state)
+            for name, nodes in names
+            if self.name in nodes
+        }
         ours = topics.get_publications, topics.get_subscriptions, services.get_services
-        for kind, own, theirs in zip(_METHODS, ours, map(dict, state)):
-            known = {name for name, nodes in theirs.items() if self.name in nodes}
-            with topics.lock, services.lock:  # what is closed meanwhile stays closed
-                for name, data in own():
-                    if name in self.known[kind] - known and not self.stopping.is_set():
-                        is_forgotten = True
-                        self.register(kind, name, data)
-                self.known[kind] = {name for name, _ in own()}
-        if is_forgotten and not self.stopping.is_set():
+        with topics.lock, services.lock:  # what is closed meanwhile stays closed
+            own = [(kind, *each) for kind, get in zip(_METHODS, ours) for each in get()]
+            # what was there at the last look: all else may be about to be registered
+            missing = [each for each in own if each[:2] in self.known - known]
+            for each in missing:
+                self.stopping.is_set() or self.register(*each)
+            self.known = {each[:2] for each in own}
+        if missing and not self.stopping.is_set():
             self.modules.load('rospy.client')._init_node_params(self.argv, self.name)
             for parameter in self.node.parameters:
                 parameter.subscribe()
