@@ -6,10 +6,8 @@ import collections.abc
 import contextlib
 import os
 import re
-import socket
 import subprocess
 import sys
-import urllib.parse
 from typing import Any, Callable, Iterator, Sequence
 
 import rosgraph.names
@@ -271,12 +269,11 @@ class Master:
     def may_live(self, name: str) -> bool:
         """False if the node of that name refuses connections, or is not registered."""
         uri = self.call('lookupNode', name)
-        parts = urllib.parse.urlsplit(uri or '')
         try:
-            socket.create_connection((parts.hostname, parts.port or 0), 0.5).close()
+            uri and ServerProxy(uri, 0.5).getPid(CALLER_ID)
         except ConnectionRefusedError:
             return False
-        except OSError:
+        except UNREACHABLE:
             pass
         return bool(uri)
 

@@ -41,8 +41,8 @@ def wait(
     """
     end = float('inf') if timeout is None else time.monotonic() + timeout
     node, pause = node or here.node, 0.002
-    stopping = node.run.stopping if node else threading.Event()
-    while not (value := predicate()) and time.monotonic() < end and not stopping.wait(pause):
+    sleep = node.run.stopping.wait if node else time.sleep
+    while not (value := predicate()) and time.monotonic() < end and not sleep(pause):
         pause = min(pause * 1.2, 0.02)
     return value
 

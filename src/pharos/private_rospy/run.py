@@ -31,7 +31,6 @@ UNREACHABLE = (
     xml.parsers.expat.ExpatError,
 )
 _METHODS = {'pub': 'registerPublisher', 'sub': 'registerSubscriber', 'srv': 'registerService'}
-_watch_guard = threading.Lock()
 _end_of_watch = threading.Event()
 
 
@@ -152,13 +151,12 @@ class Run:
 
     def ready(self, handler, uri):
         """Be found and watched: the servers run, and nothing is registered yet."""
-        global _end_of_watch
         self.handler, self.uri = handler, uri
         handler.pharosHealth = lambda caller_id: (1, '', self.node.told())
-        with _watch_guard:
+        with transport.guard:
             if not runs:
-                _end_of_watch = threading.Event()
-                threading.Thread(target=_watch, args=[_end_of_watch], daemon=True).start()
+                _end_of_watch.clear()
+                threading.Thread(target=_watch, daemon=True).start()
             runs[uri] = self
 
     def _check_name(self):
@@ -261,7 +259,7 @@ class Run:
         :param timeout: seconds for souls, and as long for what is under way
         """
         self.stopping.set()
-        with _watch_guard:
+        with transport.guard:
             runs.pop(self.uri, None)
             if not runs:
                 _end_of_watch.set()
@@ -299,9 +297,9 @@ def join(threads, timeout):
     return [thread for thread in others if thread.is_alive()]
 
 
-def _watch(end):
+def _watch():
     """Ask each master once a second what it knows of our nodes: it may have been started again."""
-    while not end.wait(WATCH_PERIOD):
+    while not _end_of_watch.wait(WATCH_PERIOD):
         nodes = list(runs.values())
         for run in nodes:
             run.topics.check_all()  # rospy looks twice a second who has left (ros_comm #927)

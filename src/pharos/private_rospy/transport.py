@@ -24,6 +24,7 @@ RETRY_DELAY = 1.0  # seconds until the next one
 _length = struct.Struct('<I')
 #: the runs of this process by the URI of their node
 runs = {}
+guard = threading.Lock()  # of runs and _shares
 
 
 class Link(Transport):
@@ -80,7 +81,6 @@ class Share:
 
 
 _shares = {}  # (topic, URI, message class) -> Share
-_share_guard = threading.Lock()
 
 
 def follow(run, topic, uri, subscription):
@@ -89,7 +89,7 @@ def follow(run, topic, uri, subscription):
     If nobody has, this one is the first.
     """
     key = topic, uri, subscription.data_class
-    with _share_guard:
+    with guard:
         share = _shares.get(key)
         if share is None or share.leader is run:
             _shares[key] = Share(run)
@@ -106,7 +106,7 @@ def follow(run, topic, uri, subscription):
 
 def end_share(topic, uri, cls, run):
     """Have those that share a connection that has ended connect anew."""
-    with _share_guard:
+    with guard:
         share = _shares.get((topic, uri, cls))
         if share is None or share.leader is not run:
             return
