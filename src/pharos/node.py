@@ -66,10 +66,9 @@ class Node(Receiver):
     :ivar master: its :class:`Master`
     :ivar soul: the block that says what the node does, called as ``soul(node)``, or None
     :ivar lifecycle: its state, a :class:`Lifecycle`
-    :ivar uri: the URI of its XML-RPC server, None before the first start
-    :ivar domain: the address that it advertises; likewise, unless it was given
-    :ivar tcp_port: the TCPROS port; the one asked for, before the first start
-    :ivar xmlrpc_port: the XML-RPC port, likewise
+    :ivar uri: the URI of its XML-RPC server, None before the first start, as ``domain``, the
+        address that it advertises, unless it was given
+    :ivar tcp_port, xmlrpc_port: its ports; before the first start those asked for
     :ivar failures: for each of :attr:`errors` a :class:`Failure`: what failed, on what, how often
     """
 
@@ -265,31 +264,29 @@ class Node(Receiver):
         """Return how the node is doing; asks the master.
 
         :returns: an object with ``registered`` (True if the master has the node at its URI, None if
-            the master does not answer), ``connections`` ({transport: how many}), ``dropped`` (how
-            many messages), ``errors`` (how often blocks failed), ``threads``, ``souls`` (how many
-            run in threads of their own), ``ended_souls`` (names of those that were forked)
+            the master does not answer), ``kind`` (its class), ``connections`` ({transport: how
+            many}), ``dropped`` (how many messages), ``errors`` (how often blocks failed),
+            ``threads``, ``souls`` (how many run in threads), ``ended_souls`` (their names)
         """
-        impls = [*self.run.topics.pubs.values(), *self.run.topics.subs.values()]
-        kinds = [each.transport_type for impl in impls for each in impl.connections]
-        ended = [soul.name for soul in self.souls if not soul.is_alive()]
         registered = None
         with contextlib.suppress(MasterUnreachableError):
             registered = self.master.call('lookupNode', self.name) == self.uri
-        return types.SimpleNamespace(
-            registered=registered,
-            connections=dict(collections.Counter(kinds)),
-            dropped=sum(getattr(channel, 'dropped', 0) for channel in self.channels),
-            errors=self.failures.total,
-            threads=sum(thread.is_alive() for thread in list(self.run.threads)),
-            souls=len(self.souls) - len(ended),
-            ended_souls=ended,
-        )
+        return types.SimpleNamespace(registered=registered, **self.told())
 
     def told(self) -> dict[str, Any]:
-        """Return what top and graph ask for, by XML-RPC."""
-        dropped = {each.topic: each.dropped for each in self.channels if hasattr(each, 'dropped')}
-        kind, failures = type(self).__name__, self.failures.total
-        return {'class': kind, 'failures': failures, 'dropped': dropped}
+        """Return what :meth:`health` knows without the master; top asks for it by XML-RPC."""
+        impls = [*self.run.topics.pubs.values(), *self.run.topics.subs.values()]
+        kinds = [each.transport_type for impl in impls for each in impl.connections]
+        ended = [soul.name for soul in self.souls if not soul.is_alive()]
+        return {
+            'kind': type(self).__name__,
+            'connections': dict(collections.Counter(kinds)),
+            'dropped': sum(getattr(channel, 'dropped', 0) for channel in self.channels),
+            'errors': self.failures.total,
+            'threads': sum(thread.is_alive() for thread in list(self.run.threads)),
+            'souls': len(self.souls) - len(ended),
+            'ended_souls': ended,
+        }
 
     describe = ExternalNode.describe
 

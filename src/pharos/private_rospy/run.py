@@ -205,11 +205,11 @@ class Run:
                     self.node.refused(topic, refusal)
             elif self.node.master.share_connections and transport.follow(self, *key, subscription):
                 pass
-            elif not self.handler.done and self.handler._connect_topic(*key)[0] != 1:
+            elif self.handler._connect_topic(*key)[0] != 1:
                 self.start_thread(lambda: self.connect_again(*key), f'connect {topic}')
-        except AttributeError:
-            if topic in self.topics.subs:
-                raise  # else it was closed meanwhile, for which rospy does not look
+        except (AttributeError, UnboundLocalError):  # rospy's, if it was closed meanwhile
+            if topic in self.topics.subs and not self.stopping.is_set():
+                raise
         finally:
             self.connecting.discard(attempt)
 
