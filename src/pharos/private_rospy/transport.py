@@ -56,17 +56,11 @@ class Follower(Transport):
     """The share of a subscription in the connection of another node."""
 
     transport_type = 'TCPROS'
-    header = property(lambda self: self.share.header)
-    latch = property(lambda self: self.share.latch)
+    header = property(lambda self: self.share.connection and self.share.connection.header)
+    latch = property(lambda self: self.share.connection and self.share.connection.latch)
 
     def get_transport_info(self):
         return f'TCPROS connection of {self.share.leader.name}'
-
-    def close(self):
-        if not self.done:
-            self.done = True
-            self.share.followers = [each for each in self.share.followers if each is not self]
-            self.cleanup_cb(self)
 
 
 class Share:
@@ -76,8 +70,10 @@ class Share:
     connect anew.
     """
 
+    connection = None
+
     def __init__(self, leader):
-        self.leader, self.followers, self.header, self.latch = leader, [], {}, None
+        self.leader, self.followers = leader, []
 
 
 _shares = {}  # (topic, URI, message class) -> Share
@@ -98,9 +94,9 @@ def follow(run, topic, uri, subscription):
         follower.endpoint_id, follower.share, follower.run = uri, share, run
         follower.subscription = subscription
         subscription.add_connection(follower)
-        share.followers = [*share.followers, follower]
-    for inbox in subscription.inboxes() if share.latch else ():
-        inbox.receive(copied(share.latch), 0)
+        share.followers = [*(each for each in share.followers if not each.done), follower]
+    for inbox in subscription.inboxes() if follower.latch else ():
+        inbox.receive(copied(follower.latch), 0)
     return True
 
 
@@ -322,9 +318,8 @@ def close(impl):
 def keep_alive(sock):
     """Have a connection break within 30 s if the other host has silently gone."""
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 10)
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 5)
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 4)
+    for option in (socket.TCP_KEEPIDLE, 10), (socket.TCP_KEEPINTVL, 5), (socket.TCP_KEEPCNT, 4):
+        sock.setsockopt(socket.IPPROTO_TCP, *option)
 
 
 def receive(connection, address, port, uri, subscription, run):
@@ -338,7 +333,7 @@ def receive(connection, address, port, uri, subscription, run):
     cls, header = subscription.data_class, connection.header
     share = _shares.get((subscription.resolved_name, uri, cls))
     if share:
-        share.header = header
+        share.connection = connection
     with sock.makefile('rb', 1 << 16) as stream:
         while not connection.done:
             head = stream.read(4)
@@ -355,15 +350,14 @@ def receive(connection, address, port, uri, subscription, run):
             message = None
             inboxes = subscription.inboxes()
             for follower in share.followers if share else ():
-                inboxes = [*inboxes, *follower.subscription.inboxes()]
+                if not follower.done:
+                    inboxes = [*inboxes, *follower.subscription.inboxes()]
             for inbox in inboxes:
                 message = cls().deserialize(data)
                 message._connection_header = header
                 inbox.receive(message, size)
             if connection.is_latched:
                 connection.latch = message or cls().deserialize(data)
-                if share:
-                    share.latch = connection.latch
 
 
 class Sender:
