@@ -87,7 +87,7 @@ class ExternalNode:
         return self._names(2)
 
     def describe(self, seconds: float = 1.0) -> str:
-        """Return what it publishes, receives and offers, to whom and how often, as text."""
+        """Return as text what it publishes, receives and offers, its peers, and how often."""
         from pharos.live.words import describe
 
         return describe(self, seconds)

@@ -1,4 +1,4 @@
-"""What blocks raised: kept, counted, told once, and run again."""
+"""Failures of blocks: kept, counted, told once, and run again."""
 from __future__ import annotations
 
 import contextlib
@@ -16,7 +16,7 @@ WHOLE = 5  # of them, the newest, whose messages and frames are kept
 
 
 class Failure:
-    """What a block raised at one place, as often as it came: one of :attr:`Node.failures`.
+    """An exception that a block raised at one place: one of :attr:`Node.failures`.
 
     :ivar error: the exception, of the last time
     :ivar block: the block that raised it

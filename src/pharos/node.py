@@ -369,7 +369,7 @@ class Node(Receiver):
 
     @property
     def errors(self) -> list[BaseException]:
-        """What blocks raised in this run of the node, the newest last; 100 kinds at most."""
+        """The exceptions of blocks in this run of the node, the newest last; 100 kinds at most."""
         return [failure.error for failure in self.failures]
 
     def report(self, error, block, what: str, message=None, channel=None, again=None) -> None:
@@ -557,10 +557,11 @@ class Node(Receiver):
         timeout: float | None = None,
         where: Callable[[Any], Any] | None = None,
     ) -> genpy.Message:
-        """Return the next message of a topic, for which ``where(message)`` is true.
+        """Return the next message of a topic.
 
         :param timeout: seconds until its type is known, and as long for the message; None: without
             limit, for a topic of a known type
+        :param where: skip messages unless ``where(message)`` is true
         :raises UnknownTopicError, TimeoutError: if none comes in time
         :raises NodeStoppedError: if the node stops meanwhile
         """

@@ -64,7 +64,7 @@ class RosProcess:
 
     @property
     def output(self) -> str:
-        """What it has printed so far; the last 10,000 lines."""
+        """The last 10,000 lines that it has printed."""
         return '\n'.join(self._lines)
 
     def send(self, text: str) -> None:

@@ -27,7 +27,7 @@ from pharos.intraprocess.copier import serialize
 from pharos.private_rospy.patches import answer
 from pharos.private_rospy.transport import keep_alive, local_service
 
-PROBE_LIMIT = 5.0  # seconds in which a provider that is called must say its type
+PROBE_LIMIT = 5.0  # seconds until a provider that is called must have said its type
 PATIENCE = 0.25  # seconds that a look-up waits for that; a call asks again
 
 

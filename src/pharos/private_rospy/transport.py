@@ -1,4 +1,4 @@
-"""What a topic's connections do here: INTRAPROCESS links, publishing, and receiving from sockets.
+"""Connect topics: INTRAPROCESS links, publishing, and receiving from sockets.
 
 A link is two ends, one in the list of connections of rospy's publisher and one in that of its
 subscription, so that rosnode info, closing and duplicates are rospy's own matter.
@@ -160,7 +160,7 @@ def shut(sock):
 
 
 class PublisherOverlay:
-    """What is set on a node's own rospy.topics._PublisherImpl; ``rospy_NAME`` is rospy's method.
+    """Methods for a node's own rospy.topics._PublisherImpl; ``rospy_NAME`` is rospy's method.
 
     rospy serializes for all, latches the user's object, one for all Publishers of a topic, and keeps
     what did not serialize in its buffer, which corrupts the next message.
@@ -255,7 +255,7 @@ class PublisherOverlay:
 
 
 class SubscriptionOverlay:
-    """What is set on a node's own rospy.topics._SubscriberImpl.
+    """Methods for a node's own rospy.topics._SubscriberImpl.
 
     Callbacks that are an Inbox get messages directly. All others of a topic share one, which takes
     turns by itself, for they may wait for each other.
