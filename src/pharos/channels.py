@@ -180,9 +180,7 @@ class OutputChannel(Channel):
         except Exception as error:
             if self.closed:
                 raise NodeStoppedError(f'{self!r} was closed while it sent') from error
-            if not messages.convert_numpy(message):
-                raise messages.explain(message, error) from error
-            return self.publish(message, connection)
+            raise messages.explain(message, error) from error
         self.sent += 1
 
     def send(self, block: Any = None, *, to: Any = None, **fields: Any) -> genpy.Message:

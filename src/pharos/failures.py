@@ -11,6 +11,7 @@ import traceback
 from pharos.blocks import name_of
 from pharos.errors import PharosError
 
+_HEAD = f'times  last      {"by":30}  {"on":20}  raised'
 KEPT = 100  # failures of a node; the oldest go
 WHOLE = 5  # of them, the newest, whose messages and frames are kept
 
@@ -100,12 +101,10 @@ class Failures(list):
                 self._tell(line, new.traceback)
 
     def __repr__(self) -> str:
-        row = '{:60.60}  {:30.30}  {:20.20}  {:>5}  {}'.format
-        lines = [row('raised', 'by', 'on', 'times', 'last')]
-        for each in self:
-            error, topic = f'{type(each.error).__name__}: {each.error}', each.channel
-            last = time.strftime('%H:%M:%S', time.localtime(each.time))
-            lines.append(
-                row(error, name_of(each.block), getattr(topic, 'topic', ''), each.count, last)
-            )
-        return '\n'.join(lines) if self else '[]'
+        rows = [
+            f'{each.count:5}  {time.strftime("%H:%M:%S", time.localtime(each.time))}'
+            f'  {name_of(each.block):30.30}  {getattr(each.channel, "topic", ""):20.20}'
+            f'  {type(each.error).__name__}: {each.error}'
+            for each in self
+        ]
+        return '\n'.join([_HEAD, *rows]) if self else '[]'

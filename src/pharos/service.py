@@ -131,7 +131,7 @@ class Service:
                 raise MessageTypeError(
                     f'{self.name} takes {cls._request_class._type}, not {request._type}'
                 )
-            messages.check(request)
+            request = messages.check(request)
             if self.md5sum not in ('*', cls._md5sum):
                 raise self._wrong_type(cls)
             if timeout is None and self._local():

@@ -233,7 +233,10 @@ class PublisherOverlay:
         return True
 
     def write(self, message, connections):
-        data = serialize(message)
+        try:
+            data = serialize(message)
+        except Exception:  # copying makes bytes of numpy's arrays, or says what is wrong
+            data = serialize(self.thaw(self.freeze(message)))
         data = _length.pack(len(data)) + data
         self.message_data_sent += len(data)
         for connection in connections:
