@@ -19,7 +19,6 @@ from pharos.errors import (
     MasterUnreachableError,
     PharosError,
     PortInUseError,
-    UnknownNodeError,
 )
 from pharos.external_node import ExternalNode
 from pharos.names import full_name, node_name
@@ -246,12 +245,9 @@ class Master:
 
     def nodes(self) -> list[Node | ExternalNode]:
         """Return all nodes, of this process and others."""
+        own = {node.name: node for node in self.own_nodes()}
         names = {name for kind in self.system_state() for users in kind.values() for name in users}
-        found = []
-        for name in sorted(names):
-            with contextlib.suppress(UnknownNodeError):  # it has gone meanwhile
-                found.append(self.node(name))
-        return found
+        return [own.get(name) or ExternalNode(self, name) for name in sorted(names)]
 
     def node(self, name: str) -> Node | ExternalNode:
         """Return the node of that name.
@@ -259,12 +255,9 @@ class Master:
         :raises UnknownNodeError: if there is none
         """
         name = full_name(node_name(name))
-        for node in self.own_nodes():
-            if node.name == name:
-                return node
         external = ExternalNode(self, name)
-        external.uri  # raises if there is none
-        return external
+        own = [node for node in self.own_nodes() if node.name == name]
+        return own[0] if own else external.uri and external  # raises if there is none
 
     def may_live(self, name: str) -> bool:
         """False if the node of that name refuses connections, or is not registered."""

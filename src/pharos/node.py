@@ -147,24 +147,13 @@ class Node(Receiver):
         Does nothing if the node is stopped. Waits up to :attr:`stop_timeout` for souls, and as long
         for messages under way; what goes on then is left behind, and named in the log.
         """
-        if self._is_stopped_here():
-            return
         with self._life:
             if self.is_running:
                 self.lifecycle = Lifecycle.STOPPING
                 self._end(self.stop_timeout)
 
-    def _is_stopped_here(self):
-        """True if a thread of the node asks, and another one stops it, which waits for this one."""
-        return self.lifecycle is Lifecycle.STOPPING and (
-            threading.current_thread() in self.run.threads
-            or self.run.turns.runner == threading.get_ident()
-        )
-
     def end_now(self) -> None:
         """Stop the node, whatever the stop() of its class raises; two threads may ask for it."""
-        if self._is_stopped_here():
-            return
         with self._life:
             try:
                 if self.is_running:
