@@ -178,11 +178,6 @@ class PublisherOverlay:
 
     release = acquire
 
-    def enable_latch(self):  # rospy calls it when its first links are made
-        self.is_latch = True
-        for link in by_kind(self.connections)[0]:
-            link.header['latching'] = '1'
-
     def add_connection(self, connection):
         with self.lock:
             self.rospy_add_connection(connection)
