@@ -151,10 +151,9 @@ class OutputChannel(Channel):
         def missing():
             return names - {peer_of(each) for each in self._impl.connections}
 
-        if not wait(lambda: not missing(), min(0.2, node.connect_timeout), node):
-            names = {name for name in missing() if node.master.may_live(name)}
-            wait(lambda: not missing(), node.connect_timeout, node)
-        if missing() and node.connect_timeout and node.is_running:
+        names = {name for name in names if node.master.may_live(name)}
+        is_ready = wait(lambda: not missing(), node.connect_timeout, node)
+        if not is_ready and node.connect_timeout and node.is_running:
             node.log(
                 f'{self.topic}: {", ".join(sorted(missing()))} did not connect within'
                 f' {node.connect_timeout:g} s, and may miss the first messages: can they reach'

@@ -311,14 +311,12 @@ class Master:
         path = find_program(package, executable)
         return RosProcess([path, *map(str, args)], self.url, on_line)
 
-    def launch(
-        self, package: str | None, file: str, on_line: Any = None, **args: Any
-    ) -> RosProcess:
+    def launch(self, package: str | None, file: str, **args: Any) -> RosProcess:
         """Run a launch file at this master, as roslaunch does; ``package`` None: it is a path."""
         path = find_launch_file(package, file)
         arguments = [f'{name}:={value}' for name, value in args.items()]
         roslaunch = [sys.executable, '-c', 'import roslaunch; roslaunch.main()', '--skip-log-check']
-        return RosProcess([*roslaunch, path, *arguments], self.url, on_line)
+        return RosProcess([*roslaunch, path, *arguments], self.url)
 
     def load(self, *args: Any, **options: Any) -> Any:
         """Run a program of rospy, unmodified, as a node of this process: a :class:`ScriptNode`.

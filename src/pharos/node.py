@@ -87,9 +87,6 @@ class Node(Receiver):
     master: Master
     run: Run
 
-    def __init__(self) -> None:
-        """Take nothing; a class of your own may take what :meth:`Master.create` passes on."""
-
     def _configure(self, master, name, soul, delegate, domain, ports, remappings):
         taking(soul, 'soul', 1, 0)
         self.master, self.name, self.uri, self.domain = master, name, None, domain

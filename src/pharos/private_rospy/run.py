@@ -70,7 +70,7 @@ class Run:
         self.connecting = set()  # (topic, URI, ...)
         self.told = set()  # (topic, URI) that the log knows to be lost
         self.known = set()  # (kind, name) of what is registered
-        self.uri, self.turns = '', Turns(node.name)
+        self.uri, self.turns = '', Turns()
         namespace, _, self.base = node.name.rpartition('/')
         self.environ = {'ROSCONSOLE_FORMAT': '[${severity}] [${time}]: ${node}: ${message}'}
         self.environ.update(os.environ, ROS_MASTER_URI=node.master.url)

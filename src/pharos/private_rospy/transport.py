@@ -131,7 +131,6 @@ def connect(sender, receiver, topic):
         out.other, end.other, out.subscription = end, out, subscription
         for each in out, end:
             each.publisher, each.thaw, each.header = publisher, thawer(sent, wanted), header
-            each.callerid_pub = sender.name
         with subscription.c_lock:
             if subscription.closed or publisher.closed or subscription.has_connection(sender.uri):
                 return None
@@ -177,6 +176,11 @@ class PublisherOverlay:
         """Do nothing: publish() locks, but not while it runs inline delegates."""
 
     release = acquire
+
+    def enable_latch(self):  # rospy calls it when its first links are made
+        self.is_latch = True
+        for link in by_kind(self.connections)[0]:
+            link.header['latching'] = '1'
 
     def add_connection(self, connection):
         with self.lock:
@@ -270,7 +274,7 @@ class SubscriptionOverlay:
             known = [callback for callback, _ in callbacks or () if isinstance(callback, Inbox)]
             if callbacks and len(known) < len(callbacks):
                 if self.plain is None:
-                    self.plain = Inbox(Turns(self.name), self.call_plain, self.queue_size)
+                    self.plain = Inbox(Turns(), self.call_plain, self.queue_size)
                 known.append(self.plain)
             self.seen, self.known = callbacks, known
         return self.known
