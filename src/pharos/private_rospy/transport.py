@@ -131,6 +131,7 @@ def connect(sender, receiver, topic):
         out.other, end.other, out.subscription = end, out, subscription
         for each in out, end:
             each.publisher, each.thaw, each.header = publisher, thawer(sent, wanted), header
+            each.callerid_pub = sender.name  # actionlib asks for it
         with subscription.c_lock:
             if subscription.closed or publisher.closed or subscription.has_connection(sender.uri):
                 return None
