@@ -11,7 +11,7 @@ import traceback
 from pharos.blocks import name_of
 from pharos.errors import PharosError
 
-_HEAD = f'times  last      {"by":30}  {"on":20}  raised'
+_HEAD = f'{"raised":60}  {"by":30}  {"on":20}  times  last'
 KEPT = 100  # failures of a node; the oldest go
 WHOLE = 5  # of them, the newest, whose messages and frames are kept
 
@@ -102,9 +102,9 @@ class Failures(list):
 
     def __repr__(self) -> str:
         rows = [
-            f'{each.count:5}  {time.strftime("%H:%M:%S", time.localtime(each.time))}'
-            f'  {name_of(each.block):30.30}  {getattr(each.channel, "topic", ""):20.20}'
-            f'  {type(each.error).__name__}: {each.error}'
+            f'{f"{type(each.error).__name__}: {each.error}":60.60}  {name_of(each.block):30.30}'
+            f'  {getattr(each.channel, "topic", ""):20.20}  {each.count:5}'
+            f'  {time.strftime("%H:%M:%S", time.localtime(each.time))}'
             for each in self
         ]
         return '\n'.join([_HEAD, *rows]) if self else '[]'
