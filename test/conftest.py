@@ -45,11 +45,11 @@ def master(ros_master, monkeypatch):
     threads = set(threading.enumerate())
     yield master
     helpers.stop_nodes(master)
-    until(lambda: not any(master.system_state()), 10, 'the end of all registrations')
     try:
+        until(lambda: not any(master.system_state()), 10)
         until(lambda: not left_threads(threads), 10)
     except TimeoutError:
-        pytest.fail(f'left behind: {left_threads(threads)}')
+        pytest.fail(f'left behind: {left_threads(threads)}, {master.system_state()}')
     ros_master.forget()
 
 

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import inspect
+import types
 from typing import Any, Callable
 
 Block = Callable[..., Any]
@@ -30,11 +31,34 @@ def taking(block: Any, what: str, *counts: int) -> Any:
     raise TypeError(f'a {what} takes {" or ".join(map(str, counts))} arguments, not {signature}')
 
 
-def rebound(block: Any, node: Any) -> Any:
-    """Return the block, or the method of its name if it is one of the node, whose class changed."""
+class Receiver:
+    """Runs a delegate for each message."""
+
+    delegate_runs: Block | None = None  #: the delegate, as a block that takes two arguments
+    _delegate: Block | None = None
+
+    @property
+    def delegate(self) -> Any:
+        """The block run for each message, as ``block(message, channel)`` or ``block(message)``.
+
+        That of a channel goes before that of its node. One that is set takes effect with the next
+        message. The report: ``self receiverDelegate: [:message :channel | ...]``.
+        """
+        return self._delegate
+
+    @delegate.setter
+    def delegate(self, block: Block | None) -> None:
+        self.delegate_runs = taking(block, 'delegate', 2, 1)
+        self._delegate = block
+
+
+def rebound(block: Any, node: Any, cls: type) -> Any:
+    """Return the block; if it is a method of the node, that of the same name of another class."""
     if isinstance(block, list):
-        return [rebound(each, node) for each in block]
-    return getattr(node, block.__name__) if getattr(block, '__self__', None) is node else block
+        return [rebound(each, node, cls) for each in block]
+    if getattr(block, '__self__', None) is not node:
+        return block
+    return types.MethodType(getattr(cls, block.__name__), node)
 
 
 def name_of(block: Any) -> str:

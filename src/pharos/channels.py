@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 import genpy
 
 from pharos import messages
-from pharos.blocks import Block, taking
+from pharos.blocks import Block, Receiver
 from pharos.errors import MessageTypeError, NodeStoppedError, UnknownNodeError
 from pharos.intraprocess.workers import Inbox
+from pharos.private_rospy.transport import peer_of
 from pharos.program import wait
 
 if TYPE_CHECKING:
@@ -67,12 +68,18 @@ class Channel(Opened):
         impl.check()  # rospy looks now and then who has left (ros_comm #927)
         return impl.connections
 
+    @property
+    def connections(self) -> list[tuple[str, str]]:
+        """The peers: ``(name of the node, 'INTRAPROCESS' or 'TCPROS')``."""
+        named = [(peer_of(each), each.transport_type) for each in self._connections()]
+        return [(name, transport) for name, transport in named if name]
+
     def __repr__(self) -> str:
         state = 'closed ' if self.closed else ''
         return f'<{state}{type(self).__name__} {self.topic} ({self.type}) of {self.node.name}>'
 
 
-class InputChannel(Channel, Inbox):
+class InputChannel(Receiver, Channel, Inbox):
     """The end of a topic at which a node receives; see :meth:`Node.interested_in`.
 
     :ivar received: how many messages the delegate was run on
@@ -84,19 +91,6 @@ class InputChannel(Channel, Inbox):
         self.queue_bytes, self.received, self.from_ = node.queue_bytes, 0, from_
         self.delegate = delegate
         self._begin(node, topic, message_class)
-
-    @property
-    def delegate(self) -> Block | None:
-        """The block run for each message, as ``block(message, channel)`` or ``block(message)``.
-
-        None: the node's. One that is set takes effect with the next message.
-        """
-        return self._delegate
-
-    @delegate.setter
-    def delegate(self, block: Block | None) -> None:
-        self._runs = taking(block, 'delegate', 2, 1)
-        self._delegate = block
 
     def open(self) -> None:
         """Subscribe. Called again after the node was stopped and started."""
@@ -113,25 +107,16 @@ class InputChannel(Channel, Inbox):
         if self.closed or self.from_ and message._connection_header['callerid'] != self.from_:
             return
         self.received += 1
-        block = self._runs or self.node.delegate_runs
-        if block is None:
-            return
+        receiver = self if self.delegate_runs else self.node
         try:
-            block(message, self)
+            receiver.delegate_runs and receiver.delegate_runs(message, self)
         except BaseException as error:
-            given = self._delegate or self.node.delegate
-            self.node.report(error, given, 'delegate', message, self, self._retry)
+            self.node.report(error, receiver.delegate, 'delegate', message, self, self._retry)
 
     def _retry(self, message):
         """Run the delegate on a message once more, in the node's turn."""
         self.node.check_running()
         self.turns.call(lambda: self._deliver(message))
-
-    @property
-    def connections(self) -> list[tuple[str, str]]:
-        """The peers: ``(name of the node, 'INTRAPROCESS' or 'TCPROS')``."""
-        found = [each for each in self._connections() if each.header]
-        return [(each.header['callerid'], each.transport_type) for each in found]
 
 
 class OutputChannel(Channel):
@@ -164,12 +149,11 @@ class OutputChannel(Channel):
         node = self.node
 
         def missing():
-            return names - {each.endpoint_id for each in self._impl.connections}
+            return names - {peer_of(each) for each in self._impl.connections}
 
-        if not wait(lambda: not missing(), min(0.2, node.connect_timeout), node):
-            names = {name for name in missing() if node.master.may_live(name)}
-            wait(lambda: not missing(), node.connect_timeout, node)
-        if missing() and node.connect_timeout and node.is_running:
+        names = {name for name in names if node.master.may_live(name)}
+        is_ready = wait(lambda: not missing(), node.connect_timeout, node)
+        if not is_ready and node.connect_timeout and node.is_running:
             node.log(
                 f'{self.topic}: {", ".join(sorted(missing()))} did not connect within'
                 f' {node.connect_timeout:g} s, and may miss the first messages: can they reach'
@@ -177,17 +161,17 @@ class OutputChannel(Channel):
                 'warning',
             )
 
-    def publish(self, message: genpy.Message) -> None:
+    def publish(self, message: genpy.Message, connection: Any = None) -> None:
         """Send a message.
 
+        :param connection: to that one alone
         :raises MessageTypeError: if it is of another type, or cannot be serialized
         :raises NodeStoppedError: if the channel is closed
         """
-        self._publish(message, None)
-
-    def _publish(self, message, connection):
-        if message.__class__ is not self.message_class:
-            self._check_type(message)
+        cls, kind = self.message_class, type(message)
+        if kind is not cls and getattr(kind, '_md5sum', None) not in (cls._md5sum, '*'):
+            found = getattr(kind, '_type', repr(message)[:80])
+            raise MessageTypeError(f'{self.topic} carries {self.type}, not {found}')
         if self.closed:
             raise NodeStoppedError(f'{self!r} cannot send: open another one, or start the node')
         try:
@@ -195,15 +179,8 @@ class OutputChannel(Channel):
         except Exception as error:
             if self.closed:
                 raise NodeStoppedError(f'{self!r} was closed while it sent') from error
-            if not messages.convert_numpy(message):
-                raise messages.explain(message, error) from error
-            return self._publish(message, connection)
+            raise messages.explain(message, error) from error
         self.sent += 1
-
-    def _check_type(self, message):
-        found = getattr(message, '_type', repr(message)[:80])
-        if getattr(message, '_md5sum', None) not in (self.message_class._md5sum, '*'):
-            raise MessageTypeError(f'{self.topic} carries {self.type}, not {found}')
 
     def send(self, block: Any = None, *, to: Any = None, **fields: Any) -> genpy.Message:
         """Fill a new message by ``block(message)`` and keywords, or take a ready one; send it.
@@ -212,23 +189,20 @@ class OutputChannel(Channel):
         :returns: the message
         """
         message = messages.build(self.message_class, block, fields)
-        if to is not None:
-            self._publish(message, self._connection_to(self.node.peer_name(to)))
-            return message
-        self.publish(message)
+        self.publish(message, to and self._connection_to(self.node.peer_name(to)))
         return message
 
     def _connection_to(self, peer):
         def find():
-            return next((each for each in self._connections() if each.endpoint_id == peer), None)
+            return [each for each in self._connections() if peer_of(each) == peer]
 
         is_known = peer in Topic(self.node.master, self.topic).subscribers
         found = wait(find, self.node.connect_timeout if is_known else 0, self.node)
-        if found is None:
+        if not found:
             raise UnknownNodeError(
                 f'{peer} is not interested in {self.topic}: rostopic info {self.topic} tells who is'
             )
-        return found
+        return found[0]
 
     def close(self) -> None:
         """Send no more, once what was published is with the sockets; unregister."""
@@ -242,11 +216,6 @@ class OutputChannel(Channel):
         super().node_stopped()
         frozen = self._impl.latches.get(self)
         self._latched = None if frozen is None else self._impl.thaw(frozen)
-
-    @property
-    def connections(self) -> list[tuple[str, str]]:
-        """The peers: ``(name of the node, 'INTRAPROCESS' or 'TCPROS')``."""
-        return [(each.endpoint_id, each.transport_type) for each in self._connections()]
 
     def wait_for_subscribers(self, count: int = 1, timeout: float | None = None) -> bool:
         """Wait until so many subscribers are connected; True if they are.

@@ -74,20 +74,16 @@ class ExternalNode:
         return self._topics(1)
 
     def _topics(self, kind):
-        types = dict(self.master.call('getTopicTypes'))
-        return {name: types.get(name) for name in self._names(kind)}
-
-    def _names(self, kind):
-        names = self.master.system_state()[kind]
-        return sorted(name for name, nodes in names.items() if self.name in nodes)
+        types, names = dict(self.master.call('getTopicTypes')), self.master.system_state()[kind]
+        return {name: types.get(name) for name in sorted(names) if self.name in names[name]}
 
     @property
     def services(self) -> list[str]:
         """The names of the services that it offers."""
-        return self._names(2)
+        return list(self._topics(2))
 
     def describe(self, seconds: float = 1.0) -> str:
-        """Return what it publishes, receives and offers, to whom and how often, as text."""
+        """Return as text what it publishes, receives and offers, its peers, and how often."""
         from pharos.live.words import describe
 
         return describe(self, seconds)

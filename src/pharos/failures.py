@@ -1,4 +1,4 @@
-"""What blocks raised: kept, counted, told once, and run again."""
+"""Failures of blocks: kept, counted, told once, and run again."""
 from __future__ import annotations
 
 import contextlib
@@ -11,12 +11,13 @@ import traceback
 from pharos.blocks import name_of
 from pharos.errors import PharosError
 
+_HEAD = f'{"raised":60}  {"by":30}  {"on":20}  times  last'
 KEPT = 100  # failures of a node; the oldest go
 WHOLE = 5  # of them, the newest, whose messages and frames are kept
 
 
 class Failure:
-    """What a block raised at one place, as often as it came: one of :attr:`Node.failures`.
+    """An exception that a block raised at one place: one of :attr:`Node.failures`.
 
     :ivar error: the exception, of the last time
     :ivar block: the block that raised it
@@ -100,12 +101,10 @@ class Failures(list):
                 self._tell(line, new.traceback)
 
     def __repr__(self) -> str:
-        row = '{:60.60}  {:30.30}  {:20.20}  {:>5}  {}'.format
-        lines = [row('raised', 'by', 'on', 'times', 'last')]
-        for each in self:
-            error, topic = f'{type(each.error).__name__}: {each.error}', each.channel
-            last = time.strftime('%H:%M:%S', time.localtime(each.time))
-            lines.append(
-                row(error, name_of(each.block), getattr(topic, 'topic', ''), each.count, last)
-            )
-        return '\n'.join(lines) if self else '[]'
+        rows = [
+            f'{f"{type(each.error).__name__}: {each.error}":60.60}  {name_of(each.block):30.30}'
+            f'  {getattr(each.channel, "topic", ""):20.20}  {each.count:5}'
+            f'  {time.strftime("%H:%M:%S", time.localtime(each.time))}'
+            for each in self
+        ]
+        return '\n'.join([_HEAD, *rows]) if self else '[]'

@@ -6,10 +6,8 @@ import collections.abc
 import contextlib
 import os
 import re
-import socket
 import subprocess
 import sys
-import urllib.parse
 from typing import Any, Callable, Iterator, Sequence
 
 import rosgraph.names
@@ -21,7 +19,6 @@ from pharos.errors import (
     MasterUnreachableError,
     PharosError,
     PortInUseError,
-    UnknownNodeError,
 )
 from pharos.external_node import ExternalNode
 from pharos.names import full_name, node_name
@@ -248,12 +245,9 @@ class Master:
 
     def nodes(self) -> list[Node | ExternalNode]:
         """Return all nodes, of this process and others."""
+        own = {node.name: node for node in self.own_nodes()}
         names = {name for kind in self.system_state() for users in kind.values() for name in users}
-        found = []
-        for name in sorted(names):
-            with contextlib.suppress(UnknownNodeError):  # it has gone meanwhile
-                found.append(self.node(name))
-        return found
+        return [own.get(name) or ExternalNode(self, name) for name in sorted(names)]
 
     def node(self, name: str) -> Node | ExternalNode:
         """Return the node of that name.
@@ -261,22 +255,18 @@ class Master:
         :raises UnknownNodeError: if there is none
         """
         name = full_name(node_name(name))
-        for node in self.own_nodes():
-            if node.name == name:
-                return node
         external = ExternalNode(self, name)
-        external.uri  # raises if there is none
-        return external
+        own = [node for node in self.own_nodes() if node.name == name]
+        return own[0] if own else external.uri and external  # raises if there is none
 
     def may_live(self, name: str) -> bool:
         """False if the node of that name refuses connections, or is not registered."""
         uri = self.call('lookupNode', name)
-        parts = urllib.parse.urlsplit(uri or '')
         try:
-            socket.create_connection((parts.hostname, parts.port or 0), 0.5).close()
+            uri and ServerProxy(uri, 0.5).getPid(CALLER_ID)
         except ConnectionRefusedError:
             return False
-        except OSError:
+        except UNREACHABLE:
             pass
         return bool(uri)
 
@@ -321,26 +311,17 @@ class Master:
         path = find_program(package, executable)
         return RosProcess([path, *map(str, args)], self.url, on_line)
 
-    def launch(
-        self, package: str | None, file: str, on_line: Any = None, **args: Any
-    ) -> RosProcess:
+    def launch(self, package: str | None, file: str, **args: Any) -> RosProcess:
         """Run a launch file at this master, as roslaunch does; ``package`` None: it is a path."""
         path = find_launch_file(package, file)
         arguments = [f'{name}:={value}' for name, value in args.items()]
         roslaunch = [sys.executable, '-c', 'import roslaunch; roslaunch.main()', '--skip-log-check']
-        return RosProcess([*roslaunch, path, *arguments], self.url, on_line)
+        return RosProcess([*roslaunch, path, *arguments], self.url)
 
-    def load(
-        self,
-        package: str,
-        executable: str | None = None,
-        *args: Any,
-        name: str | None = None,
-        namespace: str | None = None,
-        remap: dict[str, str] | None = None,
-        params: dict[str, Any] | None = None,
-    ) -> Any:
+    def load(self, *args: Any, **options: Any) -> Any:
         """Run a program of rospy, unmodified, as a node of this process: a :class:`ScriptNode`.
+
+        ``load(package, executable=None, *args, name=None, namespace=None, remap=None, params=None)``
 
         :param package: without ``executable``, the path of the program
         :param args: its arguments
@@ -350,19 +331,12 @@ class Master:
         """
         from pharos.compose.script import load
 
-        return load(self, package, executable, args, name, namespace, remap, params)
+        return load(self, *args, **options)
 
-    def compose(
-        self,
-        package: str | None,
-        file: str,
-        *,
-        only: Sequence[str] = (),
-        apart: Sequence[str] = (),
-        share_connections: bool = False,
-        **args: Any,
-    ) -> Any:
+    def compose(self, package: str | None, file: str, **options: Any) -> Any:
         """Run the Python nodes of a launch file in this process: a :class:`Composition`.
+
+        ``compose(package, file, only=(), apart=(), share_connections=False, **args)``
 
         The rest (C++, other machines, with a launch-prefix or cwd) runs as roslaunch starts it.
 
@@ -373,13 +347,9 @@ class Master:
         :raises UnknownNodeError: if there is no such file, argument or node
         :raises PharosError: if roslaunch cannot read it
         """
-        from pharos.compose.composition import Composition
-        from pharos.compose.launch_file import LaunchFile
+        from pharos.compose.composition import compose
 
-        launch_file = LaunchFile(self.url, package, file, args, only, apart)
-        composition = Composition(Master(self.url, share_connections or self.share_connections))
-        composition.launch(launch_file)
-        return composition
+        return compose(self, package, file, **options)
 
     def graph(self, seconds: float = 0) -> Any:
         """Return the :class:`Graph` of all nodes and topics, with rates if it looks for a while."""

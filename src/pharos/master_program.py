@@ -9,6 +9,7 @@ import sys
 
 import rosgraph.network
 import rosmaster.master
+from rosgraph_msgs.msg import Log
 
 from pharos import BlockNode, Master
 
@@ -24,14 +25,10 @@ def main(port: int) -> None:
         return
     server = rosmaster.master.Master(port=port)
     server.start()
-    host = os.environ['ROS_HOSTNAME']
-    master = Master(f'http://{host}:{server.master_node.port}/')
+    master = Master(f'http://{os.environ["ROS_HOSTNAME"]}:{server.master_node.port}/')
     rosout = master.create(BlockNode, named='/rosout')
-    aggregate = rosout.output_channel('/rosout_agg', 'rosgraph_msgs/Log')
-    rosout.interested_in(
-        '/rosout', 'rosgraph_msgs/Log', delegate=lambda log: aggregate.publish(log)
-    )
-    master.parameters['/rosdistro'] = os.environ.get('ROS_DISTRO', 'Debian')
+    aggregate = rosout.output_channel('/rosout_agg', Log)
+    rosout.interested_in('/rosout', Log, delegate=lambda log: aggregate.publish(log))
     print(master.url, file=answers, flush=True)
     sys.stdin.read()
     os._exit(0)  # nothing of it has to be unregistered

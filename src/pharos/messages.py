@@ -14,11 +14,10 @@ from genmsg.msgs import bare_msg_type, is_builtin
 from rospy.impl.tcpros_service import convert_return_to_response as as_rospy
 
 from pharos.errors import MessageTypeError, UnknownTypeError
-from pharos.intraprocess.copier import copier_for, nested_class
+from pharos.intraprocess.copier import copied, nested_class
 
 _TYPE = re.compile(r'[A-Za-z][A-Za-z0-9_]{0,127}/[A-Za-z][A-Za-z0-9_]{0,127}')
 _RULE = '=' * 80
-_OCTETS = 'uint8[', 'char['
 _COLOUR = 'uint8 r\nuint8 g\nuint8 b\n'
 _PLACE = 'float32 x\nfloat32 y\nfloat32 theta\n'
 _VELOCITY = 'float32 linear\nfloat32 angular\n'
@@ -275,19 +274,18 @@ def response(cls: Any, value: Any) -> genpy.Message:
     names = cls.__slots__
     if value is None and not names:
         value = {}
-    elif len(names) == 1 and cls._slot_types[0].endswith(']') and type(value) in (list, tuple):
-        if not (len(value) == 1 and type(value[0]) in (list, tuple)):
+    elif len(names) == 1 and type(value) is list and cls._slot_types[0].endswith(']'):
+        if not (value and type(value[0]) is list):
             value = {names[0]: value}
     return check(_fill(cls(), value) if type(value) is dict else as_rospy(value, cls))
 
 
 def check(message):
-    """Return the message; raise MessageTypeError if it cannot be sent."""
+    """Return a copy of the message; raise MessageTypeError if it cannot be sent."""
     try:
-        copier_for(type(message))[0](message)
+        return copied(message)
     except Exception as error:
         raise explain(message, error) from error
-    return message
 
 
 def _fill(message, fields):
@@ -301,29 +299,8 @@ def _fill(message, fields):
             value = _fill(nested_class(base, cls)(), value)
         elif type(value) is list and value and type(value[0]) is dict:
             value = [_fill(nested_class(base, cls)(), each) for each in value]
-        elif hasattr(value, 'tolist'):
-            value = _from_numpy(value, types[name])
         setattr(message, name, value)
     return message
-
-
-def _from_numpy(value, type_):
-    if type_.startswith(_OCTETS):
-        return value.astype('uint8', casting='same_kind').tobytes()
-    return value.ravel().tolist() if type_.endswith(']') else value.tolist()
-
-
-def convert_numpy(message: genpy.Message) -> bool:
-    """Replace numpy arrays among the fields by what the wire takes; True if there were any."""
-    found = False
-    for name, type_ in zip(message.__slots__, getattr(message, '_slot_types', ())):
-        value = getattr(message, name)
-        if hasattr(value, 'tolist') and type_.startswith(_OCTETS):
-            setattr(message, name, _from_numpy(value, type_))
-            found = True
-        elif isinstance(value, genpy.Message):
-            found = convert_numpy(value) or found
-    return found
 
 
 def explain(message: genpy.Message, error: Exception) -> MessageTypeError:

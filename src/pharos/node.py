@@ -13,7 +13,7 @@ import rosgraph.names
 import rospy
 
 from pharos import messages, program
-from pharos.blocks import Block, name_of, rebound, taking
+from pharos.blocks import Block, Receiver, name_of, rebound, taking
 from pharos.channels import QUEUE_SIZE, Channel, InputChannel, OutputChannel
 from pharos.errors import (
     MasterUnreachableError,
@@ -22,6 +22,7 @@ from pharos.errors import (
     PharosError,
     UnknownTopicError,
 )
+from pharos.external_node import ExternalNode
 from pharos.failures import Failures
 from pharos.names import legal_name, node_name
 from pharos.parameter import Parameter
@@ -45,7 +46,7 @@ class Lifecycle(enum.Enum):
     STOPPED = 'stopped'
 
 
-class Node:
+class Node(Receiver):
     """A ROS node of this process, made by :meth:`Master.create`.
 
     The report: a subclass of PhaROSNode. A class of your own overrides :meth:`start` and
@@ -65,14 +66,13 @@ class Node:
     :ivar master: its :class:`Master`
     :ivar soul: the block that says what the node does, called as ``soul(node)``, or None
     :ivar lifecycle: its state, a :class:`Lifecycle`
-    :ivar uri: the URI of its XML-RPC server, None before the first start
-    :ivar domain: the address that it advertises; likewise, unless it was given
-    :ivar tcp_port: the TCPROS port; the one asked for, before the first start
-    :ivar xmlrpc_port: the XML-RPC port, likewise
+    :ivar uri: the URI of its XML-RPC server, None before the first start, as ``domain``, the
+        address that it advertises, unless it was given
+    :ivar tcp_port, xmlrpc_port: its ports; before the first start those asked for
     :ivar failures: for each of :attr:`errors` a :class:`Failure`: what failed, on what, how often
     """
 
-    #: seconds that a start waits for the master, and a topic's first message for subscribers
+    #: seconds that a topic's first message waits for subscribers
     connect_timeout = 2.0
     #: seconds that a stop waits for souls, and as long for messages under way
     stop_timeout = 2.0
@@ -87,14 +87,10 @@ class Node:
     master: Master
     run: Run
 
-    def __init__(self) -> None:
-        """Take nothing; a class of your own may take what :meth:`Master.create` passes on."""
-
     def _configure(self, master, name, soul, delegate, domain, ports, remappings):
         taking(soul, 'soul', 1, 0)
-        self.master, self.name = master, name
+        self.master, self.name, self.uri, self.domain = master, name, None, domain
         self.soul, self.delegate, self.remappings = soul, delegate, remappings
-        self.uri, self.domain = None, domain
         self.tcp_port, self.xmlrpc_port = ports
         self.failures = Failures(self._tell_failure)
         self._life = threading.RLock()  # held by a start, stop or restart
@@ -120,20 +116,14 @@ class Node:
             self.failures, self.souls = Failures(self._tell_failure), {}
             self.lifecycle, self.run = Lifecycle.STARTING, Run(self)
             program.nodes.append(self)
+            opened, self.opened = self.opened, []
             try:
                 self.run.start()
                 self.lifecycle = Lifecycle.RUNNING
-            except BaseException:
-                self.run.stop(0)
-                self.lifecycle = Lifecycle.STOPPED
-                program.nodes.remove(self)
-                raise
-            opened, self.opened = self.opened, []
-            try:
                 for each in () if self._opens_itself else opened:
                     each.open()
-            except Exception:
-                self.stop()
+            except BaseException:
+                self._end(0)
                 self.opened = opened
                 raise
 
@@ -141,34 +131,26 @@ class Node:
     def _opens_itself(self):
         return type(self).start is not Node.start
 
+    def _end(self, timeout):
+        self.run.stop(timeout)
+        for each in self.opened:
+            each.node_stopped()
+        self._senders, self.lifecycle = {}, Lifecycle.STOPPED
+        program.nodes.remove(self)
+
     def stop(self) -> None:
         """End the souls, send what is under way, unregister, free ports and threads.
 
         Does nothing if the node is stopped. Waits up to :attr:`stop_timeout` for souls, and as long
         for messages under way; what goes on then is left behind, and named in the log.
         """
-        if self._is_stopped_here():
-            return
         with self._life:
             if self.is_running:
                 self.lifecycle = Lifecycle.STOPPING
-                self.run.stop(self.stop_timeout)
-                for each in self.opened:
-                    each.node_stopped()
-                self._senders, self.lifecycle = {}, Lifecycle.STOPPED
-                program.nodes.remove(self)
-
-    def _is_stopped_here(self):
-        """True if a thread of the node asks, and another one stops it, which waits for this one."""
-        return self.lifecycle is Lifecycle.STOPPING and (
-            threading.current_thread() in self.run.threads
-            or self.run.turns.runner == threading.get_ident()
-        )
+                self._end(self.stop_timeout)
 
     def end_now(self) -> None:
         """Stop the node, whatever the stop() of its class raises; two threads may ask for it."""
-        if self._is_stopped_here():
-            return
         with self._life:
             try:
                 if self.is_running:
@@ -211,15 +193,15 @@ class Node:
         self.run.turns.call(lambda: self._become(node_class))
 
     def _become(self, node_class):
-        before, self.__class__ = self.__class__, node_class
+        receivers = self, *self.opened
         try:
-            blocks = [rebound(each.delegate, self) for each in (self, *self.opened)]
-            self.soul = rebound(self.soul, self)
+            soul = rebound(self.soul, self, node_class)
+            blocks = [rebound(each.delegate, self, node_class) for each in receivers]
         except AttributeError as error:
-            self.__class__ = before
             raise PharosError(f'{node_class.__name__} lacks a method in use: {error}') from error
-        for each, block in zip((self, *self.opened), blocks):
-            each.delegate = block
+        self.__class__, self.soul = node_class, soul
+        for receiver, block in zip(receivers, blocks):
+            receiver.delegate = block
 
     def abandon(self) -> None:
         """Be stopped in a forked child: the node runs in the parent."""
@@ -268,55 +250,36 @@ class Node:
         """Return how the node is doing; asks the master.
 
         :returns: an object with ``registered`` (True if the master has the node at its URI, None if
-            the master does not answer), ``connections`` ({transport: how many}), ``dropped`` (how
-            many messages), ``errors`` (how often blocks failed), ``threads``, ``souls`` (how many
-            run in threads of their own), ``ended_souls`` (names of those that were forked)
+            the master does not answer), ``kind`` (its class), ``connections`` ({transport: how
+            many}), ``dropped`` (how many messages), ``errors`` (how often blocks failed),
+            ``threads``, ``souls`` (how many run in threads), ``ended_souls`` (their names)
         """
-        impls = [*self.run.topics.pubs.values(), *self.run.topics.subs.values()]
-        kinds = [each.transport_type for impl in impls for each in impl.connections]
-        ended = [soul.name for soul in self.souls if not soul.is_alive()]
         registered = None
         with contextlib.suppress(MasterUnreachableError):
             registered = self.master.call('lookupNode', self.name) == self.uri
-        return types.SimpleNamespace(
-            registered=registered,
-            connections=dict(collections.Counter(kinds)),
-            dropped=sum(getattr(channel, 'dropped', 0) for channel in self.channels),
-            errors=self.failures.total,
-            threads=sum(thread.is_alive() for thread in list(self.run.threads)),
-            souls=len(self.souls) - len(ended),
-            ended_souls=ended,
-        )
+        return types.SimpleNamespace(registered=registered, **self.told())
 
     def told(self) -> dict[str, Any]:
-        """Return what top and graph ask for, by XML-RPC."""
-        dropped = {each.topic: each.dropped for each in self.channels if hasattr(each, 'dropped')}
-        kind, failures = type(self).__name__, self.failures.total
-        return {'class': kind, 'failures': failures, 'dropped': dropped}
+        """Return what :meth:`health` knows without the master; top asks for it by XML-RPC."""
+        impls = [*self.run.topics.pubs.values(), *self.run.topics.subs.values()]
+        kinds = [each.transport_type for impl in impls for each in impl.connections]
+        ended = [soul.name for soul in self.souls if not soul.is_alive()]
+        return {
+            'kind': type(self).__name__,
+            'connections': dict(collections.Counter(kinds)),
+            'dropped': sum(getattr(channel, 'dropped', 0) for channel in self.channels),
+            'errors': self.failures.total,
+            'threads': sum(thread.is_alive() for thread in list(self.run.threads)),
+            'souls': len(self.souls) - len(ended),
+            'ended_souls': ended,
+        }
 
-    def describe(self, seconds: float = 1.0) -> str:
-        """Return what it publishes, receives and offers, to whom and how often, as text."""
-        from pharos.live.words import describe
-
-        return describe(self, seconds)
+    describe = ExternalNode.describe
 
     def __repr__(self) -> str:
         return f'<{type(self).__name__} {self.name} {self.lifecycle.value}>'
 
     # -- souls
-
-    @property
-    def delegate(self) -> Block | None:
-        """The block run for each message, as ``block(message, channel)`` or ``block(message)``.
-
-        The report: ``self receiverDelegate: [:message :channel | ...]``.
-        """
-        return self._delegate
-
-    @delegate.setter
-    def delegate(self, block: Block | None) -> None:
-        self.delegate_runs = taking(block, 'delegate', 2, 1)
-        self._delegate = block
 
     def execute(self) -> Any:
         """Run the soul once, in the calling thread, and return its value.
@@ -392,7 +355,7 @@ class Node:
 
     @property
     def errors(self) -> list[BaseException]:
-        """What blocks raised in this run of the node, the newest last; 100 kinds at most."""
+        """The exceptions of blocks in this run of the node, the newest last; 100 kinds at most."""
         return [failure.error for failure in self.failures]
 
     def report(self, error, block, what: str, message=None, channel=None, again=None) -> None:
@@ -557,14 +520,19 @@ class Node:
         """Return the definition that a publisher sends when it is connected."""
         if not self.master.topic(topic).publishers:
             return None
-        end = self.ros.Subscriber(topic, self.ros.AnyMsg)
 
-        def find():
+        def find(end):
             headers = [each.header or {} for each in end.impl.connections]
             return [each['message_definition'] for each in headers if each.get('type') == type_]
 
+        return (self._subscribed(find, self.connect_timeout, topic, self.ros.AnyMsg) or [None])[0]
+
+    def _subscribed(self, find, timeout, *options):
+        """Wait until ``find(subscriber)`` is true of a subscriber of rospy, and return what it is."""
+        # not through a channel: a delegate may call this, whose turn it is
+        end = self.ros.Subscriber(*options)
         try:
-            return (program.wait(find, self.connect_timeout, self) or [None])[0]
+            return program.wait(lambda: find(end), timeout, self)
         finally:
             end.unregister()
 
@@ -575,16 +543,17 @@ class Node:
         timeout: float | None = None,
         where: Callable[[Any], Any] | None = None,
     ) -> genpy.Message:
-        """Return the next message of a topic, for which ``where(message)`` is true.
+        """Return the next message of a topic.
 
         :param timeout: seconds until its type is known, and as long for the message; None: without
             limit, for a topic of a known type
+        :param where: skip messages unless ``where(message)`` is true
         :raises UnknownTopicError, TimeoutError: if none comes in time
         :raises NodeStoppedError: if the node stops meanwhile
         """
         came, topic = [], self.resolve(topic)
 
-        def find():
+        def find(end):
             while came and where and not where(came[0]):
                 del came[0]
             return came
@@ -593,13 +562,8 @@ class Node:
         if timeout and not typed_as:
             typed_as = program.wait(lambda: self.master.topic_type(topic), timeout, self)
         cls = self._class_of(topic, typed_as, True)
-        # not through a channel: this may be called by a delegate, whose turn it is
-        end = self.ros.Subscriber(topic, cls, came.append)
-        try:
-            if program.wait(find, timeout, self):
-                return came[0]
-        finally:
-            end.unregister()
+        if self._subscribed(find, timeout, topic, cls, came.append):
+            return came[0]
         if self.is_running:
             raise TimeoutError(f'no message on {topic} came within {timeout:g} s: is it published?')
         raise NodeStoppedError(f'{self.name} stopped while it waited for {topic}')
@@ -636,11 +600,10 @@ class Node:
         """The parameters that :meth:`parameter` has returned."""
         return [each for each in self.opened if isinstance(each, Parameter)]
 
-    def parameter_changed(self, name: str) -> None:
-        """Have the parameters read their values that a change may concern."""
+    def read_parameters(self) -> None:
+        """Have the parameters read their values: one has changed."""
         for each in self.parameters:
-            if each.overlaps(name):
-                each.read()
+            each.read()
 
 
 class BlockNode(Node):

@@ -59,12 +59,7 @@ class Parameter(Opened):
         self.node.check_running()
         check_value(self.name, value)
         self.node.master.call('setParam', self.name, value, caller_id=self.node.name)
-        self.node.parameter_changed(self.name)  # the master tells others alone
-
-    def overlaps(self, name: str) -> bool:
-        """True if it is that parameter, or one below or above it."""
-        own, other = f'{self.name}/', f'{name}/'
-        return own.startswith(other) or other.startswith(own)
+        self.node.read_parameters()  # the master tells others alone
 
     def read(self) -> None:
         """Take the value that the server has, and tell of a change."""

@@ -27,7 +27,6 @@ here = _Here()
 #: the nodes of this process that run or restart
 nodes = []
 signalled = False  # after a signal that ends the program
-_quiet_waits = 0  # of the main thread, which a signal ends without an exception
 
 
 def wait(
@@ -41,22 +40,20 @@ def wait(
     """
     end = float('inf') if timeout is None else time.monotonic() + timeout
     node, pause = node or here.node, 0.002
-    stopping = node.run.stopping if node else threading.Event()
-    while not (value := predicate()) and time.monotonic() < end and not stopping.wait(pause):
+    sleep = node.run.stopping.wait if node else time.sleep
+    while not (value := predicate()) and time.monotonic() < end and not sleep(pause):
         pause = min(pause * 1.2, 0.02)
     return value
 
 
 @contextlib.contextmanager
 def quiet_wait() -> Iterator[None]:
-    """Have signals end what the main thread does by stopping the nodes alone."""
-    global _quiet_waits
-    is_main = threading.current_thread() is threading.main_thread()
-    _quiet_waits += is_main
+    """End at a signal of ours, which stops the nodes, without its exception."""
     try:
         yield
-    finally:
-        _quiet_waits -= is_main
+    except (KeyboardInterrupt, SystemExit):
+        if not signalled:
+            raise
 
 
 def stop_all() -> None:
@@ -98,8 +95,7 @@ def _end(number, frame):
     signalled = True
     signal.signal(number, signal.SIG_DFL)  # a second one ends the program at once
     threading.Thread(target=stop_all, name='pharos end').start()
-    if not _quiet_waits:
-        raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(128 + number)
+    raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(128 + number)
 
 
 def _forget():

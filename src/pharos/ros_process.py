@@ -37,14 +37,15 @@ class RosProcess:
     def __init__(self, command, master_url, on_line=None):
         self.command, self._on_line = command, on_line
         self._lines = collections.deque(maxlen=KEPT_LINES)
-        self._terminal, slave = os.openpty()
+        terminal, slave = os.openpty()
         tty.setraw(slave)
+        self._terminal = open(terminal, errors='replace')
         environ = {**os.environ, 'ROS_MASTER_URI': master_url, 'TERM': 'dumb'}
         pipes = dict.fromkeys(('stdin', 'stdout', 'stderr'), slave)
         try:
             self._process = subprocess.Popen(command, env=environ, start_new_session=True, **pipes)
         except OSError as error:
-            os.close(self._terminal)
+            self._terminal.close()
             raise PharosError(f'{command[0]} cannot be started: {error}') from None
         finally:
             os.close(slave)
@@ -54,16 +55,16 @@ class RosProcess:
         atexit.register(self.terminate)
 
     def _read(self):
-        with contextlib.suppress(OSError), open(self._terminal, 'rb', closefd=False) as stream:
-            for line in stream:  # until it has closed its terminal
-                text = _COLOURS.sub('', line.decode(errors='replace').rstrip('\r\n'))
+        with contextlib.suppress(OSError), self._terminal:
+            for line in self._terminal:  # until the program has closed it
+                text = _COLOURS.sub('', line.rstrip('\n'))
                 self._lines.append(text)
                 if self._on_line:
                     self._on_line(text)
 
     @property
     def output(self) -> str:
-        """What it has printed so far; the last 10,000 lines."""
+        """The last 10,000 lines that it has printed."""
         return '\n'.join(self._lines)
 
     def send(self, text: str) -> None:
@@ -72,8 +73,8 @@ class RosProcess:
         :raises PharosError: if it has ended
         """
         try:
-            os.write(self._terminal, text.encode())
-        except OSError:
+            os.write(self._terminal.fileno(), text.encode())
+        except (OSError, ValueError):
             raise PharosError(f'{self.command[0]} has ended, and reads nothing') from None
 
     def poll(self) -> int | None:
@@ -96,9 +97,7 @@ class RosProcess:
         :returns: its exit code
         """
         atexit.unregister(self.terminate)
-        started = []
-        with contextlib.suppress(psutil.Error):
-            started = psutil.Process(self.pid).children(recursive=True)
+        started = psutil.Process(self.pid).children(recursive=True) if self.poll() is None else []
         for number in signal.SIGINT, signal.SIGTERM, signal.SIGKILL:
             with contextlib.suppress(ProcessLookupError, subprocess.TimeoutExpired):
                 os.killpg(self.pid, number)

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import socket
 import struct
 import time
@@ -26,7 +27,7 @@ from pharos.intraprocess.copier import serialize
 from pharos.private_rospy.patches import answer
 from pharos.private_rospy.transport import keep_alive, local_service
 
-PROBE_LIMIT = 5.0  # seconds in which a provider that is called must say its type
+PROBE_LIMIT = 5.0  # seconds until a provider that is called must have said its type
 PATIENCE = 0.25  # seconds that a look-up waits for that; a call asks again
 
 
@@ -62,12 +63,6 @@ class OfferedService(Opened):
         with contextlib.suppress(rospy.ServiceException):  # it is reported
             self._answer(request)
 
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        self.close()
-
 
 class Service:
     """A service of any node, to be called; made by :meth:`Master.lookup_service`.
@@ -100,18 +95,19 @@ class Service:
             raise UnknownServiceError(
                 f'no node offers the service {self.name} at {self.master.url}: see rosservice list'
             )
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, network.ROSHandshakeException):
             self._ask(PATIENCE)
 
     def _ask(self, limit):
         """Ask the provider for its type."""
         local = self._local()
         if local:
-            self.type, self.md5sum = local[1].service_class._type, local[1].service_class._md5sum
-        else:
-            sock, header = self._connect('*', time.monotonic() + limit, probe='1')
-            self.type, self.md5sum = header['type'], header['md5sum']
-            sock.close()
+            cls = local[1].service_class
+            self.type, self.md5sum = cls._type, cls._md5sum
+            return
+        sock, header = self._connect('*', time.monotonic() + limit, probe='1')
+        self.type, self.md5sum = header['type'], header['md5sum']
+        sock.close()
 
     def _local(self):
         return local_service(self.master.url, self.name, self.uri)
@@ -135,7 +131,7 @@ class Service:
                 raise MessageTypeError(
                     f'{self.name} takes {cls._request_class._type}, not {request._type}'
                 )
-            messages.check(request)
+            request = messages.check(request)
             if self.md5sum not in ('*', cls._md5sum):
                 raise self._wrong_type(cls)
             if timeout is None and self._local():
@@ -144,11 +140,13 @@ class Service:
                 self.response = self._call(cls, serialize(request), timeout)
         except rospy.ServiceException as error:
             raise ServiceCallError(f'{self.name} failed: {error}') from error
-        except OSError as error:
-            if program.here.node and not program.here.node.is_running:
-                raise NodeStoppedError(f'{program.here.node.name} stops, and the call with it')
-            reason = str(error) or type(error).__name__
-            raise ServiceCallError(f'{self.name} at {self.uri} did not answer: {reason}') from error
+        except (OSError, network.ROSHandshakeException) as error:
+            node = program.here.node
+            if node and not node.is_running:
+                raise NodeStoppedError(f'{node.name} stops, and the call with it') from None
+            raise ServiceCallError(
+                f'{self.name} at {self.uri} did not answer: {error!r}'
+            ) from error
         return self.response
 
     def _call(self, cls, data, timeout):
@@ -165,7 +163,7 @@ class Service:
             is_ok, size = struct.unpack('<BI', _read(sock, 5, deadline))
             data = _read(sock, size, deadline)
         if not is_ok:
-            raise ServiceCallError(f'{self.name} failed: {data.decode(errors="replace")}')
+            raise rospy.ServiceException(data.decode(errors='replace'))
         return cls._response_class().deserialize(data)
 
     def _connect(self, md5sum, deadline, **more):
@@ -177,9 +175,7 @@ class Service:
             program.here.node.run.calls.add(sock)
         header = {'callerid': self.caller_id, 'service': self.name, 'md5sum': md5sum, **more}
         network.write_ros_handshake_header(sock, header)
-        head = _read(sock, 4, deadline)
-        body = _read(sock, *struct.unpack('<I', head), deadline)
-        header = network.decode_ros_handshake_header(head + body)
+        header = network.read_ros_handshake_header(sock, io.BytesIO(), 1 << 16)
         if 'error' in header:
             raise ConnectionError(header['error'])
         return sock, header

@@ -21,7 +21,7 @@ from pharos import Master, Node
 from pharos.program import wait
 
 TIMEOUT = 30.0  # seconds; a test that passes never waits so long
-_expecting_failures = threading.Event()  # set by the running test
+_expects_failures = False  # said by the running test
 
 
 def until(predicate: Callable[[], Any], timeout: float | None = None, what: str = '') -> Any:
@@ -107,7 +107,8 @@ def _check_gone(left: Callable[[], set]) -> None:
 
 def expect_failures() -> None:
     """Say in a test that blocks of its nodes may fail; a fixture of this name does so, too."""
-    _expecting_failures.set()
+    global _expects_failures
+    _expects_failures = True
 
 
 @pytest.fixture
@@ -126,12 +127,13 @@ def create_node(master: Master) -> Iterator[Callable[..., Any]]:
         nodes.append(master.create(node_class, name, **kwargs))
         return nodes[-1]
 
-    _expecting_failures.clear()
+    global _expects_failures
+    _expects_failures = False
     yield create
     for node in nodes:
         node.end_now()
     told = [f'{failure}\n{failure.traceback}' for node in nodes for failure in node.failures]
-    if told and not _expecting_failures.is_set():
+    if told and not _expects_failures:
         told.insert(0, 'blocks of its nodes failed (or say expect_failures()):')
         pytest.fail('\n'.join(told), False)
 

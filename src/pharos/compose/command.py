@@ -77,7 +77,7 @@ def _run(stack, options, mappings):
         package, _, executable = text.partition('/')
         is_file = os.path.isfile(text)
         with composition.telling(text):
-            script = load(master, text if is_file else package, None if is_file else executable, ())
+            script = load(master, text if is_file else package, None if is_file else executable)
             composition.nodes.append(script)
     if options.script:
         return composition.wait()

@@ -154,3 +154,12 @@ class Composition:
 
     def __exit__(self, *error: Any) -> None:
         self.stop()
+
+
+def compose(master, package, file, *, only=(), apart=(), share_connections=False, **args):
+    """Do what :meth:`Master.compose` does."""
+    launch_file = LaunchFile(master.url, package, file, args, only, apart)
+    share_connections = share_connections or master.share_connections
+    composition = Composition(type(master)(master.url, share_connections))
+    composition.launch(launch_file)
+    return composition

@@ -259,8 +259,8 @@ def source_of(path: str) -> str:
 def load(
     master: Master,
     package: str,
-    executable: str | None,
-    args: Sequence[Any],
+    executable: str | None = None,
+    *args: Any,
     name: str | None = None,
     namespace: str | None = None,
     remap: dict[str, str] | None = None,

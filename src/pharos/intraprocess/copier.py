@@ -91,7 +91,9 @@ def size_of(frozen):
 
 def _sequence(value):
     if type(value) not in (list, tuple):
-        raise _UnusualError
+        if not hasattr(value, 'ravel'):  # an array of numpy
+            raise _UnusualError
+        value = value.ravel().tolist()
     return tuple(value)
 
 
@@ -103,6 +105,8 @@ def _text(value):
 
 
 def _octets(value):
+    if getattr(value, 'dtype', None) == 'uint8':
+        return value.tobytes()
     return value if type(value) is bytes else bytes(_sequence(value))
 
 

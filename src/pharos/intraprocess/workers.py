@@ -30,8 +30,7 @@ _no_yield_before = 0.0
 class Turns:
     """Whatever takes turns: the callbacks of one node, or those of one subscription of plain rospy."""
 
-    def __init__(self, name):
-        self.name = name
+    def __init__(self):
         self.jobs = collections.deque()
         self.scheduled = False
         self.runner = None  # the identifier of the thread that runs it
@@ -50,19 +49,17 @@ class Turns:
                 self.runner = None
                 self._running.release()
 
-    def call(self, block, timeout=-1):
-        """Run ``block()`` between two callbacks; raises TimeoutError if none ends in time."""
+    def call(self, block):
+        """Run ``block()`` between two callbacks."""
         if self.runner == threading.get_ident():
             return block()
-        if not self._running.acquire(True, timeout):
-            raise TimeoutError(f'a callback of {self.name} goes on')
-        self.runner = threading.get_ident()
-        try:
-            return block()
-        finally:
-            self.runner = None
-            self._running.release()
-            self.wake()
+        with self._running:
+            self.runner = threading.get_ident()
+            try:
+                block()
+            finally:
+                self.runner = None
+        self.wake()
 
     def schedule(self):
         """Have a worker take it; True if none is about to."""

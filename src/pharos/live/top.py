@@ -85,10 +85,9 @@ def _nodes(before, now) -> Iterator[dict[str, Any]]:
         sent[link.topic] = max(sent.get(link.topic, 0), rate)  # however many receive it
     for name, node in now.nodes.items():
         own = [link.transport for link in now.links if name in link[1:3]]
-        dropped = node.health.get('dropped')
         yield {
             'NODE': name,
-            'CLASS': node.health.get('class'),
+            'CLASS': node.health.get('kind'),
             'HOST': node.host,
             'PID': node.pid,
             'IN/S': came[name][0],
@@ -97,8 +96,8 @@ def _nodes(before, now) -> Iterator[dict[str, Any]]:
             'OUT B/S': sizes[name],
             'LOCAL': own.count('INTRAPROCESS'),
             'TCP': own.count('TCPROS'),
-            'DROP': None if dropped is None else sum(dropped.values()),
-            'FAIL': node.health.get('failures'),
+            'DROP': node.health.get('dropped'),
+            'FAIL': node.health.get('errors'),
             'PROBLEM': node.problem,
         }
 
@@ -117,7 +116,6 @@ def _topics(before, now) -> Iterator[dict[str, Any]]:
             'SUB': sum(name in node.subscribes for node in nodes),
             'LOCAL': links.count('INTRAPROCESS'),
             'TCP': links.count('TCPROS'),
-            'DROP': sum(node.health.get('dropped', {}).get(name, 0) for node in nodes),
         }
 
 

@@ -1,8 +1,8 @@
-"""What is mended in rospy: a table of patches, applied to each node's own copy.
+"""Mend rospy: a table of patches, applied to each node's own copy.
 
 Over ``def f(original, run, *args)``, ``@patch(module, target)`` has ``f`` called instead of the
 target; ``run`` is the Run whose copy is patched. Over ``def f(original, run)``, ``@replace(module,
-target)`` puts what it returns in the target's place. The docstring says what is wrong with rospy's.
+target)`` puts what it returns in the target's place. Each docstring says what is wrong with rospy.
 """
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def start_xmlrpc(original, run, self):
 
 @patch('rosgraph.xmlrpc', 'XmlRpcNode.shutdown')
 def shutdown_xmlrpc(original, run, self, reason):
-    """Only closes the socket, on which its thread then spins (ros_comm #2238)."""
+    """Only closes the socket; its thread then spins (ros_comm #2238)."""
     self.is_shutdown = True
     if self.server:
         self.handler._shutdown(reason)
@@ -318,7 +318,7 @@ def cleanup(original, run, self, reason):
 @patch('rospy.impl.masterslave', 'ROSHandler.paramUpdate')
 def parameter_changed(original, run, self, caller_id, key, value):
     """Tells its own cache alone."""
-    run.node.parameter_changed('/' + str(key).strip('/'))
+    run.node.read_parameters()
     return original(self, caller_id, key, value)
 
 
@@ -327,7 +327,7 @@ def parameter_changed(original, run, self, caller_id, key, value):
 def set_parameter(original, run, self, key, *value):
     """Tells others of the change, and not the node itself."""
     original(self, key, *value)
-    run.node.parameter_changed(run.ros.resolve_name(key))
+    run.node.read_parameters()
 
 
 @patch('subprocess', 'Popen.__init__')

@@ -15,7 +15,7 @@ import weakref
 import xml.parsers.expat
 import xmlrpc.client
 
-from pharos.errors import MasterUnreachableError, NodeNameInUseError, PortInUseError
+from pharos.errors import NodeNameInUseError, PortInUseError
 from pharos.intraprocess.workers import Turns
 from pharos.private_rospy import patches, transport
 from pharos.private_rospy.loader import PrivateModules, Shim
@@ -31,28 +31,32 @@ UNREACHABLE = (
     xml.parsers.expat.ExpatError,
 )
 _METHODS = {'pub': 'registerPublisher', 'sub': 'registerSubscriber', 'srv': 'registerService'}
-_watch_guard = threading.Lock()
 _end_of_watch = threading.Event()
+
+
+class _Transport(xmlrpc.client.Transport):
+    limit = MASTER_LIMIT
+
+    def make_connection(self, host):
+        connection = super().make_connection(host)
+        connection.timeout = self.limit
+        return connection
 
 
 class ServerProxy(xmlrpc.client.ServerProxy):
     """One that gives up after ``limit`` seconds."""
 
-    def __init__(self, uri, limit=MASTER_LIMIT, **options):
-        class Transport(xmlrpc.client.Transport):
-            def make_connection(self, host):
-                connection = super().make_connection(host)
-                connection.timeout = limit
-                return connection
-
-        super().__init__(uri, **{'transport': Transport(), **options})
+    def __init__(self, uri, limit=MASTER_LIMIT):
+        transport = _Transport()
+        transport.limit = limit
+        super().__init__(uri, transport)
 
 
 class Run:
     """A rospy with a node.
 
     :param node: a Node, with a name, ports, settings, and methods that are called: ``end_now()`` if
-        ROS ends it, ``parameter_changed(name)``, ``refused(topic, reason)``
+        ROS ends it, ``read_parameters()``, ``refused(topic, reason)``
     """
 
     def __init__(self, node):
@@ -63,12 +67,10 @@ class Run:
         self.sockets, self.calls = weakref.WeakSet(), weakref.WeakSet()
         self.deadlines = {}  # socket of a client that is to say something -> until when
         self.publishers = {}  # topic -> URIs, as the master last said
-        self.connecting, self.told = (
-            set(),
-            set(),
-        )  # (topic, URI ...); told: whose loss the log knows
-        self.known = {kind: set() for kind in _METHODS}  # names that are registered
-        self.uri, self.turns = '', Turns(node.name)
+        self.connecting = set()  # (topic, URI, ...)
+        self.told = set()  # (topic, URI) that the log knows to be lost
+        self.known = set()  # (kind, name) of what is registered
+        self.uri, self.turns = '', Turns()
         namespace, _, self.base = node.name.rpartition('/')
         self.environ = {'ROSCONSOLE_FORMAT': '[${severity}] [${time}]: ${node}: ${message}'}
         self.environ.update(os.environ, ROS_MASTER_URI=node.master.url)
@@ -134,8 +136,8 @@ class Run:
             server = base.init_tcpros_server(port)
             server.tcp_ros_server = base.TCPServer(server._tcp_server_callback, port)
             server.tcp_ros_server.start()
-            self.tcp_port, port = server.tcp_ros_server.port, self.node.xmlrpc_port
-            options.update(xmlrpc_port=port, tcpros_port=self.tcp_port, disable_signals=True)
+            port_taken, port = server.tcp_ros_server.port, self.node.xmlrpc_port
+            options.update(xmlrpc_port=port, tcpros_port=port_taken, disable_signals=True)
             self.modules.load('rospy.client').init_node(self.base, self.argv, **options)
         except OSError as error:
             if error.errno != errno.EADDRINUSE:
@@ -143,35 +145,24 @@ class Run:
             raise PortInUseError(
                 f'{self.name}: port {port} is in use: choose another one, or 0 for any'
             ) from None
-        address = urllib.parse.urlsplit(self.uri)
-        node = self.node
-        node.uri, node.tcp_port, node.xmlrpc_port = self.uri, self.tcp_port, address.port
+        node, address = self.node, urllib.parse.urlsplit(self.uri)
+        node.uri, node.tcp_port, node.xmlrpc_port = self.uri, port_taken, address.port
         node.domain = node.domain or address.hostname
 
     def ready(self, handler, uri):
         """Be found and watched: the servers run, and nothing is registered yet."""
-        global _end_of_watch
         self.handler, self.uri = handler, uri
         handler.pharosHealth = lambda caller_id: (1, '', self.node.told())
-        with _watch_guard:
+        with transport.guard:
             if not runs:
-                _end_of_watch = threading.Event()
-                threading.Thread(target=_watch, args=[_end_of_watch], daemon=True).start()
+                _end_of_watch.clear()
+                threading.Thread(target=_watch, daemon=True).start()
             runs[uri] = self
 
     def _check_name(self):
-        url, limit = self.master_url, max(self.node.connect_timeout, 1.0)
-        try:
-            code, _, uri = ServerProxy(url, limit).lookupNode('/pharos', self.name)
-        except UNREACHABLE as error:
-            raise MasterUnreachableError(
-                f'{self.name} cannot start: no ROS master answers at {url} ({error}):'
-                ' start roscore, or give the right URL'
-            ) from None
-        if code != 1:
-            return
+        uri = self.node.master.call('lookupNode', self.name)
         with contextlib.suppress(*UNREACHABLE):
-            if ServerProxy(uri, 1.0).getPid('/pharos'):
+            if uri and ServerProxy(uri, 1.0).getPid('/pharos'):
                 raise NodeNameInUseError(
                     f'{self.name} is running already, at {uri}: choose another name, or end that one'
                 )
@@ -214,11 +205,11 @@ class Run:
                     self.node.refused(topic, refusal)
             elif self.node.master.share_connections and transport.follow(self, *key, subscription):
                 pass
-            elif not self.handler.done and self.handler._connect_topic(*key)[0] != 1:
+            elif self.handler._connect_topic(*key)[0] != 1:
                 self.start_thread(lambda: self.connect_again(*key), f'connect {topic}')
-        except AttributeError:
-            if topic in self.topics.subs:
-                raise  # else it was closed meanwhile, for which rospy does not look
+        except (AttributeError, UnboundLocalError):  # rospy's, if it was closed meanwhile
+            if topic in self.topics.subs and not self.stopping.is_set():
+                raise
         finally:
             self.connecting.discard(attempt)
 
@@ -232,17 +223,22 @@ class Run:
 
     def register_missing(self, state):
         """Register what is not in the master's system state."""
-        topics, services, is_forgotten = self.topics, self.services, False
+        topics, services = self.topics, self.services
+        known = {
+            (kind, name)
+            for kind, names in zip(_METHODS, state)
+            for name, nodes in names
+            if self.name in nodes
+        }
         ours = topics.get_publications, topics.get_subscriptions, services.get_services
-        for kind, own, theirs in zip(_METHODS, ours, map(dict, state)):
-            known = {name for name, nodes in theirs.items() if self.name in nodes}
-            with topics.lock, services.lock:  # what is closed meanwhile stays closed
-                for name, data in own():
-                    if name in self.known[kind] - known and not self.stopping.is_set():
-                        is_forgotten = True
-                        self.register(kind, name, data)
-                self.known[kind] = {name for name, _ in own()}
-        if is_forgotten and not self.stopping.is_set():
+        with topics.lock, services.lock:  # what is closed meanwhile stays closed
+            own = [(kind, *each) for kind, get in zip(_METHODS, ours) for each in get()]
+            # what was there at the last look: all else may be about to be registered
+            missing = [each for each in own if each[:2] in self.known - known]
+            for each in missing:
+                self.stopping.is_set() or self.register(*each)
+            self.known = {each[:2] for each in own}
+        if missing and not self.stopping.is_set():
             self.modules.load('rospy.client')._init_node_params(self.argv, self.name)
             for parameter in self.node.parameters:
                 parameter.subscribe()
@@ -263,7 +259,7 @@ class Run:
         :param timeout: seconds for souls, and as long for what is under way
         """
         self.stopping.set()
-        with _watch_guard:
+        with transport.guard:
             runs.pop(self.uri, None)
             if not runs:
                 _end_of_watch.set()
@@ -301,9 +297,9 @@ def join(threads, timeout):
     return [thread for thread in others if thread.is_alive()]
 
 
-def _watch(end):
+def _watch():
     """Ask each master once a second what it knows of our nodes: it may have been started again."""
-    while not end.wait(WATCH_PERIOD):
+    while not _end_of_watch.wait(WATCH_PERIOD):
         nodes = list(runs.values())
         for run in nodes:
             run.topics.check_all()  # rospy looks twice a second who has left (ros_comm #927)

@@ -1,4 +1,4 @@
-"""What a topic's connections do here: INTRAPROCESS links, publishing, and receiving from sockets.
+"""Connect topics: INTRAPROCESS links, publishing, and receiving from sockets.
 
 A link is two ends, one in the list of connections of rospy's publisher and one in that of its
 subscription, so that rosnode info, closing and duplicates are rospy's own matter.
@@ -24,6 +24,7 @@ RETRY_DELAY = 1.0  # seconds until the next one
 _length = struct.Struct('<I')
 #: the runs of this process by the URI of their node
 runs = {}
+guard = threading.Lock()  # of runs and _shares
 
 
 class Link(Transport):
@@ -55,17 +56,11 @@ class Follower(Transport):
     """The share of a subscription in the connection of another node."""
 
     transport_type = 'TCPROS'
-    header = property(lambda self: self.share.header)
-    latch = property(lambda self: self.share.latch)
+    header = property(lambda self: self.share.connection and self.share.connection.header)
+    latch = property(lambda self: self.share.connection and self.share.connection.latch)
 
     def get_transport_info(self):
         return f'TCPROS connection of {self.share.leader.name}'
-
-    def close(self):
-        if not self.done:
-            self.done = True
-            self.share.followers = [each for each in self.share.followers if each is not self]
-            self.cleanup_cb(self)
 
 
 class Share:
@@ -75,12 +70,13 @@ class Share:
     connect anew.
     """
 
+    connection = None
+
     def __init__(self, leader):
-        self.leader, self.followers, self.header, self.latch = leader, [], {}, None
+        self.leader, self.followers = leader, []
 
 
 _shares = {}  # (topic, URI, message class) -> Share
-_share_guard = threading.Lock()
 
 
 def follow(run, topic, uri, subscription):
@@ -89,7 +85,7 @@ def follow(run, topic, uri, subscription):
     If nobody has, this one is the first.
     """
     key = topic, uri, subscription.data_class
-    with _share_guard:
+    with guard:
         share = _shares.get(key)
         if share is None or share.leader is run:
             _shares[key] = Share(run)
@@ -98,15 +94,15 @@ def follow(run, topic, uri, subscription):
         follower.endpoint_id, follower.share, follower.run = uri, share, run
         follower.subscription = subscription
         subscription.add_connection(follower)
-        share.followers = [*share.followers, follower]
-    for inbox in subscription.inboxes() if share.latch else ():
-        inbox.receive(copied(share.latch), 0)
+        share.followers = [*(each for each in share.followers if not each.done), follower]
+    for inbox in subscription.inboxes() if follower.latch else ():
+        inbox.receive(copied(follower.latch), 0)
     return True
 
 
 def end_share(topic, uri, cls, run):
     """Have those that share a connection that has ended connect anew."""
-    with _share_guard:
+    with guard:
         share = _shares.get((topic, uri, cls))
         if share is None or share.leader is not run:
             return
@@ -135,7 +131,7 @@ def connect(sender, receiver, topic):
         out.other, end.other, out.subscription = end, out, subscription
         for each in out, end:
             each.publisher, each.thaw, each.header = publisher, thawer(sent, wanted), header
-            each.callerid_pub = sender.name
+            each.callerid_pub = sender.name  # actionlib asks for it
         with subscription.c_lock:
             if subscription.closed or publisher.closed or subscription.has_connection(sender.uri):
                 return None
@@ -164,7 +160,7 @@ def shut(sock):
 
 
 class PublisherOverlay:
-    """What is set on a node's own rospy.topics._PublisherImpl; ``rospy_NAME`` is rospy's method.
+    """Methods for a node's own rospy.topics._PublisherImpl; ``rospy_NAME`` is rospy's method.
 
     rospy serializes for all, latches the user's object, one for all Publishers of a topic, and keeps
     what did not serialize in its buffer, which corrupts the next message.
@@ -237,7 +233,10 @@ class PublisherOverlay:
         return True
 
     def write(self, message, connections):
-        data = serialize(message)
+        try:
+            data = serialize(message)
+        except Exception:  # copying makes bytes of numpy's arrays, or says what is wrong
+            data = serialize(self.thaw(self.freeze(message)))
         data = _length.pack(len(data)) + data
         self.message_data_sent += len(data)
         for connection in connections:
@@ -259,7 +258,7 @@ class PublisherOverlay:
 
 
 class SubscriptionOverlay:
-    """What is set on a node's own rospy.topics._SubscriberImpl.
+    """Methods for a node's own rospy.topics._SubscriberImpl.
 
     Callbacks that are an Inbox get messages directly. All others of a topic share one, which takes
     turns by itself, for they may wait for each other.
@@ -276,7 +275,7 @@ class SubscriptionOverlay:
             known = [callback for callback, _ in callbacks or () if isinstance(callback, Inbox)]
             if callbacks and len(known) < len(callbacks):
                 if self.plain is None:
-                    self.plain = Inbox(Turns(self.name), self.call_plain, self.queue_size)
+                    self.plain = Inbox(Turns(), self.call_plain, self.queue_size)
                 known.append(self.plain)
             self.seen, self.known = callbacks, known
         return self.known
@@ -298,6 +297,13 @@ class SubscriptionOverlay:
             self.plain.turns.close(0)
 
 
+def peer_of(connection):
+    """Return the name of the node at the other end; None if it has not said it yet."""
+    if connection.direction == 'o':
+        return connection.endpoint_id
+    return connection.header and connection.header['callerid']
+
+
 def by_kind(connections):
     """Return the links and the others of some connections."""
     links = [each for each in connections if each.transport_type == 'INTRAPROCESS']
@@ -315,9 +321,8 @@ def close(impl):
 def keep_alive(sock):
     """Have a connection break within 30 s if the other host has silently gone."""
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 10)
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 5)
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 4)
+    for option in (socket.TCP_KEEPIDLE, 10), (socket.TCP_KEEPINTVL, 5), (socket.TCP_KEEPCNT, 4):
+        sock.setsockopt(socket.IPPROTO_TCP, *option)
 
 
 def receive(connection, address, port, uri, subscription, run):
@@ -331,7 +336,7 @@ def receive(connection, address, port, uri, subscription, run):
     cls, header = subscription.data_class, connection.header
     share = _shares.get((subscription.resolved_name, uri, cls))
     if share:
-        share.header = header
+        share.connection = connection
     with sock.makefile('rb', 1 << 16) as stream:
         while not connection.done:
             head = stream.read(4)
@@ -348,15 +353,14 @@ def receive(connection, address, port, uri, subscription, run):
             message = None
             inboxes = subscription.inboxes()
             for follower in share.followers if share else ():
-                inboxes = [*inboxes, *follower.subscription.inboxes()]
+                if not follower.done:
+                    inboxes = [*inboxes, *follower.subscription.inboxes()]
             for inbox in inboxes:
                 message = cls().deserialize(data)
                 message._connection_header = header
                 inbox.receive(message, size)
             if connection.is_latched:
                 connection.latch = message or cls().deserialize(data)
-                if share:
-                    share.latch = connection.latch
 
 
 class Sender:
