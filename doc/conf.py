@@ -1,5 +1,4 @@
 """What Sphinx is to make of the documentation; tools/doc runs it."""
-import os
 import pathlib
 import re
 import sys
@@ -8,8 +7,6 @@ from pygments.lexers.special import TextLexer
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / 'src'))
-os.environ['PYTHONPATH'] = str(ROOT / 'src')  # for the programs whose --help is shown
-os.environ['COLUMNS'] = '90'  # which those are to fill
 
 import pharos  # noqa: E402
 
@@ -31,7 +28,6 @@ extensions = [
     'myst_parser',
     'sphinx.ext.autodoc',
     'sphinx.ext.graphviz',
-    'sphinxcontrib.programoutput',
 ]
 myst_heading_anchors = 3
 graphviz_output_format = 'svg'
@@ -45,14 +41,12 @@ maximum_signature_line_length = 90  # Sphinx 7.1 and later
 
 nitpicky = True
 nitpick_ignore_regex = [
-    # types in signatures that have no page here: those of others, type variables, what is internal
-    ('py:(class|exc)', r'(genpy|rospy|rosgraph|threading|os|subprocess|_pytest)\..*'),
-    ('py:class', r'(Init|Init\.k?w?args|.*\.Self|(.*\.)?(\w+Type|Value)|Block|Peer|Image)'),
-    (
-        'py:class',
-        r'(Run|pharos\.run\.Run|pharos\.channel\.Channel|pharos\.failures\.Failure(s|List))',
-    ),
-    ('py:class', r'pharos\.(live\.(snapshot|edges)|compose\.(progress|launch_file|kept_node))\..*'),
+    # types of others, type variables, and what is internal
+    ('py:(class|exc)', r'(genpy|rospy|rosgraph|threading|os|subprocess|types|_pytest)\..*'),
+    ('py:class', r'(pharos\.channels\.Channel|.*\.Launch(File|edNode)|Edge)'),
+    # attributes that a docstring lists have no place of their own, nor has an inherited stop()
+    ('py:(attr|data)', r'.*'),
+    ('py:meth', r'(stop|Node\.serve)'),
 ]
 
 html_theme = 'furo'
@@ -69,18 +63,12 @@ def draw_flowcharts(app, name, source):
 
 
 def _by_graphviz(flowchart):
-    dot = re.sub(r'^( *\w+)\["(.*)"\]$', r'\1 [label=<\2>]', flowchart[1], flags=re.M)
+    label = re.compile(r'(\w+)\["(.*?)"\]')
+    nodes = '\n'.join(f'{name} [label=<{text}>]' for name, text in label.findall(flowchart[1]))
+    edges = [line for line in label.sub(r'\1', flowchart[1]).splitlines() if '-->' in line]
     style = 'node [shape=box, fontname="sans-serif", fontsize=10, margin="0.2,0.1"]'
-    return f'```{{graphviz}}\ndigraph {{\n{style}\n{dot.replace("-->", "->")}}}\n```'
-
-
-def tell_programs(app, name, source):
-    """Have the page of the programs show what each says to --help."""
-    if name == 'doc/reference/programs':
-        for script in sorted(filter(pathlib.Path.is_file, (ROOT / 'scripts').iterdir())):
-            source[
-                0
-            ] += f'\n## {script.name}\n\n```{{program-output}} {sys.executable} {script} --help\n```\n'
+    dot = '\n'.join([style, nodes, *edges]).replace('-->', '->')
+    return f'```{{graphviz}}\ndigraph {{\n{dot}\n}}\n```'
 
 
 def take_fields_apart(app, what, name, thing, options, lines):
@@ -112,7 +100,6 @@ def let_folders_be(app, name, source):
 def setup(app):
     """What Sphinx calls first."""
     app.connect('source-read', draw_flowcharts)
-    app.connect('source-read', tell_programs)
     app.connect('source-read', let_folders_be)
     app.connect('autodoc-process-docstring', take_fields_apart)
     for kind in 'debugger', 'ipython':  # of what is typed in the tutorial

@@ -1,8 +1,8 @@
 #!/usr/bin/python3
 """An action server and its client: actionlib, unmodified, in two nodes of one process.
 
-The server counts down, and tells at each step what is left. The client cancels what takes longer
-than 2 s, every second one. It goes on until Ctrl-C; meanwhile, in other terminals:
+The server counts down, and tells each step. The client cancels a goal that takes longer than 2 s:
+each second one. It runs until Ctrl-C. Meanwhile, in other terminals:
 
   rostopic echo /countdown/feedback
   rostopic pub -1 /countdown/goal actionlib/TestActionGoal '{goal: {goal: 4}}'    # takes its place

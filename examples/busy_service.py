@@ -1,9 +1,9 @@
 #!/usr/bin/python3
-"""A service whose provider is busy: an arm that takes 3 s or 1 s to pick, one thing at a time.
+"""A service that takes its time: an arm that needs 3 s or 1 s to pick, one thing at a time.
 
-Each call runs in a thread of its own, so that the arm can tell a second caller at once that it is
-busy, and everybody how far it is. The callers wait for 2 s and then do something else. All this
-goes on until Ctrl-C; meanwhile, in other terminals:
+Each call runs in a thread of its own, so the arm can tell a second caller at once that it is busy.
+The callers wait for 2 s, and then do something else. It runs until Ctrl-C. Meanwhile, in other
+terminals:
 
   rostopic echo /arm/progress
   rosservice call /arm/pick     # tells when it has picked, or at once that the arm is busy

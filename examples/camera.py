@@ -1,7 +1,7 @@
 #!/usr/bin/python3
-"""A camera, a detector and a controller: nodes of one process, between which images need no socket.
+"""A camera, a detector and a controller, in one process: their images need no socket.
 
-A ball swings before the camera; the robot turns towards it, until Ctrl-C. In other terminals:
+A ball swings before the camera, and the robot turns towards it, until Ctrl-C. In other terminals:
 
   rostopic echo /cmd_vel                # angular.z follows the ball
   rosparam set /controller/gain 3.0     # the robot turns three times as fast, at once

@@ -1,9 +1,9 @@
 #!/usr/bin/python3
 """Recording a drive with rosbag, and replaying it again and again, in the time of the recording.
 
-Each replay jumps back in time, which neither the node's loop nor rospy's Timer minds. No roscore is
-needed: all nodes of a master have one time, so this has a master of its own. It goes on until
-Ctrl-C; what to type meanwhile, in another terminal, it says itself.
+Each replay jumps back in time, and the node's loop and rospy's Timer follow. All nodes of a master
+have one time, so this starts a master of its own: it needs no roscore. It runs until Ctrl-C, and
+says what to type meanwhile in another terminal.
 """
 import contextlib
 import itertools

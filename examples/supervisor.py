@@ -1,8 +1,8 @@
 #!/usr/bin/python3
-"""A supervisor that restarts nodes of its process: those that have failed, and those that stopped.
+"""A supervisor that restarts nodes of its process, if they have failed or were stopped.
 
 Each worker fails after some steps: that ends its soul, and no other node. The supervisor says why,
-restarts it, and tells on /diagnostics how all are. It goes on until Ctrl-C; meanwhile, in other
+restarts it, and sends the health of all on /diagnostics. It runs until Ctrl-C. Meanwhile, in other
 terminals:
 
   rosnode kill /left        # the supervisor starts it again
@@ -31,7 +31,7 @@ def supervise(supervisor, workers):
     for _ in supervisor.every(1):
         for worker in workers:
             if worker.errors or not worker.is_running:
-                due[worker] = worker.errors.pop() if worker.errors else 'it was stopped'
+                due[worker] = worker.errors[-1] if worker.errors else 'it was stopped'
             if worker in due:
                 supervisor.log(f'restarts {worker.name}: {due[worker]}', level='warn')
                 try:
@@ -39,7 +39,7 @@ def supervise(supervisor, workers):
                     del due[worker]
                 except (MasterUnreachableError, NodeStoppedError) as error:  # stopped half way
                     supervisor.log(f'will try again: {error}', level='warn')
-        health = [{'name': worker.name, 'message': str(worker.health())} for worker in workers]
+        health = [{'name': each.name, 'message': str(vars(each.health()))} for each in workers]
         supervisor.send_to(
             '/diagnostics', typed_as='diagnostic_msgs/DiagnosticArray', status=health
         )

@@ -1,8 +1,8 @@
 #!/usr/bin/python3
 """Coordinate frames with tf2: a robot drives in a circle, and a node asks where its camera is.
 
-The robot broadcasts where it is in the map, and once where the camera is mounted on it; tf2 puts
-the two together. It goes on until Ctrl-C; meanwhile, in other terminals:
+The robot broadcasts where it is in the map, and once where its camera is mounted. tf2 puts the two
+together. It runs until Ctrl-C. Meanwhile, in other terminals:
 
   rostopic echo /camera/position
   rostopic echo /tf

@@ -1,26 +1,25 @@
 """README.md, the pages of doc/ and the examples: their links, their Python, their commands.
 
-Nothing here knows the words of a page. A block is used as its fence says: ``python`` runs as a
-program or in a session, ``text`` is what the block before prints, with ``...`` for anything,
-``debugger`` is typed at the debugger's prompt, and ``console`` opens the session.
+A block is used as its fence says. ``python`` is a program, a test, or a file if its first line names
+one. ``console`` is commands, and ``text`` what the block before prints, with ``...`` for anything.
+In the tutorial, ``python`` and ``debugger`` are typed into a session, which ``console`` opens.
 """
+import contextlib
 import re
 import signal
-import subprocess
-import sys
 from typing import NamedTuple
 from urllib.parse import unquote
 
 import pexpect
 import pytest
-import rospkg
 
 import helpers
-from helpers import DEFAULT_SIGNALS, PYTHON, ROOT, TIMEOUT, create
+from helpers import DEFAULT_SIGNALS, PYTHON, ROOT, TIMEOUT
 from pharos.testing import until
 
 README, TUTORIAL = ROOT / 'README.md', ROOT / 'doc' / 'tutorial.md'
 PAGES = [README, *sorted((ROOT / 'doc').glob('*.md')), *sorted(ROOT.glob('examples/*.md'))]
+ROBOT_NODES = 'camera', 'detector', 'planner'
 EXAMPLES = sorted((ROOT / 'examples').glob('*.py'))
 FENCE = re.compile(r'^```(\w*)\n(.*?)^```$', re.DOTALL | re.MULTILINE)
 INDENTED = re.compile(r'^(?: {4}[^\n]*\n)+', re.MULTILINE)
@@ -46,12 +45,8 @@ def blocks(page, *kinds):
 
 
 def name_of(value):
-    """Say which page or block a case is about."""
-    return value.where if isinstance(value, Block) else str(value.relative_to(ROOT))
-
-
-def each_block(page, *kinds):
-    return pytest.mark.parametrize('block', list(blocks(page, *kinds)), ids=name_of)
+    """Say which page a case is about."""
+    return str(value.relative_to(ROOT))
 
 
 # -- links, and code that is not run
@@ -94,78 +89,74 @@ def test_programs_of_pages_exist():
     assert named - there == set()
 
 
-# -- README.md
+# -- all pages but the tutorial: each block is a program, a test or a command
+
+ROBOT = """#!/usr/bin/python3
+import rospy
+from std_msgs.msg import String
+rospy.init_node('camera')
+print('ready')
+images = rospy.Publisher('image', String, queue_size=1)
+while not rospy.core.is_shutdown_requested():
+    images.publish('an image')
+    rospy.rostime.wallsleep(0.1)
+"""
 
 
 @pytest.fixture
-def packages(tmp_path, monkeypatch):
-    """Make the packages that a block launches, with the nodes that it waits for."""
-
-    def provide(block):
-        names = re.findall(r"wait_for_node\('/?(\w+)'", block.text)
-        for package, file in re.findall(r"\('(\w+)', '(\w+\.launch)'", block.text):
-            if package not in rospkg.RosPack().list():
-                folder = tmp_path / package
-                folder.mkdir()
-                manifest = f'<package><name>{package}</name><version>1.0.0</version></package>'
-                (folder / 'package.xml').write_text(manifest)
-                program = folder / 'program.py'
-                program.write_text(
-                    '#!/usr/bin/python3\nimport rospy\nrospy.init_node("x")\nrospy.spin()\n'
-                )
-                program.chmod(0o755)
-                nodes = [
-                    f'<node name="{name}" pkg="{package}" type="program.py" />' for name in names
-                ]
-                (folder / file).write_text(f'<launch>{"".join(nodes)}</launch>')
-
+def folder(tmp_path, monkeypatch):
+    """The folder of a page's reader, who has the package my_robot and tests with pharos."""
+    robot = tmp_path / 'my_robot'
+    robot.mkdir()
+    manifest = (ROOT / 'test' / 'robot' / 'package.xml').read_text()
+    (robot / 'package.xml').write_text(manifest.replace('>robot<', '>my_robot<'))
+    nodes = [f'<node name="{name}" pkg="my_robot" type="{name}" />' for name in ROBOT_NODES]
+    (robot / 'robot.launch').write_text(f'<launch><arg name="speed" />{"".join(nodes)}</launch>')
+    for name in ROBOT_NODES:
+        (robot / name).write_text(ROBOT)
+        (robot / name).chmod(0o755)
+    (tmp_path / 'conftest.py').write_text("pytest_plugins = ['pharos.testing']\n")
     monkeypatch.setenv('ROS_PACKAGE_PATH', str(tmp_path), prepend=':')
     monkeypatch.setenv('ROS_HOME', str(tmp_path / 'home'))
-    return provide
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
 
 
-def run_as_program(command, master, is_up=lambda: False, codes=(0,)):
-    """Run a program until it prints something or is up, end it by Ctrl-C; return its output."""
+def commands_of(block, folder):
+    """Save a block, and yield the commands that run it."""
+    saved = re.match(r'# (\w+\.py)\n', block.text)
+    if block.kind == 'console':
+        yield from (line.partition(' #')[0][2:].split() for line in block.text.splitlines())
+    elif saved:
+        (folder / saved[1]).write_text(block.text)
+    elif re.search(r'^def test_', block.text, re.MULTILINE):
+        (folder / 'test_block.py').write_text(block.text)
+        yield [PYTHON, '-m', 'pytest', '-q', 'test_block.py']
+    else:
+        (folder / 'program.py').write_text(block.text)
+        yield [PYTHON, 'program.py']
+
+
+def run(command, master, expected='.'):
+    """Run a program until it prints what is expected; end it by Ctrl-C if it goes on."""
     with helpers.Program(command, master.url) as program:
-        until(lambda: program.output or program.poll() is not None or is_up(), TIMEOUT)
+        with contextlib.suppress(TimeoutError):  # what it printed says more
+            until(
+                lambda: program.poll() is not None or re.search(expected, program.output), TIMEOUT
+            )
         if program.poll() is None:
             program.signal(signal.SIGINT)
-        assert program.wait() in codes, program.output
-        return program.output
+        assert program.wait() in (0, -signal.SIGINT), program.output  # that is before spin()
+        assert re.search(expected, program.output), program.output
 
 
-@each_block(README, 'python')
-def test_python_of_readme_runs(block, master, packages, monkeypatch, tmp_path):
-    packages(block)
-    if 'spin()' in block.text:
-        (tmp_path / 'program.py').write_text(block.text)
-        said = run_as_program([PYTHON, str(tmp_path / 'program.py')], master)
-        assert 'Traceback' not in said
-    elif re.search(r'^def test_', block.text, re.MULTILINE):
-        (tmp_path / 'conftest.py').write_text("pytest_plugins = ['pharos.testing']\n")
-        (tmp_path / 'test_block.py').write_text(f'from pharos import *\n\n{block.text}')
-        command = [sys.executable, '-m', 'pytest', '-q', str(tmp_path)]
-        ended = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
-        assert ended.returncode == 0, ended.stdout
-    else:
-        monkeypatch.setattr(sys, 'argv', ['program'])
-        names = {'master': master, 'node': create(master, '/node')}
-        exec(compile(f'from pharos import *\n{block.text}', block.where, 'exec'), names)
-
-
-def commands_of(page):
-    """The indented lines of a page that start a program of this package."""
-    for block in INDENTED.findall(FENCE.sub('', page.read_text())):
-        for line in block.splitlines():
-            command = line.partition(' #')[0].strip()
-            if re.match(r'rosrun pharos ', command):
-                yield command
-
-
-def test_command_of_readme_runs(master):
-    """It may end by itself, with the status 1, if there is nobody to talk to."""
-    for command in sorted({*commands_of(README)}):
-        assert 'Traceback' not in run_as_program(command.split(), master, codes=(0, 1))
+@pytest.mark.parametrize('page', [page for page in PAGES if page != TUTORIAL], ids=name_of)
+def test_page_does_what_it_says(page, master, folder):
+    found = list(blocks(page))
+    for block, after in zip(found, [*found[1:], None]):
+        expected = pattern_of(after.text) if after and after.kind == 'text' else '.'
+        for command in commands_of(block, folder) if block.kind in ('python', 'console') else ():
+            run(command, master, expected)
 
 
 # -- the tutorial: a session that is typed
@@ -255,4 +246,4 @@ def test_tutorial_does_what_it_says(tmp_path):
 
 @pytest.mark.parametrize('example', EXAMPLES, ids=lambda path: path.name)
 def test_example_starts_and_ends(example, master):
-    run_as_program([PYTHON, str(example)], master, lambda: any(master.system_state()))
+    run([PYTHON, str(example)], master)

@@ -1,4 +1,4 @@
-"""What ends or silences a rospy node does not end or silence these nodes: doc/robustness.md."""
+"""What ends or silences a rospy node does not end or silence these nodes: doc/limits.md."""
 import concurrent.futures
 import contextlib
 import itertools
@@ -124,7 +124,7 @@ def bare(ros_master):
 
 @pytest.mark.parametrize('wish', WISHES)
 def test_bare_rospy_still_fails(bare, wish):
-    """If this fails, rospy was mended: delete the twin, and its mark in robustness.md."""
+    """If this fails, rospy was mended: delete the twin."""
     assert bare[wish] is False
 
 

@@ -1,4 +1,4 @@
-"""Try each fault of bare rospy (doc/robustness.md), and print what came out as a line of JSON."""
+"""Try each fault of bare rospy (doc/limits.md), and print what came out as a line of JSON."""
 import json
 import os
 import queue
