@@ -566,6 +566,7 @@ def test_wait_returns_when_all_ended(master, compose):
 def test_stop_ends_all_nodes(master, compose):
     composition = compose('mixed.launch')
     master.wait_for_node('/relay', TIMEOUT)
+    until(lambda: '/gripper/count' in master.system_state()[2], TIMEOUT)  # a killed start leaves it
     composition.stop()
     assert not any(each.is_running for each in composition.nodes)
     assert composition.process.poll() is not None

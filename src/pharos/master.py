@@ -257,7 +257,7 @@ class Master:
         name = full_name(node_name(name))
         external = ExternalNode(self, name)
         own = [node for node in self.own_nodes() if node.name == name]
-        return own[0] if own else external.uri and external  # raises if there is none
+        return own[0] if own else external.uri and external  # type: ignore[return-value]
 
     def may_live(self, name: str) -> bool:
         """False if the node of that name refuses connections, or is not registered."""

@@ -13,7 +13,7 @@ import roslaunch.core
 
 from pharos import program
 from pharos.compose import apart_program
-from pharos.compose.launch_file import LaunchedNode, LaunchFile, log_folder
+from pharos.compose.launch_file import LaunchFile
 from pharos.compose.script import ScriptNode
 from pharos.errors import PharosError
 from pharos.node import Lifecycle
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from pharos.master import Master
 
 PATIENCE = 2.0  # seconds that a node may take to start before the next one does
+APART_PATIENCE = 40.0  # seconds: half of it for roslaunch, which gives each node 17
 POLL = 0.02  # seconds between two looks at what has ended
 
 
@@ -47,20 +48,17 @@ class Composition:
         :raises PharosError: if the master does not answer, or refuses a parameter
         """
         run_id = self.master.parameters.setdefault('/run_id', roslaunch.core.generate_run_id())
-        log_folder(run_id)
         file.set_parameters(run_id)
         for text in file.config.config_errors:
             Transcript.show(text)
-        for name, why in file.problems.items():
-            Transcript.show(f'{name} is not started: {why}')
         if file.apart:
             with tempfile.NamedTemporaryFile('wb', suffix='.launch', delete=False) as pickled:
                 pickle.dump(file.config_apart(), pickled)
             command = [sys.executable, apart_program.__file__, pickled.name, str(os.getpid())]
             self.process = RosProcess(command, self.master.url, Transcript.show)
-        for launched in file.here:
-            with self.telling(launched.name):
-                self.start(launched)
+        for name, *program_and_node in file.here:
+            with self.telling(name):
+                self.start(name, *program_and_node)
         threading.Thread(target=self._watch, name='composition', daemon=True).start()
 
     @contextlib.contextmanager
@@ -72,14 +70,16 @@ class Composition:
             self._status = 1
             Transcript.show(f'{name} is not started: {error}')
 
-    def start(self, launched: LaunchedNode) -> ScriptNode:
-        """Start a node, and return it."""
+    def start(self, name: str, path: str, args: list[str], launched: Any = None) -> ScriptNode:
+        """Start a program as the node of that name, and return it.
+
+        :param launched: roslaunch's node, if it is of a launch file
+        """
         node = ScriptNode.__new__(ScriptNode)
-        node._configure(self.master, launched.name, None, None, None, (0, 0), ())
-        node.__init__(launched.path, launched.args, None, launched.env)
-        node.init_timeout = PATIENCE
+        node._configure(self.master, name, None, None, None, (0, 0), ())
+        node.__init__(path, args, None, dict(launched.env_args) if launched else None)
+        node.init_timeout, node.launched = PATIENCE, launched
         self.nodes.append(node)
-        node.launched = launched
         node.start()
         self._status = 0
         return node
@@ -88,8 +88,7 @@ class Composition:
     def is_over(self) -> bool:
         """True if all that it started has ended."""
         goes_on = [
-            node.lifecycle is not Lifecycle.STOPPED
-            or (node.launched and node.launched.respawn_delay is not None)
+            node.lifecycle is not Lifecycle.STOPPED or (node.launched and node.launched.respawn)
             for node in self.nodes
         ]
         return not any(goes_on) and (self.process is None or self.process.poll() is not None)
@@ -106,10 +105,10 @@ class Composition:
             launched = node.launched
             if self._ending.is_set() or not launched:
                 return
-            if launched.is_required:
-                return self._end(launched.name)
-            if launched.respawn_delay is not None and not self._ending.wait(launched.respawn_delay):
-                with self.telling(launched.name):
+            if launched.required:
+                return self._end(node.name)
+            if launched.respawn and not self._ending.wait(float(launched.respawn_delay)):
+                with self.telling(node.name):
                     node.start()
                 if self._ending.is_set():  # since it looked
                     node.end_now()
@@ -145,7 +144,7 @@ class Composition:
         for thread in threads:
             thread.start()
         if self.process:
-            self.process.terminate()
+            self.process.terminate(APART_PATIENCE)
         for thread in threads:
             thread.join()
 

@@ -7,7 +7,7 @@ from typing import Any
 import rosgraph.names
 
 from pharos.compose.composition import Composition
-from pharos.compose.launch_file import LaunchedNode, can_run_here
+from pharos.compose.launch_file import can_run_here
 from pharos.compose.script import ScriptNode, source_of
 from pharos.errors import PharosError, UnknownNodeError, UnknownTypeError
 from pharos.node import Node
@@ -52,8 +52,7 @@ class Container(Node):
         remaps = zip(request.remap_source_args, request.remap_target_args)
         args = [*request.my_argv, *(f'{source}:={target}' for source, target in remaps)]
         args.append(f'__name:={name.rpartition("/")[2]}')
-        launched = LaunchedNode(name, source_of(path), args, {}, False, None)
-        self.loaded[full] = self.composition.start(launched)
+        self.loaded[full] = self.composition.start(name, source_of(path), args)
         if request.bond_id:  # which ends when whoever loaded it has gone
             bond = self._bonds[full] = self.ros_import('bondpy.bondpy').Bond(
                 f'{self.name}/bond', request.bond_id, on_broken=lambda: self._drop(full)

@@ -2,13 +2,11 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 import os
 import re
 from typing import Any, Iterable
 
 import rosgraph.names
-import rospkg
 import roslaunch.config
 import roslaunch.core
 import roslaunch.launch
@@ -19,21 +17,10 @@ import roslaunch.xmlloader
 from pharos.compose.script import source_of
 from pharos.errors import PharosError, UnknownNodeError
 from pharos.ros_process import find_launch_file
+from pharos.transcript import Transcript
 
 _PYTHON = re.compile(r'#!.*\bpython(3(\.\d+)?)?\b')
 _USES_PHAROS = re.compile(r'^\s*(from|import) pharos\b', re.MULTILINE)
-
-
-@dataclasses.dataclass
-class LaunchedNode:
-    """A node of a launch file that is to run in this process."""
-
-    name: str
-    path: str
-    args: list[str]
-    env: dict[str, str]
-    is_required: bool
-    respawn_delay: float | None  # seconds; None: it is not started again
 
 
 class LaunchFile:
@@ -43,9 +30,8 @@ class LaunchFile:
     :param only: the names of the nodes that are wanted; none: all
     :param apart: the names of those that are to run in processes of their own
     :ivar config: roslaunch's configuration
-    :ivar here: the nodes for this process
+    :ivar here: a tuple for each node of this process: name, program, arguments, roslaunch's node
     :ivar apart: roslaunch's nodes for other processes
-    :ivar problems: name of a node that nobody can start -> why
     :raises UnknownNodeError: if there is no such package, file, argument or node
     :raises PharosError: if roslaunch cannot read it
     """
@@ -62,9 +48,8 @@ class LaunchFile:
             raise PharosError(f'{self.path}: {error}') from error
         self._check(args, loader.root_context.resolve_dict.get('arg_doc', {}), 'arg')
         self.config.master.uri = url
-        self.here: list[LaunchedNode] = []
+        self.here: list[tuple[str, str, list[str], Any]] = []
         self.apart: list[Any] = []
-        self.problems: dict[str, str] = {}
         nodes = {
             rosgraph.names.ns_join(node.namespace, node.name): node for node in self.config.nodes
         }
@@ -90,14 +75,10 @@ class LaunchFile:
                 node, node.machine, env=os.environ
             )
         except Exception as error:  # roslaunch's, or of what it asks
-            self.problems[name] = str(error)
-            return
+            return Transcript.show(f'{name} is not started: {error}')
         if not can_run_here(command[0]):
             return self.apart.append(node)
-        delay = float(node.respawn_delay or 0) if node.respawn else None
-        env = {str(key): str(value) for key, value in node.env_args}
-        path, args = source_of(command[0]), list(command[1:])
-        self.here.append(LaunchedNode(name, path, args, env, bool(node.required), delay))
+        self.here.append((name, source_of(command[0]), command[1:], node))
 
     def set_parameters(self, run_id: str) -> None:
         """Run what is to run before, clear and set the parameters, as roslaunch does.
@@ -130,10 +111,3 @@ def can_run_here(path: str) -> bool:
             return False
     with open(source_of(path), errors='replace') as file:
         return not _USES_PHAROS.search(file.read())
-
-
-def log_folder(run_id: str) -> str:
-    """Return the folder of a launch's logs, which is made."""
-    folder = os.path.join(rospkg.get_log_dir(env=os.environ), run_id)
-    os.makedirs(folder, exist_ok=True)
-    return folder

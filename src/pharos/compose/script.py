@@ -47,7 +47,7 @@ class ScriptNode(Node):
     #: seconds that :meth:`stop` waits for the program, as long as roslaunch waits after its SIGINT
     stop_timeout = 15.0
     exit_code: int | None = None
-    launched: Any = None  # the LaunchedNode, if a launch file named it
+    launched: Any = None  # roslaunch's node, if a launch file named it
 
     def __init__(self, path: str, args: Sequence[str], params: dict | None, env: dict | None):
         self.path, self.args = path, list(args)
