@@ -1,4 +1,4 @@
-"""What Sphinx is to make of the documentation; tools/doc runs it."""
+"""Configure Sphinx; tools/package runs it for the documentation."""
 import pathlib
 import re
 import sys
@@ -56,7 +56,7 @@ html_show_copyright = False
 
 
 def draw_flowcharts(app, name, source):
-    """Have graphviz draw what GitHub draws by mermaid, of which Debian has no Sphinx extension."""
+    """Have graphviz draw what GitHub draws by mermaid: Debian has no Sphinx extension for it."""
     source[0] = re.sub(
         r'^```mermaid\nflowchart TD\n(.*?)^```$', _by_graphviz, source[0], flags=re.M | re.S
     )
@@ -98,7 +98,7 @@ def let_folders_be(app, name, source):
 
 
 def setup(app):
-    """What Sphinx calls first."""
+    """Set up this configuration; Sphinx calls it first."""
     app.connect('source-read', draw_flowcharts)
     app.connect('source-read', let_folders_be)
     app.connect('autodoc-process-docstring', take_fields_apart)

@@ -5,7 +5,7 @@ A ball swings before the camera, and the robot turns towards it, until Ctrl-C. I
 
   rostopic echo /cmd_vel                # angular.z follows the ball
   rosparam set /controller/gain 3.0     # the robot turns three times as fast, at once
-  rosrun pharos top                     # how often messages come, and by which transport
+  rosrun pharos top                     # how often messages come, and by what transport
 """
 import contextlib
 import math

@@ -196,7 +196,7 @@ class Program:
 
     @property
     def output(self):
-        """What it has written so far, to standard output and error."""
+        """The text that it has written so far, to standard output and error."""
         return ''.join(self._lines)
 
     def expect(self, text):

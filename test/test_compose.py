@@ -97,7 +97,7 @@ def node(type_, package='bench', more='', inside=''):
 
 
 def links(ros_node):
-    """Return the links by which a node sends, as ``(topic, receiver, transport)``."""
+    """Return the links that a node sends by, as ``(topic, receiver, transport)``."""
     _, _, found = xmlrpc.client.ServerProxy(ros_node.uri).getBusInfo('/test')
     return {(topic, receiver, how) for _, receiver, way, how, topic, *_ in found if way == 'o'}
 
@@ -127,7 +127,7 @@ def behaviour(start):
 
 @pytest.fixture(scope='module')
 def robots(packages):
-    """What others find out about the robot: composed, and started by roslaunch."""
+    """Facts that others find out about the robot: composed, and started by roslaunch."""
     path = os.pathsep.join([str(packages), '/usr/share'])
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv('ROS_PACKAGE_PATH', path)

@@ -76,7 +76,7 @@ def definitions(draw, types=(*VALUES, *NESTED)):
 
 
 def genmsg_context(name, inner):
-    """What genmsg knows: the nested types, of which 'Inner' has that name and text."""
+    """The definitions that genmsg knows; 'Inner' has that name and text."""
     context = genmsg.MsgContext.create_default()
     for cls in geometry_msgs.msg.Point, std_msgs.msg.Header:
         genmsg.msg_loader.load_msg_from_string(context, cls._full_text, cls._type)

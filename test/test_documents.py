@@ -183,7 +183,7 @@ class Session:
 
     @property
     def answer(self):
-        """What it has written since the last block was typed."""
+        """The text that it has written since the last block was typed."""
         try:
             self._written += self._process.read_nonblocking(1 << 16, 0.02)
         except (pexpect.TIMEOUT, pexpect.EOF):

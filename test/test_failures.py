@@ -1,4 +1,4 @@
-"""What blocks raise, which ends nothing else; and the errors of the package."""
+"""Exceptions of blocks, which end nothing else; and the errors of the package."""
 import contextlib
 import socket
 import threading

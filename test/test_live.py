@@ -76,7 +76,7 @@ class Terminal:
 
     @property
     def text(self):
-        """What it has written, without what moves the cursor or colours the text."""
+        """The text that it has written, without what moves the cursor or colours the text."""
         with contextlib.suppress(pexpect.TIMEOUT, pexpect.EOF):
             self._written += self._process.read_nonblocking(1 << 16, 0.02)
         return ESCAPES.sub('', self._written)
@@ -301,7 +301,7 @@ COMMANDS = {
 
 
 class Scene:
-    """What the programs print of nodes of this process, and of /peer in another one."""
+    """Output of the programs of nodes of this process, and of /peer in another one."""
 
     def __init__(self, folder):
         ros_master = helpers.InProcessMaster()

@@ -30,7 +30,7 @@ def server(master):
 
 
 class Changes:
-    """What the blocks of parameters were told, as (name, value)."""
+    """The values that the blocks of parameters were told, as (name, value)."""
 
     def __init__(self, *parameters):
         self._queue = queue.Queue()

@@ -117,7 +117,7 @@ print('changed', json.dumps([what for what, now in look().items() if now != befo
 
 @pytest.fixture(scope='module')
 def changed(ros_master):
-    """What a node changed of its process, in a process of its own."""
+    """The changes that a node made to its process, in a process of its own."""
     targets = json.dumps(patched())
     with Program(HOST, ros_master.url, targets) as program:
         assert program.wait() == 0, program.output

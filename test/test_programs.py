@@ -44,7 +44,7 @@ def run(url, name, *arguments):
 
 
 def run_all(names, *arguments):
-    """Run programs side by side where there is no master: ``{name: (exit code, output)}``."""
+    """Run programs side by side without a master: ``{name: (exit code, output)}``."""
     with contextlib.ExitStack() as stack:
         programs = [
             stack.enter_context(Program(['rosrun', 'pharos', name, *arguments], NOWHERE))
@@ -156,7 +156,7 @@ def test_listing_follows_remappings(master):
 
 @pytest.fixture(scope='module')
 def drive():
-    """What came of turtle.launch without a window, and of a second turtle."""
+    """The outcome of turtle.launch without a window, and of a second turtle."""
     with Master.embedded() as master, master.create(BlockNode, named='/ear') as ear:
         poses = Mailbox(ear, '/turtle1/pose', 'turtlesim/Pose')
         args = {'window': 'false', 'picture': '', 'period': 0.1, 'linear': 1.5}

@@ -1,4 +1,4 @@
-"""What ends or silences a rospy node does not end or silence these nodes: doc/limits.md."""
+"""Causes that end or silence a rospy node do not end or silence these nodes: doc/limits.md."""
 import concurrent.futures
 import contextlib
 import itertools
@@ -467,7 +467,7 @@ OPENERS = {
 
 
 def test_killed_master_is_unreachable_and_harmless(mortal):
-    """What cannot be opened raises, and is not there later; what is closed is gone later."""
+    """A channel that cannot be opened raises, and is not there later; a closed one is gone later."""
     master = Master(mortal.url)
     node = create(master)
     before = registrations(master, '/node')

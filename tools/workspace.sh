@@ -1,4 +1,3 @@
-# shellcheck shell=bash
 # Sourced by the tools in bash: Debian's packages, and a catkin workspace around this clone, in build/.
 
 root=$(cd -P "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
@@ -19,17 +18,13 @@ export ROS_HOSTNAME=127.0.0.1 ROS_HOME=$ws/ros_home ROS_LOG_DIR=$ws/ros_home/log
 usage() { sed -n '2,/^[^#]/s/^# \?//p' "$0"; }
 
 say() { printf '== %s\n' "$*"; }
-
-fail() {
-  printf 'tools/%s: %s\n' "${0##*/}" "$*" >&2
-  exit 1
-}
+fail() { printf 'tools/%s: %s\n' "${0##*/}" "$*" >&2 && exit 1; }
+as_root() { if ((EUID)); then sudo "$@"; else "$@"; fi; }
 
 # quietly LOG COMMAND...: the command's output goes to the log, and is shown if it fails.
 quietly() {
   local log=$logs/$1
-  shift
-  mkdir -p "$logs"
+  shift && mkdir -p "$logs"
   "$@" >"$log" 2>&1 </dev/null && return
   tail -n 60 "$log" >&2
   printf "tools/%s: '%s' failed; its whole output is in %s\n" "${0##*/}" "$*" "$log" >&2
@@ -45,23 +40,17 @@ install_packages() {
     [[ $installed == *" $package:installed "* ]] || missing+=("$package")
   done
   ((${#missing[@]})) || return 0
-  if ((EUID)) && ! command -v sudo >/dev/null; then
-    fail "neither root nor sudo: as root, run: apt-get install --no-install-recommends ${missing[*]}"
-  fi
+  ((EUID == 0)) || command -v sudo >/dev/null || fail "neither root nor sudo: as root, run: apt-get install ${missing[*]}"
   say "installing from Debian, this once: ${missing[*]}"
   quietly apt-update.log as_root apt-get update || true # some sources may do: apt-get install decides
   quietly apt-install.log as_root env DEBIAN_FRONTEND=noninteractive \
     apt-get -o DPkg::Lock::Timeout=300 install -y --no-install-recommends "${missing[@]}" || exit 1
 }
 
-as_root() { if ((EUID)); then sudo "$@"; else "$@"; fi; }
-
 # build_workspace devel|install: builds the devel space, and the install space if asked, unless they are up to date.
 build_workspace() {
-  local lock space key files
+  local space key files
   mkdir -p "$root/build" "$ws"
-  exec {lock}>"$ws/lock"
-  flock "$lock" # two commands may be started at once
   for space in devel ${1/devel/}; do
     files='CMakeLists.txt package.xml setup.py' # the devel space uses the clone's Python files where they are
     [[ $space == devel ]] || files+=' src scripts launch examples template'
@@ -78,13 +67,7 @@ build_workspace() {
     quietly "catkin-$space.log" catkin_make -C "$ws" --no-color -DPYTHON_EXECUTABLE=/usr/bin/python3 ${space/devel/all} || exit 1
     printf '%s\n' "$key" >"$ws/$space.key"
   done
-  exec {lock}>&-
 }
 
-# use_space devel|install: what a user's shell has after sourcing that setup.bash.
-use_space() {
-  set +u # catkin's setup files read variables that may not be set
-  # shellcheck disable=SC1090
-  source "$ws/$1/setup.bash"
-  set -u
-}
+# use_space devel|install: sources setup.bash, which reads variables that may not be set.
+use_space() { set +u && source "$ws/$1/setup.bash" && set -u; }

@@ -6,7 +6,7 @@ usage: pharos COMMAND [ARGUMENT ...]
   workspace       a session in IPython, with the live graph at hand
   compose         run the Python nodes of a launch file in one process
   top             a live table of nodes, processes and topics
-  graph           who talks with whom, as text or as a picture
+  graph           who talks to whom, as text or as a picture
   create_package  make a catkin package with nodes and tests
 
 'pharos COMMAND --help' tells the arguments of one.

@@ -185,7 +185,7 @@ class Node(Receiver):
         It happens between two delegates. Blocks that are methods of the node are looked up anew.
         Neither ``__init__`` nor ``start`` of the new class runs.
 
-        :raises TypeError: if it is no subclass of Node
+        :raises TypeError: if it is not a subclass of Node
         """
         if not (isinstance(node_class, type) and issubclass(node_class, Node)):
             raise TypeError(f'{self.name} can become a subclass of Node, not {node_class!r}')

@@ -1,4 +1,4 @@
-"""What the programs of the report's listings have in common: options, a turtle, an end.
+"""Shared by the programs of the report's listings: options, a turtle, an end.
 
 The turtle's commands differ between the releases of turtlesim: up to ROS groovy, and so in the
 report, they are turtlesim/Velocity on /turtle1/command_velocity, since ROS hydro

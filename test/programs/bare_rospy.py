@@ -258,8 +258,8 @@ def starts_again():
 
 
 def main():
-    ports = {which: busy_port(which) for which in ('xmlrpc_port', 'tcpros_port')}
-    found = {f'busy_{which}_is_named': answer() for which, answer in ports.items()}
+    ports = {kind: busy_port(kind) for kind in ('xmlrpc_port', 'tcpros_port')}
+    found = {f'busy_{kind}_is_named': answer() for kind, answer in ports.items()}
     rospy.init_node('bare', anonymous=True)
     found.update({function.__name__: function() for function in TRIALS})
     os.write(1, f'\nfound {json.dumps(found)}\n'.encode())

@@ -68,7 +68,7 @@ def is_without_delay(sock):
 
 
 class FakeNode:
-    """A node in this process that is no rospy: XML-RPC answers, and a TCPROS port if it listens."""
+    """A node in this process without rospy: XML-RPC answers, and a TCPROS port if it listens."""
 
     def __init__(self, master, topic, type_='std_msgs/String', bus_info=(), name='/fake'):
         self.name, self.topic, self.type = name, topic, type_

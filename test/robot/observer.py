@@ -1,4 +1,4 @@
-"""What a rospy node of another process finds out about the robot of robot.launch."""
+"""Print what a rospy node of another process finds out about the robot of robot.launch."""
 import json
 import threading
 import time

@@ -245,7 +245,7 @@ def _compiled(path):
             return compile(file.read(), path, 'exec', dont_inherit=True)
     except (SyntaxError, ValueError, OSError) as error:
         raise PharosError(
-            f'{path} is no program in Python 3 that can be read: {error}; master.run() starts others'
+            f'{path} cannot be read as Python 3: {error}; master.run() starts others'
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""Show the graph of a master: who sends what to whom, from which process, and how."""
+"""Show the graph of a master: who sends what to whom, their processes, and how."""
 from __future__ import annotations
 
 import collections
@@ -156,7 +156,9 @@ class Graph:
         """
         path = pathlib.Path(path)
         if path.suffix not in FORMATS:
-            raise ValueError(f'{path} is no picture: its name ends in one of {", ".join(FORMATS)}')
+            raise ValueError(
+                f'{path} is not a picture: its name ends in one of {", ".join(FORMATS)}'
+            )
         is_dot = path.suffix == '.dot'
         path.write_bytes(self.dot().encode() if is_dot else self._draw(path.suffix[1:]))
 

@@ -103,7 +103,7 @@ def _ask(master, node):
             node.ends[is_incoming, topic, other, transport] = found
         node.health = api.pharosHealth('/pharos')[2]
     except Exception as error:  # whatever it answers, it is one of many
-        if 'pharosHealth' not in str(error):  # else it is no node of pharos
+        if 'pharosHealth' not in str(error):  # else it is not a node of pharos
             node.problem = str(error)
 
 
