@@ -1,5 +1,4 @@
-"""The rows of the table: each is a player, a process of its own, or two where messages go from one
-to another."""
+"""The rows of a table: each is a player, a process of its own, or two with a socket between them."""
 import contextlib
 import ctypes
 import json
@@ -11,43 +10,38 @@ import socket
 import subprocess
 import sys
 import time
-import xmlrpc.client
 from typing import List, NamedTuple
 
-from player import STAMPS
+import rosgraph
 
 HERE = pathlib.Path(__file__).resolve().parent
 SOURCE = HERE.parent / 'src'
 BUILD = HERE.parent / 'build' / 'benchmark'
-# Debian package -> what of it is in /usr/include
-CPP_PACKAGES = {
-    'libroscpp-dev': 'ros/ros.h',
-    'libnodeletlib-dev': 'nodelet/loader.h',
-    'pluginlib-dev': 'pluginlib',
-    'libgeometry-msgs-dev': 'geometry_msgs/Twist.h',
-    'libsensor-msgs-dev': 'sensor_msgs/Image.h',
-    'libstd-msgs-dev': 'std_msgs/String.h',
+CPP_NEEDS = {  # Debian's package -> a file of it
+    'catkin': '/usr/share/catkin/cmake',
+    'cmake': '/usr/bin/cmake',
+    'g++': '/usr/bin/g++',
+    'libnodeletlib-dev': '/usr/include/nodelet/loader.h',
+    'libgeometry-msgs-dev': '/usr/include/geometry_msgs/Twist.h',
+    'libsensor-msgs-dev': '/usr/include/sensor_msgs/Image.h',
 }
-CPP_TOOLS = {'catkin': '/usr/share/catkin/cmake', 'cmake': '/usr/bin/cmake', 'g++': '/usr/bin/g++'}
-
-# What stands in the table -> the words for player.py; a row of two processes has '--two'
-PYTHON_ROWS = {
+NODELETS = 'C++ nodelets'
+# row -> the words for player.py; 'two': a process sends, another receives
+ROWS = {
     'direct call': ['direct'],
     'SimpleQueue, 2 threads': ['queue'],
-    'pharos inline': ['pharos', '--inline'],
-    'pharos inline, send_to': ['pharos', '--inline', '--send-to'],
-    'pharos inline, shared': ['pharos', '--inline', '--shared'],
+    'pharos inline': ['pharos', 'inline'],
+    'pharos inline, shared': ['pharos', 'inline', 'shared'],
     'pharos default': ['pharos'],
+    'pharos default, send_to': ['pharos', 'send_to'],
+    NODELETS: ['nodelets'],
     'rospy, 1 process': ['rospy'],
-    'rospy, 1 process, tuned': ['rospy', '--tuned'],
-    'pharos, 2 processes': ['pharos', '--two'],
-    'pharos, 2 pr., sharing': ['pharos', '--share-connections', '--two'],
-    'rospy, 2 processes': ['rospy', '--two'],
-    'rospy, 2 proc., tuned': ['rospy', '--tuned', '--two'],
+    'pharos, 2 processes': ['pharos', 'two'],
+    'pharos, 2 pr., sharing': ['pharos', 'sharing', 'two'],
+    'rospy, 2 processes': ['rospy', 'two'],
+    'rospy, 2 proc., tuned': ['rospy', 'tuned', 'two'],
 }
-CPP_ROWS = {'C++ nodelets': 'nodelets', 'roscpp, 1 process': 'roscpp'}
-# seconds without a message after which the rest is lost; at a rate, where nothing is to be lost, as
-# long as the largest message may be under way: what came later would count in the next slice
+# seconds without a message after which the rest is lost: flat out, and at a rate
 SILENCE, SILENCE_AT_A_RATE = 0.4, 2.0
 
 
@@ -56,7 +50,7 @@ class Ended(Exception):
 
 
 class Slice(NamedTuple):
-    """What was measured in a short while; times in seconds."""
+    """The measurement of a short while; times in seconds."""
 
     took: List[float]  # latencies, a sample of them
     sent: int  # messages to be received, over all receivers
@@ -66,256 +60,146 @@ class Slice(NamedTuple):
 
 
 class Row:
-    """One way of messages; it runs only within :meth:`measure`, and is stopped by a signal
-    meanwhile."""
+    """One way of messages; a signal stops its processes while others are measured."""
 
     def __init__(self, name, commands, environment, errors):
-        self.name = name
+        self.name, self._errors, self._open = name, errors, set()
+        pipes = {'stdin': subprocess.PIPE, 'stdout': subprocess.PIPE, 'stderr': errors}
+        options = {'text': True, 'env': environment, 'preexec_fn': end_with_parent}
         # the sender last
-        self._players = [_Player(command, environment, errors) for command in commands]
-        self._open = set()
-        self._pause()
+        self._players = [subprocess.Popen(command, **pipes, **options) for command in commands]
+        self._signal(signal.SIGSTOP)
 
     def measure(self, message, receivers, queue_size, rate, seconds, busy=False):
         """Send for so long and return the :class:`Slice`; the first time, connect."""
-        what = (message, receivers, queue_size)
-        for player in self._players:
-            player.signal(signal.SIGCONT)
-        if what not in self._open:
-            self._open.add(what)
-            for player in self._players:
-                player.ask('open', *what)
-        # what the players put off while they were stopped, and cold caches
-        self._slice(what, 100, 0.05, busy)
+        what = message, receivers, queue_size
+        self._signal(signal.SIGCONT)
+        for player in self._players if what not in self._open else ():
+            self._ask(player, 'open', *what)
+        self._open.add(what)
+        self._slice(what, 100, 0.05, busy)  # warms the caches
         measured = self._slice(what, rate, seconds, busy)
-        self._pause()
+        self._signal(signal.SIGSTOP)
         return measured
 
     def _slice(self, what, rate, seconds, busy):
         for player in self._players:
-            player.ask('begin', *what)
-        sent = self._players[-1].ask('send', rate, seconds, int(busy))
+            self._ask(player, 'begin', *what)
+        sent = self._ask(self._players[-1], 'send', rate, seconds, int(busy))
         expected = sent['sent'] * what[1]
         silence = SILENCE_AT_A_RATE if rate else SILENCE
-        receiver = self._players[0].ask('result', expected, silence)
-        others = [player.ask('result', 0, silence) for player in self._players[1:]]
-        cpu = sum(each['cpu'] for each in (receiver, *others))
-        duration = max(receiver['last'] - sent['begun'], sent['took'])
-        return Slice(receiver['took'], expected, receiver['received'], duration, cpu)
+        found = [self._ask(self._players[0], 'result', expected, silence)]
+        found += [self._ask(player, 'result', 0, silence) for player in self._players[1:]]
+        duration = max(found[0]['last'] - sent['begun'], sent['took'])
+        cpu = sum(each['cpu'] for each in found)
+        return Slice(found[0]['took'], expected, found[0]['received'], duration, cpu)
 
-    def ask_receiver(self, *words):
-        """What the receiving player answers."""
-        self._players[0].signal(signal.SIGCONT)
-        answer = self._players[0].ask(*words)
-        self._pause()
-        return answer
-
-    def _pause(self):
-        for player in self._players:
-            player.signal(signal.SIGSTOP)
-
-    def end(self):
-        for player in self._players:
-            player.end()
-
-
-class _Player:
-    def __init__(self, command, environment, errors):
-        self._errors = errors
-        self._process = subprocess.Popen(
-            command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=errors,
-            text=True,
-            env=environment,
-            preexec_fn=end_with_parent,
-        )
-
-    def ask(self, *words):
-        try:
-            print(*words, file=self._process.stdin, flush=True)
-            answer = self._process.stdout.readline()
-        except BrokenPipeError:
-            answer = ''
+    def _ask(self, player, *words):
+        with contextlib.suppress(BrokenPipeError):
+            print(*words, file=player.stdin, flush=True)
+        answer = player.stdout.readline()
         if not answer:
-            status = self._process.wait()
-            how = signal.Signals(-status).name if status < 0 else f'status {status}'
-            what = f"a process ended by {how} at {' '.join(map(str, words))}"
-            raise Ended(f'{what}: {what_was_raised(self._errors)}')
+            self._errors.seek(0)
+            said = self._errors.read().splitlines()[-1:]
+            raise Ended(f'{self.name} ended with {player.wait()} at {words}: {said}')
         return json.loads(answer)
 
-    def signal(self, number):
-        self._process.send_signal(number)
+    def _signal(self, number):
+        for player in self._players:
+            player.send_signal(number)
 
     def end(self):
-        self._process.kill()
-        self._process.wait()
-
-
-def what_was_raised(errors):
-    """The last error in a file, without the frames of its traceback."""
-    errors.seek(0)
-    last = errors.read().rpartition('Traceback (most recent call last):')[2].splitlines()
-    return ' '.join(line for line in last if line and not line.startswith(' '))[:1000]
+        """End its processes."""
+        self._signal(signal.SIGKILL)
+        for player in self._players:
+            player.wait()
 
 
 def end_with_parent():
-    """Has a child process end with the thread that starts it."""
-    # PR_SET_PDEATHSIG: a stopped player would stay for ever
-    ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+    """Have a child process end with the thread that starts it: a stopped one would stay for ever."""
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 
 
-def shuffled(all_rows):
-    """The rows in another order each time, so that none always finds the processor's caches as the
-    same other one has left them."""
-    return random.sample(all_rows, len(all_rows))
+def shuffled(rows):
+    """Return the rows in another order each time: none always follows the same other one."""
+    return random.sample(rows, len(rows))
 
 
-def make(names, environment, folder, beside=()):
-    """The rows of these names.
+def make(names, environment, folder, beside=None):
+    """Return the rows of these names, those of another pharos in ``beside`` marked with '.
 
-    :param folder: where they may keep files
-    :param beside: other ``src`` folders of pharos: their rows are there too, marked with ', '' and
-        so on
+    :param folder: for the files of the rows
     """
-    rows = []
+    found = []
     for name in names:
-        label = f'row{len(rows)}'
-        if name in CPP_ROWS:
-            command = [str(BUILD / 'player'), CPP_ROWS[name], label]
-            rows.append(Row(name, [command], environment, open_errors(folder, label)))
-            continue
-        words = PYTHON_ROWS[name]
-        for number, source in enumerate((SOURCE, *beside) if 'pharos' in name else (SOURCE,)):
-            label = f'row{len(rows)}'
-            rows.append(
-                Row(
-                    name + "'" * number,
-                    commands(words, label, folder),
-                    {**environment, 'PYTHONPATH': str(source)},
-                    open_errors(folder, label),
-                )
-            )
-    return rows
+        way, *words = ROWS[name]
+        for source in (SOURCE, beside) if beside and way == 'pharos' else (SOURCE,):
+            label = f'row{len(found)}'
+            command = ['/usr/bin/python3', str(HERE / 'player.py'), way, label, *words]
+            commands = [command]
+            if way == 'nodelets':
+                commands = [[str(BUILD / 'player'), way, label]]
+            elif 'two' in words:
+                stamps = folder / f'{label}.stamps'
+                stamps.touch()
+                os.truncate(stamps, 8 << 21)
+                roles = 'role=receive', 'role=send'
+                commands = [[*command, role, f'stamps={stamps}'] for role in roles]
+            errors = open(folder / f'{label}.errors', 'w+')
+            mark = "'" if source is beside else ''
+            environ = {**environment, 'PYTHONPATH': str(source)}
+            found.append(Row(name + mark, commands, environ, errors))
+    return found
 
 
-def open_errors(folder, label):
-    """Where the processes of a row write what is wrong."""
-    return open(folder / f'{label}.errors', 'w+')
-
-
-def commands(words, label, folder, program=('/usr/bin/python3', str(HERE / 'player.py'))):
-    """The command of each player of a row, as Row takes them.
-
-    :param words: of PYTHON_ROWS
-    :param label: of the row, for topics and files
-    """
-    command = [
-        *program,
-        words[0],
-        label,
-        *(word for word in words[1:] if word != '--two'),
-    ]
-    if '--two' not in words:
-        return [command]
-    stamps = folder / (label + '.stamps')
-    with open(stamps, 'wb') as file:
-        file.truncate(8 * STAMPS)
-    return [[*command, '--role', role, '--stamps', str(stamps)] for role in ('receive', 'send')]
-
-
-def build_cpp():
-    """Build the C++ player, where its packages are installed; returns the names of those that are
-    missing."""
-    missing = [
-        package
-        for package, file in CPP_PACKAGES.items()
-        if not os.path.exists('/usr/include/' + file)
-    ]
-    missing += [package for package, file in CPP_TOOLS.items() if not os.path.exists(file)]
+def build_nodelets():
+    """Build the player in C++; False, and a message, if packages are missing."""
+    missing = [package for package, file in CPP_NEEDS.items() if not os.path.exists(file)]
     if missing:
-        return sorted(missing)
+        print(f'without {NODELETS}: apt-get install {" ".join(missing)}', file=sys.stderr)
+        return False
     BUILD.mkdir(parents=True, exist_ok=True)
     python = [f'-D{name}_EXECUTABLE=/usr/bin/python3' for name in ('PYTHON', 'Python3')]
-    for command in (
-        ['cmake', str(HERE / 'nodelet'), '-DCATKIN_ENABLE_TESTING=OFF', *python],
-        ['cmake', '--build', '.'],
-    ):
-        done = subprocess.run(
-            command, cwd=BUILD, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-        )
+    configure = ['cmake', str(HERE / 'nodelet'), '-DCATKIN_ENABLE_TESTING=OFF', *python]
+    for command in configure, ['cmake', '--build', '.']:
+        done = subprocess.run(command, cwd=BUILD, capture_output=True, text=True)
         if done.returncode:
-            sys.exit(f"{' '.join(command)} failed in {BUILD}:\n{done.stdout}")
-    return []
+            sys.exit(f'{" ".join(command)} failed in {BUILD}:\n{done.stdout}{done.stderr}')
+    return True
 
 
 @contextlib.contextmanager
-def ros_master(folder, program=('/usr/bin/rosmaster', '--core', '-p')):
-    """A ROS master as a child process; gives the environment for nodes of it.
-
-    :param program: what is started, with its port as one more argument
-    """
-    port = free_port()
-    environment = {
-        **os.environ,
-        'ROS_MASTER_URI': f'http://127.0.0.1:{port}/',
-        'ROS_HOSTNAME': '127.0.0.1',
-        'ROS_LOG_DIR': str(folder),
-        'ROS_HOME': str(folder),
-    }
-    environment.pop('ROS_NAMESPACE', None)
-    process = subprocess.Popen(
-        [*program, str(port)],
-        env=environment,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        preexec_fn=end_with_parent,
-    )
+def ros_master(folder):
+    """Start a ROS master as a child process; gives the environment for its nodes."""
+    with socket.socket() as free:
+        free.bind(('127.0.0.1', 0))
+        port = str(free.getsockname()[1])
+    dropped = 'ROS_NAMESPACE', 'ROS_IP', 'CMAKE_PREFIX_PATH', 'PYTHONDONTWRITEBYTECODE'
+    environment = {key: value for key, value in os.environ.items() if key not in dropped}
+    environment.update(ROS_MASTER_URI=f'http://127.0.0.1:{port}/', ROS_HOSTNAME='127.0.0.1')
+    environment.update(ROS_LOG_DIR=str(folder), ROS_HOME=str(folder), PYTHONPATH=str(SOURCE))
+    pipes = dict.fromkeys(('stdin', 'stdout', 'stderr'), subprocess.DEVNULL)
+    command = ['/usr/bin/rosmaster', '--core', '-p', port]
+    process = subprocess.Popen(command, env=environment, preexec_fn=end_with_parent, **pipes)
     try:
-        deadline = time.monotonic() + 20
-        while True:
-            try:
-                xmlrpc.client.ServerProxy(environment['ROS_MASTER_URI']).getPid('/benchmark')
-                break
-            except OSError:
-                if time.monotonic() > deadline or process.poll() is not None:
-                    raise Ended(f"no ROS master by {' '.join(map(str, program))}") from None
-                time.sleep(0.05)
+        while not rosgraph.is_master_online(environment['ROS_MASTER_URI']):
+            if process.poll() is not None:
+                raise Ended('no ROS master')
+            time.sleep(0.05)
         yield environment
     finally:
         process.terminate()
         process.wait()
 
 
-def free_port():
-    """A port that nobody has now."""
-    with socket.socket() as free:
-        free.bind(('127.0.0.1', 0))
-        return free.getsockname()[1]
-
-
-def tell(text=''):
-    """Show what is measured now, at a terminal, in a line that the next one overwrites."""
-    if sys.stderr.isatty():
-        print(f'\r{text:<78.78}', end='' if text else '\r', file=sys.stderr, flush=True)
-
-
 def run_program(main):
-    """Run it to its end; by Ctrl-C or another signal it ends as by an exception, so that all that it
-    has begun ends, too."""
-
-    def end(number, frame):
-        sys.exit(128 + number)
-
+    """Run it; a signal ends it as an exception does, so that all that it has begun ends, too."""
     for number in signal.SIGTERM, signal.SIGHUP:
         if signal.getsignal(number) is signal.SIG_DFL:  # nohup has it ignored
-            signal.signal(number, end)
+            signal.signal(number, lambda number, frame: sys.exit(128 + number))
     try:
         main()
     except KeyboardInterrupt:
         sys.exit(130)
     except Ended as error:
-        tell()
         sys.exit(f'{os.path.basename(sys.argv[0])}: {error}')

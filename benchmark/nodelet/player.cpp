@@ -1,8 +1,8 @@
-// Plays the rows of the table in C++: nodelets in one manager, or roscpp subscribers in the publisher's process.
-// The commands are those of benchmark/player.py, which see.
+// Plays the row of nodelets in one manager; the commands are those of benchmark/player.py.
 #include <atomic>
 #include <cstdio>
 #include <ctime>
+#include <functional>
 #include <iostream>
 #include <map>
 #include <memory>
@@ -16,17 +16,13 @@
 #include <geometry_msgs/Twist.h>
 #include <nodelet/loader.h>
 #include <nodelet/nodelet.h>
-#include <ros/callback_queue.h>
 #include <ros/ros.h>
-#include <ros/spinner.h>
 #include <sensor_msgs/Image.h>
-#include <std_msgs/String.h>
 
 namespace {
 
-constexpr std::size_t STAMPS = 1 << 21;    // messages of a slice at the most
-constexpr std::size_t SAMPLES = 4000;      // latencies told of a slice at the most
-constexpr double PATIENCE = 10.0;          // seconds that connecting may take
+constexpr std::size_t STAMPS = 1 << 21;    // messages of a slice at most
+constexpr std::size_t SAMPLES = 4000;      // latencies of a slice that are answered
 
 double seconds_of(clockid_t which) {
   timespec now;
@@ -39,26 +35,20 @@ void pause(double seconds) { std::this_thread::sleep_for(std::chrono::duration<d
 
 std::vector<double> sent(STAMPS);
 
-// What the receivers noted; each writes into a vector of its own.
+// Each receiver notes into a vector of its own.
 struct Notes {
-  std::vector<float> took;
+  std::vector<float> took = std::vector<float>(STAMPS);
   std::atomic<std::size_t> count{0};
-  Notes() : took(STAMPS) {}
   void note(std::size_t index) {
     const std::size_t at = count.load(std::memory_order_relaxed);
-    if (at < STAMPS) {
-      took[at] = now() - sent[index];
-      count.store(at + 1, std::memory_order_release);
-    }
+    if (at >= STAMPS) return;
+    took[at] = now() - sent[index];
+    count.store(at + 1, std::memory_order_release);
   }
 };
 
 std::size_t index_of(const geometry_msgs::Twist& message) { return message.linear.x; }
-std::size_t index_of(const std_msgs::String& message) { return std::stoul(message.data); }
 std::size_t index_of(const sensor_msgs::Image& message) { return message.step; }
-void mark(geometry_msgs::Twist& message, std::size_t index) { message.linear.x = index; }
-void mark(std_msgs::String& message, std::size_t index) { message.data = std::to_string(index); }
-void mark(sensor_msgs::Image& message, std::size_t index) { message.step = index; }
 
 struct Setting {
   std::string kind, topic;
@@ -70,10 +60,17 @@ struct Way {
   std::vector<std::unique_ptr<Notes>> notes;
   std::vector<ros::Subscriber> subscribers;
   ros::Publisher publisher;
-  std::vector<boost::shared_ptr<sensor_msgs::Image>> images;    // a ring, longer than all queues: none is changed in use
-  std::function<void(std::size_t)> prepare;                     // before the stamp, as the message is filled there too
-  std::function<void()> publish;
+  std::vector<boost::shared_ptr<sensor_msgs::Image>> images;    // more than all queues hold: none changes in use
+  boost::shared_ptr<geometry_msgs::Twist> twist;
 
+  void prepare(std::size_t index) {    // before the stamp, as Python's message is filled there, too
+    if (images.empty()) twist = boost::make_shared<geometry_msgs::Twist>(), twist->linear.x = index;
+    else images[index % images.size()]->step = index;
+  }
+  void publish(std::size_t index) {
+    if (images.empty()) publisher.publish(boost::shared_ptr<const geometry_msgs::Twist>(twist));
+    else publisher.publish(boost::shared_ptr<const sensor_msgs::Image>(images[index % images.size()]));
+  }
   template <class M> void subscribe(ros::NodeHandle node, const Setting& setting) {
     notes.push_back(std::make_unique<Notes>());
     Notes* mine = notes.back().get();
@@ -82,34 +79,23 @@ struct Way {
         boost::function<void(const boost::shared_ptr<const M>&)>(
             [mine](const boost::shared_ptr<const M>& message) { mine->note(index_of(*message)); })));
   }
-  template <class M> void advertise(ros::NodeHandle node, const Setting& setting) {
-    publisher = node.advertise<M>(setting.topic, setting.queue_size);
+};
+
+Way* opening;
+Setting setting;
+
+struct Receiver : nodelet::Nodelet {
+  void onInit() override {
+    if (setting.kind == "twist") opening->subscribe<geometry_msgs::Twist>(getNodeHandle(), setting);
+    else opening->subscribe<sensor_msgs::Image>(getNodeHandle(), setting);
   }
 };
 
-template <class F> void with_type(const std::string& kind, F&& f) {
-  if (kind == "twist") f(geometry_msgs::Twist());
-  else if (kind == "string") f(std_msgs::String());
-  else f(sensor_msgs::Image());
-}
-
-class Receiver : public nodelet::Nodelet {
- public:
-  static Way* way;
-  static Setting setting;
- private:
+struct Sender : nodelet::Nodelet {
   void onInit() override {
-    with_type(setting.kind, [this](auto message) { way->subscribe<decltype(message)>(getNodeHandle(), setting); });
-  }
-};
-Way* Receiver::way;
-Setting Receiver::setting;
-
-class Sender : public nodelet::Nodelet {
-  void onInit() override {
-    with_type(Receiver::setting.kind, [this](auto message) {
-      Receiver::way->advertise<decltype(message)>(getNodeHandle(), Receiver::setting);
-    });
+    ros::NodeHandle node = getNodeHandle();
+    opening->publisher = setting.kind == "twist" ? node.advertise<geometry_msgs::Twist>(setting.topic, setting.queue_size)
+                                                 : node.advertise<sensor_msgs::Image>(setting.topic, setting.queue_size);
   }
 };
 
@@ -120,11 +106,11 @@ boost::shared_ptr<nodelet::Nodelet> create(const std::string& type) {
 
 class Player {
  public:
-  Player(const std::string& name, bool nodelets) : name_(name), nodelets_(nodelets), loader_(boost::function<boost::shared_ptr<nodelet::Nodelet>(const std::string&)>(create)) {}
+  explicit Player(const std::string& name)
+      : name_(name), loader_(boost::function<boost::shared_ptr<nodelet::Nodelet>(const std::string&)>(create)) {}
 
   void run(std::istream& commands, FILE* answers) {
-    std::string line;
-    while (std::getline(commands, line)) {
+    for (std::string line; std::getline(commands, line);) {
       std::istringstream words(line);
       std::string command;
       words >> command;
@@ -140,75 +126,29 @@ class Player {
   }
 
  private:
-  Setting read(std::istream& words) {
-    Setting setting;
+  void read(std::istream& words) {
     words >> setting.kind >> setting.receivers >> setting.queue_size;
     std::ostringstream topic;
     topic << "/" << name_ << "/" << setting.kind << "/" << setting.receivers << "/" << setting.queue_size;
     setting.topic = topic.str();
-    for (char& letter : setting.topic) if (letter == '.') letter = '_';
-    return setting;
   }
 
   void open(std::istream& words) {
-    const Setting setting = read(words);
-    Way& way = ways_[setting.topic];
-    if (nodelets_) {
-      Receiver::way = &way;
-      Receiver::setting = setting;
-      const std::string prefix = setting.topic + "/nodelet";
-      for (unsigned i = 0; i < setting.receivers; ++i) loader_.load(prefix + std::to_string(i), "receiver", {}, {});
-      loader_.load(prefix, "sender", {}, {});
-    } else {
-      if (!spinner_) {
-        spinner_ = std::make_unique<ros::AsyncSpinner>(1, &queue_);
-        spinner_->start();
-      }
-      with_type(setting.kind, [&](auto message) {
-        using M = decltype(message);
-        ros::NodeHandle receiving, sending;
-        receiving.setCallbackQueue(&queue_);
-        for (unsigned i = 0; i < setting.receivers; ++i) way.subscribe<M>(receiving, setting);
-        way.advertise<M>(sending, setting);
-      });
+    read(words);
+    opening = &ways_[setting.topic];
+    const std::string prefix = setting.topic + "/nodelet";
+    for (unsigned i = 0; i < setting.receivers; ++i) loader_.load(prefix + std::to_string(i), "receiver", {}, {});
+    loader_.load(prefix, "sender", {}, {});
+    while (opening->publisher.getNumSubscribers() < 1) pause(0.01);
+    for (unsigned i = 0; setting.kind != "twist" && i < setting.queue_size + 6; ++i) {
+      opening->images.push_back(boost::make_shared<sensor_msgs::Image>());
+      opening->images.back()->data.resize(3 * 1920 * 1080);
     }
-    const double deadline = now() + PATIENCE;
-    while (way.publisher.getNumSubscribers() < 1) {
-      if (now() > deadline) throw std::runtime_error("not connected");
-      pause(0.01);
-    }
-    fill(way, setting);
-  }
-
-  void fill(Way& way, const Setting& setting) {
-    if (setting.kind.compare(0, 5, "image") != 0) {
-      with_type(setting.kind, [&](auto message) {
-        using M = decltype(message);
-        auto next = std::make_shared<boost::shared_ptr<M>>();
-        way.prepare = [next](std::size_t index) { *next = boost::make_shared<M>(); mark(**next, index); };
-        way.publish = [next, &way] { way.publisher.publish(boost::shared_ptr<const M>(*next)); };
-      });
-      return;
-    }
-    const unsigned width = setting.kind == "image0.9" ? 640 : 1920, height = setting.kind == "image0.9" ? 480 : 1080;
-    for (unsigned i = 0; i < setting.queue_size + 6; ++i) {
-      auto image = boost::make_shared<sensor_msgs::Image>();
-      image->width = width;
-      image->height = height;
-      image->encoding = "rgb8";
-      image->data.resize(3 * width * height);
-      way.images.push_back(image);
-    }
-    auto next = std::make_shared<std::size_t>(0);
-    way.prepare = [next, &way](std::size_t index) {
-      *next = index % way.images.size();
-      mark(*way.images[*next], index);
-    };
-    way.publish = [next, &way] { way.publisher.publish(boost::shared_ptr<const sensor_msgs::Image>(way.images[*next])); };
   }
 
   void begin(std::istream& words) {
-    way_ = &ways_.at(read(words).topic);
+    read(words);
+    way_ = &ways_.at(setting.topic);
     for (auto& notes : way_->notes) notes->count = 0;
     cpu_ = cpu();
   }
@@ -220,28 +160,22 @@ class Player {
     const double begun = now();
     double due = begun;
     std::size_t index = 0;
-    while (index < STAMPS) {
+    while (index < STAMPS && (rate == 0 || index < static_cast<std::size_t>(rate * seconds))) {
       way_->prepare(index);
       const double stamp = sent[index] = now();
-      way_->publish();
-      ++index;
-      if (rate == 0) {
-        if (stamp > begun + seconds) break;
-        continue;
-      }
-      due += 1 / rate;
-      if (busy) while (now() < due) {}
-      else pause(std::max(0.0, due - now()));
-      if (index >= static_cast<std::size_t>(rate * seconds)) break;
+      way_->publish(index++);
+      if (rate == 0 && stamp > begun + seconds) break;
+      due += rate == 0 ? 0 : 1 / rate;
+      while (busy && now() < due) {}
+      if (rate != 0) pause(std::max(0.0, due - now()));
     }
     answer << "\"sent\": " << index << ", \"begun\": " << begun << ", \"took\": " << now() - begun;
   }
 
   void result(std::istream& words, std::ostream& answer) {
     std::size_t expected, arrived = 0;
-    double silence;    // seconds without a message after which the rest is lost
+    double silence, last = now(), used = cpu();    // silence: seconds after which the rest is lost
     words >> expected >> silence;
-    double last = now(), used = cpu();
     for (bool first = true; arrived < expected && now() - last < silence; first = false) {
       std::size_t sum = 0;
       for (auto& notes : way_->notes) sum += notes->count;
@@ -257,10 +191,7 @@ class Player {
   }
 
   std::string name_;
-  bool nodelets_;
   nodelet::Loader loader_;
-  ros::CallbackQueue queue_;
-  std::unique_ptr<ros::AsyncSpinner> spinner_;
   std::map<std::string, Way> ways_;
   Way* way_ = nullptr;
   double cpu_ = 0;
@@ -270,11 +201,10 @@ class Player {
 
 int main(int argc, char** argv) {
   FILE* answers = fdopen(dup(1), "w");
-  dup2(2, 1);    // what ROS prints is no answer
-  const std::string way = argv[1], name = argv[2];
-  ros::init(argc, argv, name + "_player", ros::init_options::NoSigintHandler);
+  dup2(2, 1);    // an answer is not mixed with what ROS prints
+  ros::init(argc, argv, std::string(argv[2]) + "_player", ros::init_options::NoSigintHandler);
   ros::NodeHandle keeps_ros_running;
-  Player player(name, way == "nodelets");
+  Player player(argv[2]);
   ros::AsyncSpinner spinner(1);
   spinner.start();
   player.run(std::cin, answers);

@@ -107,11 +107,12 @@ class InputChannel(Receiver, Channel, Inbox):
         if self.closed or self.from_ and message._connection_header['callerid'] != self.from_:
             return
         self.received += 1
-        receiver = self if self.delegate_runs else self.node
+        run = self.delegate_runs or self.node.delegate_runs
         try:
-            receiver.delegate_runs and receiver.delegate_runs(message, self)
+            run and run(message, self)
         except BaseException as error:
-            self.node.report(error, receiver.delegate, 'delegate', message, self, self._retry)
+            delegate = self.delegate or self.node.delegate
+            self.node.report(error, delegate, 'delegate', message, self, self._retry)
 
     def _retry(self, message):
         """Run the delegate on a message once more, in the node's turn."""

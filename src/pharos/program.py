@@ -42,6 +42,7 @@ def wait(
     node, pause = node or here.node, 0.002
     sleep = node.run.stopping.wait if node else time.sleep
     while not (value := predicate()) and time.monotonic() < end and not sleep(pause):
+        workers.relieve()
         pause = min(pause * 1.2, 0.02)
     return value
 
@@ -68,6 +69,7 @@ def spin() -> None:
     with contextlib.suppress(KeyboardInterrupt), quiet_wait():
         while nodes and not rospy.is_shutdown():  # a signal has ended rospy's own node
             time.sleep(0.01)
+            workers.relieve()
     stop_all()
 
 

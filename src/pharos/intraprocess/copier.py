@@ -36,7 +36,7 @@ def serialize(message):
 def copier_for(cls):
     """Return ``freeze(message)``, which raises what ``serialize`` raises, and ``thaw(frozen)``."""
     try:
-        freeze_fields, thaw_fields = _generate(cls)
+        freeze_fields, thaw = _generate(cls)
     except Exception:  # a class that is not understood costs time, never a wrong copy
         return serialize, lambda frozen: cls().deserialize(frozen)
 
@@ -47,9 +47,6 @@ def copier_for(cls):
             except Exception:  # the serializer says what is wrong
                 pass
         return serialize(message)
-
-    def thaw(frozen):
-        return thaw_fields(frozen) if type(frozen) is tuple else cls().deserialize(frozen)
 
     return freeze, thaw
 
@@ -227,8 +224,10 @@ def _generate(cls, depth=0):
     unpack = [f'{", ".join(source.values)}, = frozen'] if source.values else []
     frozen = ''.join(f'{value}, ' for value in source.values)
     lines = ['def freeze_fields(m):', *source.reads, f'return ({frozen})']
-    lines += ['def thaw_fields(frozen):', *unpack, f'm = new({source.refer(cls)})']
+    made = source.refer(cls)
+    lines += ['def thaw(frozen):', f'if type(frozen) is bytes: return {made}().deserialize(frozen)']
+    lines += [*unpack, f'm = new({made})']
     lines += [*source.builds, 'return m']
     text = '\n'.join(line if line.startswith('def ') else f'    {line}' for line in lines)
     exec(compile(text, f'<copier of {cls.__name__}>', 'exec'), source.scope)
-    return source.scope['freeze_fields'], source.scope['thaw_fields']
+    return source.scope['freeze_fields'], source.scope['thaw']

@@ -1,15 +1,17 @@
 """Run the callbacks of all nodes in a pool of threads, those of one node one at a time.
 
 A publisher puts a message into the Inbox of each receiver and wakes a worker. A worker takes the
-next node that has something to run; there are at most as many workers as nodes, so that a callback
-that blocks holds up its own node alone. They end with the last node. Inline inboxes are run by the publisher's thread.
+next node that has something to run, and wakes another worker for the rest, unless the callbacks of
+that node were fast. There are at most as many workers as nodes, so that a callback that blocks
+holds up its own node alone. They end with the last node. Inline inboxes are run by the publisher's
+thread.
 """
 from __future__ import annotations
 
 import collections
 import threading
 import time
-from _thread import allocate_lock
+from _thread import allocate_lock, get_ident
 
 from pharos.intraprocess.copier import size_of
 
@@ -32,7 +34,7 @@ class Turns:
 
     def __init__(self):
         self.jobs = collections.deque()
-        self.scheduled = False
+        self.scheduled = self.closed = self.is_fast = False
         self.runner = None  # the identifier of the thread that runs it
         self._running = allocate_lock()
         with _guard:
@@ -40,21 +42,22 @@ class Turns:
 
     def run(self):
         """Run what waits, unless another thread does so; that one then runs this, too."""
-        while self.jobs and self._running.acquire(False):
-            self.runner = threading.get_ident()
+        jobs = self.jobs
+        while jobs and self._running.acquire(False):
+            self.runner = get_ident()
             try:
-                while self.jobs:
-                    self.jobs.popleft().run()
+                while jobs:
+                    jobs.popleft().run()
             finally:
                 self.runner = None
                 self._running.release()
 
     def call(self, block):
         """Run ``block()`` between two callbacks."""
-        if self.runner == threading.get_ident():
+        if self.runner == get_ident():
             return block()
         with self._running:
-            self.runner = threading.get_ident()
+            self.runner = get_ident()
             try:
                 block()
             finally:
@@ -78,8 +81,8 @@ class Turns:
         """Forget what has not run, and wait for the callback that runs; True if it ended in time."""
         with _guard:
             _turns.discard(self)
-        self.jobs.clear()
-        ended = self.runner == threading.get_ident() or self._running.acquire(True, timeout)
+        self.closed = True
+        ended = self.runner == get_ident() or self._running.acquire(True, timeout)
         self.jobs.clear()
         if not _turns:
             _wake_worker()
@@ -120,10 +123,12 @@ class _Worker:
                 if self._awake.locked():
                     self._awake.release()
                 continue
-            if _ready:
+            if _ready and not turns.is_fast:
                 _wake_worker()
             turns.scheduled = False
+            began = time.perf_counter()
             turns.run()
+            turns.is_fast = time.perf_counter() - began < FAST
         _wake_worker()
 
 
@@ -138,6 +143,12 @@ def _wake_worker():
         return None
     worker.wake()
     return worker
+
+
+def relieve():
+    """Have another worker run what waits behind a callback that was fast so far, and now blocks."""
+    if _ready:
+        _wake_worker()
 
 
 class Inbox:
@@ -188,24 +199,30 @@ class Inbox:
             time.sleep(1e-6)
 
     def run(self):
-        """Run the callback on the oldest message."""
-        self._scheduled = False
+        """Run the callback on the messages, the oldest first, until it is another inbox's turn."""
+        queue, jobs, callback = self.queue, self.turns.jobs, self.callback
         try:
-            value, thaw, header = self.queue.popleft()
-        except IndexError:
-            return
-        self.taken += 1
-        if self.queue and not self._scheduled:
-            self._scheduled = True
-            self.turns.jobs.append(self)
-        if thaw is not None:
-            value = thaw(value)
-            value._connection_header = header
-            self.callback(value)
-            return
-        began = time.perf_counter()
-        self.callback(value)
-        self._fast = self._fast + 1 if time.perf_counter() - began < FAST else 0
+            while queue:
+                try:
+                    value, thaw, header = queue.popleft()
+                except IndexError:  # the publisher has dropped it
+                    break
+                self.taken += 1
+                if thaw is not None:
+                    value = thaw(value)
+                    value._connection_header = header
+                    callback(value)
+                else:
+                    began = time.perf_counter()
+                    callback(value)
+                    self._fast = self._fast + 1 if time.perf_counter() - began < FAST else 0
+                if jobs or self.turns.closed:
+                    break
+        finally:
+            self._scheduled = False
+            if queue and not self.turns.closed:
+                self._scheduled = True
+                jobs.append(self)
 
     def receive(self, message, size):
         """Take a message from the thread that reads a socket.

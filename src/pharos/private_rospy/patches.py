@@ -11,6 +11,7 @@ import socket
 import threading
 import urllib.parse
 
+import rospkg
 import rospy
 
 from pharos.intraprocess.copier import copied
@@ -20,6 +21,7 @@ from pharos.private_rospy.loader import Shim
 LARGEST = 1 << 20  # bytes of a connection header, and of an XML-RPC request
 #: module -> [(target, function that makes the replacement)]
 TABLE = {}
+_packages = functools.lru_cache(None)(rospkg.RosPack)
 _client = threading.local()  # .address: of the client whose request this thread answers
 
 
@@ -207,6 +209,12 @@ def is_shutdown(original, run):
 def poll_often(original, run):
     """Looks every 0.1 s whether the node is registered."""
     return Shim(original, sleep=lambda seconds: original.sleep(min(seconds, 0.001)))
+
+
+@replace('rosgraph.roslogging', 'rospkg')
+def packages(original, run):
+    """Searches all packages for rosgraph's configuration of the log, again for each node."""
+    return Shim(original, RosPack=_packages)
 
 
 @patch('rospy.impl.masterslave', 'ROSHandler._ready')

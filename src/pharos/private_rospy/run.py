@@ -16,7 +16,7 @@ import xml.parsers.expat
 import xmlrpc.client
 
 from pharos.errors import NodeNameInUseError, PortInUseError
-from pharos.intraprocess.workers import Turns
+from pharos.intraprocess.workers import Turns, relieve
 from pharos.private_rospy import patches, transport
 from pharos.private_rospy.loader import PrivateModules, Shim
 from pharos.private_rospy.transport import runs
@@ -300,6 +300,7 @@ def join(threads, timeout):
 def _watch():
     """Ask each master once a second what it knows of our nodes: it may have been started again."""
     while not _end_of_watch.wait(WATCH_PERIOD):
+        relieve()
         nodes = list(runs.values())
         for run in nodes:
             run.topics.check_all()  # rospy looks twice a second who has left (ros_comm #927)

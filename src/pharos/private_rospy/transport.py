@@ -219,13 +219,14 @@ class PublisherOverlay:
                 for link in links:
                     link.stat_num_msg += 1
                     thaw, header = link.thaw, link.header
-                    received = link.subscription.inboxes()
+                    end = link.subscription
+                    received = end.known if end.callbacks is end.seen else end.inboxes()
                     for inbox in received:
                         if inbox.shared:
                             inbox.put(message)
                         else:
                             inbox.put(frozen, thaw, header)
-                    inboxes = [*inboxes, *received] if inboxes else received
+                    inboxes += received
             if remote:
                 self.write(message, remote)
         if inboxes:
