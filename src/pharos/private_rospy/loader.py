@@ -64,10 +64,10 @@ def _imports_of(top):
 def _reaches_rospy(top):
     """True if the code of a package says rospy, or imports a package that does, and so on."""
     names, new = set(), {top}
-    while new:
+    while new and new.isdisjoint(('rospy', 'rosgraph')):
         names |= new
         new = set().union(*map(_imports_of, new)) - names
-    return not names.isdisjoint(('rospy', 'rosgraph'))
+    return bool(new)
 
 
 def is_private(name):
