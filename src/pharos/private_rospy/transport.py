@@ -5,6 +5,7 @@ subscription, so that rosnode info, closing and duplicates are rospy's own matte
 """
 import collections
 import contextlib
+import io
 import socket
 import struct
 import threading
@@ -12,9 +13,10 @@ import time
 
 import rospy
 from rospy.impl.transport import Transport
+from rospy.msg import serialize_message
 from rospy.names import TOPIC_ANYTYPE
 
-from pharos.intraprocess.copier import copied, copier_for, serialize, thawer
+from pharos.intraprocess.copier import copied, copier_for, thawer
 from pharos.intraprocess.workers import Inbox, Turns, hand_over
 
 LARGEST_MESSAGE = 1_000_000_000  # bytes, as roscpp has it
@@ -31,7 +33,7 @@ class Link(Transport):
     """One end of a link; ``subscription`` is at the other one, if this is the publisher's."""
 
     transport_type = 'INTRAPROCESS'
-    is_latched = subscription = latch = None
+    subscription = latch = None
 
     def get_transport_info(self):
         return f'INTRAPROCESS connection to [{self.endpoint_id}]'
@@ -234,11 +236,13 @@ class PublisherOverlay:
         return True
 
     def write(self, message, connections):
+        buffer = io.BytesIO()
         try:
-            data = serialize(message)
+            serialize_message(buffer, self.seq, message)
         except Exception:  # copying makes bytes of numpy's arrays, or says what is wrong
-            data = serialize(self.thaw(self.freeze(message)))
-        data = _length.pack(len(data)) + data
+            buffer = io.BytesIO()
+            serialize_message(buffer, self.seq, self.thaw(self.freeze(message)))
+        data = buffer.getvalue()
         self.message_data_sent += len(data)
         for connection in connections:
             try:
@@ -351,17 +355,17 @@ def receive(connection, address, port, uri, subscription, run):
                 return
             connection.stat_bytes += size + 4
             connection.stat_num_msg += 1
-            message = None
+            message = cls().deserialize(data)
             inboxes = subscription.inboxes()
             for follower in share.followers if share else ():
                 if not follower.done:
                     inboxes = [*inboxes, *follower.subscription.inboxes()]
-            for inbox in inboxes:
-                message = cls().deserialize(data)
-                message._connection_header = header
-                inbox.receive(message, size)
+            copies = [copied(message) for _ in inboxes[1:]]  # which share its bytes
+            for each, inbox in zip([message, *copies], inboxes):
+                each._connection_header = header
+                inbox.receive(each, size)
             if connection.is_latched:
-                connection.latch = message or cls().deserialize(data)
+                connection.latch = message
 
 
 class Sender:
