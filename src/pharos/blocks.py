@@ -18,10 +18,7 @@ def taking(block: Any, what: str, *counts: int) -> Any:
         return None
     if not callable(block):
         raise TypeError(f'a {what} is a callable, not {block!r}')
-    try:
-        signature = inspect.signature(block)
-    except (TypeError, ValueError):  # of some functions in C
-        return block
+    signature = inspect.signature(block)
     for count in counts:
         try:
             signature.bind(*[None] * count)

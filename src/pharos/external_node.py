@@ -60,7 +60,7 @@ class ExternalNode:
         """True if it answers."""
         try:
             return self.pid > 0
-        except (UnknownNodeError, TypeError):
+        except UnknownNodeError:
             return False
 
     @property

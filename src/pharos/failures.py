@@ -34,9 +34,8 @@ class Failure:
         self.count, self.time, self._again = 1, time.time(), again
         self.traceback = ''.join(traceback.format_exception(error))
         self._frames = error.__traceback__
-        last = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(self._frames, -1)]
         #: is equal for failures of one kind
-        self.place = name_of(block), type(error), last, channel
+        self.place = block, type(error), traceback.extract_tb(self._frames, -1), channel
 
     def let_go(self) -> None:
         """Keep neither message nor frames, which may be large."""

@@ -22,7 +22,7 @@ from pharos.errors import (
 )
 from pharos.external_node import ExternalNode
 from pharos.names import full_name, node_name
-from pharos.node import Node
+from pharos.node import Node, check_class
 from pharos.parameter import check_value
 from pharos.private_rospy.run import UNREACHABLE, ServerProxy
 from pharos.ros_process import RosProcess, find_launch_file, find_program
@@ -207,12 +207,11 @@ class Master:
         :param kwargs: what the ``__init__`` of the class takes
         :raises NodeNameInUseError, PortInUseError, MasterUnreachableError: and nothing is left
         """
-        if not (isinstance(node_class, type) and issubclass(node_class, Node)):
-            raise TypeError(f'a node is made of a subclass of Node, not {node_class!r}')
+        check_class(node_class)
         if not (domain is None or isinstance(domain, str) and re.fullmatch(r'[\w.:-]+', domain)):
             raise ValueError(f'{domain!r} cannot be an address: give one such as 127.0.0.1')
         for port in tcp_port, xmlrpc_port:
-            if not (isinstance(port, int) and 0 <= port < 65536):
+            if port not in range(65536):
                 raise ValueError(f'{port!r} cannot be a port: give 0 to 65535')
         mappings = [arg for arg in argv or () if rosgraph.names.is_legal_remap(arg)]
         node = node_class.__new__(node_class)

@@ -36,17 +36,18 @@ _defined = {}
 _lock = threading.RLock()  # genpy's generator is not thread-safe
 
 
-def message_class(type_: str | type) -> type[genpy.Message]:
+def message_class(type_: str | type, ask: Callable | None = None) -> type[genpy.Message]:
     """Return the class of a message type, such as ``'geometry_msgs/Twist'``.
 
     Types are sought in installed Python packages, in ``.msg`` files on ROS_PACKAGE_PATH, among those
     given to :func:`define_message`, and among turtlesim's. A message class is returned as it is.
 
+    :param ask: ``ask(type_)`` returns the definition that a publisher sends, or None
     :raises UnknownTypeError: if the type is nowhere, or its definition cannot be read
     """
     if isinstance(type_, type) and issubclass(type_, genpy.Message):
         return type_
-    return _installed('msg', type_) or _made_message(type_, _text_of('msg', type_))
+    return _installed('msg', type_) or _made_message(type_, _text_of('msg', type_, ask))
 
 
 def service_class(type_: Any) -> Any:
@@ -73,8 +74,6 @@ def define_service(type_: str, text: str) -> Any:
 
 def _define(kind, type_, text, find, make):
     check_name(type_)
-    if not isinstance(text, str):
-        raise UnknownTypeError(f'the definition of {type_} is a str, not {text!r}')
     for name, nested in _Definition(type_, text).nested.items():
         _defined.setdefault(('msg', name), nested)
     cls = make(type_, text)
@@ -115,17 +114,12 @@ def _file_text(kind, type_):
         return None
 
 
-def is_installed(type_: Any) -> bool:
-    """True if a message type has a class or file, or is turtlesim's; False if define_message gave it."""
-    if not isinstance(type_, str) or ('msg', type_) in TURTLESIM:
-        return True
-    return bool(_installed('msg', type_)) or _file_text('msg', type_) is not None
-
-
-def _text_of(kind, type_):
+def _text_of(kind, type_, ask=None):
     """Return the definition of a type that has no generated class."""
     key, (package, name) = (kind, type_), type_.split('/')
     text = _file_text(*key)
+    if text is None and ask and key not in TURTLESIM:
+        text = ask(type_)
     text = _defined.get(key, TURTLESIM.get(key)) if text is None else text
     if text is None:
         define = 'define_message' if kind == 'msg' else 'define_service'
@@ -148,7 +142,7 @@ class _Definition:
     def __init__(self, type_: str, text: str):
         self.type, self.nested = type_, {}
         self.context = genmsg.MsgContext.create_default()
-        self.own, *parts = re.split(r'\n=+[ \t]*\nMSG: *', '\n' + text)
+        self.own, *parts = re.split(r'\n=+[ \t]*\nMSG: *', f'\n{text}')
         self.own = self.own[1:]
         given = {part.partition('\n')[0].strip(): part.partition('\n')[2] for part in parts}
         for part in re.split(r'^---.*$', self.own, flags=re.M):  # of a service there are two
@@ -206,9 +200,6 @@ def _made_message(type_, text):
                 classes[name] = known
                 cls.serialize.__globals__['_' + name.replace('/', '__')] = known
     return cls
-
-
-class_from_definition = _made_message
 
 
 @_made

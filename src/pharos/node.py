@@ -4,6 +4,7 @@ from __future__ import annotations
 import collections
 import contextlib
 import enum
+import functools
 import threading
 import types
 from typing import TYPE_CHECKING, Any, Callable, Iterator
@@ -15,13 +16,8 @@ import rospy
 from pharos import messages, program
 from pharos.blocks import Block, Receiver, name_of, rebound, taking
 from pharos.channels import QUEUE_SIZE, Channel, InputChannel, OutputChannel
-from pharos.errors import (
-    MasterUnreachableError,
-    MessageTypeError,
-    NodeStoppedError,
-    PharosError,
-    UnknownTopicError,
-)
+from pharos.errors import MasterUnreachableError, MessageTypeError, NodeStoppedError
+from pharos.errors import PharosError, UnknownTopicError
 from pharos.external_node import ExternalNode
 from pharos.failures import Failures
 from pharos.names import legal_name, node_name
@@ -68,7 +64,8 @@ class Node(Receiver):
     :ivar lifecycle: its state, a :class:`Lifecycle`
     :ivar uri: the URI of its XML-RPC server, None before the first start, as ``domain``, the
         address that it advertises, unless it was given
-    :ivar tcp_port, xmlrpc_port: its ports; before the first start those asked for
+    :ivar tcp_port: its port for messages; before the first start the one asked for
+    :ivar xmlrpc_port: its port for ROS's calls, likewise
     :ivar failures: for each of :attr:`errors` a :class:`Failure`: what failed, on what, how often
     """
 
@@ -163,7 +160,7 @@ class Node(Receiver):
     def restart(self) -> None:
         """Stop the node and start it again, under its name and ports, with its channels and souls.
 
-        Souls that were forked and had not ended run again from their first lines.
+        Souls that had not ended run again from their first lines.
 
         :raises MasterUnreachableError: if the master does not answer, and the node runs on
         """
@@ -187,8 +184,7 @@ class Node(Receiver):
 
         :raises TypeError: if it is not a subclass of Node
         """
-        if not (isinstance(node_class, type) and issubclass(node_class, Node)):
-            raise TypeError(f'{self.name} can become a subclass of Node, not {node_class!r}')
+        check_class(node_class)
         self.check_running()
         self.run.turns.call(lambda: self._become(node_class))
 
@@ -234,10 +230,7 @@ class Node(Receiver):
 
     @property
     def ros(self) -> Any:
-        """The node's own rospy, whole: ``node.ros.Timer``, ``node.ros.Time.now()``.
-
-        It belongs to this run of the node.
-        """
+        """The node's own rospy in this run, whole: ``node.ros.Timer``, ``node.ros.Time.now()``."""
         self.check_running()
         return self.run.ros
 
@@ -249,10 +242,10 @@ class Node(Receiver):
     def health(self) -> types.SimpleNamespace:
         """Return how the node is doing; asks the master.
 
-        :returns: an object with ``registered`` (True if the master has the node at its URI, None if
-            the master does not answer), ``kind`` (its class), ``connections`` ({transport: how
-            many}), ``dropped`` (how many messages), ``errors`` (how often blocks failed),
-            ``threads``, ``souls`` (how many run in threads), ``ended_souls`` (their names)
+        :returns: an object with ``registered`` (True if the master has the node, None if it does not
+            answer), ``kind`` (its class), ``connections`` ({transport: how many}), ``dropped`` (how
+            many messages), ``errors`` (how often blocks failed), ``threads``, ``souls`` (how many
+            run in threads), ``ended_souls`` (their names)
         """
         registered = None
         with contextlib.suppress(MasterUnreachableError):
@@ -279,13 +272,8 @@ class Node(Receiver):
     def __repr__(self) -> str:
         return f'<{type(self).__name__} {self.name} {self.lifecycle.value}>'
 
-    # -- souls
-
     def execute(self) -> Any:
-        """Run the soul once, in the calling thread, and return its value.
-
-        The report (listing 3.7): ``node execute``. What the soul raises goes to :attr:`failures`.
-        """
+        """Run the soul once, in this thread, and return its value (``node execute`` in the report)."""
         return self._run_soul(self._soul_or(None))
 
     def fork(self, block: Block | None = None, name: str | None = None) -> threading.Thread:
@@ -319,11 +307,9 @@ class Node(Receiver):
         return None
 
     def sleep(self, seconds: float) -> None:
-        """Sleep for some seconds of ROS time; the stop of the node ends it, and its soul.
-
-        The report: ``(Delay forSeconds: 1) wait``.
-        """
-        self._sleep(lambda: self.ros.sleep(seconds))
+        """Sleep for some seconds of ROS time; the stop of the node ends it, and its soul."""
+        with program.quiet_wait():
+            self.ros.sleep(seconds)
         if not self.is_running and program.here.node is self:
             raise NodeStoppedError(f'{self.name} stops, and this soul with it')
 
@@ -343,13 +329,10 @@ class Node(Receiver):
             while not stopping.is_set():
                 yield turn
                 turn += 1
-                self._sleep(rate.sleep)
+                with program.quiet_wait():
+                    rate.sleep()
 
         return turns()
-
-    def _sleep(self, sleep):
-        with program.quiet_wait(), contextlib.suppress(rospy.ROSInterruptException):
-            sleep()
 
     # -- failures
 
@@ -401,14 +384,12 @@ class Node(Receiver):
         :raises ValueError: if it cannot be a name
         """
         self.check_running()
-        name = legal_name(name)
-        return self.run.ros.resolve_name('~' + name[2:] if name.startswith('~/') else name)
+        return self.run.ros.resolve_name(legal_name(name).replace('~/', '~'))
 
     def peer_name(self, peer: Any) -> str:
         """Return the full name of a Node, an ExternalNode, or a node given by its name."""
-        if hasattr(peer, 'name'):
-            return peer.name
-        return rosgraph.names.resolve_name(node_name(peer), self.name)
+        name = getattr(peer, 'name', None)
+        return name or rosgraph.names.resolve_name(node_name(peer), self.name)
 
     def interested_in(
         self,
@@ -506,10 +487,8 @@ class Node(Receiver):
             raise UnknownTopicError(
                 f'the master knows no type of {topic}: give typed_as=, such as "std_msgs/String"'
             )
-        text = None
-        if is_receiver and not messages.is_installed(type_):
-            text = self._definition_of_publisher(topic, type_)
-        cls = messages.class_from_definition(type_, text) if text else messages.message_class(type_)
+        ask = functools.partial(self._definition_of_publisher, topic) if is_receiver else None
+        cls = messages.message_class(type_, ask)
         if known and known[0]._md5sum != cls._md5sum:
             raise MessageTypeError(
                 f'{self.name} has {topic} open as {known[0]._type}, not as {cls._type}'
@@ -601,16 +580,16 @@ class Node(Receiver):
         return [each for each in self.opened if isinstance(each, Parameter)]
 
     def read_parameters(self) -> None:
-        """Have the parameters read their values: one has changed."""
+        """Have the parameters read their values."""
         for each in self.parameters:
             each.read()
 
 
+def check_class(node_class: Any) -> None:
+    """Raise TypeError unless it is a class of nodes."""
+    if not (isinstance(node_class, type) and issubclass(node_class, Node)):
+        raise TypeError(f'a node is made of a subclass of Node, not {node_class!r}')
+
+
 class BlockNode(Node):
-    """A node made of blocks alone, for tests and prototypes.
-
-    The report (listing 3.7)::
-
-        node := master create: PhaROSBlockNode named: '/myNode' ... soul: [:myNode | ...].
-        node = master.create(BlockNode, named='/myNode', soul=lambda me: ...)
-    """
+    """A node made of blocks alone, for tests and prototypes: PhaROSBlockNode in the report."""

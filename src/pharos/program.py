@@ -49,9 +49,10 @@ def wait(
 
 @contextlib.contextmanager
 def quiet_wait() -> Iterator[None]:
-    """End at a signal of ours, which stops the nodes, without its exception."""
+    """End without an exception at the stop of a node, and at a signal of ours, which stops all."""
     try:
-        yield
+        with contextlib.suppress(rospy.ROSInterruptException):
+            yield
     except (KeyboardInterrupt, SystemExit):
         if not signalled:
             raise

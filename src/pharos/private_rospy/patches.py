@@ -103,7 +103,7 @@ def accept(original, run, self, sock, address):
 @patch('rospy.impl.tcpros_base', 'logwarn')
 def name_client(original, run, text, *args):
     """Does not say which client it refused."""
-    host, port = getattr(_client, 'address', ('', 0))
+    host, port = _client.address
     original(f'{host}:{port}: {text}', *args)
 
 
@@ -111,14 +111,6 @@ def name_client(original, run, text, *args):
 @patch('rospy.impl.tcpros_base', 'rospywarn')
 def log_no_traceback(original, run, *args):
     """Log a traceback for each client that says nonsense; a line says so already."""
-
-
-@patch('rospy.impl.tcpros_base', 'TCPServer._create_server_sock')
-def listen(original, run, self):
-    """Lets five clients wait."""
-    sock = original(self)
-    sock.listen(128)
-    return sock
 
 
 @patch('rospy.impl.tcpros_base', 'TCPServer.shutdown')
@@ -280,7 +272,6 @@ def receive(original, run, connection, address, port, uri, callback, topic):
     subscription, error = callback.__self__, None
     try:
         transport.receive(connection, address, port, uri, subscription, run)
-        run.told.discard((topic, uri))
     except Exception as problem:
         error = str(problem)
     connection.close()
@@ -363,13 +354,6 @@ def handle_call(original, run, self, connection, header):
         original(self, connection, header)
     except (rospy.exceptions.TransportException, OSError):
         connection.close()
-
-
-@patch('rospy.impl.tcpros_service', 'ServiceImpl.error_handler')
-def service_failed(original, run, self, error, *about):
-    """Takes it for an error of the service if the client has gone."""
-    if not isinstance(error, rospy.exceptions.TransportException):
-        original(self, error, *about)
 
 
 @patch('rospy.impl.tcpros_service', 'ServiceProxy.call')

@@ -68,7 +68,6 @@ class Run:
         self.deadlines = {}  # socket of a client that is to say something -> until when
         self.publishers = {}  # topic -> URIs, as the master last said
         self.connecting = set()  # (topic, URI, ...)
-        self.told = set()  # (topic, URI) that the log knows to be lost
         self.known = set()  # (kind, name) of what is registered
         self.uri, self.turns = '', Turns()
         namespace, _, self.base = node.name.rpartition('/')
@@ -134,9 +133,10 @@ class Run:
         self._check_name()
         try:
             server = base.init_tcpros_server(port)
-            server.tcp_ros_server = base.TCPServer(server._tcp_server_callback, port)
-            server.tcp_ros_server.start()
-            port_taken, port = server.tcp_ros_server.port, self.node.xmlrpc_port
+            tcp = server.tcp_ros_server = base.TCPServer(server._tcp_server_callback, port)
+            tcp.server_sock.listen(128)  # rospy lets five clients wait
+            tcp.start()
+            port_taken, port = tcp.port, self.node.xmlrpc_port
             options.update(xmlrpc_port=port, tcpros_port=port_taken, disable_signals=True)
             self.modules.load('rospy.client').init_node(self.base, self.argv, **options)
         except OSError as error:
@@ -216,9 +216,9 @@ class Run:
     def connect_again(self, topic, uri, error=None):
         """Connect once more after a while, if the master still names the publisher."""
         if not self.stopping.wait(transport.RETRY_DELAY) and uri in self.publishers.get(topic, ()):
-            if error and (topic, uri) not in self.told:
-                self.told.add((topic, uri))
-                self.ros.logwarn(f'{topic}: no connection to {uri}, it is tried again: {error}')
+            if error:
+                text = f'{topic}: no connection to {uri}, it is tried again: {error}'
+                self.ros.logwarn_throttle_identical(60, text)
             self.connect(topic, uri)
 
     def register_missing(self, state):
