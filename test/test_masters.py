@@ -367,7 +367,8 @@ def test_run_starts_node_of_package(master, robot):
     with master.run('small_robot', robot('talker', TALKER), '__name:=robot7') as process:
         assert isinstance(process, RosProcess)
         assert process.poll() is None
-        assert master.wait_for_node('/robot7', TIMEOUT).pid == process.pid
+        until(lambda: master.topic('/talk').publishers, TIMEOUT)  # it has registered all
+        assert master.node('/robot7').pid == process.pid
     assert process.poll() is not None
     assert '/robot7' not in names(master.nodes())
 
