@@ -80,6 +80,7 @@ class Node(Receiver):
     #: True if any host may end the node by ROS's shutdown call, not only this one and the master's
     allow_remote_shutdown = False
 
+    run_class = Run
     lifecycle = Lifecycle.NEW
     master: Master
     run: Run
@@ -111,7 +112,7 @@ class Node(Receiver):
             if self.lifecycle not in (Lifecycle.NEW, Lifecycle.STOPPED):
                 raise PharosError(f'{self.name} is {self.lifecycle.value} already')
             self.failures, self.souls = Failures(self._tell_failure), {}
-            self.lifecycle, self.run = Lifecycle.STARTING, Run(self)
+            self.lifecycle, self.run = Lifecycle.STARTING, self.run_class(self)
             program.nodes.append(self)
             opened, self.opened = self.opened, []
             try:
@@ -290,9 +291,10 @@ class Node(Receiver):
 
     def _soul_or(self, block):
         self.check_running()
-        if taking(block or self.soul, 'soul', 1, 0) is None:
+        block = block or self.soul
+        if taking(block, 'soul', 1, 0) is None:
             raise PharosError(f'{self.name} has no soul to run: give it one, node.soul = block')
-        return block or self.soul
+        return block
 
     def _run_soul(self, block):
         before, program.here.node = program.here.node, self

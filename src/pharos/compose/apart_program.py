@@ -1,7 +1,7 @@
 """Run the nodes of a launch file that need their own processes: ``apart_program.py FILE PARENT``.
 
-roslaunch runs them, with the configuration that is pickled in FILE. It ends as roslaunch does, with
-REQUIRED_ENDED if a required node has ended, and when the process PARENT is no more.
+roslaunch runs them, with the configuration that is pickled in FILE. It ends as roslaunch does, and
+when the process PARENT is no more.
 """
 import os
 import pickle
@@ -12,21 +12,7 @@ import time
 
 import roslaunch
 import roslaunch.parent
-import roslaunch.pmon
 import roslaunch.rlutil
-
-REQUIRED_ENDED = 3  # the status if a required node has ended
-
-
-class _Required(roslaunch.pmon.ProcessListener):
-    """Hears of the nodes that end."""
-
-    launch, has_ended = None, False
-
-    def process_died(self, process_name, exit_code):
-        """Take note; roslaunch calls this before it shuts all others down."""
-        process = self.launch.pm.get_process(process_name)
-        self.has_ended |= process is not None and process.required
 
 
 def _end_with(parent):
@@ -43,10 +29,7 @@ def main(path, parent):
     threading.Thread(target=_end_with, args=[parent], daemon=True).start()
     run_id = roslaunch.rlutil.get_or_generate_uuid(None, False)
     roslaunch.configure_logging(run_id)
-    required = _Required()
-    required.launch = launch = roslaunch.parent.ROSLaunchParent(
-        run_id, [], process_listeners=[required], show_summary=False
-    )
+    launch = roslaunch.parent.ROSLaunchParent(run_id, [], show_summary=False)
     launch.config = config
     try:
         launch.start()
@@ -54,7 +37,7 @@ def main(path, parent):
     except roslaunch.RLException as error:
         print(f'roslaunch: {error}', file=sys.stderr)
         return 1
-    return REQUIRED_ENDED if required.has_ended else 0
+    return 0
 
 
 if __name__ == '__main__':

@@ -14,7 +14,7 @@ import roslaunch.core
 from pharos import program
 from pharos.compose import apart_program
 from pharos.compose.launch_file import LaunchFile
-from pharos.compose.script import ScriptNode
+from pharos.compose.script import ScriptNode, wait_for_end
 from pharos.errors import PharosError
 from pharos.node import Lifecycle
 from pharos.ros_process import RosProcess
@@ -40,7 +40,7 @@ class Composition:
     def __init__(self, master: Master):
         self.master, self.process = master, None
         self.nodes: list[ScriptNode] = []
-        self._ending, self._status = threading.Event(), 0
+        self._ending, self._status, self._required = threading.Event(), 0, False
 
     def launch(self, file: LaunchFile) -> None:
         """Set the parameters of a launch file, and start its nodes.
@@ -55,6 +55,7 @@ class Composition:
             with tempfile.NamedTemporaryFile('wb', suffix='.launch', delete=False) as pickled:
                 pickle.dump(file.config_apart(), pickled)
             command = [sys.executable, apart_program.__file__, pickled.name, str(os.getpid())]
+            self._required = any(node.required for node in file.apart)
             self.process = RosProcess(command, self.master.url, Transcript.show)
         for name, *program_and_node in file.here:
             with self.telling(name):
@@ -77,7 +78,7 @@ class Composition:
         """
         node = ScriptNode.__new__(ScriptNode)
         node._configure(self.master, name, None, None, None, (0, 0), ())
-        node.__init__(path, args, None, dict(launched.env_args) if launched else None)
+        node.__init__(path, args, None, launched.env_args if launched else ())
         node.init_timeout, node.launched = PATIENCE, launched
         self.nodes.append(node)
         node.start()
@@ -112,7 +113,7 @@ class Composition:
                     node.start()
                 if self._ending.is_set():  # since it looked
                     node.end_now()
-        if self.process and self.process.poll() == apart_program.REQUIRED_ENDED:
+        if self._required and self.process.poll() is not None:  # all of it has ended
             self._end('a node in a process of its own')
 
     def _end(self, name):
@@ -127,9 +128,7 @@ class Composition:
         :param timeout: seconds, None: without limit
         :raises TimeoutError: if they have not in that time
         """
-        with program.quiet_wait():
-            if not program.wait(self._is_to_end, timeout):
-                raise TimeoutError(f'it has not ended within {timeout:g} s; stop() ends all')
+        wait_for_end(self._is_to_end, timeout, 'the composition')
         self.look()
         self.stop()
         return self._status

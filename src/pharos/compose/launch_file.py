@@ -53,12 +53,11 @@ class LaunchFile:
         nodes = {
             rosgraph.names.ns_join(node.namespace, node.name): node for node in self.config.nodes
         }
-        short = {name.rpartition('/')[2] for name in nodes} | {name[1:] for name in nodes}
-        self._check([*only, *apart], {*nodes, *short}, 'node')
+        names = {name: {name, name[1:], name.rpartition('/')[2]} for name in nodes}
+        self._check([*only, *apart], set().union(*names.values()), 'node')
         for name, node in nodes.items():
-            names = {name, name[1:], name.rpartition('/')[2]}
-            if names & set(only) or not only:
-                self._sort(name, node, bool(names & set(apart)))
+            if names[name] & set(only) or not only:
+                self._sort(name, node, bool(names[name] & set(apart)))
 
     def _check(self, names, known, kind):
         for name in names:
@@ -99,8 +98,6 @@ class LaunchFile:
         rest = copy.copy(self.config)
         rest.nodes, rest.nodes_core, rest.tests, rest.executables = self.apart, [], [], []
         rest.params, rest.clear_params, rest.config_errors = {}, [], []
-        machines = [self.config.machines[''], *(node.machine for node in self.apart)]
-        rest.machines = {machine.name: machine for machine in machines}
         return rest
 
 

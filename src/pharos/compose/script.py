@@ -12,13 +12,12 @@ import sys
 import threading
 import tokenize
 import types
-from typing import TYPE_CHECKING, Any, Sequence
+from typing import TYPE_CHECKING, Any
 
 import rosgraph.names
 
 from pharos import program
 from pharos.errors import PharosError, UnknownNodeError
-from pharos.failures import Failures
 from pharos.node import Lifecycle, Node
 from pharos.private_rospy.loader import Shim
 from pharos.private_rospy.run import Run
@@ -31,73 +30,17 @@ if TYPE_CHECKING:
 _WRAPPER = re.compile(r'^python_script = (.+?)$.*exec\(compile\(', re.MULTILINE | re.DOTALL)
 
 
-class ScriptNode(Node):
-    """A program of rospy, unmodified, as a node of this process; made by :meth:`Master.load`.
-
-    :meth:`start` runs it from its first line, in a thread of its own; its ``rospy.init_node``
-    registers the node. :meth:`stop` ends it. The node stops when the program has ended.
-
-    :ivar path: the file of the program
-    :ivar args: its arguments, ROS's among them
-    :ivar exit_code: what its process would have ended with; None while it runs
-    """
-
-    #: seconds that :meth:`start` waits for the program to call ``rospy.init_node``, or to end
-    init_timeout = 10.0
-    #: seconds that :meth:`stop` waits for the program, as long as roslaunch waits after its SIGINT
-    stop_timeout = 15.0
-    exit_code: int | None = None
-    launched: Any = None  # roslaunch's node, if a launch file named it
-
-    def __init__(self, path: str, args: Sequence[str], params: dict | None, env: dict | None):
-        self.path, self.args = path, list(args)
-        self.params, self.env, self.remappings = params or {}, env or {}, self.args
-
-    def start(self) -> None:
-        """Run the program from its first line.
-
-        Returns when its node is registered, or it has ended, or after :attr:`init_timeout`.
-
-        :raises PharosError: if the program raised an exception by then, its cause
-        """
-        with self._life:
-            if self.lifecycle not in (Lifecycle.NEW, Lifecycle.STOPPED):
-                raise PharosError(f'{self.name} runs already')
-            code = _compiled(self.path)
-            self.failures, self.souls, self.exit_code = Failures(self._tell_failure), {}, None
-            run = self.run = ScriptRun(self)
-            self.lifecycle = Lifecycle.RUNNING
-            program.nodes.append(self)
-            run.main = run.Thread(target=run.run_main, args=[code], name=self.name)
-            self.souls[run.main] = None
-            run.main.start()
-        program.wait(lambda: run.is_registered or not run.main.is_alive(), self.init_timeout, self)
-        run.is_awaited = False
-        if run.error:
-            self.stop()
-            kind = type(run.error) if isinstance(run.error, PharosError) else PharosError
-            raise kind(f'{self.path} ended before it was a node: {run.error!r}') from run.error
-
-    def wait(self, timeout: float | None = None) -> int | None:
-        """Wait until it has ended, and return its :attr:`exit_code`.
-
-        :param timeout: seconds, None: without limit
-        :raises TimeoutError: if it has not in that time
-        """
-        with program.quiet_wait():
-            if not program.wait(lambda: self.lifecycle is Lifecycle.STOPPED, timeout):
-                raise TimeoutError(f'{self.name} has not ended within {timeout:g} s: stop() it')
-        return self.exit_code
-
-
 class ScriptRun(Run):
     """One run of a program."""
 
     is_registered, is_awaited, error, wanted = False, True, None, None
 
     def __init__(self, node):
+        code = _compiled(node.path)
         self.exits, self.awaited, self.handlers = [], [], {}
         super().__init__(node)
+        self.main = self.Thread(target=self.run_main, args=[code], name=self.name)
+        node.exit_code = None
         self.environ.update(node.env)
         self.argv[0] = node.path
         system = self.modules.modules['sys']
@@ -154,6 +97,21 @@ class ScriptRun(Run):
     def _print(self, *values, file=None, **options):
         print(*values, file=file or self.modules.modules['sys'].stdout, **options)
 
+    def start(self):
+        """Run the program until its node is registered, or it has ended, or ``init_timeout``.
+
+        :raises PharosError: if the program raised an exception by then, its cause
+        """
+        node, main = self.node, self.main
+        node.souls[main] = None
+        main.start()
+        program.wait(lambda: self.is_registered or not main.is_alive(), node.init_timeout, node)
+        self.is_awaited = False
+        if self.error:
+            kind = type(self.error) if isinstance(self.error, PharosError) else PharosError
+            text = f'{node.path} ended before it was a node: {self.error!r}'
+            raise kind(text) from self.error
+
     def init_node(self, name, argv=None, anonymous=False, disable_signals=False, **options):
         """Register the node; stands in for ``rospy.init_node``."""
         if self.is_registered:
@@ -167,7 +125,7 @@ class ScriptRun(Run):
         node.xmlrpc_port = options.pop('xmlrpc_port', 0) or node.xmlrpc_port
         for key, value in node.params.items():
             node.master.parameters[f'{node.name}/{key}'] = value
-        self.start(**options)
+        super().start(**options)
         self.is_registered = True
 
     def run_main(self, code):
@@ -222,6 +180,39 @@ class ScriptRun(Run):
             ctypes.pythonapi.PyThreadState_SetAsyncExc(ident, ctypes.py_object(SystemExit))
 
 
+class ScriptNode(Node):
+    """A program of rospy, unmodified, as a node of this process; made by :meth:`Master.load`.
+
+    :meth:`start` runs it from its first line, in a thread of its own; its ``rospy.init_node``
+    registers the node. :meth:`stop` ends it. The node stops when the program has ended.
+
+    :ivar path: the file of the program
+    :ivar args: its arguments, ROS's among them
+    :ivar exit_code: what its process would have ended with; None while it runs
+    """
+
+    #: seconds that :meth:`start` waits for the program to call ``rospy.init_node``, or to end
+    init_timeout = 10.0
+    #: seconds that :meth:`stop` waits for the program, as long as roslaunch waits after its SIGINT
+    stop_timeout = 15.0
+    exit_code: int | None = None
+    launched: Any = None  # roslaunch's node, if a launch file named it
+    run_class, _opens_itself = ScriptRun, True
+
+    def __init__(self, path: str, args: list[str], params: dict | None = None, env: Any = ()):
+        self.path, self.args, self.remappings = path, args, args
+        self.params, self.env = params or {}, dict(env)
+
+    def wait(self, timeout: float | None = None) -> int | None:
+        """Wait until it has ended, and return its :attr:`exit_code`.
+
+        :param timeout: seconds, None: without limit
+        :raises TimeoutError: if it has not in that time
+        """
+        wait_for_end(lambda: self.lifecycle is Lifecycle.STOPPED, timeout, self.name)
+        return self.exit_code
+
+
 class NamedLines:
     """A stream that puts the node's name before each line."""
 
@@ -237,6 +228,13 @@ class NamedLines:
         self._stream.write(''.join(f'[{self._run.name}] {line}\n' for line in lines))
         self._stream.flush()
         return len(text)
+
+
+def wait_for_end(predicate: Any, timeout: float | None, name: str) -> None:
+    """Wait until ``predicate()`` is true, or Ctrl-C; raise TimeoutError if it is not in time."""
+    with program.quiet_wait():
+        if not program.wait(predicate, timeout):
+            raise TimeoutError(f'{name} has not ended within {timeout:g} s: stop() it')
 
 
 def _compiled(path):
@@ -265,7 +263,6 @@ def load(
     namespace: str | None = None,
     remap: dict[str, str] | None = None,
     params: dict[str, Any] | None = None,
-    env: dict[str, str] | None = None,
 ) -> ScriptNode:
     """Do what :meth:`Master.load` does."""
     path = os.path.abspath(package) if executable is None else find_program(package, executable)
@@ -276,5 +273,4 @@ def load(
     # until it calls init_node, it is called after its file
     named = name or re.sub(r'\W|^(?=[^A-Za-z])', 'x', os.path.basename(path).removesuffix('.py'))
     named = rosgraph.names.ns_join(namespace, named) if namespace else named
-    settings = {'args': arguments, 'params': params, 'env': env}
-    return master.create(ScriptNode, named, path=source_of(path), **settings)
+    return master.create(ScriptNode, named, path=source_of(path), args=arguments, params=params)
