@@ -4,7 +4,6 @@ import ctypes
 import json
 import os
 import pathlib
-import random
 import signal
 import socket
 import subprocess
@@ -17,14 +16,7 @@ import rosgraph
 HERE = pathlib.Path(__file__).resolve().parent
 SOURCE = HERE.parent / 'src'
 BUILD = HERE.parent / 'build' / 'benchmark'
-CPP_NEEDS = {  # Debian's package -> a file of it
-    'catkin': '/usr/share/catkin/cmake',
-    'cmake': '/usr/bin/cmake',
-    'g++': '/usr/bin/g++',
-    'libnodeletlib-dev': '/usr/include/nodelet/loader.h',
-    'libgeometry-msgs-dev': '/usr/include/geometry_msgs/Twist.h',
-    'libsensor-msgs-dev': '/usr/include/sensor_msgs/Image.h',
-}
+CPP_NEEDS = 'catkin cmake g++ libnodeletlib-dev libgeometry-msgs-dev libsensor-msgs-dev'
 NODELETS = 'C++ nodelets'
 # row -> the words for player.py; 'two': a process sends, another receives
 ROWS = {
@@ -120,11 +112,6 @@ def end_with_parent():
     ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 
 
-def shuffled(rows):
-    """Return the rows in another order each time: none always follows the same other one."""
-    return random.sample(rows, len(rows))
-
-
 def make(names, environment, folder, beside=None):
     """Return the rows of these names, those of another pharos in ``beside`` marked with '.
 
@@ -136,10 +123,8 @@ def make(names, environment, folder, beside=None):
         for source in (SOURCE, beside) if beside and way == 'pharos' else (SOURCE,):
             label = f'row{len(found)}'
             command = ['/usr/bin/python3', str(HERE / 'player.py'), way, label, *words]
-            commands = [command]
-            if way == 'nodelets':
-                commands = [[str(BUILD / 'player'), way, label]]
-            elif 'two' in words:
+            commands = [[str(BUILD / 'player'), way, label] if way == 'nodelets' else command]
+            if 'two' in words:
                 stamps = folder / f'{label}.stamps'
                 stamps.touch()
                 os.truncate(stamps, 8 << 21)
@@ -154,18 +139,13 @@ def make(names, environment, folder, beside=None):
 
 def build_nodelets():
     """Build the player in C++; False, and a message, if packages are missing."""
-    missing = [package for package, file in CPP_NEEDS.items() if not os.path.exists(file)]
-    if missing:
-        print(f'without {NODELETS}: apt-get install {" ".join(missing)}', file=sys.stderr)
-        return False
     BUILD.mkdir(parents=True, exist_ok=True)
-    python = [f'-D{name}_EXECUTABLE=/usr/bin/python3' for name in ('PYTHON', 'Python3')]
-    configure = ['cmake', str(HERE / 'nodelet'), '-DCATKIN_ENABLE_TESTING=OFF', *python]
-    for command in configure, ['cmake', '--build', '.']:
-        done = subprocess.run(command, cwd=BUILD, capture_output=True, text=True)
-        if done.returncode:
-            sys.exit(f'{" ".join(command)} failed in {BUILD}:\n{done.stdout}{done.stderr}')
-    return True
+    python = '-DPYTHON_EXECUTABLE=/usr/bin/python3 -DPython3_EXECUTABLE=/usr/bin/python3'
+    command = f'cmake {HERE}/nodelet -DCATKIN_ENABLE_TESTING=OFF {python} && cmake --build .'
+    done = subprocess.run(command, cwd=BUILD, shell=True, capture_output=True, text=True)
+    if done.returncode:
+        print(f'{done.stderr}without {NODELETS}: apt-get install {CPP_NEEDS}', file=sys.stderr)
+    return not done.returncode
 
 
 @contextlib.contextmanager
@@ -193,13 +173,9 @@ def ros_master(folder):
 
 
 def run_program(main):
-    """Run it; a signal ends it as an exception does, so that all that it has begun ends, too."""
-    for number in signal.SIGTERM, signal.SIGHUP:
-        if signal.getsignal(number) is signal.SIG_DFL:  # nohup has it ignored
-            signal.signal(number, lambda number, frame: sys.exit(128 + number))
+    """Run it; SIGTERM ends it as Ctrl-C does, so that all that it has begun ends, too."""
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     try:
         main()
-    except KeyboardInterrupt:
-        sys.exit(130)
     except Ended as error:
         sys.exit(f'{os.path.basename(sys.argv[0])}: {error}')

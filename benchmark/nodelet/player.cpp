@@ -1,16 +1,10 @@
 // Plays the row of nodelets in one manager; the commands are those of benchmark/player.py.
 #include <atomic>
-#include <cstdio>
-#include <ctime>
-#include <functional>
 #include <iostream>
 #include <map>
-#include <memory>
 #include <sstream>
-#include <string>
 #include <thread>
 #include <unistd.h>
-#include <vector>
 
 #include <boost/make_shared.hpp>
 #include <geometry_msgs/Twist.h>
@@ -21,13 +15,11 @@
 
 namespace {
 
-constexpr std::size_t STAMPS = 1 << 21;    // messages of a slice at most
-constexpr std::size_t SAMPLES = 4000;      // latencies of a slice that are answered
+constexpr std::size_t STAMPS = 1 << 21, SAMPLES = 4000;    // messages of a slice, latencies that are answered at most
 
 double seconds_of(clockid_t which) {
   timespec now;
-  clock_gettime(which, &now);
-  return now.tv_sec + now.tv_nsec * 1e-9;
+  return clock_gettime(which, &now), now.tv_sec + now.tv_nsec * 1e-9;
 }
 double now() { return seconds_of(CLOCK_MONOTONIC); }
 double cpu() { return seconds_of(CLOCK_PROCESS_CPUTIME_ID); }
@@ -40,27 +32,21 @@ struct Notes {
   std::vector<float> took = std::vector<float>(STAMPS);
   std::atomic<std::size_t> count{0};
   void note(std::size_t index) {
-    const std::size_t at = count.load(std::memory_order_relaxed);
-    if (at >= STAMPS) return;
-    took[at] = now() - sent[index];
-    count.store(at + 1, std::memory_order_release);
+    if (count < STAMPS) took[count] = now() - sent[index], ++count;
   }
 };
 
 std::size_t index_of(const geometry_msgs::Twist& message) { return message.linear.x; }
 std::size_t index_of(const sensor_msgs::Image& message) { return message.step; }
 
-struct Setting {
-  std::string kind, topic;
-  unsigned receivers, queue_size;
-};
+struct Setting { std::string kind, topic; unsigned receivers, queue_size; };
 
 // What is open: subscribers, and how to publish the message of an index.
 struct Way {
   std::vector<std::unique_ptr<Notes>> notes;
   std::vector<ros::Subscriber> subscribers;
   ros::Publisher publisher;
-  std::vector<boost::shared_ptr<sensor_msgs::Image>> images;    // more than all queues hold: none changes in use
+  std::vector<boost::shared_ptr<sensor_msgs::Image>> images;    // more than queues hold: none changes in use
   boost::shared_ptr<geometry_msgs::Twist> twist;
 
   void prepare(std::size_t index) {    // before the stamp, as Python's message is filled there, too
@@ -71,37 +57,32 @@ struct Way {
     if (images.empty()) publisher.publish(boost::shared_ptr<const geometry_msgs::Twist>(twist));
     else publisher.publish(boost::shared_ptr<const sensor_msgs::Image>(images[index % images.size()]));
   }
-  template <class M> void subscribe(ros::NodeHandle node, const Setting& setting) {
-    notes.push_back(std::make_unique<Notes>());
-    Notes* mine = notes.back().get();
-    subscribers.push_back(node.subscribe<M>(
-        setting.topic, setting.queue_size,
-        boost::function<void(const boost::shared_ptr<const M>&)>(
-            [mine](const boost::shared_ptr<const M>& message) { mine->note(index_of(*message)); })));
-  }
 };
 
 Way* opening;
 Setting setting;
 
 struct Receiver : nodelet::Nodelet {
+  template <class M> void open() {
+    opening->notes.push_back(std::make_unique<Notes>());
+    auto note = [mine = opening->notes.back().get()](const boost::shared_ptr<const M>& m) { mine->note(index_of(*m)); };
+    boost::function<void(const boost::shared_ptr<const M>&)> callback(note);
+    opening->subscribers.push_back(getNodeHandle().subscribe<M>(setting.topic, setting.queue_size, callback));
+  }
   void onInit() override {
-    if (setting.kind == "twist") opening->subscribe<geometry_msgs::Twist>(getNodeHandle(), setting);
-    else opening->subscribe<sensor_msgs::Image>(getNodeHandle(), setting);
+    setting.kind == "twist" ? open<geometry_msgs::Twist>() : open<sensor_msgs::Image>();
   }
 };
 
 struct Sender : nodelet::Nodelet {
+  template <class M> void open() { opening->publisher = getNodeHandle().advertise<M>(setting.topic, setting.queue_size); }
   void onInit() override {
-    ros::NodeHandle node = getNodeHandle();
-    opening->publisher = setting.kind == "twist" ? node.advertise<geometry_msgs::Twist>(setting.topic, setting.queue_size)
-                                                 : node.advertise<sensor_msgs::Image>(setting.topic, setting.queue_size);
+    setting.kind == "twist" ? open<geometry_msgs::Twist>() : open<sensor_msgs::Image>();
   }
 };
 
 boost::shared_ptr<nodelet::Nodelet> create(const std::string& type) {
-  if (type == "receiver") return boost::make_shared<Receiver>();
-  return boost::make_shared<Sender>();
+  return type == "receiver" ? boost::shared_ptr<nodelet::Nodelet>(new Receiver) : boost::make_shared<Sender>();
 }
 
 class Player {
