@@ -183,7 +183,7 @@ class ScriptRun(Run):
 class ScriptNode(Node):
     """A program of rospy, unmodified, as a node of this process; made by :meth:`Master.load`.
 
-    :meth:`start` runs it from its first line, in a thread of its own; its ``rospy.init_node``
+    A start runs it from its first line, in a thread of its own; its ``rospy.init_node``
     registers the node. :meth:`stop` ends it. The node stops when the program has ended.
 
     :ivar path: the file of the program
@@ -191,7 +191,7 @@ class ScriptNode(Node):
     :ivar exit_code: what its process would have ended with; None while it runs
     """
 
-    #: seconds that :meth:`start` waits for the program to call ``rospy.init_node``, or to end
+    #: seconds that a start waits for the program to call ``rospy.init_node``, or to end
     init_timeout = 10.0
     #: seconds that :meth:`stop` waits for the program, as long as roslaunch waits after its SIGINT
     stop_timeout = 15.0
