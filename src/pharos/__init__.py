@@ -1,8 +1,6 @@
 """PhaROS for Python: many ROS nodes in one process, written with blocks."""
-from __future__ import annotations
-
 import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pharos.channels import InputChannel, OutputChannel, Topic
 from pharos.errors import (
@@ -79,12 +77,12 @@ _EXTRAS = {
 }
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name):
     """Load extras when they are used."""
     if name in _EXTRAS:
         return getattr(importlib.import_module(f'pharos.{_EXTRAS[name]}'), name)
     raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
 
 
-def __dir__() -> list[str]:
+def __dir__():
     return __all__

@@ -11,8 +11,6 @@ usage: pharos COMMAND [ARGUMENT ...]
 
 'pharos COMMAND --help' tells the arguments of one.
 """
-from __future__ import annotations
-
 import importlib
 import sys
 
@@ -27,7 +25,7 @@ MODULES = {
 }
 
 
-def main() -> int | None:
+def main():
     """Run the command that the first argument names; returns its exit status."""
     command = sys.argv[1] if sys.argv[1:] else '--help'
     if command in MODULES:

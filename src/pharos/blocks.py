@@ -1,6 +1,4 @@
 """Blocks: what they take, and which method they are."""
-from __future__ import annotations
-
 import inspect
 import types
 from typing import Any, Callable
@@ -8,7 +6,7 @@ from typing import Any, Callable
 Block = Callable[..., Any]
 
 
-def taking(block: Any, what: str, *counts: int) -> Any:
+def taking(block, what, *counts):
     """Return a block that takes the first of ``counts`` arguments, made from one that may take fewer.
 
     :param what: what it is, for the error
@@ -18,7 +16,10 @@ def taking(block: Any, what: str, *counts: int) -> Any:
         return None
     if not callable(block):
         raise TypeError(f'a {what} is a callable, not {block!r}')
-    signature = inspect.signature(block)
+    try:
+        signature = inspect.signature(block)
+    except ValueError:  # of a function in C, such as deque.append
+        signature = inspect.signature(lambda value: None)
     for count in counts:
         try:
             signature.bind(*[None] * count)
@@ -49,7 +50,7 @@ class Receiver:
         self._delegate = block
 
 
-def rebound(block: Any, node: Any, cls: type) -> Any:
+def rebound(block, node, cls):
     """Return the block; if it is a method of the node, that of the same name of another class."""
     if isinstance(block, list):
         return [rebound(each, node, cls) for each in block]
@@ -58,7 +59,7 @@ def rebound(block: Any, node: Any, cls: type) -> Any:
     return types.MethodType(getattr(cls, block.__name__), node)
 
 
-def name_of(block: Any) -> str:
+def name_of(block):
     """Return the name of a block, for texts."""
     if isinstance(block, str):
         return block

@@ -2,9 +2,10 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from typing import TYPE_CHECKING, Any
 
-import genpy
+from genpy import Message
 
 from pharos import messages
 from pharos.blocks import Block, Receiver
@@ -32,12 +33,14 @@ class Opened:
     delegate: Any = None  # its block or blocks
     end: Any = None  # rospy's Publisher, Subscriber or Service
 
-    def open(self) -> None:
-        """Be opened by the node."""
+    def open(self):
+        """Have the subclass register it, by _open(); the node's next start calls this again."""
+        self.node.master.call('getPid')  # raises if it does not answer
+        self._open()
         self.node.opened = [*self.node.opened, self]
         self.closed = False
 
-    def node_stopped(self) -> None:
+    def node_stopped(self):
         """Take note that rospy has closed it."""
         self.closed = True
 
@@ -62,7 +65,7 @@ class Channel(Opened):
         self.open()
 
     def _connections(self):
-        impl = self.end and self.end.impl
+        impl = self.end.impl
         if not impl or impl.closed:
             return []
         impl.check()  # rospy looks now and then who has left (ros_comm #927)
@@ -71,10 +74,9 @@ class Channel(Opened):
     @property
     def connections(self) -> list[tuple[str, str]]:
         """The peers: ``(name of the node, 'INTRAPROCESS' or 'TCPROS')``."""
-        named = [(peer_of(each), each.transport_type) for each in self._connections()]
-        return [(name, transport) for name, transport in named if name]
+        return [(peer_of(end), end.transport_type) for end in filter(peer_of, self._connections())]
 
-    def __repr__(self) -> str:
+    def __repr__(self):
         state = 'closed ' if self.closed else ''
         return f'<{state}{type(self).__name__} {self.topic} ({self.type}) of {self.node.name}>'
 
@@ -87,28 +89,26 @@ class InputChannel(Receiver, Channel, Inbox):
     """
 
     def __init__(self, node, topic, message_class, delegate, queue_size, inline, shared, from_):
-        Inbox.__init__(self, node.run.turns, self._deliver, queue_size, inline, shared)
+        Inbox.__init__(self, None, self._deliver, queue_size, inline, shared)
         self.queue_bytes, self.received, self.from_ = node.queue_bytes, 0, from_
         self.delegate = delegate
         self._begin(node, topic, message_class)
 
-    def open(self) -> None:
-        """Subscribe. Called again after the node was stopped and started."""
-        self.node.master.call('getPid')  # raises if it does not answer
-        self.turns, self.closed = self.node.run.turns, False
+    def _open(self):
+        self.queue.clear()  # what came while the node stopped was never scheduled
+        self.turns, self.closed, self._scheduled = self.node.run.turns, False, False
         self.end = self.node.ros.Subscriber(self.topic, self.message_class, self)
-        super().open()
 
     def __call__(self, message):
-        """Take a message; rospy calls this if nobody has made it an Inbox."""
+        """Take a latched message; rospy calls this for a connection that was there before."""
         self.receive(message, 0)
 
     def _deliver(self, message):
-        if self.closed or self.from_ and message._connection_header['callerid'] != self.from_:
-            return
-        self.received += 1
-        run = self.delegate_runs or self.node.delegate_runs
         try:
+            if self.closed or self.from_ and message._connection_header['callerid'] != self.from_:
+                return
+            self.received += 1
+            run = self.delegate_runs or self.node.delegate_runs
             run and run(message, self)
         except BaseException as error:
             delegate = self.delegate or self.node.delegate
@@ -131,16 +131,18 @@ class OutputChannel(Channel):
         self._key = latch and self  # under which rospy's publisher keeps what is latched
         self._begin(node, topic, message_class)
 
-    def open(self) -> None:
+    def open(self):
         """Advertise, and wait for the subscribers that the master knows."""
-        known = set(self.node.master.system_state()[1].get(self.topic, ()))
-        options = {'latch': self.latch, 'queue_size': self.queue_size}
-        self.end = self.node.ros.Publisher(self.topic, self.message_class, **options)
-        self._impl = self.end.impl
+        known = set(Topic(self.node.master, self.topic).subscribers)
         super().open()
         if self._latched is not None:
             self._impl.publish(self._latched, None, self)
         self._wait_for(known)
+
+    def _open(self):
+        options = {'latch': self.latch, 'queue_size': self.queue_size}
+        self.end = self.node.ros.Publisher(self.topic, self.message_class, **options)
+        self._impl = self.end.impl
 
     def _wait_for(self, names):
         """Wait until these subscribers are connected: rospy loses what is sent before (#176).
@@ -150,9 +152,9 @@ class OutputChannel(Channel):
         node = self.node
 
         def missing():
-            return names - {peer_of(each) for each in self._impl.connections}
+            return names.difference(map(peer_of, self._impl.connections))
 
-        names = {name for name in names if node.master.may_live(name)}
+        names = set(filter(node.master.may_live, missing()))
         is_ready = wait(lambda: not missing(), node.connect_timeout, node)
         if not is_ready and node.connect_timeout and node.is_running:
             node.log(
@@ -162,7 +164,7 @@ class OutputChannel(Channel):
                 'warning',
             )
 
-    def publish(self, message: genpy.Message, connection: Any = None) -> None:
+    def publish(self, message: Message, connection: Any = None) -> None:
         """Send a message.
 
         :param connection: to that one alone
@@ -183,7 +185,7 @@ class OutputChannel(Channel):
             raise messages.explain(message, error) from error
         self.sent += 1
 
-    def send(self, block: Any = None, *, to: Any = None, **fields: Any) -> genpy.Message:
+    def send(self, block: Any = None, *, to: Any = None, **fields: Any) -> Message:
         """Fill a new message by ``block(message)`` and keywords, or take a ready one; send it.
 
         :param to: the node that alone gets it: a name, Node or ExternalNode
@@ -194,26 +196,22 @@ class OutputChannel(Channel):
         return message
 
     def _connection_to(self, peer):
-        def find():
-            return [each for each in self._connections() if peer_of(each) == peer]
-
-        is_known = peer in Topic(self.node.master, self.topic).subscribers
-        found = wait(find, self.node.connect_timeout if is_known else 0, self.node)
-        if not found:
-            raise UnknownNodeError(
-                f'{peer} is not interested in {self.topic}: rostopic info {self.topic} tells who is'
-            )
-        return found[0]
+        for each in self._connections():
+            if peer_of(each) == peer:
+                return each
+        raise UnknownNodeError(
+            f'{peer} is not connected to {self.topic}: rostopic info {self.topic} tells who is'
+        )
 
     def close(self) -> None:
         """Send no more, once what was published is with the sockets; unregister."""
         if not self.closed:
             self._impl.latches.pop(self, None)
             if self._impl.ref_count == 1:
-                self._impl.flush(self.node.stop_timeout)
+                self._impl.flush(time.monotonic() + self.node.stop_timeout)
         super().close()
 
-    def node_stopped(self) -> None:
+    def node_stopped(self):
         super().node_stopped()
         frozen = self._impl.latches.get(self)
         self._latched = None if frozen is None else self._impl.thaw(frozen)
@@ -223,7 +221,7 @@ class OutputChannel(Channel):
 
         :param timeout: seconds, None: without limit
         """
-        return bool(wait(lambda: len(self.connections) >= count, timeout, self.node))
+        return wait(lambda: len(self.connections) >= count, timeout, self.node)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -266,7 +264,7 @@ class Topic:
     bw = hz
 
     @property
-    def last(self) -> genpy.Message:
+    def last(self) -> Message:
         """The latched or else the next message; TimeoutError if none comes within 3 s."""
         from pharos.live import watching
 

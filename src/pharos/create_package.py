@@ -8,8 +8,6 @@ Each node is a class in a module, with a program in scripts/ and a test. A node 
 that it hears: replace that by what it shall do. The launch file starts all nodes. Write who
 maintains the package, and its license, into package.xml.
 """
-from __future__ import annotations
-
 import argparse
 import keyword
 import pathlib
@@ -22,7 +20,7 @@ import rospy
 NAME = re.compile(r'[a-z][a-z0-9]*(_[a-z0-9]+)*')
 
 
-def create_package(package: str, nodes: list[str]) -> None:
+def create_package(package, nodes):
     """Write a package to a folder of its name, after the folder template of this package.
 
     There, my_package, my_node and MyNode stand for the names. A file that has my_node in its name
@@ -32,7 +30,7 @@ def create_package(package: str, nodes: list[str]) -> None:
     :raises rospkg.ResourceNotFound: if this package is not installed as one of ROS
     """
 
-    def fill(text: str, node: str) -> str:
+    def fill(text, node):
         text = text.replace('MyNode', node.title().replace('_', '')).replace('my_node', node)
         return text.replace('my_package', package)
 
@@ -51,7 +49,7 @@ def create_package(package: str, nodes: list[str]) -> None:
             target.chmod(path.stat().st_mode)
 
 
-def name_of(text: str) -> str:
+def name_of(text):
     """Return the text if a package or node can have it as its name, else raise an error."""
     if not NAME.fullmatch(text) or keyword.iskeyword(text) or text in sys.stdlib_module_names:
         raise argparse.ArgumentTypeError(
@@ -61,7 +59,7 @@ def name_of(text: str) -> str:
     return text
 
 
-def main() -> None:
+def main():
     """Run the command."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter

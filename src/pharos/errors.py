@@ -1,6 +1,4 @@
 """The errors of this package. Each says what failed, on what name, and what to do next."""
-from __future__ import annotations
-
 import rospy
 
 

@@ -2,8 +2,8 @@
 from __future__ import annotations
 
 import dataclasses
-import urllib.parse
 from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
 
 from pharos.errors import UnknownNodeError
 from pharos.private_rospy.run import UNREACHABLE, ServerProxy
@@ -41,7 +41,7 @@ class ExternalNode:
     @property
     def host(self) -> str | None:
         """The host in its URI."""
-        return urllib.parse.urlsplit(self.uri).hostname
+        return urlsplit(self.uri).hostname
 
     def _call(self, method, *args):
         try:
@@ -92,5 +92,5 @@ class ExternalNode:
         """Ask it to end, as rosnode kill does."""
         self._call('shutdown', 'asked by pharos')
 
-    def __repr__(self) -> str:
+    def __repr__(self):
         return f'<ExternalNode {self.name} of {self.master.url}>'

@@ -1,7 +1,4 @@
-"""Failures of blocks: kept, counted, told once, and run again."""
-from __future__ import annotations
-
-import contextlib
+"""Failures of blocks: kept, counted, and run again."""
 import importlib
 import sys
 import threading
@@ -37,7 +34,7 @@ class Failure:
         #: is equal for failures of one kind
         self.place = block, type(error), traceback.extract_tb(self._frames, -1), channel
 
-    def let_go(self) -> None:
+    def let_go(self):
         """Keep neither message nor frames, which may be large."""
         self.message = self._again = self._frames = None
         self.error.__traceback__ = self.error.__context__ = self.error.__cause__ = None
@@ -63,7 +60,7 @@ class Failure:
         debugger.reset()
         debugger.interaction(None, self._frames)
 
-    def __repr__(self) -> str:
+    def __repr__(self):
         times = f', {self.count} times' if self.count > 1 else ''
         return (
             f'<Failure of {name_of(self.block)}: {type(self.error).__name__}: {self.error}{times}>'
@@ -75,15 +72,11 @@ class Failures(list):
 
     total = 0  #: how often blocks failed
 
-    def __init__(self, tell):
-        self._tell, self._lock = tell, threading.RLock()
+    def __init__(self):
+        self._lock = threading.RLock()
 
-    def report(self, error, block, where: str, message=None, channel=None, again=None) -> None:
-        """Keep what a block raised, and tell it at the 1st, 10th, 100th time.
-
-        :param where: the block and its node, in words
-        """
-        new = Failure(error, block, message, channel, again)
+    def keep(self, new):
+        """Add a failure, and count it if there was one of its kind."""
         with self._lock:
             self.total += 1
             for known in [each for each in self if each.place == new.place]:
@@ -93,13 +86,8 @@ class Failures(list):
             for failure in self[:-WHOLE]:
                 failure.let_go()
             del self[:-KEPT]
-        if str(new.count).strip('0') == '1':
-            times = f' ({new.count} times)' if new.count > 1 else ''
-            with contextlib.suppress(Exception):  # neither log nor Transcript can be written
-                line = f'{where} raised {type(error).__name__}: {error}{times}'
-                self._tell(line, new.traceback)
 
-    def __repr__(self) -> str:
+    def __repr__(self):
         rows = [
             f'{f"{type(each.error).__name__}: {each.error}":60.60}  {name_of(each.block):30.30}'
             f'  {getattr(each.channel, "topic", ""):20.20}  {each.count:5}'

@@ -8,9 +8,10 @@ import os
 import re
 import subprocess
 import sys
-from typing import Any, Callable, Iterator, Sequence
+from typing import Any, Sequence
+from xmlrpc.client import dumps, loads
 
-import rosgraph.names
+from rosgraph.names import get_ros_namespace, is_legal_remap, load_mappings, ns_join
 
 from pharos import program
 from pharos.blocks import Block
@@ -23,7 +24,6 @@ from pharos.errors import (
 from pharos.external_node import ExternalNode
 from pharos.names import full_name, node_name
 from pharos.node import Node, check_class
-from pharos.parameter import check_value
 from pharos.private_rospy.run import UNREACHABLE, ServerProxy
 from pharos.ros_process import RosProcess, find_launch_file, find_program
 from pharos.service import Service
@@ -35,27 +35,30 @@ _first_with = {}  # argv -> the first node that was created with it
 class Parameters(collections.abc.MutableMapping):
     """The parameter server as a mapping: names to values."""
 
-    def __init__(self, call: Callable[..., Any]):
+    def __init__(self, call):
         self._call = call
 
-    def __getitem__(self, name: str) -> Any:
+    def __getitem__(self, name):
         value = self._call('getParam', full_name(name))
         if value is None:
             raise KeyError(name)
         return value
 
-    def __setitem__(self, name: str, value: Any) -> None:
-        check_value(name, value)
+    def __setitem__(self, name, value):
+        try:
+            loads(dumps((value,)))
+        except Exception as error:
+            raise ValueError(f'{name} cannot be set to {value!r}: {error}') from None
         self._call('setParam', full_name(name), value)
 
-    def __delitem__(self, name: str) -> None:
+    def __delitem__(self, name):
         self[name]
         self._call('deleteParam', name)
 
-    def __iter__(self) -> Iterator[str]:
+    def __iter__(self):
         return iter(sorted(self._call('getParamNames')))
 
-    def __len__(self) -> int:
+    def __len__(self):
         return len(self._call('getParamNames'))
 
 
@@ -74,8 +77,8 @@ class Master:
 
     def __init__(self, url: str | None = None, share_connections: bool = False):
         url = url or os.environ.get('ROS_MASTER_URI') or 'http://localhost:11311/'
-        parts = re.fullmatch(r'http://(\[[\w:]+\]|[\w.-]+):(\d{1,5})/?', str(url).lower())
-        if not parts or not 0 < int(parts[2]) < 65536:
+        parts = re.fullmatch(r'http://(\[[\w:]+\]|[\w.-]+):([1-6]?\d{1,4})/?', str(url).lower())
+        if not parts:
             raise ValueError(
                 f"{url!r} cannot be the URL of a master: give one such as 'http://127.0.0.1:11311/'"
             )
@@ -125,12 +128,12 @@ class Master:
     def __enter__(self) -> Master:
         return self
 
-    def __exit__(self, *error: Any) -> None:
+    def __exit__(self, *error):
         self.stop()
 
     # -- asking
 
-    def call(self, method: str, *args: Any, caller_id: str = CALLER_ID) -> Any:
+    def call(self, method, *args, caller_id=CALLER_ID):
         """Call a method of the master's API; returns its value, None if it says no.
 
         :raises MasterUnreachableError: if it does not answer within 5 s
@@ -145,10 +148,9 @@ class Master:
 
     def is_reachable(self) -> bool:
         """True if it answers."""
-        try:
+        with contextlib.suppress(MasterUnreachableError):
             return bool(self.pid)
-        except MasterUnreachableError:
-            return False
+        return False
 
     def wait(self, timeout: float | None = None) -> bool:
         """Wait until it answers, and return True.
@@ -213,7 +215,7 @@ class Master:
         for port in tcp_port, xmlrpc_port:
             if port not in range(65536):
                 raise ValueError(f'{port!r} cannot be a port: give 0 to 65535')
-        mappings = [arg for arg in argv or () if rosgraph.names.is_legal_remap(arg)]
+        mappings = [arg for arg in argv or () if is_legal_remap(arg)]
         node = node_class.__new__(node_class)
         name = self._full_name(node, node_name(named), tuple(mappings))
         mappings = [arg for arg in mappings if not arg.startswith(('__name:=', '__ns:='))]
@@ -228,17 +230,16 @@ class Master:
 
     def _full_name(self, node, name, mappings):
         """Return the full name of a new node; of those with equal mappings, one has ``__name``."""
-        given = dict(arg.split(':=', 1) for arg in mappings)
+        given = load_mappings(mappings)
         first = _first_with.get(mappings)
         if '__name' in given and not (first and first.is_running and first.master == self):
             _first_with[mappings] = node
             name = name[: name.rfind('/') + 1] + node_name(given['__name'])
         if '__ns' in given and name.startswith('/'):
             name = name[name.rfind('/') + 1 :]
-        outer = given.get('__ns') or os.environ.get('ROS_NAMESPACE', '/')
-        return rosgraph.names.ns_join(rosgraph.names.make_global_ns(outer), name)
+        return ns_join(get_ros_namespace(argv=mappings), name)
 
-    def own_nodes(self) -> list[Node]:
+    def own_nodes(self):
         """Return the nodes of this process that run at this master, or start or stop."""
         return [node for node in program.nodes if node.master == self]
 
@@ -258,15 +259,13 @@ class Master:
         own = [node for node in self.own_nodes() if node.name == name]
         return own[0] if own else external.uri and external  # type: ignore[return-value]
 
-    def may_live(self, name: str) -> bool:
+    def may_live(self, name):
         """False if the node of that name refuses connections, or is not registered."""
         uri = self.call('lookupNode', name)
         try:
             uri and ServerProxy(uri, 0.5).getPid(CALLER_ID)
-        except ConnectionRefusedError:
-            return False
-        except UNREACHABLE:
-            pass
+        except UNREACHABLE as error:
+            return not isinstance(error, ConnectionRefusedError)
         return bool(uri)
 
     def wait_for_node(self, name: str, timeout: float | None = None) -> Node | ExternalNode:
@@ -314,8 +313,7 @@ class Master:
         """Run a launch file at this master, as roslaunch does; ``package`` None: it is a path."""
         path = find_launch_file(package, file)
         arguments = [f'{name}:={value}' for name, value in args.items()]
-        roslaunch = [sys.executable, '-c', 'import roslaunch; roslaunch.main()', '--skip-log-check']
-        return RosProcess([*roslaunch, path, *arguments], self.url)
+        return RosProcess(['roslaunch', '--skip-log-check', path, *arguments], self.url)
 
     def load(self, *args: Any, **options: Any) -> Any:
         """Run a program of rospy, unmodified, as a node of this process: a :class:`ScriptNode`.
@@ -356,13 +354,13 @@ class Master:
 
         return graph_of(self, seconds)
 
-    def __eq__(self, other: object) -> bool:
+    def __eq__(self, other):
         return isinstance(other, Master) and self.url == other.url
 
-    def __hash__(self) -> int:
+    def __hash__(self):
         return hash(self.url)
 
-    def __repr__(self) -> str:
+    def __repr__(self):
         return f'<Master {self.url}>'
 
 

@@ -14,7 +14,7 @@ from rosgraph_msgs.msg import Log
 from pharos import BlockNode, Master
 
 
-def main(port: int) -> None:
+def main(port):
     """Run rosmaster, and a /rosout that passes log lines on to /rosout_agg, as roscore does."""
     answers, sys.stdout = sys.stdout, sys.stderr
     for name in 'rosmaster', 'xmlrpc':  # they complain of every node that stops

@@ -1,13 +1,9 @@
 """Names of nodes, topics, services and parameters."""
-from __future__ import annotations
-
 import re
-from typing import Any
-
 import rosgraph.names
 
 
-def legal_name(name: Any) -> str:
+def legal_name(name):
     """Return the name if it can be that of a topic, service or parameter, else raise ValueError."""
     is_text = isinstance(name, str) and name.isascii() and name.strip('/~')
     if not (is_text and rosgraph.names.is_legal_name(name)):
@@ -17,12 +13,12 @@ def legal_name(name: Any) -> str:
     return name
 
 
-def full_name(name: Any) -> str:
+def full_name(name):
     """Return the legal name with its slash."""
     return rosgraph.names.make_global_ns(legal_name(name)).rstrip('/')
 
 
-def node_name(name: Any) -> str:
+def node_name(name):
     """Return the name if it can be a node's, else raise ValueError."""
     if isinstance(name, str) and re.fullmatch(r'/?[A-Za-z]\w*(/[A-Za-z]\w*)*', name, re.A):
         return name

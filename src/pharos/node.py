@@ -1,28 +1,29 @@
 """Nodes: real ROS nodes of this process, written with blocks."""
 from __future__ import annotations
 
-import collections
-import contextlib
 import enum
 import functools
 import threading
 import types
+from collections import Counter
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Callable, Iterator
 
-import genpy
+from genpy import Message
 import rosgraph.names
 import rospy
 
-from pharos import messages, program
+from pharos import messages
 from pharos.blocks import Block, Receiver, name_of, rebound, taking
 from pharos.channels import QUEUE_SIZE, Channel, InputChannel, OutputChannel
 from pharos.errors import MasterUnreachableError, MessageTypeError, NodeStoppedError
 from pharos.errors import PharosError, UnknownTopicError
 from pharos.external_node import ExternalNode
-from pharos.failures import Failures
+from pharos.failures import Failure, Failures
 from pharos.names import legal_name, node_name
 from pharos.parameter import Parameter
 from pharos.private_rospy.run import Run
+from pharos.program import here, is_signalled, nodes, quiet_wait, wait
 from pharos.service import OfferedService, Service
 from pharos.transcript import Transcript
 
@@ -90,7 +91,7 @@ class Node(Receiver):
         self.master, self.name, self.uri, self.domain = master, name, None, domain
         self.soul, self.delegate, self.remappings = soul, delegate, remappings
         self.tcp_port, self.xmlrpc_port = ports
-        self.failures = Failures(self._tell_failure)
+        self.failures = Failures()
         self._life = threading.RLock()  # held by a start, stop or restart
         self._opening = threading.RLock()  # of two threads that send first, one opens the channel
         self.opened = []  # channels, services and parameters, also while it is stopped
@@ -111,30 +112,26 @@ class Node(Receiver):
         with self._life:
             if self.lifecycle not in (Lifecycle.NEW, Lifecycle.STOPPED):
                 raise PharosError(f'{self.name} is {self.lifecycle.value} already')
-            self.failures, self.souls = Failures(self._tell_failure), {}
+            self.failures, self.souls = Failures(), {}
             self.lifecycle, self.run = Lifecycle.STARTING, self.run_class(self)
-            program.nodes.append(self)
+            nodes.append(self)
             opened, self.opened = self.opened, []
             try:
                 self.run.start()
                 self.lifecycle = Lifecycle.RUNNING
-                for each in () if self._opens_itself else opened:
+                for each in opened if type(self).start is Node.start else ():
                     each.open()
             except BaseException:
                 self._end(0)
                 self.opened = opened
                 raise
 
-    @property
-    def _opens_itself(self):
-        return type(self).start is not Node.start
-
     def _end(self, timeout):
         self.run.stop(timeout)
         for each in self.opened:
             each.node_stopped()
         self._senders, self.lifecycle = {}, Lifecycle.STOPPED
-        program.nodes.remove(self)
+        nodes.remove(self)
 
     def stop(self) -> None:
         """End the souls, send what is under way, unregister, free ports and threads.
@@ -147,7 +144,7 @@ class Node(Receiver):
                 self.lifecycle = Lifecycle.STOPPING
                 self._end(self.stop_timeout)
 
-    def end_now(self) -> None:
+    def end_now(self):
         """Stop the node, whatever the stop() of its class raises; two threads may ask for it."""
         with self._life:
             try:
@@ -168,13 +165,13 @@ class Node(Receiver):
         with self._life:
             self.master.call('getPid')
             souls = {soul: block for soul, block in self.souls.items() if soul.is_alive()}
-            program.nodes.append(self)  # spin() waits for it meanwhile
+            nodes.append(self)  # spin() waits for it meanwhile
             try:
                 self.stop()
                 self.start()
             finally:
-                program.nodes.remove(self)
-            for soul, block in {} if self._opens_itself else souls.items():
+                nodes.remove(self)
+            for soul, block in souls.items() if type(self).start is Node.start else ():
                 self.fork(block, soul.name)
 
     def become(self, node_class: type[Node]) -> None:
@@ -187,20 +184,21 @@ class Node(Receiver):
         """
         check_class(node_class)
         self.check_running()
-        self.run.turns.call(lambda: self._become(node_class))
 
-    def _become(self, node_class):
-        receivers = self, *self.opened
-        try:
-            soul = rebound(self.soul, self, node_class)
-            blocks = [rebound(each.delegate, self, node_class) for each in receivers]
-        except AttributeError as error:
-            raise PharosError(f'{node_class.__name__} lacks a method in use: {error}') from error
-        self.__class__, self.soul = node_class, soul
-        for receiver, block in zip(receivers, blocks):
-            receiver.delegate = block
+        def change():
+            receivers = self, *self.opened
+            try:
+                soul = rebound(self.soul, self, node_class)
+                blocks = [rebound(each.delegate, self, node_class) for each in receivers]
+            except AttributeError as error:
+                raise PharosError(f'{node_class.__name__} lacks a method: {error}') from error
+            self.__class__, self.soul = node_class, soul
+            for receiver, block in zip(receivers, blocks):
+                receiver.delegate = block
 
-    def abandon(self) -> None:
+        self.run.turns.call(change)
+
+    def abandon(self):
         """Be stopped in a forked child: the node runs in the parent."""
         self.lifecycle = Lifecycle.STOPPED
         for each in self.opened:
@@ -209,10 +207,10 @@ class Node(Receiver):
     def __enter__(self):
         return self
 
-    def __exit__(self, *error: Any) -> None:
+    def __exit__(self, *error):
         self.stop()
 
-    def check_running(self) -> None:
+    def check_running(self):
         """Raise NodeStoppedError if the node has not started, or has stopped."""
         if self.lifecycle not in (Lifecycle.RUNNING, Lifecycle.STOPPING):
             raise NodeStoppedError(
@@ -249,18 +247,17 @@ class Node(Receiver):
             run in threads), ``ended_souls`` (their names)
         """
         registered = None
-        with contextlib.suppress(MasterUnreachableError):
+        with suppress(MasterUnreachableError):
             registered = self.master.call('lookupNode', self.name) == self.uri
         return types.SimpleNamespace(registered=registered, **self.told())
 
-    def told(self) -> dict[str, Any]:
+    def told(self):
         """Return what :meth:`health` knows without the master; top asks for it by XML-RPC."""
-        impls = [*self.run.topics.pubs.values(), *self.run.topics.subs.values()]
-        kinds = [each.transport_type for impl in impls for each in impl.connections]
+        kinds = [info[3] for info in self.run.topics.get_pub_sub_info()]
         ended = [soul.name for soul in self.souls if not soul.is_alive()]
         return {
             'kind': type(self).__name__,
-            'connections': dict(collections.Counter(kinds)),
+            'connections': dict(Counter(kinds)),
             'dropped': sum(getattr(channel, 'dropped', 0) for channel in self.channels),
             'errors': self.failures.total,
             'threads': sum(thread.is_alive() for thread in list(self.run.threads)),
@@ -270,7 +267,7 @@ class Node(Receiver):
 
     describe = ExternalNode.describe
 
-    def __repr__(self) -> str:
+    def __repr__(self):
         return f'<{type(self).__name__} {self.name} {self.lifecycle.value}>'
 
     def execute(self) -> Any:
@@ -297,22 +294,27 @@ class Node(Receiver):
         return block
 
     def _run_soul(self, block):
-        before, program.here.node = program.here.node, self
+        before, here.node, is_own = here.node, self, block is self.soul
         try:
             return taking(block, 'soul', 1, 0)(self)
         except BaseException as error:
             is_stop = isinstance(error, (NodeStoppedError, rospy.ROSInterruptException))
             if self.is_running or not is_stop:
-                self.report(error, block, 'soul', again=lambda nothing: self._run_soul(self.soul))
+                self.report(
+                    error,
+                    block,
+                    'soul',
+                    again=lambda _: self._run_soul(self.soul if is_own else block),
+                )
         finally:
-            program.here.node = before
+            here.node = before
         return None
 
     def sleep(self, seconds: float) -> None:
         """Sleep for some seconds of ROS time; the stop of the node ends it, and its soul."""
-        with program.quiet_wait():
+        with quiet_wait():
             self.ros.sleep(seconds)
-        if not self.is_running and program.here.node is self:
+        if not self.is_running and here.node is self:
             raise NodeStoppedError(f'{self.name} stops, and this soul with it')
 
     def every(self, seconds: float) -> Iterator[int]:
@@ -331,7 +333,7 @@ class Node(Receiver):
             while not stopping.is_set():
                 yield turn
                 turn += 1
-                with program.quiet_wait():
+                with quiet_wait():
                     rate.sleep()
 
         return turns()
@@ -343,24 +345,25 @@ class Node(Receiver):
         """The exceptions of blocks in this run of the node, the newest last; 100 kinds at most."""
         return [failure.error for failure in self.failures]
 
-    def report(self, error, block, what: str, message=None, channel=None, again=None) -> None:
-        """Keep and tell what a block raised. Ctrl-C in the main thread goes on.
-
-        :param what: 'soul', 'delegate' and so on
-        """
-        if isinstance(error, (KeyboardInterrupt, SystemExit)) and program.is_signalled():
+    def report(self, error, block, what, message=None, channel=None, again=None):
+        """Keep what a block raised, and tell it at the 1st, 10th, 100th time; Ctrl-C goes on."""
+        if isinstance(error, (KeyboardInterrupt, SystemExit)) and is_signalled():
             raise error
-        where = f'{what} {name_of(block)} of {self.name}'
-        where += f' on {channel.topic}' if channel else ''
-        self.failures.report(error, block, where, message, channel, again)
+        failure = Failure(error, block, message, channel, again)
+        self.failures.keep(failure)
+        if str(failure.count).strip('0') != '1':
+            return
+        with suppress(Exception):  # neither log nor Transcript can be written
+            line = f'{what} {name_of(block)} of {self.name}'
+            line += f' on {channel.topic}' if channel else ''
+            line += f' raised {type(error).__name__}: {error}'
+            line += f' ({failure.count} times)' if failure.count > 1 else ''
+            try:
+                self.log(f'{line}\n{failure.traceback}', 'error')
+            finally:
+                Transcript.show(line)
 
-    def _tell_failure(self, line, details):
-        try:
-            self.log(f'{line}\n{details}', 'error')
-        finally:
-            Transcript.show(line)
-
-    def refused(self, topic: str, reason: str) -> None:
+    def refused(self, topic, reason):
         """Take note that a publisher sends another type."""
         error = MessageTypeError(f'{self.name} does not receive from {topic}: {reason}')
         self.report(error, topic, 'connection')
@@ -372,7 +375,7 @@ class Node(Receiver):
         """
         level = _LEVELS.get(level, level)
         if level not in ('debug', 'info', *_LEVELS.values()):
-            raise ValueError(f'there is no log level {level!r}: give debug, info, warn or fatal')
+            raise ValueError(f'unknown level {level!r}: give info or error, and one text')
         if self.lifecycle not in (Lifecycle.RUNNING, Lifecycle.STOPPING):
             return Transcript.show(f'[{level.upper()}] {self.name}: {text}')
         # no wrapper between: rospy looks for the caller of this method
@@ -388,7 +391,7 @@ class Node(Receiver):
         self.check_running()
         return self.run.ros.resolve_name(legal_name(name).replace('~/', '~'))
 
-    def peer_name(self, peer: Any) -> str:
+    def peer_name(self, peer):
         """Return the full name of a Node, an ExternalNode, or a node given by its name."""
         name = getattr(peer, 'name', None)
         return name or rosgraph.names.resolve_name(node_name(peer), self.name)
@@ -417,7 +420,7 @@ class Node(Receiver):
         :raises MasterUnreachableError: if the master does not answer; nothing is left behind
         """
         topic = self.resolve(topic)
-        peer = None if from_ is None else self.peer_name(from_)
+        peer = from_ and self.peer_name(from_)
         cls = self._class_of(topic, typed_as, is_receiver=True)
         return InputChannel(self, topic, cls, delegate, queue_size, inline, shared, peer)
 
@@ -445,7 +448,7 @@ class Node(Receiver):
         typed_as: str | type | None = None,
         to: Any = None,
         **fields: Any,
-    ) -> genpy.Message:
+    ) -> Message:
         """Send a message, and return it.
 
         The report: ``self sendTo: '/cmd_vel' a: [:msg | msg linear: 2.0]``::
@@ -460,17 +463,17 @@ class Node(Receiver):
         :param to: the node that alone gets it: a name, Node or ExternalNode
         :param fields: fill the message by name
         """
-        if isinstance(block, type) and issubclass(block, genpy.Message):
+        if isinstance(block, type) and issubclass(block, Message):
             typed_as, block = block, fill
         channel = self._senders.get((topic, typed_as))
         if channel and not channel.closed:
             return channel.send(block, to=to, **fields)
         with self._opening:
             name = self.resolve(topic)
-            given = type(block) if isinstance(block, genpy.Message) else None
+            given = type(block) if isinstance(block, Message) else None
             cls = self._class_of(name, typed_as or given)
-            senders = (each for each in self.channels if isinstance(each, OutputChannel))
-            known = [each for each in senders if each.topic == name]
+            open_ones = (each for each in self.channels if each.topic == name)
+            known = [each for each in open_ones if isinstance(each, OutputChannel)]
             channel = known[0] if known else OutputChannel(self, name, cls, False, QUEUE_SIZE)
             self._senders[topic, typed_as] = channel
         try:
@@ -513,7 +516,7 @@ class Node(Receiver):
         # not through a channel: a delegate may call this, whose turn it is
         end = self.ros.Subscriber(*options)
         try:
-            return program.wait(lambda: find(end), timeout, self)
+            return wait(lambda: find(end), timeout, self)
         finally:
             end.unregister()
 
@@ -523,7 +526,7 @@ class Node(Receiver):
         typed_as: str | type | None = None,
         timeout: float | None = None,
         where: Callable[[Any], Any] | None = None,
-    ) -> genpy.Message:
+    ) -> Message:
         """Return the next message of a topic.
 
         :param timeout: seconds until its type is known, and as long for the message; None: without
@@ -541,7 +544,7 @@ class Node(Receiver):
 
         self.master.call('getPid')  # raises if it does not answer
         if timeout and not typed_as:
-            typed_as = program.wait(lambda: self.master.topic_type(topic), timeout, self)
+            typed_as = wait(lambda: self.master.topic_type(topic), timeout, self)
         cls = self._class_of(topic, typed_as, True)
         if self._subscribed(find, timeout, topic, cls, came.append):
             return came[0]
@@ -581,13 +584,13 @@ class Node(Receiver):
         """The parameters that :meth:`parameter` has returned."""
         return [each for each in self.opened if isinstance(each, Parameter)]
 
-    def read_parameters(self) -> None:
+    def read_parameters(self):
         """Have the parameters read their values."""
         for each in self.parameters:
             each.read()
 
 
-def check_class(node_class: Any) -> None:
+def check_class(node_class):
     """Raise TypeError unless it is a class of nodes."""
     if not (isinstance(node_class, type) and issubclass(node_class, Node)):
         raise TypeError(f'a node is made of a subclass of Node, not {node_class!r}')

@@ -1,22 +1,11 @@
 """Parameters of the parameter server, bound both ways."""
-from __future__ import annotations
-
-import copy
 import functools
 import threading
-import xmlrpc.client
+from copy import deepcopy
 from typing import Any
 
 from pharos.blocks import Block, taking
 from pharos.channels import Opened
-
-
-def check_value(name: str, value: Any) -> None:
-    """Raise ValueError if the parameter server cannot hold a value."""
-    try:
-        xmlrpc.client.loads(xmlrpc.client.dumps((value,)))
-    except Exception as error:
-        raise ValueError(f'{name} cannot be set to {value!r}: {error}') from None
 
 
 class Parameter(Opened):
@@ -31,24 +20,21 @@ class Parameter(Opened):
         self._reading = threading.Lock()
         self.open()
 
-    def open(self) -> None:
-        """Subscribe at the master, and set the value that the node knows if there is none there."""
-        self.subscribe()
-        super().open()
-
-    def subscribe(self) -> None:
-        """Tell the master that the node wants to hear of changes."""
+    def subscribe(self):
+        """Hear of changes, and set the value that the node knows if the master has none."""
         master = self.node.master
         master.call('subscribeParam', self.node.run.uri, self.name, caller_id=self.node.name)
         if self._value is not None and self.name not in master.parameters:
             self.set(self._value)
         self.read()
 
+    _open = subscribe
+
     @property
     def value(self) -> Any:
         """The value: a bool, int, float, str, list or dict; None if it has none."""
         self.node.check_running()
-        return copy.deepcopy(self._value)
+        return deepcopy(self._value)
 
     def set(self, value: Any) -> None:
         """Set it on the server.
@@ -57,18 +43,17 @@ class Parameter(Opened):
         :raises MasterUnreachableError: if the master does not answer
         """
         self.node.check_running()
-        check_value(self.name, value)
-        self.node.master.call('setParam', self.name, value, caller_id=self.node.name)
-        self.node.read_parameters()  # the master tells others alone
+        self.node.master.parameters[self.name] = value
+        self.node.read_parameters()
 
-    def read(self) -> None:
+    def read(self):
         """Take the value that the server has, and tell of a change."""
         with self._reading:
             before, self._value = self._value, self.node.master.parameters.get(self.name)
             value = self._value
         if not self.closed and (value, type(value)) != (before, type(before)):
             for block in self.delegate:
-                self._run(block, copy.deepcopy(value))
+                self._run(block, deepcopy(value))
 
     def on_change(self, block: Block) -> Block:
         """Have ``block(value)`` run when it changes, also by others."""
@@ -82,5 +67,5 @@ class Parameter(Opened):
             run = functools.partial(self._run, block)
             self.node.report(error, block, 'block of on_change', value, again=run)
 
-    def __repr__(self) -> str:
+    def __repr__(self):
         return f'<Parameter {self.name} of {self.node.name}: {self.value!r}>'

@@ -1,6 +1,4 @@
 """The program that has nodes: its signals, its end, its forks, and waiting on behalf of a node."""
-from __future__ import annotations
-
 import atexit
 import contextlib
 import os
@@ -8,33 +6,28 @@ import signal
 import sys
 import threading
 import time
-from typing import TYPE_CHECKING, Any, Callable, Iterator
 
 import rospy
 
 from pharos.intraprocess import workers
 from pharos.private_rospy.transport import runs
 
-if TYPE_CHECKING:
-    from pharos.node import Node
-
 
 class _Here(threading.local):
-    node: Node | None = None  #: on whose behalf this thread runs
+    node = None  #: on whose behalf this thread runs
 
 
 here = _Here()
 #: the nodes of this process that run or restart
 nodes = []
 signalled = False  # after a signal that ends the program
+_exiting = False  # at its end
 
 
-def wait(
-    predicate: Callable[[], Any], timeout: float | None = None, node: Node | None = None
-) -> Any:
+def wait(predicate, timeout=None, node=None):
     """Wait until ``predicate()`` is true.
 
-    :param timeout: seconds, None: without limit
+    :param timeout: seconds; None: without limit
     :param node: its stop ends the wait, too; default: the node on whose behalf this thread runs
     :returns: the last value of ``predicate()``, false if the wait ended otherwise
     """
@@ -48,7 +41,7 @@ def wait(
 
 
 @contextlib.contextmanager
-def quiet_wait() -> Iterator[None]:
+def quiet_wait():
     """End without an exception at the stop of a node, and at a signal of ours, which stops all."""
     try:
         with contextlib.suppress(rospy.ROSInterruptException):
@@ -58,7 +51,7 @@ def quiet_wait() -> Iterator[None]:
             raise
 
 
-def stop_all() -> None:
+def stop_all():
     """Stop every node of this process, whatever the stop() of a class of its own raises."""
     for node in nodes[:]:
         node.end_now()
@@ -74,7 +67,7 @@ def spin() -> None:
     stop_all()
 
 
-def handle_signals() -> None:
+def handle_signals():
     """Have signals stop the nodes and end the program, unless somebody else handles them."""
     if threading.current_thread() is not threading.main_thread():
         return
@@ -86,7 +79,7 @@ def handle_signals() -> None:
             signal.signal(number, _end)
 
 
-def is_signalled() -> bool:
+def is_signalled():
     """True if an exception of this thread may come from a signal."""
     by_python = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     is_main = threading.current_thread() is threading.main_thread()
@@ -97,8 +90,16 @@ def _end(number, frame):
     global signalled
     signalled = True
     signal.signal(number, signal.SIG_DFL)  # a second one ends the program at once
+    if _exiting:  # and stops the nodes already
+        return
     threading.Thread(target=stop_all, name='pharos end').start()
     raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(128 + number)
+
+
+def _exit():
+    global _exiting
+    _exiting = True
+    stop_all()
 
 
 def _forget():
@@ -110,5 +111,5 @@ def _forget():
     workers.forget()
 
 
-atexit.register(stop_all)
+atexit.register(_exit)
 os.register_at_fork(after_in_child=_forget)

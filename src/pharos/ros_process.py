@@ -1,6 +1,4 @@
 """Programs of ROS as children of this process."""
-from __future__ import annotations
-
 import atexit
 import collections
 import contextlib
@@ -11,7 +9,6 @@ import signal
 import subprocess
 import threading
 import tty
-from typing import Any
 
 import psutil
 import roslib.packages
@@ -41,9 +38,15 @@ class RosProcess:
         tty.setraw(slave)
         self._terminal = open(terminal, errors='replace')
         environ = {**os.environ, 'ROS_MASTER_URI': master_url, 'TERM': 'dumb'}
-        pipes = dict.fromkeys(('stdin', 'stdout', 'stderr'), slave)
         try:
-            self._process = subprocess.Popen(command, env=environ, start_new_session=True, **pipes)
+            self._process = subprocess.Popen(
+                command,
+                stdin=slave,
+                stdout=slave,
+                stderr=slave,
+                env=environ,
+                start_new_session=True,
+            )
         except OSError as error:
             self._terminal.close()
             raise PharosError(f'{command[0]} cannot be started: {error}') from None
@@ -110,16 +113,16 @@ class RosProcess:
     def __enter__(self):
         return self
 
-    def __exit__(self, *error: Any) -> None:
+    def __exit__(self, *error):
         self.terminate()
 
-    def __repr__(self) -> str:
+    def __repr__(self):
         code = self.poll()
         state = f'pid {self.pid}' if code is None else f'ended with {code}'
         return f'<RosProcess {" ".join(self.command)}, {state}>'
 
 
-def find_program(package: str, executable: str) -> str:
+def find_program(package, executable):
     """Return the path of a program, as rosrun finds it.
 
     :raises UnknownNodeError: if there is none
@@ -137,7 +140,7 @@ def find_program(package: str, executable: str) -> str:
     return paths[0]
 
 
-def find_launch_file(package: str | None, file: str) -> str:
+def find_launch_file(package, file):
     """Return the path of a launch file, as roslaunch finds it; without a package, it is the path.
 
     :raises UnknownNodeError: if there is none

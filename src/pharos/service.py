@@ -1,18 +1,20 @@
 """Services: offered by a node, or called by name alone."""
-from __future__ import annotations
-
-import contextlib
 import io
 import socket
 import struct
-import time
-import urllib.parse
+from contextlib import suppress
+from time import monotonic
 from typing import Any
+from urllib.parse import urlsplit
 
-import rosgraph.network as network
-import rospy
+from rosgraph.network import (
+    ROSHandshakeException,
+    read_ros_handshake_header,
+    write_ros_handshake_header,
+)
+from rospy import ServiceException
 
-from pharos import messages, program
+from pharos import messages
 from pharos.blocks import taking
 from pharos.channels import Opened
 from pharos.errors import (
@@ -26,6 +28,7 @@ from pharos.errors import (
 from pharos.intraprocess.copier import serialize
 from pharos.private_rospy.patches import answer
 from pharos.private_rospy.transport import keep_alive, local_service
+from pharos.program import here
 
 PROBE_LIMIT = 5.0  # seconds until a provider that is called must have said its type
 PATIENCE = 0.25  # seconds that a look-up waits for that; a call asks again
@@ -42,14 +45,11 @@ class OfferedService(Opened):
         self.delegate = taking(block, 'block of a service', 1)
         self.open()
 
-    def open(self) -> None:
-        """Register it. Called again after the node was stopped and started."""
-        self.node.master.call('getPid')  # raises if it does not answer
+    def _open(self):
         try:
             self.end = self.node.ros.Service(self.name, self.service_class, self._answer)
-        except rospy.ServiceException as error:
+        except ServiceException as error:
             raise PharosError(f'{self.node.name} offers {self.name} already: {error}') from None
-        super().open()
 
     def _answer(self, request):
         try:
@@ -57,10 +57,10 @@ class OfferedService(Opened):
         except BaseException as error:
             where = f'service {self.name}'
             self.node.report(error, self.delegate, where, request, again=self._answer_again)
-            raise rospy.ServiceException(f'{type(error).__name__}: {error}') from error
+            raise ServiceException(f'{type(error).__name__}: {error}') from error
 
     def _answer_again(self, request):
-        with contextlib.suppress(rospy.ServiceException):  # it is reported
+        with suppress(ServiceException):  # it is reported
             self._answer(request)
 
 
@@ -85,7 +85,7 @@ class Service:
         self.master, self.name, self.caller_id = master, name, caller_id
         self.look_up()
 
-    def look_up(self) -> None:
+    def look_up(self):
         """Ask the master for the provider, and the provider for the type.
 
         :raises UnknownServiceError: if nobody offers it
@@ -95,22 +95,14 @@ class Service:
             raise UnknownServiceError(
                 f'no node offers the service {self.name} at {self.master.url}: see rosservice list'
             )
-        with contextlib.suppress(OSError, network.ROSHandshakeException):
+        with suppress(OSError, ROSHandshakeException):
             self._ask(PATIENCE)
 
     def _ask(self, limit):
         """Ask the provider for its type."""
-        local = self._local()
-        if local:
-            cls = local[1].service_class
-            self.type, self.md5sum = cls._type, cls._md5sum
-            return
-        sock, header = self._connect('*', time.monotonic() + limit, probe='1')
+        sock, header = self._connect('*', limit, probe='1')
         self.type, self.md5sum = header['type'], header['md5sum']
         sock.close()
-
-    def _local(self):
-        return local_service(self.master.url, self.name, self.uri)
 
     def call(self, block: Any = None, *, timeout: float | None = None, **fields: Any) -> Any:
         """Call it, with a request that ``block(request)``, a dict or keywords fill, or a ready one.
@@ -124,7 +116,7 @@ class Service:
         self.response = None
         try:
             if self.type is None:
-                self._ask(min(timeout or PROBE_LIMIT, PROBE_LIMIT))
+                self._ask(timeout or PROBE_LIMIT)
             cls = messages.service_class(self.type)
             request = messages.build(cls._request_class, block, fields)
             if request._md5sum != cls._request_class._md5sum:
@@ -133,15 +125,21 @@ class Service:
                 )
             request = messages.check(request)
             if self.md5sum not in ('*', cls._md5sum):
-                raise self._wrong_type(cls)
-            if timeout is None and self._local():
-                self.response = answer(*self._local(), request, self.caller_id)  # type: ignore[call-arg]
+                raise ServiceTypeError(
+                    f'{self.name} is of type {self.type}, whose md5sum is {cls._md5sum} here (request'
+                    f' {messages.describe(cls._request_class)}; response'
+                    f' {messages.describe(cls._response_class)}), and not {self.md5sum}: use the'
+                    ' same definition at both ends, or leave md5sum as it is'
+                )
+            local = timeout is None and local_service(self.master.url, self.name, self.uri)
+            if local:
+                self.response = answer(local, request, self.caller_id)
             else:
                 self.response = self._call(cls, serialize(request), timeout)
-        except rospy.ServiceException as error:
+        except ServiceException as error:
             raise ServiceCallError(f'{self.name} failed: {error}') from error
-        except (OSError, network.ROSHandshakeException) as error:
-            node = program.here.node
+        except (OSError, ROSHandshakeException) as error:
+            node = here.node
             if node and not node.is_running:
                 raise NodeStoppedError(f'{node.name} stops, and the call with it') from None
             raise ServiceCallError(
@@ -150,59 +148,44 @@ class Service:
         return self.response
 
     def _call(self, cls, data, timeout):
-        deadline = timeout and time.monotonic() + timeout
+        end = timeout and monotonic() + timeout
         try:
-            sock, _ = self._connect(self.md5sum, deadline)
+            sock, _ = self._connect(self.md5sum, timeout)
         except ConnectionError as error:
             before, self.uri = self.uri, self.master.call('lookupService', self.name)
             if not self.uri or self.uri == before:  # else it has moved
                 raise ServiceCallError(f'{self.name} at {before} refused: {error}') from None
-            sock, _ = self._connect(self.md5sum, deadline)
+            sock, _ = self._connect(self.md5sum, timeout)
         with sock:
             sock.sendall(struct.pack('<I', len(data)) + data)
-            is_ok, size = struct.unpack('<BI', _read(sock, 5, deadline))
-            data = _read(sock, size, deadline)
+            is_ok, size = struct.unpack('<BI', _read(sock, 5, end))
+            data = _read(sock, size, end)
         if not is_ok:
-            raise rospy.ServiceException(data.decode(errors='replace'))
+            raise ServiceException(data.decode(errors='replace'))
         return cls._response_class().deserialize(data)
 
-    def _connect(self, md5sum, deadline, **more):
+    def _connect(self, md5sum, timeout, **more):
         """Return a socket to the provider, and the header that it answers."""
-        parts = urllib.parse.urlsplit(self.uri)
-        sock = socket.create_connection((parts.hostname, parts.port), _left(deadline))
+        parts = urlsplit(self.uri)
+        sock = socket.create_connection((parts.hostname, parts.port), timeout)
         keep_alive(sock)
-        if program.here.node:  # whose stop ends the call
-            program.here.node.run.calls.add(sock)
+        if here.node:  # whose stop ends the call
+            here.node.run.calls.add(sock)
         header = {'callerid': self.caller_id, 'service': self.name, 'md5sum': md5sum, **more}
-        network.write_ros_handshake_header(sock, header)
-        header = network.read_ros_handshake_header(sock, io.BytesIO(), 1 << 16)
+        write_ros_handshake_header(sock, header)
+        header = read_ros_handshake_header(sock, io.BytesIO(), 1 << 16)
         if 'error' in header:
             raise ConnectionError(header['error'])
         return sock, header
 
-    def _wrong_type(self, cls):
-        tried = self.md5sum
-        self.look_up()
-        right, self.md5sum = self.md5sum, tried
-        request, response = cls._request_class, cls._response_class
-        return ServiceTypeError(
-            f'{self.name} is of type {self.type} with md5sum {right} (request'
-            f' {messages.describe(request)}; response {messages.describe(response)}); the md5sum to'
-            f' be sent is {tried}: this program knows it with md5sum {cls._md5sum}'
-        )
-
-    def __repr__(self) -> str:
+    def __repr__(self):
         return f'<Service {self.name} ({self.type}) at {self.uri}>'
 
 
-def _left(deadline):
-    return deadline and max(deadline - time.monotonic(), 0.001)
-
-
-def _read(sock, size, deadline):
+def _read(sock, size, end):
     data = bytearray()
     while len(data) < size:
-        sock.settimeout(_left(deadline))
+        sock.settimeout(end and max(end - monotonic(), 0.001))
         part = sock.recv(min(size - len(data), 1 << 20))
         if not part:
             raise ConnectionError('it closed the connection')

@@ -7,8 +7,6 @@ In a ``conftest.py``: ``pytest_plugins = ['pharos.testing']``; and a test is::
         create_node(Driver).send_to('/greetings', data='hello')
         assert greetings.next().data == 'hello'
 """
-from __future__ import annotations
-
 import queue
 import re
 import threading
@@ -93,12 +91,12 @@ def master(monkeypatch) -> Iterator[Master]:
         _check_gone(lambda: set(threading.enumerate()) - threads)
 
 
-def _registrations(master: Master) -> set[tuple[str, str]]:
+def _registrations(master):
     kinds = master.system_state()
     return {(name, node) for kind in kinds for name, nodes in kind.items() for node in nodes}
 
 
-def _check_gone(left: Callable[[], set]) -> None:
+def _check_gone(left):
     try:
         until(lambda: not left())
     except TimeoutError:
@@ -139,5 +137,5 @@ def create_node(master: Master) -> Iterator[Callable[..., Any]]:
 
 
 @pytest.fixture(name='expect_failures')
-def _expect_failures(create_node: Callable[..., Any]) -> Callable[[], None]:
+def _expect_failures(create_node):
     return expect_failures

@@ -1,13 +1,11 @@
 """The Transcript: where blocks show things, as in Pharo."""
-from __future__ import annotations
-
 from typing import Any, Callable
 
 
 class _Transcript:
     """Shows things, a line each, from any thread. The report: ``Transcript show: message``."""
 
-    _receiver: Callable[[str], Any] | None = None
+    _receiver: Any = None
 
     def show(self, *things: Any) -> None:
         """Show one line on standard output, or to the receiver."""

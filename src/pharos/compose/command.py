@@ -9,14 +9,12 @@ Programs that use pharos themselves run apart. It is a node, /compose by default
 otherwise), with the services of a nodelet manager: `rosrun nodelet nodelet load PKG/EXECUTABLE
 compose __name:=talker` loads one more. It ends when all nodes have ended, or by Ctrl-C.
 """
-from __future__ import annotations
-
 import argparse
 import contextlib
 import os
 import sys
 
-import rosgraph.names
+from rosgraph.names import anonymous_name
 
 from pharos import Master, NodeNameInUseError, PharosError, spin
 from pharos.compose.composition import Composition
@@ -25,7 +23,7 @@ from pharos.compose.launch_file import LaunchFile
 from pharos.compose.script import load
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv=None):
     """Start, wait, and return the exit status."""
     parser = argparse.ArgumentParser(
         'compose', description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -40,8 +38,9 @@ def main(argv: list[str] | None = None) -> int:
     words = sys.argv[1:] if argv is None else argv
     options = parser.parse_args([word for word in words if ':=' not in word])
     mappings = [word for word in words if ':=' in word]
-    if len(options.file) > 2 or options.file and options.script:
-        parser.error('give one launch file, by package and name or by its path, or --script')
+    is_of_file = options.file or options.only or options.apart
+    if is_of_file and (options.script or len(options.file) not in (1, 2)):
+        parser.error('give one launch file, by package and name or by its path, first; or --script')
     with contextlib.ExitStack() as stack:
         try:
             return _run(stack, options, mappings)
@@ -64,7 +63,7 @@ def _run(stack, options, mappings):
     try:
         stack.enter_context(master.create(Container, 'compose', **settings))
     except NodeNameInUseError:
-        name = rosgraph.names.anonymous_name('compose')
+        name = anonymous_name('compose')
         stack.enter_context(master.create(Container, name, **settings))
     stack.enter_context(composition)
     if options.file:
@@ -75,10 +74,11 @@ def _run(stack, options, mappings):
         return composition.wait()
     for text in options.script:
         package, _, executable = text.partition('/')
-        is_file = os.path.isfile(text)
+        is_file = os.path.isfile(text) or not executable
         with composition.telling(text):
-            script = load(master, text if is_file else package, None if is_file else executable)
-            composition.nodes.append(script)
+            composition.nodes.append(
+                load(master, text if is_file else package, None if is_file else executable)
+            )
     if options.script:
         return composition.wait()
     spin()

@@ -1,13 +1,10 @@
 """Compositions: launch files whose Python nodes run in this process."""
-from __future__ import annotations
-
 import contextlib
 import os
 import pickle
 import sys
 import tempfile
 import threading
-from typing import TYPE_CHECKING, Any
 
 import roslaunch.core
 
@@ -19,9 +16,6 @@ from pharos.errors import PharosError
 from pharos.node import Lifecycle
 from pharos.ros_process import RosProcess
 from pharos.transcript import Transcript
-
-if TYPE_CHECKING:
-    from pharos.master import Master
 
 PATIENCE = 2.0  # seconds that a node may take to start before the next one does
 APART_PATIENCE = 40.0  # seconds: half of it for roslaunch, which gives each node 17
@@ -37,12 +31,12 @@ class Composition:
     :ivar process: the RosProcess in which roslaunch runs the others, or None
     """
 
-    def __init__(self, master: Master):
+    def __init__(self, master):
         self.master, self.process = master, None
         self.nodes: list[ScriptNode] = []
         self._ending, self._status, self._required = threading.Event(), 0, False
 
-    def launch(self, file: LaunchFile) -> None:
+    def launch(self, file):
         """Set the parameters of a launch file, and start its nodes.
 
         :raises PharosError: if the master does not answer, or refuses a parameter
@@ -63,7 +57,7 @@ class Composition:
         threading.Thread(target=self._watch, name='composition', daemon=True).start()
 
     @contextlib.contextmanager
-    def telling(self, name: str) -> Any:
+    def telling(self, name):
         """Show why a program is not started, and go on with the others."""
         try:
             yield
@@ -71,7 +65,7 @@ class Composition:
             self._status = 1
             Transcript.show(f'{name} is not started: {error}')
 
-    def start(self, name: str, path: str, args: list[str], launched: Any = None) -> ScriptNode:
+    def start(self, name, path, args, launched=None):
         """Start a program as the node of that name, and return it.
 
         :param launched: roslaunch's node, if it is of a launch file
@@ -86,7 +80,7 @@ class Composition:
         return node
 
     @property
-    def is_over(self) -> bool:
+    def is_over(self):
         """True if all that it started has ended."""
         goes_on = [
             node.lifecycle is not Lifecycle.STOPPED or (node.launched and node.launched.respawn)
@@ -100,7 +94,7 @@ class Composition:
             self.look()
         self.look()
 
-    def look(self) -> None:
+    def look(self):
         """Look once what has ended."""
         for node in [node for node in self.nodes if node.lifecycle is Lifecycle.STOPPED]:
             launched = node.launched
@@ -147,10 +141,10 @@ class Composition:
         for thread in threads:
             thread.join()
 
-    def __enter__(self) -> Composition:
+    def __enter__(self) -> 'Composition':
         return self
 
-    def __exit__(self, *error: Any) -> None:
+    def __exit__(self, *error):
         self.stop()
 
 

@@ -1,6 +1,4 @@
 """The node that a composition is for others: it loads and unloads programs by nodelet's services."""
-from __future__ import annotations
-
 import contextlib
 from typing import Any
 
@@ -25,7 +23,7 @@ class Container(Node):
         self.loaded: dict[str, ScriptNode] = {}
         self._bonds: dict[str, Any] = {}
 
-    def start(self) -> None:
+    def start(self):
         """Offer the services, if nodelet is installed."""
         super().start()
         with contextlib.suppress(UnknownTypeError):

@@ -1,10 +1,7 @@
 """Launch files, read by roslaunch itself, and which of their nodes can run in this process."""
-from __future__ import annotations
-
 import copy
 import os
 import re
-from typing import Any, Iterable
 
 import rosgraph.names
 import roslaunch.config
@@ -36,7 +33,7 @@ class LaunchFile:
     :raises PharosError: if roslaunch cannot read it
     """
 
-    def __init__(self, url, package, file, args: dict, only: Iterable[str], apart: Iterable[str]):
+    def __init__(self, url, package, file, args, only, apart):
         self.path = find_launch_file(package, file)
         loader = roslaunch.xmlloader.XmlLoader()
         given = [f'{name}:={value}' for name, value in args.items()]
@@ -48,8 +45,8 @@ class LaunchFile:
             raise PharosError(f'{self.path}: {error}') from error
         self._check(args, loader.root_context.resolve_dict.get('arg_doc', {}), 'arg')
         self.config.master.uri = url
-        self.here: list[tuple[str, str, list[str], Any]] = []
-        self.apart: list[Any] = []
+        self.here = []
+        self.apart = []
         nodes = {
             rosgraph.names.ns_join(node.namespace, node.name): node for node in self.config.nodes
         }
@@ -79,7 +76,7 @@ class LaunchFile:
             return self.apart.append(node)
         self.here.append((name, source_of(command[0]), command[1:], node))
 
-    def set_parameters(self, run_id: str) -> None:
+    def set_parameters(self, run_id):
         """Run what is to run before, clear and set the parameters, as roslaunch does.
 
         :raises PharosError: if a command fails, or the master refuses
@@ -93,7 +90,7 @@ class LaunchFile:
         except roslaunch.core.RLException as error:
             raise PharosError(f'{self.path}: {error}') from error
 
-    def config_apart(self) -> Any:
+    def config_apart(self):
         """Return the configuration that is left for roslaunch: the nodes apart alone."""
         rest = copy.copy(self.config)
         rest.nodes, rest.nodes_core, rest.tests, rest.executables = self.apart, [], [], []
@@ -101,7 +98,7 @@ class LaunchFile:
         return rest
 
 
-def can_run_here(path: str) -> bool:
+def can_run_here(path):
     """True if a program is written in Python, and does not make its nodes itself with pharos."""
     with open(path, errors='replace') as file:
         if not _PYTHON.match(file.readline(256)):

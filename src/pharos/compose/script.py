@@ -1,6 +1,4 @@
 """Scripts: programs of rospy that run unmodified as nodes of this process."""
-from __future__ import annotations
-
 import ast
 import collections
 import contextlib
@@ -12,9 +10,9 @@ import sys
 import threading
 import tokenize
 import types
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import rosgraph.names
+from rosgraph.names import anonymous_name, get_ros_namespace, load_mappings, ns_join
 
 from pharos import program
 from pharos.errors import PharosError, UnknownNodeError
@@ -22,9 +20,6 @@ from pharos.node import Lifecycle, Node
 from pharos.private_rospy.loader import Shim
 from pharos.private_rospy.run import Run
 from pharos.ros_process import find_program
-
-if TYPE_CHECKING:
-    from pharos.master import Master
 
 #: what catkin puts into a devel space for a script: it runs the file that it names
 _WRAPPER = re.compile(r'^python_script = (.+?)$.*exec\(compile\(', re.MULTILINE | re.DOTALL)
@@ -117,10 +112,10 @@ class ScriptRun(Run):
         if self.is_registered:
             return
         node = self.node
-        name = rosgraph.names.anonymous_name(name) if anonymous else name
-        self.base = rosgraph.names.load_mappings(self.argv).get('__name', name)
-        namespace = rosgraph.names.get_ros_namespace(self.environ, self.argv)
-        self.name = node.name = rosgraph.names.ns_join(namespace, self.base)
+        name = anonymous_name(name) if anonymous else name
+        self.base = load_mappings(self.argv).get('__name', name)
+        namespace = get_ros_namespace(self.environ, self.argv)
+        self.name = node.name = ns_join(namespace, self.base)
         node.tcp_port = options.pop('tcpros_port', 0) or node.tcp_port
         node.xmlrpc_port = options.pop('xmlrpc_port', 0) or node.xmlrpc_port
         for key, value in node.params.items():
@@ -197,11 +192,15 @@ class ScriptNode(Node):
     stop_timeout = 15.0
     exit_code: int | None = None
     launched: Any = None  # roslaunch's node, if a launch file named it
-    run_class, _opens_itself = ScriptRun, True
+    run_class = ScriptRun
 
     def __init__(self, path: str, args: list[str], params: dict | None = None, env: Any = ()):
         self.path, self.args, self.remappings = path, args, args
         self.params, self.env = params or {}, dict(env)
+
+    def start(self) -> None:
+        """Run the program, which opens its channels itself."""
+        super().start()
 
     def wait(self, timeout: float | None = None) -> int | None:
         """Wait until it has ended, and return its :attr:`exit_code`.
@@ -230,7 +229,7 @@ class NamedLines:
         return len(text)
 
 
-def wait_for_end(predicate: Any, timeout: float | None, name: str) -> None:
+def wait_for_end(predicate, timeout, name):
     """Wait until ``predicate()`` is true, or Ctrl-C; raise TimeoutError if it is not in time."""
     with program.quiet_wait():
         if not program.wait(predicate, timeout):
@@ -247,7 +246,7 @@ def _compiled(path):
         ) from error
 
 
-def source_of(path: str) -> str:
+def source_of(path):
     """Return the file with the source of a program: catkin's devel space has a wrapper."""
     with open(path, errors='replace') as file:
         wrapper = _WRAPPER.search(file.read(4000))
@@ -255,15 +254,8 @@ def source_of(path: str) -> str:
 
 
 def load(
-    master: Master,
-    package: str,
-    executable: str | None = None,
-    *args: Any,
-    name: str | None = None,
-    namespace: str | None = None,
-    remap: dict[str, str] | None = None,
-    params: dict[str, Any] | None = None,
-) -> ScriptNode:
+    master, package, executable=None, *args, name=None, namespace=None, remap=None, params=None
+):
     """Do what :meth:`Master.load` does."""
     path = os.path.abspath(package) if executable is None else find_program(package, executable)
     if not os.path.isfile(path):
@@ -272,5 +264,5 @@ def load(
     arguments += [f'__name:={name.rpartition("/")[2]}'] if name else []
     # until it calls init_node, it is called after its file
     named = name or re.sub(r'\W|^(?=[^A-Za-z])', 'x', os.path.basename(path).removesuffix('.py'))
-    named = rosgraph.names.ns_join(namespace, named) if namespace else named
+    named = ns_join(namespace, named) if namespace else named
     return master.create(ScriptNode, named, path=source_of(path), args=arguments, params=params)

@@ -6,12 +6,11 @@ numbers pass through the struct codes of the wire; only values of the very type 
 str, bytes) are shared; a message with anything else is serialized, and so is every message of a
 class that genpy did not generate in the usual way.
 """
-from __future__ import annotations
-
 import functools
 import io
 import itertools
 import struct
+import sys
 
 import genpy
 from genmsg.msgs import parse_type
@@ -32,7 +31,7 @@ def serialize(message):
     return buffer.getvalue()
 
 
-@functools.lru_cache(None)
+@functools.cache
 def copier_for(cls):
     """Return ``freeze(message)``, which raises what ``serialize`` raises, and ``thaw(frozen)``."""
     try:
@@ -57,7 +56,7 @@ def copied(message):
     return thaw(freeze(message))
 
 
-@functools.lru_cache(None)
+@functools.cache
 def thawer(sent, wanted):
     """Return the function that thaws a message of one class as one of another, such as AnyMsg."""
     thaw = copier_for(sent)[1]
@@ -75,12 +74,10 @@ def size_of(frozen):
     """Estimate the bytes that a message, frozen or not, holds."""
     if isinstance(frozen, genpy.Message):
         frozen = tuple(getattr(frozen, name) for name in frozen.__slots__)
-    if type(frozen) in (bytes, str):
-        return len(frozen)
     if type(frozen) is tuple:
         sample = frozen[:20]
         return 8 + sum(map(size_of, sample)) * len(frozen) // (len(sample) or 1)
-    return 8
+    return sys.getsizeof(frozen)
 
 
 # -- what the generated functions call
@@ -218,7 +215,7 @@ def nested_class(base, cls):
     return getattr(cls, '_classes', {}).get(base) or genpy.message.get_message_class(base)
 
 
-@functools.lru_cache(None)
+@functools.cache
 def _generate(cls, depth=0):
     source = _Source(cls, depth)
     unpack = [f'{", ".join(source.values)}, = frozen'] if source.values else []

@@ -6,12 +6,10 @@ that node were fast. There are at most as many workers as nodes, so that a callb
 holds up its own node alone. They end with the last node. Inline inboxes are run by the publisher's
 thread.
 """
-from __future__ import annotations
-
 import collections
 import threading
-import time
 from _thread import allocate_lock, get_ident
+from time import monotonic, perf_counter, sleep
 
 from pharos.intraprocess.copier import size_of
 
@@ -104,8 +102,8 @@ class _Worker:
     def wait_until_awake(self):
         """Let the woken thread have the interpreter, which takes 5 ms if this one keeps busy."""
         global _no_yield_before
-        if time.monotonic() > _no_yield_before and not self._awake.acquire(True, YIELD_LIMIT):
-            _no_yield_before = time.monotonic() + YIELD_PAUSE
+        if monotonic() > _no_yield_before and not self._awake.acquire(True, YIELD_LIMIT):
+            _no_yield_before = monotonic() + YIELD_PAUSE
 
     def _loop(self):
         while True:
@@ -126,9 +124,9 @@ class _Worker:
             if _ready and not turns.is_fast:
                 _wake_worker()
             turns.scheduled = False
-            began = time.perf_counter()
+            began = perf_counter()
             turns.run()
-            turns.is_fast = time.perf_counter() - began < FAST
+            turns.is_fast = perf_counter() - began < FAST
         _wake_worker()
 
 
@@ -196,7 +194,7 @@ class Inbox:
         """Sleep if the receiver got on since: a publisher that never sleeps would starve it."""
         if self.taken != self._taken_at_yield:
             self._taken_at_yield = self.taken
-            time.sleep(1e-6)
+            sleep(1e-6)
 
     def run(self):
         """Run the callback on the messages, the oldest first, until it is another inbox's turn."""
@@ -213,9 +211,9 @@ class Inbox:
                     value._connection_header = header
                     callback(value)
                 else:
-                    began = time.perf_counter()
+                    began = perf_counter()
                     callback(value)
-                    self._fast = self._fast + 1 if time.perf_counter() - began < FAST else 0
+                    self._fast = self._fast + 1 if perf_counter() - began < FAST else 0
                 if jobs or self.turns.closed:
                     break
         finally:
@@ -252,7 +250,7 @@ def hand_over(inboxes, last):
     woken = _wake_worker() if is_due else None  # which wakes another one, if there is more
     if woken is None:
         return last
-    now = time.perf_counter()
+    now = perf_counter()
     if now - last > BURST:
         woken.wait_until_awake()
     return now

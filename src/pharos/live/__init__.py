@@ -1,24 +1,21 @@
 """Look at what runs at a master; loaded only when used."""
-from __future__ import annotations
-
 import argparse
 import re
 import sys
-from typing import Any, Callable
 
 import rosgraph
 
 from pharos.errors import PharosError
 
 
-def parser(about: str | None) -> argparse.ArgumentParser:
+def parser(about):
     """Return a parser of arguments that shows the text as it is."""
     return argparse.ArgumentParser(
         description=about, formatter_class=argparse.RawDescriptionHelpFormatter
     )
 
 
-def run(command: Callable[[list[str]], Any]) -> int:
+def run(command):
     """Run a command with the program's arguments, and return the exit status."""
     try:
         command(rosgraph.myargv()[1:])

@@ -1,6 +1,4 @@
 """Show the graph of a master: who sends what to whom, their processes, and how."""
-from __future__ import annotations
-
 import collections
 import dataclasses
 import json
@@ -8,7 +6,7 @@ import pathlib
 import re
 import subprocess
 import time
-from typing import Any, Iterator, NamedTuple
+from typing import Any, NamedTuple
 from xml.sax.saxutils import escape
 
 from pharos import live
@@ -80,7 +78,7 @@ class Graph:
             each: name for name, node in shown for each in filter(is_shown, node.offers)
         }
 
-    def processes(self) -> dict[tuple[str, Any], list[str]]:
+    def processes(self):
         """Return ``{(host, process id): the names of its nodes}``."""
         found = collections.defaultdict(list)
         for name, node in self.nodes.items():
@@ -95,7 +93,7 @@ class Graph:
         """Return the graph for a terminal: each node with what it sends, receives and offers."""
         return '\n'.join(self._lines())
 
-    def _lines(self) -> Iterator[str]:
+    def _lines(self):
         yield f'{self.snapshot.master}: {len(self.nodes)} nodes, {len(self.topics)} topics'
         for (host, pid), names in self.processes().items():
             yield f'process {pid}, {host}'
@@ -117,7 +115,7 @@ class Graph:
         """Return the graph in graphviz's language."""
         return '\n'.join(self._dot())
 
-    def _dot(self) -> Iterator[str]:
+    def _dot(self):
         at = time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(self.snapshot.time))
         yield 'digraph pharos { rankdir=LR; newrank=true; ranksep=0.4; nodesep=0.14; nslimit=2'
         yield 'node [fontname="Helvetica", fontsize=11, height=0.3]; edge [arrowsize=0.7]'
@@ -169,10 +167,10 @@ class Graph:
         except (OSError, subprocess.SubprocessError) as error:
             raise PharosError(f'{error}: apt install graphviz, or leave out nodes') from error
 
-    def _repr_svg_(self) -> str:
+    def _repr_svg_(self):
         return self._draw('svg').decode()
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self):
         """Return it as plain values, for JSON."""
         nodes = {name: dataclasses.asdict(node) for name, node in self.nodes.items()}
         for node in nodes.values():
@@ -180,7 +178,7 @@ class Graph:
         edges = [edge._asdict() for edge in self.edges]
         return {'nodes': nodes, 'topics': self.topics, 'edges': edges, 'rates': self.rates}
 
-    def __repr__(self) -> str:
+    def __repr__(self):
         return f'<Graph of {len(self.nodes)} nodes: see text() and save()>'
 
 
@@ -195,7 +193,7 @@ def _box(kind, name, about, look):
     return f'{_id(kind, name)} [{look}, label=<{bold}{small}>]'
 
 
-def graph_of(master: Master, seconds: float = 0, **options: Any) -> Graph:
+def graph_of(master, seconds=0, **options):
     """Do what :meth:`Master.graph` does."""
     before = seen = snapshot.take(master)
     if seconds:
@@ -204,7 +202,7 @@ def graph_of(master: Master, seconds: float = 0, **options: Any) -> Graph:
     return Graph(seen, snapshot.topic_rates(before, seen), **options)
 
 
-def graph(words: list[str]) -> None:
+def graph(words):
     """Show the graph of the ROS master: processes, nodes, topics, and how messages go.
 
     graph                            as text
@@ -230,6 +228,6 @@ def graph(words: list[str]) -> None:
         print(json.dumps(found.as_dict()) if chosen.json else found.text())
 
 
-def main() -> int:
+def main():
     """Run the command."""
     return live.run(graph)

@@ -1,8 +1,5 @@
 """Draw messages by matplotlib: images, scans, clouds, paths, maps."""
-from __future__ import annotations
-
 import io
-from typing import Any
 
 import numpy
 
@@ -77,7 +74,7 @@ DRAWN = {
 }
 
 
-def png_of(message: Any) -> bytes | None:
+def png_of(message):
     """Return the picture of a message, None if it cannot be drawn."""
     if message._type not in DRAWN:
         return None
@@ -92,7 +89,7 @@ def png_of(message: Any) -> bytes | None:
         return None
 
 
-def png(figure: Any) -> bytes:
+def png(figure):
     """Return a matplotlib Figure as a notebook shows it."""
     file = io.BytesIO()
     figure.savefig(file, format='png')

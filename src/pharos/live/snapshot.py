@@ -1,6 +1,4 @@
 """Take one look at the graph of a master: nodes, topics, services, connections and their counts."""
-from __future__ import annotations
-
 import collections
 import concurrent.futures
 import dataclasses
@@ -10,7 +8,6 @@ from typing import Any, NamedTuple
 
 import rosgraph.network
 
-from pharos.master import Master
 from pharos.private_rospy.run import ServerProxy
 
 TIMEOUT = 1.0  # seconds that a node has for each answer
@@ -53,7 +50,7 @@ class Snapshot:
     topics: dict[str, str]  # and their types; '' if nobody has named it
     links: dict[Link, tuple[int, int]]  # messages and bytes so far
 
-    def rates_since(self, before: Snapshot) -> dict[Link, tuple[float, float]]:
+    def rates_since(self, before):
         """Return messages and bytes a second of the connections that both have."""
         seconds, rates = self.time - before.time, {}
         for link, now in self.links.items():
@@ -63,7 +60,7 @@ class Snapshot:
         return rates
 
 
-def take(master: Master) -> Snapshot:
+def take(master):
     """Ask the master, and all nodes at once.
 
     :raises MasterUnreachableError: if the master does not answer
@@ -123,7 +120,7 @@ def _links(nodes):
     return dict(links)
 
 
-def topic_rates(before: Snapshot, now: Snapshot, what: int = 0) -> dict[str, float]:
+def topic_rates(before, now, what=0):
     """Return ``{topic: messages (1: bytes) a second}``: the best connection of each publisher."""
     best: dict[tuple[str, str], float] = collections.defaultdict(float)
     for link, rate in now.rates_since(before).items() if now is not before else ():

@@ -2,8 +2,6 @@
 
 Nodes count what comes and goes in any case, so that two looks make rates. Nothing is subscribed to.
 """
-from __future__ import annotations
-
 import collections
 import json
 import os
@@ -12,7 +10,6 @@ import sys
 import termios
 import time
 import tty
-from typing import Any, Iterator, Sequence
 
 import psutil
 from rich.console import Console, Group
@@ -35,12 +32,12 @@ SUMS = 'IN/S', 'OUT/S', 'IN B/S', 'OUT B/S', 'DROP', 'FAIL'
 class Meter:
     """Looks again and again, and tells what has happened since the last time."""
 
-    def __init__(self, master: Master, names: Sequence[str] = ()):
+    def __init__(self, master, names=()):
         self._master, self._names = master, names
         self._before = snapshot.take(master)
         self._processes: dict[int, psutil.Process] = {}
 
-    def measure(self) -> dict[str, list[dict[str, Any]]]:
+    def measure(self):
         """Return ``{view: rows}``; a row is ``{column: value}``, None if it is not known.
 
         :raises MasterUnreachableError: if the master does not answer
@@ -73,7 +70,7 @@ class Meter:
             yield {**found, **sums, 'NODES': ' '.join(row['NODE'] for row in rows)}
 
 
-def _nodes(before, now) -> Iterator[dict[str, Any]]:
+def _nodes(before, now):
     came = collections.defaultdict(lambda: [0, 0])
     went = collections.defaultdict(dict)
     sizes = collections.defaultdict(float)
@@ -102,7 +99,7 @@ def _nodes(before, now) -> Iterator[dict[str, Any]]:
         }
 
 
-def _topics(before, now) -> Iterator[dict[str, Any]]:
+def _topics(before, now):
     rates, sizes = (snapshot.topic_rates(before, now, what) for what in (0, 1))
     nodes = now.nodes.values()
     for name, kind in now.topics.items():
@@ -119,7 +116,7 @@ def _topics(before, now) -> Iterator[dict[str, Any]]:
         }
 
 
-def table(rows: list[dict[str, Any]], sort: int = 0) -> Table:
+def table(rows, sort=0):
     """Return the rows by a column: words by the alphabet, numbers the largest first."""
     columns = list(rows[0]) if rows else ['nothing there']
     by = columns[sort % len(columns)]
@@ -145,7 +142,7 @@ def _cell(column, value):
     return f'[bold red]{text}[/]' if column in BAD and value else text
 
 
-def show(meter: Meter, interval: float) -> None:
+def show(meter, interval):
     """Show the tables until q or Ctrl-C."""
     view, sort, said = VIEWS[0], 0, ''
     keys = sys.stdin.fileno()
@@ -172,7 +169,7 @@ def show(meter: Meter, interval: float) -> None:
         termios.tcsetattr(keys, termios.TCSADRAIN, terminal)
 
 
-def top(words: list[str]) -> None:
+def top(words):
     """Show what nodes, processes and topics are doing.
 
     Messages and bytes a second, transports, what was dropped, failures, CPU and memory. Nothing is
@@ -198,6 +195,6 @@ def top(words: list[str]) -> None:
         Console(width=None if sys.stdout.isatty() else 10000).print(table(found[view]))
 
 
-def main() -> int:
+def main():
     """Run the command."""
     return live.run(top)

@@ -1,17 +1,14 @@
 """Look at a topic for a while; each look has a node of its own, which stops at its end."""
-from __future__ import annotations
-
 import contextlib
 import operator
 import queue
 import statistics
 import time
-from typing import Any, Callable, Iterator, NamedTuple
+from typing import NamedTuple
 
 import rosgraph.names
 import rospy
 
-from pharos.channels import Topic
 from pharos.errors import UnknownTopicError
 from pharos.live.words import number, text_of
 from pharos.node import BlockNode
@@ -32,13 +29,13 @@ class Rate(NamedTuple):
     max: float
     std_dev: float
 
-    def __repr__(self) -> str:
+    def __repr__(self):
         apart = f'{self.min:.3g} to {self.max:.3g} s apart, std dev {self.std_dev:.3g} s'
         return f'{self.rate:.4g} Hz ({apart}), {number(self.bandwidth)}B/s, {self.window} messages'
 
 
 @contextlib.contextmanager
-def looking(topic: Topic, typed_as: Any = None) -> Iterator[queue.Queue]:
+def looking(topic, typed_as=None):
     """Return a queue of what comes on a topic: ``(when, message)``.
 
     :raises UnknownTopicError: if nobody publishes on it
@@ -67,7 +64,7 @@ def _come(came, seconds, wait=0.0):
             yield found
 
 
-def measure(topic: Topic, seconds: float) -> Rate:
+def measure(topic, seconds):
     """Do what :meth:`Topic.hz` does."""
     with looking(topic, rospy.AnyMsg) as came:
         found = list(_come(came, seconds, FIRST_TIMEOUT))
@@ -83,7 +80,7 @@ def measure(topic: Topic, seconds: float) -> Rate:
     )
 
 
-def last(topic: Topic) -> Any:
+def last(topic):
     """Do what :attr:`Topic.last` does."""
     with looking(topic) as came:
         for _, message in _come(came, LAST_TIMEOUT):
@@ -91,7 +88,7 @@ def last(topic: Topic) -> Any:
     raise TimeoutError(f'no message came on {topic.name} within {LAST_TIMEOUT:g} s')
 
 
-def watch(topic: Topic, count: int | None, block: Callable[[Any], Any] | None) -> None:
+def watch(topic, count, block):
     """Do what :meth:`Topic.watch` does."""
     show = block or (lambda message: Transcript.show(f'{text_of(message)}\n---'))
     with looking(topic) as came, contextlib.suppress(KeyboardInterrupt):
@@ -100,7 +97,7 @@ def watch(topic: Topic, count: int | None, block: Callable[[Any], Any] | None) -
             count = None if count is None else count - 1
 
 
-def plot(topic: Topic, fields: tuple[str, ...], seconds: float) -> Any:
+def plot(topic, fields, seconds):
     """Do what :meth:`Topic.plot` does."""
     from matplotlib.figure import Figure
 

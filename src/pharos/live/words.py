@@ -1,8 +1,5 @@
 """Tell numbers, messages and nodes in words."""
-from __future__ import annotations
-
 import time
-from typing import Any
 
 import genpy
 
@@ -12,7 +9,7 @@ from pharos.live import snapshot
 LONGEST = 12  # values of an array, and lines of a text, that are shown
 
 
-def number(value: float | None) -> str:
+def number(value):
     """Return a number in at most five characters, '-' for None: 9.9, 120, 1.2k, 35M."""
     if value is None:
         return '-'
@@ -24,7 +21,7 @@ def number(value: float | None) -> str:
     return f'{value:.1f}G'
 
 
-def text_of(message: genpy.Message) -> str:
+def text_of(message):
     """Return a message as ``rostopic echo`` prints it, with long arrays and texts cut."""
     return genpy.message.strify_message(_cut(message))
 
@@ -59,7 +56,7 @@ class Description(str):
     __repr__ = str.__str__
 
 
-def describe(node: Any, seconds: float) -> Description:
+def describe(node, seconds):
     """Return a node in words; its rates are counted for so many seconds.
 
     :raises UnknownNodeError: if the master does not know the node

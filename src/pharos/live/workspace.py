@@ -2,14 +2,11 @@
 
 ``rosrun pharos workspace`` is one; a notebook has one by ``%load_ext pharos.live.workspace``.
 """
-from __future__ import annotations
-
 import argparse
 import os
 import pathlib
 import re
 import sys
-from typing import Any
 
 import rosgraph.names
 import rospkg
@@ -32,7 +29,7 @@ STRING = re.compile(r'.*[\'"]([\w/~]*)$', re.DOTALL)
 FIELD = re.compile(r'.*send_to\(\s*[\'"]([\w/]+)[\'"].*,\s*(\w*)$', re.DOTALL)
 
 
-def namespace(argv: list[str] | None = None) -> dict[str, Any]:
+def namespace(argv=None):
     """Return the names of a session: all of pharos, ``master`` and ``me``, a node.
 
     The master is one of its own if none answers.
@@ -48,7 +45,7 @@ def namespace(argv: list[str] | None = None) -> dict[str, Any]:
     return {**{each: getattr(pharos, each) for each in pharos.__all__}, 'master': master, 'me': me}
 
 
-def completions(line: str, master: Master) -> list[str]:
+def completions(line, master):
     """Return what a line can end in: names of the graph, types of messages, fields of send_to."""
     string, field = STRING.fullmatch(line), FIELD.fullmatch(line)
     words: list[str] = []
@@ -71,7 +68,7 @@ def completions(line: str, master: Master) -> list[str]:
     return sorted({word for word in words if word.startswith(typed.groups()[-1])})
 
 
-def load_ipython_extension(shell: Any, names: dict[str, Any] | None = None) -> None:
+def load_ipython_extension(shell, names=None):
     """Make a session of IPython a workspace."""
     names = names or namespace()
     shell.push(names)
@@ -89,7 +86,7 @@ def load_ipython_extension(shell: Any, names: dict[str, Any] | None = None) -> N
     print(BANNER.format(pharos=pharos, count=len(names['master'].nodes()), **names))
 
 
-def workspace(words: list[str]) -> None:
+def workspace(words):
     """Open a session of IPython with the live ROS graph: `master`, a node `me`, and all of pharos."""
     read = live.parser(workspace.__doc__)
     read.add_argument('script', nargs='?', metavar='SCRIPT', help='a program to be run first')
@@ -106,6 +103,6 @@ def workspace(words: list[str]) -> None:
     app.start()
 
 
-def main() -> int:
+def main():
     """Run the command."""
     return live.run(workspace)

@@ -4,23 +4,25 @@
 rospy, rosgraph and what is written on rospy in the private set, and all else as usual.
 """
 import builtins
-import functools
-import importlib.util
+import importlib
 import itertools
 import pathlib
 import re
 import sys
 import threading
+from functools import cache
 from importlib.machinery import PathFinder
+from importlib.util import module_from_spec, resolve_name
 
 import rospy.exceptions
 
-SHARED = set(sys.stdlib_module_names) | {
-    *('genpy', 'genmsg', 'roslib', 'rospkg', 'rosmaster', 'catkin', 'catkin_pkg', 'pharos'),
-    *('numpy', 'yaml', 'matplotlib', 'cv2', 'PIL'),
-}
-#: rospy's configuration strips the log of handlers; the others use sys.argv, sys.path, os.environ or threads
-PRIVATE = 'logging', 'argparse', 'optparse', 'subprocess', 'concurrent', 'pkgutil'
+SHARED = sys.stdlib_module_names.union(
+    'genpy genmsg roslib rospkg rosmaster catkin catkin_pkg pharos'.split(),
+    'numpy yaml matplotlib cv2 PIL'.split(),
+)
+#: rospy's configuration strips the log of handlers, and smach keeps the log and what is being built in its
+#: classes; the others use sys.argv, sys.path, os.environ or threads
+PRIVATE = 'logging argparse optparse subprocess concurrent pkgutil smach'.split()
 MOST_FILES = 300  # of a package that could be written on rospy
 
 
@@ -34,7 +36,7 @@ class Shim:
         return getattr(self._real, name)
 
 
-@functools.lru_cache(None)
+@cache
 def _find(name, path):
     spec = PathFinder.find_spec(name, path)
     if spec is None:
@@ -42,7 +44,7 @@ def _find(name, path):
     return spec, spec.loader.get_code(name) if spec.has_location else None
 
 
-@functools.lru_cache(None)
+@cache
 def _imports_of(top):
     """Return what a module or package of Python imports; nothing of a large one or one in C."""
     spec = PathFinder.find_spec(top)
@@ -60,7 +62,7 @@ def _imports_of(top):
     return {'rospy', *names} if b'rospy' in text else set(names)
 
 
-@functools.lru_cache(None)
+@cache
 def _reaches_rospy(top):
     """True if the code of a package says rospy, or imports a package that does, and so on."""
     names, new = set(), {top}
@@ -113,7 +115,7 @@ class PrivateModules:
 
     def _execute(self, name, path):
         spec, code = _find(name, path)
-        self.modules[name] = module = importlib.util.module_from_spec(spec)
+        self.modules[name] = module = module_from_spec(spec)
         vars(module)['__builtins__'] = self.builtins
         try:
             if code is None and spec.loader and spec.has_location:
@@ -124,27 +126,21 @@ class PrivateModules:
             del self.modules[name]
             raise
         self._patch(module)
-        return module
 
     def _import_module(self, name, package=None):
-        return self.load(importlib.util.resolve_name(name, package))
+        return self.load(resolve_name(name, package))
 
     def _import(self, name, globals=None, locals=None, fromlist=(), level=0):
         full = name
         if level:
-            full = importlib.util.resolve_name('.' * level + name, globals['__package__'])
+            full = resolve_name('.' * level + name, globals['__package__'])
         top = full.partition('.')[0]
         if full not in self.modules and not self._is_private(full):
             module = builtins.__import__(name, globals, locals, fromlist, level)
             return module if fromlist else self.modules.get(top, module)
         module = self.load(full)
         if not fromlist:
-            return module if level else self.load(top)
-        for item in fromlist if hasattr(module, '__path__') else ():
-            for each in getattr(module, '__all__', ()) if item == '*' else (item,):
-                if not hasattr(module, each):
-                    try:
-                        setattr(module, each, self.load(f'{full}.{each}'))
-                    except ModuleNotFoundError:
-                        pass  # the import statement itself says so
+            return self.load(top)
+        if hasattr(module, '__path__'):
+            importlib._bootstrap._handle_fromlist(module, fromlist, self.load)
         return module

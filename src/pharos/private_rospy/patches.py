@@ -4,15 +4,15 @@ Over ``def f(original, run, *args)``, ``@patch(module, target)`` has ``f`` calle
 target; ``run`` is the Run whose copy is patched. Over ``def f(original, run)``, ``@replace(module,
 target)`` puts what it returns in the target's place. Each docstring says what is wrong with rospy.
 """
-from __future__ import annotations
-
 import functools
 import socket
 import threading
-import urllib.parse
+from urllib.parse import urlsplit
 
 import rospkg
 import rospy
+from rosgraph.network import ROSHandshakeException, decode_ros_handshake_header, is_local_address
+from rospy.impl.tcpros_service import convert_return_to_response
 
 from pharos.intraprocess.copier import copied
 from pharos.private_rospy import transport
@@ -21,8 +21,14 @@ from pharos.private_rospy.loader import Shim
 LARGEST = 1 << 20  # bytes of a connection header, and of an XML-RPC request
 #: module -> [(target, function that makes the replacement)]
 TABLE = {}
-_packages = functools.lru_cache(None)(rospkg.RosPack)
-_client = threading.local()  # .address: of the client whose request this thread answers
+_packages = functools.cache(rospkg.RosPack)
+
+
+class _Client(threading.local):
+    address = ()  # of the client whose request this thread answers
+
+
+_client = _Client()
 
 
 def replace(module, target):
@@ -40,13 +46,9 @@ def patch(module, target):
 
     def enter(function):
         def make(original, run):
-            @functools.wraps(original)
-            def patched(*args, **kwargs):
-                return function(original, run, *args, **kwargs)
+            wrap = functools.wraps(original)
+            return wrap(lambda *args, **kwargs: function(original, run, *args, **kwargs))
 
-            return patched
-
-        make.__doc__ = function.__doc__
         replace(module, target)(make)
         return function
 
@@ -76,15 +78,14 @@ def overlay(cls, methods):
 @patch('rosgraph.network', 'read_ros_handshake_header')
 def read_handshake(original, run, sock, *buffer):
     """Wait for ever for a peer that says nothing, too little, or announces 4 GiB."""
-    network = run.modules.load('rosgraph.network')
     run.limit(sock)
     head = sock.recv(4, socket.MSG_WAITALL)
     size = int.from_bytes(head, 'little')
     data = head + sock.recv(size, socket.MSG_WAITALL) if size <= LARGEST else b''
     run.deadlines.pop(sock, None)
     if len(data) < 4 + size:
-        raise network.ROSHandshakeException(f'it sent no connection header of {size} bytes in time')
-    return network.decode_ros_handshake_header(data)
+        raise ROSHandshakeException(f'no connection header of {size} bytes came in time')
+    return decode_ros_handshake_header(data)
 
 
 @patch('rospy.impl.tcpros_base', 'TCPROSServer._tcp_server_callback')
@@ -97,14 +98,13 @@ def accept(original, run, self, sock, address):
         original(self, sock, address)
 
     run.sockets.add(sock)
-    run.start_thread(shake_hands, 'client')
+    run.start_thread(shake_hands)
 
 
 @patch('rospy.impl.tcpros_base', 'logwarn')
 def name_client(original, run, text, *args):
     """Does not say which client it refused."""
-    host, port = _client.address
-    original(f'{host}:{port}: {text}', *args)
+    original(f'{":".join(map(str, _client.address))}: {text}', *args)
 
 
 @patch('rospy.impl.tcpros_base', 'rospyerr')
@@ -143,7 +143,7 @@ def start_xmlrpc(original, run, self):
         with server:  # closes it
             server.serve_forever(poll_interval=60)
 
-    run.start_thread(serve, 'xmlrpc')
+    run.start_thread(serve)
 
 
 @patch('rosgraph.xmlrpc', 'XmlRpcNode.shutdown')
@@ -169,14 +169,13 @@ def process_request(original, run, self, request, address):
     run.sockets.add(request)
     if run.stopping.is_set():
         transport.shut(request)
-    run.start_thread(answer, 'request')
+    run.start_thread(answer)
 
 
 @patch('rosgraph.xmlrpc', 'SilenceableXMLRPCRequestHandler.do_POST')
 def limit_request(original, run, self):
     """Reads requests of any size."""
     if int(self.headers.get('content-length', 0)) > LARGEST:
-        self.close_connection = True
         return self.send_error(413)
     original(self)
     run.limit(self.connection)
@@ -233,10 +232,8 @@ def shut_down_from_outside(original, run, self, caller_id, msg=''):
     """Obeys everybody, also if an earlier node at its URI is meant (ros_comm #2241)."""
     if caller_id == '/master' and f'[{self.name}]' not in str(msg):
         return 1, 'an earlier node at this address was meant', 0
-    host, master = _client.address[0], urllib.parse.urlsplit(self.masterUri).hostname
-    is_near = host == socket.gethostbyname(master) or run.modules.load(
-        'rosgraph.network'
-    ).is_local_address(host)
+    host, master = _client.address[0], urlsplit(self.masterUri).hostname
+    is_near = host == socket.gethostbyname(master) or is_local_address(host)
     if is_near or run.node.allow_remote_shutdown:
         run.end_node()
         return 1, 'shutdown', 0
@@ -276,7 +273,7 @@ def receive(original, run, connection, address, port, uri, callback, topic):
         error = str(problem)
     connection.close()
     transport.end_share(topic, uri, subscription.data_class, run)
-    if error and 'md5sum' in error:
+    if error and ('md5sum' in error or 'do not match' in error):  # rospy compares the names, too
         run.node.refused(topic, error)
     elif not subscription.closed:
         run.connect_again(topic, uri, error)
@@ -296,10 +293,11 @@ def publisher_update(original, run, self, name, uris):
 
 
 @patch('rospy.impl.masterslave', 'ROSHandler.publisherUpdate')
-def publishers_changed(original, run, self, caller_id, topic, publishers):
+def publishers_changed(original, run, self, *args):  # it checks their number and types
     """Does not hear that there is none."""
-    run.publishers.pop(topic, None)
-    return original(self, caller_id, topic, publishers)
+    for topic in args[1:2]:
+        run.publishers.pop(topic, None)
+    return original(self, *args)
 
 
 @patch('rospy.impl.registration', 'RegManager.cleanup')
@@ -315,10 +313,10 @@ def cleanup(original, run, self, reason):
 
 
 @patch('rospy.impl.masterslave', 'ROSHandler.paramUpdate')
-def parameter_changed(original, run, self, caller_id, key, value):
+def parameter_changed(original, run, self, *args):
     """Tells its own cache alone."""
     run.node.read_parameters()
-    return original(self, caller_id, key, value)
+    return original(self, *args)
 
 
 @patch('rospy.msproxy', 'MasterProxy.__setitem__')
@@ -360,21 +358,19 @@ def handle_call(original, run, self, connection, header):
 def call_service(original, run, self, *args, **kwargs):
     """Has no way to a provider of the same process but a socket."""
     found = transport.local_service(run.node.master.url, self.resolved_name)
-    if not found or found[1].service_class._md5sum != self.service_class._md5sum:
+    if not found or found.service_class._md5sum != self.service_class._md5sum:
         return original(self, *args, **kwargs)
     fill = run.modules.load('rospy.msg').args_kwds_to_message
     request = fill(self.request_class, args, kwargs)
-    return answer(*found, request, run.name)
+    return answer(found, request, run.name)
 
 
-def answer(run, service, request, caller_id):
+def answer(service, request, caller_id):
     """Have a rospy.Service of this process answer a request, in this thread."""
     request = copied(request)
     request._connection_header = {'callerid': caller_id, 'service': service.resolved_name}
-    convert = run.modules.load('rospy.impl.tcpros_service').convert_return_to_response
     try:
-        return copied(convert(service.handler(request), service.response_class))
-    except rospy.ServiceException as error:
-        raise rospy.ServiceException(f'service cannot process request: {error}') from error
+        answered = service.handler(request)
+        return copied(convert_return_to_response(answered, service.response_class))
     except Exception as error:
-        raise rospy.ServiceException(f'error processing request: {error}') from error
+        raise rospy.ServiceException(f'service cannot process request: {error}') from error

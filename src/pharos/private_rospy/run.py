@@ -1,21 +1,23 @@
 """One run of one node: a rospy of its own, started and stopped."""
 import atexit
-import contextlib
 import errno
 import functools
 import gc
-import http.client
 import os
 import socket
 import sys
 import threading
 import time
-import urllib.parse
-import weakref
-import xml.parsers.expat
-import xmlrpc.client
+import xmlrpc
+from contextlib import suppress
+from http.client import HTTPException
+from time import monotonic
+from urllib.parse import urlsplit
+from weakref import WeakSet
+from xml.parsers.expat import ExpatError
+from xmlrpc import client as xmlrpc_client
 
-from pharos.errors import NodeNameInUseError, PortInUseError
+from pharos.errors import MasterUnreachableError, NodeNameInUseError, PharosError, PortInUseError
 from pharos.intraprocess.workers import Turns, relieve
 from pharos.private_rospy import patches, transport
 from pharos.private_rospy.loader import PrivateModules, Shim
@@ -23,18 +25,13 @@ from pharos.private_rospy.transport import runs
 
 MASTER_LIMIT = 5.0  # seconds for each question to a master or node
 STOP_LIMIT = 2.0  # seconds that a stop waits for threads of rospy
-WATCH_PERIOD = 1.0  # seconds between two looks at a master
-UNREACHABLE = (
-    OSError,
-    xmlrpc.client.Error,
-    http.client.HTTPException,
-    xml.parsers.expat.ExpatError,
-)
+WATCH_PERIOD = 0.25  # seconds between two looks; each fourth is at the masters, too
+UNREACHABLE = OSError, xmlrpc_client.Error, HTTPException, ExpatError
 _METHODS = {'pub': 'registerPublisher', 'sub': 'registerSubscriber', 'srv': 'registerService'}
 _end_of_watch = threading.Event()
 
 
-class _Transport(xmlrpc.client.Transport):
+class _Transport(xmlrpc_client.Transport):
     limit = MASTER_LIMIT
 
     def make_connection(self, host):
@@ -43,7 +40,7 @@ class _Transport(xmlrpc.client.Transport):
         return connection
 
 
-class ServerProxy(xmlrpc.client.ServerProxy):
+class ServerProxy(xmlrpc_client.ServerProxy):
     """One that gives up after ``limit`` seconds."""
 
     def __init__(self, uri, limit=MASTER_LIMIT):
@@ -63,17 +60,20 @@ class Run:
         self.node, self.name = node, node.name
         self.master_url = node.master.url
         self.stopping = threading.Event()
-        self.threads = weakref.WeakSet()
-        self.sockets, self.calls = weakref.WeakSet(), weakref.WeakSet()
+        self.threads = WeakSet()
+        self.sockets, self.calls = WeakSet(), WeakSet()
         self.deadlines = {}  # socket of a client that is to say something -> until when
         self.publishers = {}  # topic -> URIs, as the master last said
         self.connecting = set()  # (topic, URI, ...)
         self.known = set()  # (kind, name) of what is registered
         self.uri, self.turns = '', Turns()
         namespace, _, self.base = node.name.rpartition('/')
-        self.environ = {'ROSCONSOLE_FORMAT': '[${severity}] [${time}]: ${node}: ${message}'}
-        self.environ.update(os.environ, ROS_MASTER_URI=node.master.url)
-        self.environ['ROS_NAMESPACE'] = namespace or '/'
+        self.environ = {
+            'ROSCONSOLE_FORMAT': '[${severity}] [${time}]: ${node}: ${message}',
+            **os.environ,
+            'ROS_MASTER_URI': node.master.url,
+            'ROS_NAMESPACE': namespace or '/',
+        }
         if node.domain:  # it comes before ROS_IP
             self.environ['ROS_HOSTNAME'] = node.domain
         self.argv = [self.base, *node.remappings]
@@ -102,7 +102,7 @@ class Run:
                 time.sleep(0)
 
         self.Thread = Thread
-        client = Shim(xmlrpc.client, ServerProxy=ServerProxy)
+        client = Shim(xmlrpc_client, ServerProxy=ServerProxy)
         return {
             'os': Shim(os, environ=self.environ, register_at_fork=lambda **hooks: None),
             'sys': Shim(sys, argv=self.argv),
@@ -114,11 +114,9 @@ class Run:
             'xmlrpc.client': client,
         }
 
-    def start_thread(self, target, name=None):
+    def start_thread(self, target):
         """Start a thread of the node's."""
-        thread = self.Thread(target=target, name=name)
-        thread.start()
-        return thread
+        self.Thread(target=target).start()
 
     # -- start
 
@@ -145,7 +143,7 @@ class Run:
             raise PortInUseError(
                 f'{self.name}: port {port} is in use: choose another one, or 0 for any'
             ) from None
-        node, address = self.node, urllib.parse.urlsplit(self.uri)
+        node, address = self.node, urlsplit(self.uri)
         node.uri, node.tcp_port, node.xmlrpc_port = self.uri, port_taken, address.port
         node.domain = node.domain or address.hostname
 
@@ -161,7 +159,7 @@ class Run:
 
     def _check_name(self):
         uri = self.node.master.call('lookupNode', self.name)
-        with contextlib.suppress(*UNREACHABLE):
+        with suppress(*UNREACHABLE):
             if uri and ServerProxy(uri, 1.0).getPid('/pharos'):
                 raise NodeNameInUseError(
                     f'{self.name} is running already, at {uri}: choose another name, or end that one'
@@ -171,13 +169,12 @@ class Run:
 
     def register(self, kind, name, data):
         """Tell the master of a topic or service; the watcher repairs what it does not hear of."""
-        method = getattr(self.core.xmlrpcapi(self.master_url), _METHODS[kind])
-        with contextlib.suppress(*UNREACHABLE):
-            code, _, value = method(self.name, name, data, self.uri)
-            if kind == 'sub' and code == 1:
+        with suppress(MasterUnreachableError):
+            value = self.node.master.call(_METHODS[kind], name, data, self.uri, caller_id=self.name)
+            if kind == 'sub' and value:
                 self.update_publishers(name, value)
         for other in list(runs.values()) if kind == 'pub' else ():  # the master takes 0.1 s
-            if other.master_url == self.master_url and name in other.topics.subs:
+            if other.master_url == self.master_url:
                 other.connect(name, self.uri)
 
     def update_publishers(self, topic, uris):
@@ -187,7 +184,7 @@ class Run:
             if uri in runs:
                 self.connect(topic, uri)
             else:
-                self.start_thread(lambda uri=uri: self.connect(topic, uri), f'connect {topic}')
+                self.start_thread(lambda uri=uri: self.connect(topic, uri))
 
     def connect(self, topic, uri):
         """Connect a subscription to a publisher, unless it is or is about to be."""
@@ -200,13 +197,11 @@ class Run:
         self.connecting.add(attempt)
         try:
             if uri in runs:
-                refusal = transport.connect(runs[uri], self, topic)
-                if refusal:
-                    self.node.refused(topic, refusal)
+                transport.connect(runs[uri], self, topic)
             elif self.node.master.share_connections and transport.follow(self, *key, subscription):
                 pass
             elif self.handler._connect_topic(*key)[0] != 1:
-                self.start_thread(lambda: self.connect_again(*key), f'connect {topic}')
+                self.start_thread(lambda: self.connect_again(*key))
         except (AttributeError, UnboundLocalError):  # rospy's, if it was closed meanwhile
             if topic in self.topics.subs and not self.stopping.is_set():
                 raise
@@ -245,7 +240,7 @@ class Run:
 
     def limit(self, sock):
         """Close a client's socket if it says nothing within the node's client_timeout."""
-        self.deadlines[sock] = time.monotonic() + self.node.client_timeout
+        self.deadlines[sock] = monotonic() + self.node.client_timeout
 
     # -- stop
 
@@ -270,8 +265,9 @@ class Run:
             left.append('a delegate')
         if left:
             self.ros.logwarn(f'left behind, since they did not end in time: {", ".join(left)}')
+        deadline = monotonic() + timeout
         for publisher in list(self.topics.pubs.values()):
-            publisher.flush(timeout)
+            publisher.flush(deadline)
         self._close_calls()  # Ctrl-C may have ended one in its middle
         self.core.signal_shutdown.__wrapped__('stop')
         self._close_calls()
@@ -290,26 +286,28 @@ class Run:
 
 def join(threads, timeout):
     """Wait for the end of threads other than this one; returns those that go on."""
-    deadline = time.monotonic() + timeout
+    deadline = monotonic() + timeout
     others = [thread for thread in threads if thread is not threading.current_thread()]
     for thread in others:
-        thread.join(max(0.0, deadline - time.monotonic()))
+        thread.join(max(0.0, deadline - monotonic()))
     return [thread for thread in others if thread.is_alive()]
 
 
 def _watch():
-    """Ask each master once a second what it knows of our nodes: it may have been started again."""
+    """Look who has left or is silent; ask each master what it knows of our nodes, once a second."""
+    looks = 0
     while not _end_of_watch.wait(WATCH_PERIOD):
+        looks += 1
         relieve()
         nodes = list(runs.values())
         for run in nodes:
-            run.topics.check_all()  # rospy looks twice a second who has left (ros_comm #927)
+            run.topics.check_all()  # who has left (ros_comm #927)
             for sock, deadline in list(run.deadlines.items()):
-                if time.monotonic() > deadline:
+                if monotonic() > deadline:
                     run.deadlines.pop(sock, None)
                     transport.shut(sock)
-        for url in {run.master_url for run in nodes}:
-            with contextlib.suppress(*UNREACHABLE):
+        for url in () if looks % 4 else {run.master_url for run in nodes}:
+            with suppress(*UNREACHABLE, PharosError):
                 state = ServerProxy(url).getSystemState('/pharos')[2]
                 for run in nodes:
                     if run.master_url == url and not run.stopping.is_set():

@@ -46,13 +46,6 @@ class Link(Transport):
                 if end.cleanup_cb:
                     end.cleanup_cb(end)
 
-    def latched(self):
-        """Return the latched messages, for a callback that comes later."""
-        messages = [self.thaw(frozen) for frozen in list(self.publisher.latches.values())]
-        for message in messages:
-            message._connection_header = self.header
-        return messages
-
 
 class Follower(Transport):
     """The share of a subscription in the connection of another node."""
@@ -111,20 +104,19 @@ def end_share(topic, uri, cls, run):
         del _shares[topic, uri, cls]
     for follower in share.followers:
         follower.close()
-        follower.run.start_thread(lambda run=follower.run: run.connect(topic, uri), 'connect')
+        follower.run.start_thread(lambda run=follower.run: run.connect(topic, uri))
 
 
 def connect(sender, receiver, topic):
-    """Link the publisher and the subscription of a topic of two runs of this process.
-
-    :returns: why not, if their types differ
-    """
+    """Link the publisher and the subscription of a topic of two runs of this process."""
     publisher, subscription = sender.topics.pubs.get(topic), receiver.topics.subs.get(topic)
     if not publisher or not subscription:
-        return None
+        return
     sent, wanted = publisher.data_class, subscription.data_class
     if wanted._md5sum not in (sent._md5sum, TOPIC_ANYTYPE):
-        return f'{sender.name} publishes {sent._type}, not {wanted._type}'
+        return receiver.node.refused(
+            topic, f'{sender.name} publishes {sent._type}, not {wanted._type}'
+        )
     protocol = sender.modules.load('rospy.impl.tcpros_pubsub').TCPROSPub
     header = protocol(topic, sent, publisher.is_latch, publisher.headers).get_header_fields()
     with publisher.lock:
@@ -148,11 +140,11 @@ def connect(sender, receiver, topic):
 
 
 def local_service(master_url, name, uri=None):
-    """Return the run of this process that offers a service, and its rospy.Service, or None."""
+    """Return the rospy.Service of a node of this process, or None."""
     for run in list(runs.values()):
         service = run.services.get_service(name)
         if service and run.master_url == master_url and uri in (None, service.uri):
-            return run, service
+            return service
 
 
 def shut(sock):
@@ -203,16 +195,16 @@ class PublisherOverlay:
                 raise rospy.ROSException('publish() to a closed topic')
             if connection_override is None:
                 self.seq += 1
-                if self.has_header:
-                    message.header.seq = self.seq
-                    if message.header.frame_id is None:
-                        message.header.frame_id = '0'
                 if self.connections is not self.seen:
                     self.seen = self.connections
                     self.links, self.remote = by_kind(self.seen)
                 links, remote = self.links, self.remote
             else:
                 links, remote = by_kind([connection_override])
+            if self.has_header:  # as serialize_message does
+                message.header.seq = self.seq
+                if message.header.frame_id is None:
+                    message.header.frame_id = '0'
             is_latched = self.is_latch and latch_key is not False and connection_override is None
             if links or is_latched or not remote:  # then it is checked alone
                 frozen = self.freeze(message)
@@ -240,8 +232,7 @@ class PublisherOverlay:
         try:
             serialize_message(buffer, self.seq, message)
         except Exception:  # copying makes bytes of numpy's arrays, or says what is wrong
-            buffer = io.BytesIO()
-            serialize_message(buffer, self.seq, self.thaw(self.freeze(message)))
+            return self.write(self.thaw(self.freeze(message)), connections)
         data = buffer.getvalue()
         self.message_data_sent += len(data)
         for connection in connections:
@@ -250,9 +241,8 @@ class PublisherOverlay:
             except Exception:  # its peer has gone
                 connection.close()
 
-    def flush(self, timeout):
+    def flush(self, deadline):
         """Wait until all is with the sockets."""
-        deadline = time.monotonic() + timeout
         for sender in self.connections:
             if isinstance(sender, Sender):  # there is none without a queue_size
                 sender.flush(deadline)
@@ -288,12 +278,15 @@ class SubscriptionOverlay:
     def call_plain(self, message):
         for callback, args in self.callbacks or ():
             if not isinstance(callback, Inbox):
-                self._invoke_callback(message, callback, args)
+                with contextlib.suppress(SystemExit):  # it would end a worker
+                    self._invoke_callback(message, callback, args)
 
     def add_callback(self, callback, args):
         self.rospy_add_callback(callback, args)
         for link in by_kind(self.connections)[0]:
-            for message in link.latched():
+            for frozen in list(link.publisher.latches.values()):
+                message = link.thaw(frozen)
+                message._connection_header = link.header
                 self._invoke_callback(message, callback, args)
 
     def close(self):
@@ -337,6 +330,7 @@ def receive(connection, address, port, uri, subscription, run):
     if sock is None:
         return
     run.sockets.add(sock)
+    keep_alive(sock)
     sock.settimeout(None)
     cls, header = subscription.data_class, connection.header
     share = _shares.get((subscription.resolved_name, uri, cls))
@@ -356,6 +350,9 @@ def receive(connection, address, port, uri, subscription, run):
             connection.stat_bytes += size + 4
             connection.stat_num_msg += 1
             message = cls().deserialize(data)
+            logger = subscription.statistics_logger
+            if logger:
+                logger.callback(message, connection.callerid_pub, connection.stat_bytes)
             inboxes = subscription.inboxes()
             for follower in share.followers if share else ():
                 if not follower.done:
@@ -380,7 +377,7 @@ class Sender:
         self._queue, self.busy = collections.deque(), False
         self._rest = b''  # of a message whose beginning the socket has
         self._changed = threading.Condition()
-        run.start_thread(self._send_all, f'sender of {connection.name}')
+        run.start_thread(self._send_all)
 
     def __getattr__(self, name):
         return getattr(self._connection, name)
