@@ -127,16 +127,17 @@ class OutputChannel(Channel):
     """
 
     def __init__(self, node, topic, message_class, latch, queue_size):
-        self.latch, self.queue_size, self.sent, self._latched = latch, queue_size, 0, None
+        self.latch, self.queue_size, self.sent = latch, queue_size, 0
         self._key = latch and self  # under which rospy's publisher keeps what is latched
         self._begin(node, topic, message_class)
 
     def open(self):
         """Advertise, and wait for the subscribers that the master knows."""
         known = set(Topic(self.node.master, self.topic).subscribers)
+        latched = self.end and self._impl.latches.get(self)  # before the node stopped
         super().open()
-        if self._latched is not None:
-            self._impl.publish(self._latched, None, self)
+        if latched is not None:
+            self._impl.publish(self._impl.thaw(latched), None, self)
         self._wait_for(known)
 
     def _open(self):
@@ -210,11 +211,6 @@ class OutputChannel(Channel):
             if self._impl.ref_count == 1:
                 self._impl.flush(time.monotonic() + self.node.stop_timeout)
         super().close()
-
-    def node_stopped(self):
-        super().node_stopped()
-        frozen = self._impl.latches.get(self)
-        self._latched = None if frozen is None else self._impl.thaw(frozen)
 
     def wait_for_subscribers(self, count: int = 1, timeout: float | None = None) -> bool:
         """Wait until so many subscribers are connected; True if they are.

@@ -19,19 +19,60 @@ from pharos.intraprocess.copier import copied, nested_class
 
 _TYPE = re.compile(r'[A-Za-z][A-Za-z0-9_]{0,127}/[A-Za-z][A-Za-z0-9_]{0,127}')
 _RULE = '=' * 80
-_COLOUR = 'uint8 r\nuint8 g\nuint8 b\n'
-_PLACE = 'float32 x\nfloat32 y\nfloat32 theta\n'
-_VELOCITY = 'float32 linear\nfloat32 angular\n'
-#: the definitions of turtlesim's types as in ROS Fuerte, which the report uses; Debian has none
-TURTLESIM = {
-    ('msg', 'turtlesim/Color'): _COLOUR,
-    ('msg', 'turtlesim/Pose'): _PLACE + '\nfloat32 linear_velocity\nfloat32 angular_velocity\n',
-    ('msg', 'turtlesim/Velocity'): _VELOCITY,
-    ('srv', 'turtlesim/Kill'): 'string name\n---\n',
-    ('srv', 'turtlesim/SetPen'): _COLOUR + 'uint8 width\nuint8 off\n---\n',
-    ('srv', 'turtlesim/Spawn'): _PLACE + 'string name\n---\nstring name\n',
-    ('srv', 'turtlesim/TeleportAbsolute'): _PLACE + '---\n',
-    ('srv', 'turtlesim/TeleportRelative'): _VELOCITY + '---\n',
+#: turtlesim's types as in ROS Fuerte, which the report uses; Debian has none
+_TURTLESIM = '''
+msg turtlesim/Color
+uint8 r
+uint8 g
+uint8 b
+
+msg turtlesim/Pose
+float32 x
+float32 y
+float32 theta
+float32 linear_velocity
+float32 angular_velocity
+
+msg turtlesim/Velocity
+float32 linear
+float32 angular
+
+srv turtlesim/Kill
+string name
+---
+
+srv turtlesim/SetPen
+uint8 r
+uint8 g
+uint8 b
+uint8 width
+uint8 off
+---
+
+srv turtlesim/Spawn
+float32 x
+float32 y
+float32 theta
+string name
+---
+string name
+
+srv turtlesim/TeleportAbsolute
+float32 x
+float32 y
+float32 theta
+---
+
+srv turtlesim/TeleportRelative
+float32 linear
+float32 angular
+---
+
+'''
+#: (msg or srv, type) -> definition
+_shipped = {
+    (kind, type_): text
+    for kind, type_, text in re.findall(r'(\w+) (\S+)\n(.*?\n)\n', _TURTLESIM, re.S)
 }
 _defined = {}
 _lock = threading.RLock()  # genpy's generator is not thread-safe
@@ -76,7 +117,7 @@ def define_service(type_: str, text: str) -> Any:
 def _define(kind, type_, text, find, make):
     cls = make(type_, text)
     with suppress(UnknownTypeError):
-        if _fields(find(type_)) != _fields(cls) and (kind, type_) not in TURTLESIM:
+        if _fields(find(type_)) != _fields(cls) and (kind, type_) not in _shipped:
             raise MessageTypeError(f'{type_} is known with other fields: define another type')
     _defined.setdefault((kind, type_), text)
     return find(type_)
@@ -101,16 +142,15 @@ def _text_of(kind, type_, ask=None):
     with suppress(Exception):  # there is no file; or another package.xml cannot be parsed
         folder = pathlib.Path(rospkg.RosPack().get_path(package), kind)
         return (folder / f'{name}.{kind}').read_text('utf-8', 'replace')
-    asked = ask and key not in TURTLESIM and ask(type_)
-    for text in asked, _defined.get(key), TURTLESIM.get(key):
+    asked = ask and key not in _shipped and ask(type_)
+    for text in asked, _defined.get(key), _shipped.get(key):
         if isinstance(text, str):
             return text
-    define = 'define_message' if kind == 'msg' else 'define_service'
     raise UnknownTypeError(
         f'unknown type {type_!r}: Python has no {package}.{kind}.{name}, there is no'
         f' {package}/{kind}/{name}.{kind} on ROS_PACKAGE_PATH'
         f' ({":".join(rospkg.get_ros_paths())}), and no definition was given; install {package}, source'
-        f' its workspace, or call {define}({type_!r}, text)'
+        f' its workspace, or call define_{"message" if kind == "msg" else "service"}(type, text)'
     )
 
 

@@ -181,17 +181,15 @@ class Node(Receiver):
         Neither ``__init__`` nor ``start`` of the new class runs.
 
         :raises TypeError: if it is not a subclass of Node
+        :raises AttributeError: if it lacks a method that is a block of the node
         """
         check_class(node_class)
         self.check_running()
 
         def change():
             receivers = self, *self.opened
-            try:
-                soul = rebound(self.soul, self, node_class)
-                blocks = [rebound(each.delegate, self, node_class) for each in receivers]
-            except AttributeError as error:
-                raise PharosError(f'{node_class.__name__} lacks a method: {error}') from error
+            soul = rebound(self.soul, self, node_class)
+            blocks = [rebound(each.delegate, self, node_class) for each in receivers]
             self.__class__, self.soul = node_class, soul
             for receiver, block in zip(receivers, blocks):
                 receiver.delegate = block
@@ -466,16 +464,15 @@ class Node(Receiver):
         if isinstance(block, type) and issubclass(block, Message):
             typed_as, block = block, fill
         channel = self._senders.get((topic, typed_as))
-        if channel and not channel.closed:
-            return channel.send(block, to=to, **fields)
-        with self._opening:
-            name = self.resolve(topic)
-            given = type(block) if isinstance(block, Message) else None
-            cls = self._class_of(name, typed_as or given)
-            open_ones = (each for each in self.channels if each.topic == name)
-            known = [each for each in open_ones if isinstance(each, OutputChannel)]
-            channel = known[0] if known else OutputChannel(self, name, cls, False, QUEUE_SIZE)
-            self._senders[topic, typed_as] = channel
+        known = channel and not channel.closed
+        if not known:
+            with self._opening:
+                name = self.resolve(topic)
+                given = type(block) if isinstance(block, Message) else None
+                cls = self._class_of(name, typed_as or given)
+                known = self._open_on(name, OutputChannel)
+                channel = known[0] if known else OutputChannel(self, name, cls, False, QUEUE_SIZE)
+                self._senders[topic, typed_as] = channel
         try:
             return channel.send(block, to=to, **fields)
         except Exception:
@@ -483,8 +480,11 @@ class Node(Receiver):
                 channel.close()
             raise
 
+    def _open_on(self, topic, kind=Channel):
+        return [each for each in self.channels if each.topic == topic and isinstance(each, kind)]
+
     def _class_of(self, topic, typed_as, is_receiver=False):
-        known = [each.message_class for each in self.channels if each.topic == topic]
+        known = [each.message_class for each in self._open_on(topic)]
         if typed_as is None and known:
             return known[0]
         type_ = typed_as or self.master.topic_type(topic)

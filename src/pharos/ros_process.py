@@ -21,38 +21,29 @@ KEPT_LINES = 10_000
 _COLOURS = re.compile(r'\x1b\[[0-9;]*[A-Za-z]|\x1b\]0;[^\x07]*\x07')
 
 
-class RosProcess:
+class RosProcess(subprocess.Popen):
     """A running program; made by :meth:`Master.run` and :meth:`Master.launch`.
 
-    It has a terminal of its own, so that what it prints comes at once.
+    It has a terminal of its own, so that what it prints comes at once. ``pid`` and ``poll()`` are those
+    of ``subprocess.Popen``.
 
     :param on_line: ``on_line(text)`` is called for each line that it prints, in another thread
-    :ivar command: the program and its arguments
-    :ivar pid: the number of its process
     """
 
     def __init__(self, command, master_url, on_line=None):
-        self.command, self._on_line = command, on_line
-        self._lines = collections.deque(maxlen=KEPT_LINES)
+        self._lines, self._on_line = collections.deque(maxlen=KEPT_LINES), on_line
         terminal, slave = os.openpty()
         tty.setraw(slave)
         self._terminal = open(terminal, errors='replace')
         environ = {**os.environ, 'ROS_MASTER_URI': master_url, 'TERM': 'dumb'}
+        streams = dict.fromkeys(('stdin', 'stdout', 'stderr'), slave)
         try:
-            self._process = subprocess.Popen(
-                command,
-                stdin=slave,
-                stdout=slave,
-                stderr=slave,
-                env=environ,
-                start_new_session=True,
-            )
+            super().__init__(command, env=environ, start_new_session=True, **streams)
         except OSError as error:
             self._terminal.close()
             raise PharosError(f'{command[0]} cannot be started: {error}') from None
         finally:
             os.close(slave)
-        self.pid = self._process.pid
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
         atexit.register(self.terminate)
@@ -78,23 +69,19 @@ class RosProcess:
         try:
             os.write(self._terminal.fileno(), text.encode())
         except (OSError, ValueError):
-            raise PharosError(f'{self.command[0]} has ended, and reads nothing') from None
-
-    def poll(self) -> int | None:
-        """Return its exit code, None while it runs."""
-        return self._process.poll()
+            raise PharosError(f'{self!r} has ended, and reads nothing') from None
 
     def wait(self, timeout: float | None = None) -> int:
         """Wait for its end, and return its exit code.
 
         :raises subprocess.TimeoutExpired: after ``timeout`` seconds
         """
-        code = self._process.wait(timeout)
+        code = super().wait(timeout)
         if self._reader is not threading.current_thread():
             self._reader.join(1)
         return code
 
-    def terminate(self, timeout: float = 5.0) -> int:
+    def terminate(self, timeout: float = 5.0) -> int:  # type: ignore[override]
         """End it and what it has started, as Ctrl-C does, after ``timeout`` seconds by force.
 
         :returns: its exit code
@@ -104,22 +91,14 @@ class RosProcess:
         for number in signal.SIGINT, signal.SIGTERM, signal.SIGKILL:
             with contextlib.suppress(ProcessLookupError, subprocess.TimeoutExpired):
                 os.killpg(self.pid, number)
-                self._process.wait(timeout / 2)
+                super().wait(timeout / 2)
         for process in started:
             with contextlib.suppress(psutil.Error):
                 process.kill()
         return self.wait()
 
-    def __enter__(self):
-        return self
-
     def __exit__(self, *error):
         self.terminate()
-
-    def __repr__(self):
-        code = self.poll()
-        state = f'pid {self.pid}' if code is None else f'ended with {code}'
-        return f'<RosProcess {" ".join(self.command)}, {state}>'
 
 
 def find_program(package, executable):

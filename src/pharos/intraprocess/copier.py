@@ -73,8 +73,8 @@ def thawer(sent, wanted):
 def size_of(frozen):
     """Estimate the bytes that a message, frozen or not, holds."""
     if isinstance(frozen, genpy.Message):
-        frozen = tuple(getattr(frozen, name) for name in frozen.__slots__)
-    if type(frozen) is tuple:
+        frozen = [getattr(frozen, name) for name in frozen.__slots__]
+    if isinstance(frozen, (list, tuple)):
         sample = frozen[:20]
         return 8 + sum(map(size_of, sample)) * len(frozen) // (len(sample) or 1)
     return sys.getsizeof(frozen)

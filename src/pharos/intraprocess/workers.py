@@ -172,13 +172,13 @@ class Inbox:
         """
         queue = self.queue
         waiting = len(queue)
-        if waiting:
-            is_by_bytes = waiting >= self.limit < self.queue_size
-            if size or is_by_bytes or waiting in (2, 7) or not waiting & 63:
-                size = size or size_of(value)
-                self.limit = min(self.queue_size, max(1, self.queue_bytes // size))
+        if waiting >= self.limit or waiting and not waiting & (waiting - 1):  # a power of two
+            most = max(1, self.queue_bytes // (size or size_of(value)))
+            self.limit = min(self.queue_size, most)
             if waiting >= self.limit:
-                self._let_receiver_run()
+                if self.taken != self._taken_at_yield:  # the receiver got on since
+                    self._taken_at_yield = self.taken
+                    sleep(1e-6)  # a publisher that never sleeps would starve it
                 while len(queue) >= self.limit:
                     try:
                         queue.popleft()
@@ -189,12 +189,6 @@ class Inbox:
         if not self._scheduled:
             self._scheduled = True
             self.turns.jobs.append(self)
-
-    def _let_receiver_run(self):
-        """Sleep if the receiver got on since: a publisher that never sleeps would starve it."""
-        if self.taken != self._taken_at_yield:
-            self._taken_at_yield = self.taken
-            sleep(1e-6)
 
     def run(self):
         """Run the callback on the messages, the oldest first, until it is another inbox's turn."""

@@ -39,6 +39,12 @@ class _Transport(xmlrpc_client.Transport):
         connection.timeout = self.limit
         return connection
 
+    def single_request(self, *args):
+        try:
+            return super().single_request(*args)
+        finally:  # a call that Ctrl-C ended would spoil the next one
+            self.close()
+
 
 class ServerProxy(xmlrpc_client.ServerProxy):
     """One that gives up after ``limit`` seconds."""
@@ -128,7 +134,12 @@ class Run:
         :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: stop() undoes the rest
         """
         base, port = self.modules.load('rospy.impl.tcpros_base'), self.node.tcp_port
-        self._check_name()
+        taken = self.node.master.call('lookupNode', self.name)
+        with suppress(*UNREACHABLE):
+            if taken and ServerProxy(taken, 1.0).getPid('/pharos'):
+                raise NodeNameInUseError(
+                    f'{self.name} is running already, at {taken}: choose another name, or end that one'
+                )
         try:
             server = base.init_tcpros_server(port)
             tcp = server.tcp_ros_server = base.TCPServer(server._tcp_server_callback, port)
@@ -156,14 +167,6 @@ class Run:
                 _end_of_watch.clear()
                 threading.Thread(target=_watch, daemon=True).start()
             runs[uri] = self
-
-    def _check_name(self):
-        uri = self.node.master.call('lookupNode', self.name)
-        with suppress(*UNREACHABLE):
-            if uri and ServerProxy(uri, 1.0).getPid('/pharos'):
-                raise NodeNameInUseError(
-                    f'{self.name} is running already, at {uri}: choose another name, or end that one'
-                )
 
     # -- registration and connections
 
@@ -268,9 +271,7 @@ class Run:
         deadline = monotonic() + timeout
         for publisher in list(self.topics.pubs.values()):
             publisher.flush(deadline)
-        self._close_calls()  # Ctrl-C may have ended one in its middle
         self.core.signal_shutdown.__wrapped__('stop')
-        self._close_calls()
         for sock in list(self.sockets):
             transport.shut(sock)
         join(set(self.threads) - set(self.node.souls), STOP_LIMIT)
@@ -278,10 +279,6 @@ class Run:
         for sock in list(self.sockets):
             sock.close()
         gc.collect(1)
-
-    def _close_calls(self):
-        for proxy in self.core._xmlrpc_cache.values():
-            proxy('close')()
 
 
 def join(threads, timeout):

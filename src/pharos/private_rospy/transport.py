@@ -243,9 +243,10 @@ class PublisherOverlay:
 
     def flush(self, deadline):
         """Wait until all is with the sockets."""
-        for sender in self.connections:
-            if isinstance(sender, Sender):  # there is none without a queue_size
-                sender.flush(deadline)
+        while time.monotonic() < deadline:
+            if not any(getattr(each, 'busy', False) for each in self.connections):
+                break
+            time.sleep(0.001)
 
     def close(self):
         close(self)
@@ -419,7 +420,6 @@ class Sender:
             with self._changed:
                 while not (self._rest or self._queue or connection.done):
                     self.busy = False
-                    self._changed.notify_all()
                     self._changed.wait()
                 if connection.done:
                     self.busy = False
@@ -429,9 +429,3 @@ class Sender:
                 connection.write_data(data)
             except Exception:  # its peer has gone
                 connection.close()
-
-    def flush(self, deadline):
-        """Wait until all is with the socket."""
-        with self._changed:
-            left = deadline - time.monotonic()
-            self._changed.wait_for(lambda: not self.busy or self._connection.done, max(left, 0))
