@@ -197,6 +197,8 @@ SAY = "rospy.init_node('program')\nrospy.set_param('/said', {})\nrospy.spin()"
         ("rospy.get_param('~gains')", {'p': [1, 2]}),
         ("rospy.get_param('~depth')", 3),
         ('threading.current_thread() is threading.main_thread()', True),
+        ("exec('from std_srvs.srv import *') or sys.argv[1]", '--mode'),
+        ("__import__('actionlib.msg').msg.TestGoal.__name__", 'TestGoal'),
     ],
 )
 def test_script_finds_what_it_was_given(master, load, expression, expected):
@@ -207,13 +209,8 @@ def test_script_finds_what_it_was_given(master, load, expression, expected):
 
 
 def test_exit_code_is_the_scripts(master, ends):
-    for how, code in [
-        ('exit', 0),
-        ('exit 3', 3),
-        ('exit text', 1),
-        ('error', 1),
-        ('signal_shutdown', 0),
-    ]:
+    codes = {'exit': 0, 'exit 3': 3, 'exit text': 1, 'error': 1, 'signal_shutdown': 0}
+    for how, code in codes.items():
         script = ends(how)
         assert script.wait(TIMEOUT) == code
         assert script.exit_code == code

@@ -36,7 +36,7 @@ class Receiver:
     _delegate: Block | None = None
 
     @property
-    def delegate(self) -> Any:
+    def delegate(self):
         """The block run for each message, as ``block(message, channel)`` or ``block(message)``.
 
         That of a channel goes before that of its node. One that is set takes effect with the next

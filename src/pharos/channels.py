@@ -96,7 +96,7 @@ class InputChannel(Receiver, Channel, Inbox):
 
     def _open(self):
         self.queue.clear()  # what came while the node stopped was never scheduled
-        self.turns, self.closed, self._scheduled = self.node.run.turns, False, False
+        self.turns, self.closed = self.node.run.turns, False
         self.end = self.node.ros.Subscriber(self.topic, self.message_class, self)
 
     def __call__(self, message):
@@ -165,7 +165,7 @@ class OutputChannel(Channel):
                 'warning',
             )
 
-    def publish(self, message: Message, connection: Any = None) -> None:
+    def publish(self, message: Message, connection=None) -> None:
         """Send a message.
 
         :param connection: to that one alone
@@ -186,7 +186,7 @@ class OutputChannel(Channel):
             raise messages.explain(message, error) from error
         self.sent += 1
 
-    def send(self, block: Any = None, *, to: Any = None, **fields: Any) -> Message:
+    def send(self, block=None, *, to=None, **fields) -> Message:
         """Fill a new message by ``block(message)`` and keywords, or take a ready one; send it.
 
         :param to: the node that alone gets it: a name, Node or ExternalNode
@@ -251,7 +251,7 @@ class Topic:
         nodes = self.master.own_nodes()
         return [each for node in nodes for each in node.channels if each.topic == self.name]
 
-    def hz(self, seconds: float = 1.0) -> Any:
+    def hz(self, seconds: float = 1.0):
         """Measure for some seconds how often messages come, and how large they are."""
         from pharos.live import watching
 
@@ -272,16 +272,16 @@ class Topic:
 
         watching.watch(self, count, block)
 
-    def plot(self, *fields: str, seconds: float = 5.0) -> Any:
+    def plot(self, *fields: str, seconds: float = 5.0):
         """Return a matplotlib Figure of fields such as 'linear.x' over some seconds."""
         from pharos.live import watching
 
         return watching.plot(self, fields, seconds)
 
-    def input_channel(self, node: Node, typed_as: Any = None, **options: Any) -> InputChannel:
+    def input_channel(self, node: Node, typed_as=None, **options) -> InputChannel:
         """Hand a node its end to receive at; see :meth:`Node.interested_in`."""
         return node.interested_in(self.name, typed_as, **options)
 
-    def output_channel(self, node: Node, typed_as: Any = None, **options: Any) -> OutputChannel:
+    def output_channel(self, node: Node, typed_as=None, **options) -> OutputChannel:
         """Hand a node its end to send at; see :meth:`Node.output_channel`."""
         return node.output_channel(self.name, typed_as, **options)

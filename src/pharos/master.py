@@ -8,7 +8,7 @@ import os
 import re
 import subprocess
 import sys
-from typing import Any, Sequence
+from typing import Sequence
 from xmlrpc.client import dumps, loads
 
 from rosgraph.names import get_ros_namespace, is_legal_remap, load_mappings, ns_join
@@ -194,8 +194,8 @@ class Master:
         soul: Block | None = None,
         delegate: Block | None = None,
         argv: Sequence[str] | None = None,
-        **kwargs: Any,
-    ) -> Any:
+        **kwargs,
+    ):
         """Create a node, register and start it, and return it.
 
         The report: ``master create: Driver named: '/driver' domain: '127.0.0.1' tcpPort: 8080
@@ -245,19 +245,20 @@ class Master:
 
     def nodes(self) -> list[Node | ExternalNode]:
         """Return all nodes, of this process and others."""
-        own = {node.name: node for node in self.own_nodes()}
         names = {name for kind in self.system_state() for users in kind.values() for name in users}
-        return [own.get(name) or ExternalNode(self, name) for name in sorted(names)]
+        return [self._named(name) for name in sorted(names)]
 
     def node(self, name: str) -> Node | ExternalNode:
         """Return the node of that name.
 
         :raises UnknownNodeError: if there is none
         """
-        name = full_name(node_name(name))
-        external = ExternalNode(self, name)
+        found = self._named(full_name(node_name(name)))
+        return found.uri and found  # type: ignore[return-value]
+
+    def _named(self, name):
         own = [node for node in self.own_nodes() if node.name == name]
-        return own[0] if own else external.uri and external  # type: ignore[return-value]
+        return own[0] if own else ExternalNode(self, name)
 
     def may_live(self, name):
         """False if the node of that name refuses connections, or is not registered."""
@@ -301,7 +302,7 @@ class Master:
 
     # -- programs
 
-    def run(self, package: str, executable: str, *args: Any, on_line: Any = None) -> RosProcess:
+    def run(self, package: str, executable: str, *args, on_line=None) -> RosProcess:
         """Run a program of ROS at this master, as rosrun does.
 
         :param on_line: ``on_line(text)`` is called for each line that it prints
@@ -309,13 +310,13 @@ class Master:
         path = find_program(package, executable)
         return RosProcess([path, *map(str, args)], self.url, on_line)
 
-    def launch(self, package: str | None, file: str, **args: Any) -> RosProcess:
+    def launch(self, package: str | None, file: str, **args) -> RosProcess:
         """Run a launch file at this master, as roslaunch does; ``package`` None: it is a path."""
         path = find_launch_file(package, file)
         arguments = [f'{name}:={value}' for name, value in args.items()]
         return RosProcess(['roslaunch', '--skip-log-check', path, *arguments], self.url)
 
-    def load(self, *args: Any, **options: Any) -> Any:
+    def load(self, *args, **options):
         """Run a program of rospy, unmodified, as a node of this process: a :class:`ScriptNode`.
 
         ``load(package, executable=None, *args, name=None, namespace=None, remap=None, params=None)``
@@ -330,7 +331,7 @@ class Master:
 
         return load(self, *args, **options)
 
-    def compose(self, package: str | None, file: str, **options: Any) -> Any:
+    def compose(self, package: str | None, file: str, **options):
         """Run the Python nodes of a launch file in this process: a :class:`Composition`.
 
         ``compose(package, file, only=(), apart=(), share_connections=False, **args)``
@@ -348,7 +349,7 @@ class Master:
 
         return compose(self, package, file, **options)
 
-    def graph(self, seconds: float = 0) -> Any:
+    def graph(self, seconds: float = 0):
         """Return the :class:`Graph` of all nodes and topics, with rates if it looks for a while."""
         from pharos.live.graph import graph_of
 

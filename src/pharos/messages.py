@@ -4,7 +4,7 @@ import pathlib
 import re
 import threading
 from contextlib import suppress
-from typing import Any, Callable
+from typing import Callable
 
 import genmsg
 import rospkg
@@ -92,7 +92,7 @@ def message_class(type_: str | type, ask: Callable | None = None) -> type[Messag
     return _installed('msg', type_) or _made_message(type_, _text_of('msg', type_, ask))
 
 
-def service_class(type_: Any) -> Any:
+def service_class(type_):
     """Return the class of a service type, sought as :func:`message_class` does."""
     if hasattr(type_, '_request_class'):
         return type_
@@ -109,7 +109,7 @@ def define_message(type_: str, text: str) -> type[Message]:
     return _define('msg', type_, text, message_class, _made_message)
 
 
-def define_service(type_: str, text: str) -> Any:
+def define_service(type_: str, text: str):
     """Define a service type by the text of a ``.srv`` file, as :func:`define_message` does."""
     return _define('srv', type_, text, service_class, _made_service)
 

@@ -7,7 +7,7 @@ import threading
 import types
 from collections import Counter
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, Callable, Iterator
+from typing import TYPE_CHECKING, Iterator
 
 from genpy import Message
 import rosgraph.names
@@ -226,12 +226,12 @@ class Node(Receiver):
         return [each for each in self.opened if isinstance(each, Channel) and not each.closed]
 
     @property
-    def ros(self) -> Any:
+    def ros(self):
         """The node's own rospy in this run, whole: ``node.ros.Timer``, ``node.ros.Time.now()``."""
         self.check_running()
         return self.run.ros
 
-    def ros_import(self, name: str) -> Any:
+    def ros_import(self, name: str):
         """Return a library written on rospy, such as 'actionlib', bound to this run of the node."""
         self.check_running()
         return self.run.modules.load(name)
@@ -268,7 +268,7 @@ class Node(Receiver):
     def __repr__(self):
         return f'<{type(self).__name__} {self.name} {self.lifecycle.value}>'
 
-    def execute(self) -> Any:
+    def execute(self):
         """Run the soul once, in this thread, and return its value (``node execute`` in the report)."""
         return self._run_soul(self._soul_or(None))
 
@@ -366,7 +366,7 @@ class Node(Receiver):
         error = MessageTypeError(f'{self.name} does not receive from {topic}: {reason}')
         self.report(error, topic, 'connection')
 
-    def log(self, text: Any, level: str = 'info') -> None:
+    def log(self, text, level: str = 'info') -> None:
         """Log a line to the screen, the log file and /rosout.
 
         :param level: 'debug', 'info', 'warning' (or 'warn'), 'error' or 'fatal'
@@ -402,7 +402,7 @@ class Node(Receiver):
         queue_size: int = QUEUE_SIZE,
         inline: bool = False,
         shared: bool = False,
-        from_: Any = None,
+        from_=None,
     ) -> InputChannel:
         """Receive the messages of a topic from now on.
 
@@ -440,12 +440,12 @@ class Node(Receiver):
     def send_to(
         self,
         topic: str,
-        block: Any = None,
+        block=None,
         fill: Block | None = None,
         *,
         typed_as: str | type | None = None,
-        to: Any = None,
-        **fields: Any,
+        to=None,
+        **fields,
     ) -> Message:
         """Send a message, and return it.
 
@@ -525,7 +525,7 @@ class Node(Receiver):
         topic: str,
         typed_as: str | type | None = None,
         timeout: float | None = None,
-        where: Callable[[Any], Any] | None = None,
+        where: Block | None = None,
     ) -> Message:
         """Return the next message of a topic.
 
@@ -570,7 +570,7 @@ class Node(Receiver):
         """Wait until a service of that name is offered, and return it."""
         return self.master.wait_for_service(self.resolve(name), timeout, self.name)
 
-    def parameter(self, name: str, initialized: Any = None) -> Parameter:
+    def parameter(self, name: str, initialized=None) -> Parameter:
         """Return a parameter of the server, bound both ways; '~rate' is private.
 
         :param initialized: the value that it gets if it has none

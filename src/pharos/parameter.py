@@ -2,7 +2,6 @@
 import functools
 import threading
 from copy import deepcopy
-from typing import Any
 
 from pharos.blocks import Block, taking
 from pharos.channels import Opened
@@ -31,12 +30,12 @@ class Parameter(Opened):
     _open = subscribe
 
     @property
-    def value(self) -> Any:
+    def value(self):
         """The value: a bool, int, float, str, list or dict; None if it has none."""
         self.node.check_running()
         return deepcopy(self._value)
 
-    def set(self, value: Any) -> None:
+    def set(self, value) -> None:
         """Set it on the server.
 
         :raises ValueError: if the server cannot hold such a value

@@ -104,7 +104,7 @@ class Service:
         self.type, self.md5sum = header['type'], header['md5sum']
         sock.close()
 
-    def call(self, block: Any = None, *, timeout: float | None = None, **fields: Any) -> Any:
+    def call(self, block=None, *, timeout: float | None = None, **fields):
         """Call it, with a request that ``block(request)``, a dict or keywords fill, or a ready one.
 
         :param timeout: seconds for the whole call, None: without limit

@@ -1,5 +1,7 @@
 """The Transcript: where blocks show things, as in Pharo."""
-from typing import Any, Callable
+from typing import Any
+
+from pharos.blocks import Block
 
 
 class _Transcript:
@@ -7,7 +9,7 @@ class _Transcript:
 
     _receiver: Any = None
 
-    def show(self, *things: Any) -> None:
+    def show(self, *things) -> None:
         """Show one line on standard output, or to the receiver."""
         line = ' '.join(map(str, things))
         if self._receiver:
@@ -15,7 +17,7 @@ class _Transcript:
         else:
             print(f'{line}\n', end='', flush=True)  # in one piece
 
-    def on_show(self, receiver: Callable[[str], Any] | None) -> Callable[[str], Any] | None:
+    def on_show(self, receiver: Block | None) -> Block | None:
         """Have ``receiver(line)`` take the lines, None: standard output; returns the former one."""
         former, self._receiver = self._receiver, receiver
         return former

@@ -71,7 +71,7 @@ def observe():
         'private_service': call('/rover/gripper/count', Trigger).message,
         'action': act(3),
         'preempted_action': act(-1, True),
-        'state': wait('/rover/state'),
+        'state': next(state for state in iter(lambda: wait('/rover/state'), '') if state != 'move'),
         'parameters': rospy.get_param('/rover'),
         'log': logged('bumper is ready'),
         'warning': logged('hears the sonar'),

@@ -18,11 +18,18 @@ from pharos import program
 from pharos.errors import PharosError, UnknownNodeError
 from pharos.node import Lifecycle, Node
 from pharos.private_rospy.loader import Shim
+from pharos.private_rospy.patches import patch
 from pharos.private_rospy.run import Run
 from pharos.ros_process import find_program
 
 #: what catkin puts into a devel space for a script: it runs the file that it names
 _WRAPPER = re.compile(r'^python_script = (.+?)$.*exec\(compile\(', re.MULTILINE | re.DOTALL)
+
+
+@patch('subprocess', 'Popen.__init__')
+def start_child(original, run, self, *args, env=None, **kwargs):
+    """Gives a child the environment of this process."""
+    original(self, *args, env=run.environ if env is None else env, **kwargs)
 
 
 class ScriptRun(Run):

@@ -28,7 +28,10 @@ _no_yield_before = 0.0
 
 
 class Turns:
-    """Whatever takes turns: the callbacks of one node, or those of one subscription of plain rospy."""
+    """Whatever takes turns: the callbacks of one node, or those of one subscription of plain rospy.
+
+    ``jobs`` has an Inbox once for each of its messages, or more often if some were dropped.
+    """
 
     def __init__(self):
         self.jobs = collections.deque()
@@ -41,11 +44,25 @@ class Turns:
     def run(self):
         """Run what waits, unless another thread does so; that one then runs this, too."""
         jobs = self.jobs
-        while jobs and self._running.acquire(False):
+        while jobs and not self.closed and self._running.acquire(False):
             self.runner = get_ident()
             try:
-                while jobs:
-                    jobs.popleft().run()
+                while jobs and not self.closed:
+                    inbox = jobs.popleft()
+                    try:
+                        value, thaw, header = inbox.queue.popleft()
+                    except IndexError:  # several were dropped at once
+                        continue
+                    inbox.taken += 1
+                    if thaw is not None:
+                        value = thaw(value)
+                        value._connection_header = header
+                        inbox.callback(value)
+                    else:
+                        began = perf_counter()
+                        inbox.callback(value)
+                        is_fast = perf_counter() - began < FAST
+                        inbox.fast = inbox.fast + 1 if is_fast else 0
             finally:
                 self.runner = None
                 self._running.release()
@@ -124,9 +141,9 @@ class _Worker:
             if _ready and not turns.is_fast:
                 _wake_worker()
             turns.scheduled = False
-            began = perf_counter()
+            began, waiting = perf_counter(), len(turns.jobs)
             turns.run()
-            turns.is_fast = perf_counter() - began < FAST
+            turns.is_fast = perf_counter() - began < FAST * waiting
         _wake_worker()
 
 
@@ -163,7 +180,7 @@ class Inbox:
         self.queue = collections.deque()
         self.limit = self.queue_size = queue_size or float('inf')
         self.dropped = self.taken = 0
-        self._scheduled, self._taken_at_yield, self._fast = False, -1, 0
+        self._taken_at_yield, self.fast = -1, 0
 
     def put(self, value, thaw=None, header=None, size=0):
         """Add a message, or what ``thaw`` makes one of; ``turns`` are to be woken or run then.
@@ -175,46 +192,16 @@ class Inbox:
         if waiting >= self.limit or waiting and not waiting & (waiting - 1):  # a power of two
             most = max(1, self.queue_bytes // (size or size_of(value)))
             self.limit = min(self.queue_size, most)
-            if waiting >= self.limit:
-                if self.taken != self._taken_at_yield:  # the receiver got on since
-                    self._taken_at_yield = self.taken
-                    sleep(1e-6)  # a publisher that never sleeps would starve it
-                while len(queue) >= self.limit:
-                    try:
-                        queue.popleft()
-                    except IndexError:
-                        break
-                    self.dropped += 1
+            if waiting >= self.limit and self.taken != self._taken_at_yield:
+                self._taken_at_yield = self.taken  # the receiver got on since
+                sleep(1e-6)  # a publisher that never sleeps would starve it
         queue.append((value, thaw, header))
-        if not self._scheduled:
-            self._scheduled = True
+        if len(queue) <= self.limit:
             self.turns.jobs.append(self)
-
-    def run(self):
-        """Run the callback on the messages, the oldest first, until it is another inbox's turn."""
-        queue, jobs, callback = self.queue, self.turns.jobs, self.callback
-        try:
-            while queue:
-                try:
-                    value, thaw, header = queue.popleft()
-                except IndexError:  # the publisher has dropped it
-                    break
-                self.taken += 1
-                if thaw is not None:
-                    value = thaw(value)
-                    value._connection_header = header
-                    callback(value)
-                else:
-                    began = perf_counter()
-                    callback(value)
-                    self._fast = self._fast + 1 if perf_counter() - began < FAST else 0
-                if jobs or self.turns.closed:
-                    break
-        finally:
-            self._scheduled = False
-            if queue and not self.turns.closed:
-                self._scheduled = True
-                jobs.append(self)
+            return
+        while len(queue) > self.limit:  # after append(), or the receiver finds it empty
+            queue.popleft()
+            self.dropped += 1
 
     def receive(self, message, size):
         """Take a message from the thread that reads a socket.
@@ -223,7 +210,7 @@ class Inbox:
         longer.
         """
         self.put(message, None, None, size)
-        if self.inline or self._fast >= 10:
+        if self.inline or self.fast >= 10:
             self.turns.run()
         else:
             self.turns.wake()

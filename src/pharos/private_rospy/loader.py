@@ -13,6 +13,7 @@ import threading
 from functools import cache
 from importlib.machinery import PathFinder
 from importlib.util import module_from_spec, resolve_name
+from types import ModuleType
 
 import rospy.exceptions
 
@@ -101,9 +102,12 @@ class PrivateModules:
 
     def load(self, name):
         """Return the module of that name, as private modules import it."""
-        if name not in self.modules and not self._is_private(name):
-            return importlib.import_module(name)
         parent, _, leaf = name.rpartition('.')
+        if name not in self.modules and not self._is_private(name):
+            module = importlib.import_module(name)
+            if parent and self._is_private(parent):  # of a package with code and messages
+                setattr(self.load(parent), leaf, module)
+            return module
         with self._lock:  # or another thread would see a module that is half loaded
             if name not in self.modules:
                 path = self.load(parent).__path__ if parent else self.path
@@ -131,16 +135,17 @@ class PrivateModules:
         return self.load(resolve_name(name, package))
 
     def _import(self, name, globals=None, locals=None, fromlist=(), level=0):
-        full = name
         if level:
-            full = resolve_name('.' * level + name, globals['__package__'])
-        top = full.partition('.')[0]
-        if full not in self.modules and not self._is_private(full):
-            module = builtins.__import__(name, globals, locals, fromlist, level)
-            return module if fromlist else self.modules.get(top, module)
-        module = self.load(full)
+            name = resolve_name('.' * level + name, globals['__package__'])
+        module = self.load(name)
         if not fromlist:
-            return self.load(top)
+            return self.load(name.partition('.')[0])
         if hasattr(module, '__path__'):
             importlib._bootstrap._handle_fromlist(module, fromlist, self.load)
+        if '*' in fromlist:  # generated messages bring sys, which is to be the program's
+            starred = Shim(module)
+            for key, value in vars(module).items():
+                is_module = isinstance(value, ModuleType)
+                vars(starred)[key] = self.modules.get(key, value) if is_module else value
+            return starred
         return module

@@ -5,6 +5,7 @@ target; ``run`` is the Run whose copy is patched. Over ``def f(original, run)``,
 target)`` puts what it returns in the target's place. Each docstring says what is wrong with rospy.
 """
 import functools
+import io
 import socket
 import threading
 from urllib.parse import urlsplit
@@ -12,7 +13,6 @@ from urllib.parse import urlsplit
 import rospkg
 import rospy
 from rosgraph.network import ROSHandshakeException, decode_ros_handshake_header, is_local_address
-from rospy.impl.tcpros_service import convert_return_to_response
 
 from pharos.intraprocess.copier import copied
 from pharos.private_rospy import transport
@@ -119,11 +119,6 @@ def shutdown_server(original, run, self):
     self.is_shutdown = True
     transport.shut(self.server_sock)
     self.server_sock.close()
-
-
-@patch('rospy.impl.tcpros_base', '_is_use_tcp_keepalive')
-def use_keepalive(original, run):
-    """Asks the master before each first connection."""
 
 
 @patch('rospy.impl.tcpros_pubsub', '_configure_pub_socket')
@@ -309,6 +304,14 @@ def cleanup(original, run, self, reason):
         run.topics.close_all()
 
 
+@patch('actionlib.simple_action_client', 'SimpleActionClient.send_goal')
+@patch('actionlib.simple_action_client', 'SimpleActionClient._handle_transition')
+def keep_goal(original, run, self, *args, **kwargs):
+    """Drops what comes before send_goal() returns, as the answer of a node of this process may."""
+    with self.done_condition:
+        return original(self, *args, **kwargs)
+
+
 # -- parameters, log, services
 
 
@@ -325,12 +328,6 @@ def set_parameter(original, run, self, key, *value):
     """Tells others of the change, and not the node itself."""
     original(self, key, *value)
     run.node.read_parameters()
-
-
-@patch('subprocess', 'Popen.__init__')
-def start_child(original, run, self, *args, env=None, **kwargs):
-    """Gives a child the environment of this process."""
-    original(self, *args, env=run.environ if env is None else env, **kwargs)
 
 
 @replace('rospy.impl.rosout', 'rospy')
@@ -367,10 +364,24 @@ def call_service(original, run, self, *args, **kwargs):
 
 def answer(service, request, caller_id):
     """Have a rospy.Service of this process answer a request, in this thread."""
-    request = copied(request)
+    request, call = copied(request), _LocalCall()
     request._connection_header = {'callerid': caller_id, 'service': service.resolved_name}
-    try:
-        answered = service.handler(request)
-        return copied(convert_return_to_response(answered, service.response_class))
-    except Exception as error:
-        raise rospy.ServiceException(f'service cannot process request: {error}') from error
+    service._handle_request(call, request)
+    if call.error:
+        raise rospy.ServiceException(call.error)
+    return call.response
+
+
+class _LocalCall:
+    """Takes what a rospy.Service answers; stands in for a connection."""
+
+    error = None
+
+    def __init__(self):
+        self.write_buff = io.BytesIO()
+
+    def send_message(self, response, seq):
+        self.response = copied(response)
+
+    def write_data(self, data):
+        self.error = data[5:].decode()

@@ -206,8 +206,7 @@ class Run:
             elif self.handler._connect_topic(*key)[0] != 1:
                 self.start_thread(lambda: self.connect_again(*key))
         except (AttributeError, UnboundLocalError):  # rospy's, if it was closed meanwhile
-            if topic in self.topics.subs and not self.stopping.is_set():
-                raise
+            pass
         finally:
             self.connecting.discard(attempt)
 

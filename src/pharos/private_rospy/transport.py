@@ -23,6 +23,7 @@ LARGEST_MESSAGE = 1_000_000_000  # bytes, as roscpp has it
 AT_ONCE = 1 << 16  # bytes; copying more into the socket would hold up the publisher
 CONNECT_LIMIT = 10.0  # seconds for one attempt to connect
 RETRY_DELAY = 1.0  # seconds until the next one
+NEVER = float('inf')
 _length = struct.Struct('<I')
 #: the runs of this process by the URI of their node
 runs = {}
@@ -224,7 +225,8 @@ class PublisherOverlay:
             if remote:
                 self.write(message, remote)
         if inboxes:
-            self.last_wake = hand_over(inboxes, self.last_wake)
+            # actionlib keeps a goal only when publish() has returned: no yield to who answers it
+            self.last_wake = hand_over(inboxes, NEVER if latch_key is None else self.last_wake)
         return True
 
     def write(self, message, connections):
@@ -250,7 +252,7 @@ class PublisherOverlay:
 
     def close(self):
         close(self)
-        self.headers = {}
+        self.headers, self.subscriber_listeners = {}, []
 
 
 class SubscriptionOverlay:
