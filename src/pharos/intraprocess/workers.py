@@ -182,20 +182,21 @@ class Inbox:
         self.dropped = self.taken = 0
         self._taken_at_yield, self.fast = -1, 0
 
-    def put(self, value, thaw=None, header=None, size=0):
-        """Add a message, or what ``thaw`` makes one of; ``turns`` are to be woken or run then.
+    def put(self, item, size=0):
+        """Add ``(value, thaw, header)``; ``turns`` are to be woken or run then.
 
-        :param size: the bytes of it, if they are known
+        :param item: one for all receivers: many make the collector of garbage run often
+        :param size: the bytes of the value, if they are known
         """
         queue = self.queue
         waiting = len(queue)
         if waiting >= self.limit or waiting and not waiting & (waiting - 1):  # a power of two
-            most = max(1, self.queue_bytes // (size or size_of(value)))
+            most = max(1, self.queue_bytes // (size or size_of(item[0])))
             self.limit = min(self.queue_size, most)
             if waiting >= self.limit and self.taken != self._taken_at_yield:
                 self._taken_at_yield = self.taken  # the receiver got on since
                 sleep(1e-6)  # a publisher that never sleeps would starve it
-        queue.append((value, thaw, header))
+        queue.append(item)
         if len(queue) <= self.limit:
             self.turns.jobs.append(self)
             return
@@ -209,7 +210,7 @@ class Inbox:
         That thread runs the callback, too, if it was fast ten times running: waking another takes
         longer.
         """
-        self.put(message, None, None, size)
+        self.put((message, None, None), size)
         if self.inline or self.fast >= 10:
             self.turns.run()
         else:
@@ -224,10 +225,11 @@ def hand_over(inboxes, last):
     """
     is_due = False
     for inbox in inboxes:
+        turns = inbox.turns
         if inbox.inline:
-            inbox.turns.run()
-        else:
-            is_due |= inbox.turns.schedule()
+            turns.run()
+        elif not turns.scheduled:
+            is_due |= turns.schedule()
     woken = _wake_worker() if is_due else None  # which wakes another one, if there is more
     if woken is None:
         return last

@@ -118,14 +118,17 @@ def connect(sender, receiver, topic):
         return receiver.node.refused(
             topic, f'{sender.name} publishes {sent._type}, not {wanted._type}'
         )
-    protocol = sender.modules.load('rospy.impl.tcpros_pubsub').TCPROSPub
-    header = protocol(topic, sent, publisher.is_latch, publisher.headers).get_header_fields()
     with publisher.lock:
+        if publisher.header is None:
+            protocol = sender.modules.load('rospy.impl.tcpros_pubsub').TCPROSPub
+            options = topic, sent, publisher.is_latch, publisher.headers
+            publisher.header = protocol(*options).get_header_fields()
         out, end = Link('o', topic), Link('i', topic)
         out.endpoint_id, end.endpoint_id = receiver.name, sender.uri
         out.other, end.other, out.subscription = end, out, subscription
         for each in out, end:
-            each.publisher, each.thaw, each.header = publisher, thawer(sent, wanted), header
+            each.publisher, each.thaw = publisher, thawer(sent, wanted)
+            each.header = publisher.header
             each.callerid_pub = sender.name  # actionlib asks for it
         with subscription.c_lock:
             if subscription.closed or publisher.closed or subscription.has_connection(sender.uri):
@@ -135,7 +138,7 @@ def connect(sender, receiver, topic):
         publisher.rospy_add_connection(out)
         for inbox in inboxes if publisher.latches else ():
             for frozen in publisher.latches.values():
-                inbox.put(frozen, out.thaw, header)
+                inbox.put((frozen, out.thaw, out.header))
     for inbox in inboxes:
         inbox.turns.wake()
 
@@ -166,7 +169,7 @@ class PublisherOverlay:
         self.lock, self.latches, self.last_wake = self.publock, {}, 0.0
         self.freeze, self.thaw = copier_for(data_class)
         self.has_header = getattr(data_class, '_has_header', False)
-        self.seen, self.links, self.remote = None, (), ()
+        self.seen, self.links, self.remote, self.header = None, (), (), None
 
     def acquire(self):
         """Do nothing: publish() locks, but not while it runs inline delegates."""
@@ -175,8 +178,8 @@ class PublisherOverlay:
 
     def enable_latch(self):  # rospy calls it when its first links are made
         self.is_latch = True
-        for link in by_kind(self.connections)[0]:
-            link.header['latching'] = '1'
+        if self.header:
+            self.header['latching'] = '1'
 
     def add_connection(self, connection):
         with self.lock:
@@ -211,16 +214,14 @@ class PublisherOverlay:
                 frozen = self.freeze(message)
                 if is_latched:
                     self.latches[latch_key] = frozen
+                own = frozen, self.thaw, self.header
                 for link in links:
                     link.stat_num_msg += 1
-                    thaw, header = link.thaw, link.header
+                    item = own if link.thaw is self.thaw else (frozen, link.thaw, self.header)
                     end = link.subscription
                     received = end.known if end.callbacks is end.seen else end.inboxes()
                     for inbox in received:
-                        if inbox.shared:
-                            inbox.put(message)
-                        else:
-                            inbox.put(frozen, thaw, header)
+                        inbox.put((message, None, None) if inbox.shared else item)
                     inboxes += received
             if remote:
                 self.write(message, remote)
