@@ -367,7 +367,7 @@ def test_run_starts_node_of_package(master, robot):
     with master.run('small_robot', robot('talker', TALKER), '__name:=robot7') as process:
         assert isinstance(process, RosProcess)
         assert process.poll() is None
-        until(lambda: master.topic('/talk').publishers, TIMEOUT)  # it has registered all
+        Mailbox(create(master, '/ear'), '/talk', 'std_msgs/String').next()  # all is registered
         assert master.node('/robot7').pid == process.pid
     assert process.poll() is not None
     assert '/robot7' not in names(master.nodes())
@@ -456,7 +456,7 @@ def test_launch_starts_nodes_of_file(master, robot, tmp_path):
     file = tmp_path / 'own.launch'
     file.write_text(LAUNCH.replace('</launch>', node + '</launch>'))
     with master.launch(None, str(file), to='it'):
-        master.wait_for_node('/launched', TIMEOUT)
+        Mailbox(create(master, '/ear'), '/talk', 'std_msgs/String').next()  # all is registered
         assert master.parameters['/launched'] == 'it'
     assert '/launched' not in names(master.nodes())
 

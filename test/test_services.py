@@ -343,17 +343,12 @@ def connections_to(node):
 
 
 @pytest.mark.parametrize('served_by', ['serve', 'ros.Service'])
-@pytest.mark.parametrize('called_by', ['Service', 'ServiceProxy', 'persistent ServiceProxy'])
-def test_call_in_process_needs_no_socket(master, node, served_by, called_by):
+def test_call_in_process_needs_no_socket(master, node, served_by):
     found, class_ = [], std_srvs.srv.Trigger
     serve = node.serve if served_by == 'serve' else node.ros.Service
     serve('/trigger', class_, lambda request: (not found.append(connections_to(node)), ''))
-    if called_by == 'Service':
-        answer = master.lookup_service('/trigger').call
-        until(lambda: not connections_to(node))  # that of the look-up
-    else:
-        caller = create(master, '/caller')
-        answer = caller.ros.ServiceProxy('/trigger', class_, called_by.startswith('persistent'))
+    answer = master.lookup_service('/trigger').call
+    until(lambda: not connections_to(node))  # that of the look-up
     assert [answer().success for _ in range(3)] == [True] * 3
     assert found == [[]] * 3
 

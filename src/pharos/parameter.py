@@ -65,6 +65,3 @@ class Parameter(Opened):
         except BaseException as error:
             run = functools.partial(self._run, block)
             self.node.report(error, block, 'block of on_change', value, again=run)
-
-    def __repr__(self):
-        return f'<Parameter {self.name} of {self.node.name}: {self.value!r}>'

@@ -39,9 +39,6 @@ class RosProcess(subprocess.Popen):
         streams = dict.fromkeys(('stdin', 'stdout', 'stderr'), slave)
         try:
             super().__init__(command, env=environ, start_new_session=True, **streams)
-        except OSError as error:
-            self._terminal.close()
-            raise PharosError(f'{command[0]} cannot be started: {error}') from None
         finally:
             os.close(slave)
         self._reader = threading.Thread(target=self._read, daemon=True)

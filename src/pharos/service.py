@@ -25,8 +25,7 @@ from pharos.errors import (
     ServiceTypeError,
     UnknownServiceError,
 )
-from pharos.intraprocess.copier import serialize
-from pharos.private_rospy.patches import answer
+from pharos.intraprocess.copier import copied, serialize
 from pharos.private_rospy.transport import keep_alive, local_service
 from pharos.program import here
 
@@ -131,9 +130,9 @@ class Service:
                     f' {messages.describe(cls._response_class)}), and not {self.md5sum}: use the'
                     ' same definition at both ends, or leave md5sum as it is'
                 )
-            local = timeout is None and local_service(self.master.url, self.name, self.uri)
+            local = timeout is None and local_service(self.name, self.uri)
             if local:
-                self.response = answer(local, request, self.caller_id)
+                self.response = self._call_here(local, request)
             else:
                 self.response = self._call(cls, serialize(request), timeout)
         except ServiceException as error:
@@ -147,14 +146,24 @@ class Service:
             ) from error
         return self.response
 
+    def _call_here(self, service, request):
+        """Have a rospy.Service of this process answer in this thread."""
+        taker = _Taker()
+        request._connection_header = {'callerid': self.caller_id, 'service': self.name}
+        service._handle_request(taker, request)
+        if taker.error:
+            raise ServiceException(taker.error)
+        return taker.response
+
     def _call(self, cls, data, timeout):
         end = timeout and monotonic() + timeout
         try:
             sock, _ = self._connect(self.md5sum, timeout)
         except ConnectionError as error:
-            before, self.uri = self.uri, self.master.call('lookupService', self.name)
-            if not self.uri or self.uri == before:  # else it has moved
-                raise ServiceCallError(f'{self.name} at {before} refused: {error}') from None
+            uri = self.master.call('lookupService', self.name)
+            if uri in (None, self.uri):  # else it has moved
+                raise ServiceCallError(f'{self.name} at {self.uri} refused: {error}') from None
+            self.uri = uri
             sock, _ = self._connect(self.md5sum, timeout)
         with sock:
             sock.sendall(struct.pack('<I', len(data)) + data)
@@ -180,6 +189,21 @@ class Service:
 
     def __repr__(self):
         return f'<Service {self.name} ({self.type}) at {self.uri}>'
+
+
+class _Taker:
+    """Takes what a rospy.Service answers; stands in for a connection."""
+
+    error = None
+
+    def __init__(self):
+        self.write_buff = io.BytesIO()
+
+    def send_message(self, response, seq):
+        self.response = copied(response)
+
+    def write_data(self, data):
+        self.error = data[5:].decode()
 
 
 def _read(sock, size, end):

@@ -5,7 +5,6 @@ target; ``run`` is the Run whose copy is patched. Over ``def f(original, run)``,
 target)`` puts what it returns in the target's place. Each docstring says what is wrong with rospy.
 """
 import functools
-import io
 import socket
 import threading
 from urllib.parse import urlsplit
@@ -14,7 +13,6 @@ import rospkg
 import rospy
 from rosgraph.network import ROSHandshakeException, decode_ros_handshake_header, is_local_address
 
-from pharos.intraprocess.copier import copied
 from pharos.private_rospy import transport
 from pharos.private_rospy.loader import Shim
 
@@ -225,15 +223,15 @@ def shut_down(original, run, self, reason=''):
 @patch('rospy.impl.masterslave', 'ROSHandler.shutdown')
 def shut_down_from_outside(original, run, self, caller_id, msg=''):
     """Obeys everybody, also if an earlier node at its URI is meant (ros_comm #2241)."""
-    if caller_id == '/master' and f'[{self.name}]' not in str(msg):
-        return 1, 'an earlier node at this address was meant', 0
     host, master = _client.address[0], urlsplit(self.masterUri).hostname
     is_near = host == socket.gethostbyname(master) or is_local_address(host)
-    if is_near or run.node.allow_remote_shutdown:
+    is_meant = caller_id != '/master' or f'[{self.name}]' in str(msg)
+    obeys = is_meant and (is_near or run.node.allow_remote_shutdown)
+    if obeys:
         run.end_node()
-        return 1, 'shutdown', 0
-    run.ros.logwarn(f'refused to stop for {caller_id} at {host}')
-    return 0, 'only this host and the master may do that', 0
+    else:
+        run.ros.logwarn(f'does not stop for {caller_id} at {host}: {msg}')
+    return int(obeys), 'only this host and the master may do that', 0
 
 
 # -- topics
@@ -349,39 +347,3 @@ def handle_call(original, run, self, connection, header):
         original(self, connection, header)
     except (rospy.exceptions.TransportException, OSError):
         connection.close()
-
-
-@patch('rospy.impl.tcpros_service', 'ServiceProxy.call')
-def call_service(original, run, self, *args, **kwargs):
-    """Has no way to a provider of the same process but a socket."""
-    found = transport.local_service(run.node.master.url, self.resolved_name)
-    if not found or found.service_class._md5sum != self.service_class._md5sum:
-        return original(self, *args, **kwargs)
-    fill = run.modules.load('rospy.msg').args_kwds_to_message
-    request = fill(self.request_class, args, kwargs)
-    return answer(found, request, run.name)
-
-
-def answer(service, request, caller_id):
-    """Have a rospy.Service of this process answer a request, in this thread."""
-    request, call = copied(request), _LocalCall()
-    request._connection_header = {'callerid': caller_id, 'service': service.resolved_name}
-    service._handle_request(call, request)
-    if call.error:
-        raise rospy.ServiceException(call.error)
-    return call.response
-
-
-class _LocalCall:
-    """Takes what a rospy.Service answers; stands in for a connection."""
-
-    error = None
-
-    def __init__(self):
-        self.write_buff = io.BytesIO()
-
-    def send_message(self, response, seq):
-        self.response = copied(response)
-
-    def write_data(self, data):
-        self.error = data[5:].decode()

@@ -143,11 +143,11 @@ def connect(sender, receiver, topic):
         inbox.turns.wake()
 
 
-def local_service(master_url, name, uri=None):
+def local_service(name, uri):
     """Return the rospy.Service of a node of this process, or None."""
     for run in list(runs.values()):
         service = run.services.get_service(name)
-        if service and run.master_url == master_url and uri in (None, service.uri):
+        if service and service.uri == uri:
             return service
 
 
@@ -207,8 +207,6 @@ class PublisherOverlay:
                 links, remote = by_kind([connection_override])
             if self.has_header:  # as serialize_message does
                 message.header.seq = self.seq
-                if message.header.frame_id is None:
-                    message.header.frame_id = '0'
             is_latched = self.is_latch and latch_key is not False and connection_override is None
             if links or is_latched or not remote:  # then it is checked alone
                 frozen = self.freeze(message)
