@@ -124,11 +124,14 @@ def test_value_fits_its_field(node, other):
         (FLOATS, [1.0, 2.0], (1.0, 2.0)),
         (BYTES, b'ab', b'ab'),
         (BYTES, [97, 98], b'ab'),
+        (BYTES, numpy.array([97, 98], 'u1'), b'ab'),
+        (FLOATS, numpy.array([1.0, 2.0]), (1.0, 2.0)),
     ]
     for number, (type_, value, came) in enumerate(table):
-        mailbox = Mailbox(other, f'/value{number}', type_)
+        mailbox, cls = Mailbox(other, f'/value{number}', type_), pharos.message_class(type_)
         node.send_to(f'/value{number}', typed_as=type_, data=value)
-        assert mailbox.next().data == came
+        node.send_to(f'/value{number}', cls, data=value)
+        assert mailbox.next().data == mailbox.next().data == came
 
 
 def test_unfit_field_is_refused(node, other):
