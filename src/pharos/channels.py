@@ -40,10 +40,6 @@ class Opened:
         self.node.opened = [*self.node.opened, self]
         self.closed = False
 
-    def node_stopped(self):
-        """Take note that rospy has closed it."""
-        self.closed = True
-
     def close(self) -> None:
         """Receive, send or offer no more, and unregister."""
         self.node.opened = [each for each in self.node.opened if each is not self]

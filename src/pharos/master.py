@@ -16,11 +16,7 @@ from rosgraph.names import get_ros_namespace, is_legal_remap, load_mappings, ns_
 from pharos import program
 from pharos.blocks import Block
 from pharos.channels import Topic
-from pharos.errors import (
-    MasterUnreachableError,
-    PharosError,
-    PortInUseError,
-)
+from pharos.errors import MasterUnreachableError, PortInUseError
 from pharos.external_node import ExternalNode
 from pharos.names import full_name, node_name
 from pharos.node import Node, check_class
@@ -158,7 +154,7 @@ class Master:
         :param timeout: seconds, None: without limit
         :raises MasterUnreachableError: if it does not answer in time
         """
-        return bool(_wait_for(self.call, timeout, 'getPid'))
+        return bool(program.wait_for(lambda: self.call('getPid'), timeout))
 
     @property
     def pid(self) -> int:
@@ -274,7 +270,7 @@ class Master:
 
         :raises UnknownNodeError: if it does not come in time
         """
-        return _wait_for(self.node, timeout, name)
+        return program.wait_for(lambda: self.node(name), timeout)
 
     # -- services
 
@@ -298,7 +294,7 @@ class Master:
 
         :raises UnknownServiceError: if it is not in time
         """
-        return _wait_for(self.lookup_service, timeout, name, caller_id)
+        return program.wait_for(lambda: self.lookup_service(name, caller_id), timeout)
 
     # -- programs
 
@@ -363,13 +359,3 @@ class Master:
 
     def __repr__(self):
         return f'<Master {self.url}>'
-
-
-def _wait_for(find, timeout, *args):
-    """Return ``find(*args)``, tried again while it raises errors of ours."""
-
-    def attempt():
-        with contextlib.suppress(PharosError):
-            return find(*args)
-
-    return program.wait(attempt, timeout) or find(*args)

@@ -23,7 +23,7 @@ from pharos.failures import Failure, Failures
 from pharos.names import legal_name, node_name
 from pharos.parameter import Parameter
 from pharos.private_rospy.run import Run
-from pharos.program import here, is_signalled, nodes, quiet_wait, wait
+from pharos.program import here, is_signalled, nodes, quiet_wait, wait, wait_for
 from pharos.service import OfferedService, Service
 from pharos.transcript import Transcript
 
@@ -128,8 +128,8 @@ class Node(Receiver):
 
     def _end(self, timeout):
         self.run.stop(timeout)
-        for each in self.opened:
-            each.node_stopped()
+        for each in self.opened:  # rospy has closed it
+            each.closed = True
         self._senders, self.lifecycle = {}, Lifecycle.STOPPED
         nodes.remove(self)
 
@@ -296,8 +296,7 @@ class Node(Receiver):
         try:
             return taking(block, 'soul', 1, 0)(self)
         except BaseException as error:
-            is_stop = isinstance(error, (NodeStoppedError, rospy.ROSInterruptException))
-            if self.is_running or not is_stop:
+            if self.is_running or not isinstance(error, rospy.ROSException):  # else the stop's
                 self.report(
                     error,
                     block,
@@ -464,19 +463,20 @@ class Node(Receiver):
         if isinstance(block, type) and issubclass(block, Message):
             typed_as, block = block, fill
         channel = self._senders.get((topic, typed_as))
-        known = channel and not channel.closed
-        if not known:
+        was_open = channel and not channel.closed
+        if not was_open:
             with self._opening:
                 name = self.resolve(topic)
                 given = type(block) if isinstance(block, Message) else None
                 cls = self._class_of(name, typed_as or given)
-                known = self._open_on(name, OutputChannel)
-                channel = known[0] if known else OutputChannel(self, name, cls, False, QUEUE_SIZE)
+                was_open = self._open_on(name, OutputChannel)
+                new = name, cls, False, QUEUE_SIZE
+                channel = was_open[0] if was_open else OutputChannel(self, *new)
                 self._senders[topic, typed_as] = channel
         try:
             return channel.send(block, to=to, **fields)
         except Exception:
-            if not known:
+            if not was_open:
                 channel.close()
             raise
 
@@ -568,7 +568,7 @@ class Node(Receiver):
 
     def wait_for_service(self, name: str, timeout: float | None = None) -> Service:
         """Wait until a service of that name is offered, and return it."""
-        return self.master.wait_for_service(self.resolve(name), timeout, self.name)
+        return wait_for(lambda: self.lookup_service(name), timeout, self)
 
     def parameter(self, name: str, initialized=None) -> Parameter:
         """Return a parameter of the server, bound both ways; '~rate' is private.

@@ -9,6 +9,7 @@ import time
 
 import rospy
 
+from pharos.errors import PharosError
 from pharos.intraprocess import workers
 from pharos.private_rospy.transport import runs
 
@@ -38,6 +39,16 @@ def wait(predicate, timeout=None, node=None):
         workers.relieve()
         pause = min(pause * 1.2, 0.02)
     return value
+
+
+def wait_for(find, timeout, node=None):
+    """Return ``find()``, tried again while it raises errors of ours."""
+
+    def attempt():
+        with contextlib.suppress(PharosError):
+            return find()
+
+    return wait(attempt, timeout, node) or find()
 
 
 @contextlib.contextmanager

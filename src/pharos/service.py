@@ -94,8 +94,14 @@ class Service:
             raise UnknownServiceError(
                 f'no node offers the service {self.name} at {self.master.url}: see rosservice list'
             )
-        with suppress(OSError, ROSHandshakeException):
+        try:
             self._ask(PATIENCE)
+        except ConnectionRefusedError:
+            raise UnknownServiceError(
+                f'{self.name} was offered at {self.uri}, which has died: rosnode cleanup forgets it'
+            ) from None
+        except (OSError, ROSHandshakeException):  # a call asks again
+            pass
 
     def _ask(self, limit):
         """Ask the provider for its type."""

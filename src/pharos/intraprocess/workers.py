@@ -62,7 +62,7 @@ class Turns:
                         began = perf_counter()
                         inbox.callback(value)
                         is_fast = perf_counter() - began < FAST
-                        inbox.fast = inbox.fast + 1 if is_fast else 0
+                        inbox.fast_in_a_row = inbox.fast_in_a_row + 1 if is_fast else 0
             finally:
                 self.runner = None
                 self._running.release()
@@ -94,14 +94,18 @@ class Turns:
 
     def close(self, timeout):
         """Forget what has not run, and wait for the callback that runs; True if it ended in time."""
-        with _guard:
-            _turns.discard(self)
         self.closed = True
         ended = self.runner == get_ident() or self._running.acquire(True, timeout)
         self.jobs.clear()
+        if ended:  # else it keeps its worker, and others need one more
+            self.forget()
+        return ended
+
+    def forget(self):
+        with _guard:
+            _turns.discard(self)
         if not _turns:
             _wake_worker()
-        return ended
 
 
 class _Worker:
@@ -144,6 +148,8 @@ class _Worker:
             began, waiting = perf_counter(), len(turns.jobs)
             turns.run()
             turns.is_fast = perf_counter() - began < FAST * waiting
+            if turns.closed:
+                turns.forget()
         _wake_worker()
 
 
@@ -180,7 +186,7 @@ class Inbox:
         self.queue = collections.deque()
         self.limit = self.queue_size = queue_size or float('inf')
         self.dropped = self.taken = 0
-        self._taken_at_yield, self.fast = -1, 0
+        self._taken_at_yield, self.fast_in_a_row = -1, 0
 
     def put(self, item, size=0):
         """Add ``(value, thaw, header)``; ``turns`` are to be woken or run then.
@@ -211,14 +217,14 @@ class Inbox:
         longer.
         """
         self.put((message, None, None), size)
-        if self.inline or self.fast >= 10:
+        if self.inline or self.fast_in_a_row >= 10:
             self.turns.run()
         else:
             self.turns.wake()
 
 
 def hand_over(inboxes, last):
-    """Have the callbacks of filled inboxes run: here the inline ones, all others in workers.
+    """Have the callbacks of filled inboxes run: in workers, or here all of a node with an inline one.
 
     :param last: when the same publisher last did so
     :returns: the time, if a worker was woken, else ``last``

@@ -200,7 +200,7 @@ class Run:
         self.connecting.add(attempt)
         try:
             if uri in runs:
-                transport.connect(runs[uri], self, topic)
+                transport.link(runs[uri], self, topic)
             elif self.node.master.share_connections and transport.follow(self, *key, subscription):
                 pass
             elif self.handler._connect_topic(*key)[0] != 1:
@@ -270,7 +270,7 @@ class Run:
         deadline = monotonic() + timeout
         for publisher in list(self.topics.pubs.values()):
             publisher.flush(deadline)
-        self.core.signal_shutdown.__wrapped__('stop')
+        self.core.signal_shutdown.__wrapped__('stop')  # rospy's: the patch calls end_node()
         for sock in list(self.sockets):
             transport.shut(sock)
         join(set(self.threads) - set(self.node.souls), STOP_LIMIT)

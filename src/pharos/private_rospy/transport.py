@@ -108,7 +108,7 @@ def end_share(topic, uri, cls, run):
         follower.run.start_thread(lambda run=follower.run: run.connect(topic, uri))
 
 
-def connect(sender, receiver, topic):
+def link(sender, receiver, topic):
     """Link the publisher and the subscription of a topic of two runs of this process."""
     publisher, subscription = sender.topics.pubs.get(topic), receiver.topics.subs.get(topic)
     if not publisher or not subscription:
@@ -244,9 +244,8 @@ class PublisherOverlay:
 
     def flush(self, deadline):
         """Wait until all is with the sockets."""
-        while time.monotonic() < deadline:
-            if not any(getattr(each, 'busy', False) for each in self.connections):
-                break
+        senders = [each for each in self.connections if isinstance(each, Sender)]
+        while any(each.busy for each in senders) and time.monotonic() < deadline:
             time.sleep(0.001)
 
     def close(self):
