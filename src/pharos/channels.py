@@ -104,8 +104,8 @@ class InputChannel(Receiver, Channel, Inbox):
             if self.closed or self.from_ and message._connection_header['callerid'] != self.from_:
                 return
             self.received += 1
-            run = self.delegate_runs or self.node.delegate_runs
-            run and run(message, self)
+            delegate = self.delegate_runs or self.node.delegate_runs
+            delegate and delegate(message, self)
         except BaseException as error:
             delegate = self.delegate or self.node.delegate
             self.node.report(error, delegate, 'delegate', message, self, self._retry)

@@ -185,7 +185,7 @@ def signal_shutdown(original, run, reason):
 
 @patch('rospy.core', 'is_shutdown')
 def is_shutdown(original, run):
-    """Holds at the end of a stop, which waits for loops that ask it."""
+    """Is true too late: a stop waits for the loops that ask it."""
     return run.stopping.is_set() or original()
 
 

@@ -191,7 +191,7 @@ class PublisherOverlay:
     def publish(self, message, connection_override=None, latch_key=None):
         """Publish to the links, then to the sockets.
 
-        :param latch_key: whose latch it is, if the topic latches; False: nobody's
+        :param latch_key: whose latch it is, if the topic latches; False: nobody's; None: of plain rospy
         """
         inboxes = []
         with self.lock:
@@ -208,7 +208,7 @@ class PublisherOverlay:
             if self.has_header:  # as serialize_message does
                 message.header.seq = self.seq
             is_latched = self.is_latch and latch_key is not False and connection_override is None
-            if links or is_latched or not remote:  # then it is checked alone
+            if links or is_latched or not remote:  # if nobody hears it, this checks it
                 frozen = self.freeze(message)
                 if is_latched:
                     self.latches[latch_key] = frozen
