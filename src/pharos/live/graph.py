@@ -43,6 +43,9 @@ class Edge(NamedTuple):
     is_incoming: bool  # True if it ends at a node
     transports: tuple[str, ...]  # none if nothing is connected
 
+    node = property(lambda self: self[self.is_incoming])
+    topic = property(lambda self: self[not self.is_incoming])
+
 
 class Graph:
     """A graph; made by :meth:`Master.graph`.
@@ -71,7 +74,7 @@ class Graph:
                     ends = (topic, name) if is_incoming else (name, topic)
                     by = tuple(sorted(carried[topic, name, is_incoming]))
                     self.edges.append(Edge(*ends, is_incoming, by))
-        used = {edge.start if edge.is_incoming else edge.end for edge in self.edges}
+        used = {edge.topic for edge in self.edges}
         self.topics = {name: kind for name, kind in seen.topics.items() if name in used}
         shown = self.nodes.items() if services else ()
         self.services = {
@@ -100,10 +103,11 @@ class Graph:
             for name in names:
                 yield f'  {name}  {self.nodes[name].problem}'
                 for edge in self.edges:
-                    if name in edge[:2]:
+                    if name == edge.node:
                         yield self._line(edge, name)
-                offered = (service for service, node in self.services.items() if node == name)
-                yield from (f'    offers {service}' for service in offered)
+                for service, node in self.services.items():
+                    if node == name:
+                        yield f'    offers {service}'
 
     def _line(self, edge, name):
         topic, own, peer = (edge.start, 2, 1) if edge.is_incoming else (edge.end, 1, 2)
@@ -127,7 +131,7 @@ class Graph:
             about = 'does not answer' if node.problem else ''
             inside[homes[name]].append(_box('n', name, about, look))
         for topic in self.topics:  # beside its publishers, or else its subscribers
-            edges = [edge for edge in self.edges if topic in edge[:2]]
+            edges = [edge for edge in self.edges if topic == edge.topic]
             senders = {homes[edge.start] for edge in edges if not edge.is_incoming}
             own = senders or {homes[edge.end] for edge in edges}
             home = own.pop() if len(own) == 1 else None
@@ -219,9 +223,8 @@ def graph(words):
     read.add_argument('--hide', default='(?!)', metavar='REGEX', help='of the names, not those')
     read.add_argument('--rates', type=float, default=0, metavar='S', help='count messages so long')
     chosen = read.parse_args(words)
-    names = {'only': chosen.only, 'hide': chosen.hide}
-    options = {'show_all': chosen.all, 'services': chosen.services, **names}
-    found = graph_of(Master(), chosen.rates, **options)
+    which = {'show_all': chosen.all, 'only': chosen.only, 'hide': chosen.hide}
+    found = graph_of(Master(), chosen.rates, services=chosen.services, **which)
     if chosen.output:
         found.save(chosen.output)
     else:

@@ -234,6 +234,12 @@ def shut_down_from_outside(original, run, self, caller_id, msg=''):
     return int(obeys), 'only this host and the master may do that', 0
 
 
+@patch('rospy.timer', 'Timer.__init__')
+def start_timer(original, run, self, period, callback, *args, **kwargs):
+    """Calls once more at a stop, which ends its sleep."""
+    original(self, period, lambda event: run.stopping.is_set() or callback(event), *args, **kwargs)
+
+
 # -- topics
 
 
