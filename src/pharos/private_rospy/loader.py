@@ -145,7 +145,7 @@ class PrivateModules:
         if '*' in fromlist:  # generated messages bring sys, which is to be the program's
             starred = Shim(module)
             for key, value in vars(module).items():
-                is_module = isinstance(value, ModuleType)
-                vars(starred)[key] = self.modules.get(key, value) if is_module else value
+                name = isinstance(value, ModuleType) and value.__name__
+                vars(starred)[key] = self.modules.get(name, value)
             return starred
         return module
