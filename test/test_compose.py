@@ -324,11 +324,15 @@ def test_script_waits_for_its_threads(master, ends, how):
 # -- what is a script's own
 
 
+PLACES = 'from __future__ import annotations\nfrom dataclasses import dataclass\n@dataclass\nclass P:\n  x: int'
+
+
 def test_helpers_beside_scripts_are_their_own(master, write):
     for side in 'left', 'right':
         write(f'SIDE = {side!r}', f'{side}/helpers.py')
+        write(PLACES, f'{side}/places.py', '')
         path = write(
-            "import helpers\nrospy.init_node('program')\nrospy.set_param('~side', helpers.SIDE)",
+            "import helpers, places\nrospy.init_node('program')\nrospy.set_param('~side', helpers.SIDE)",
             f'{side}/program',
         )
         master.load(path, name=side).wait(TIMEOUT)

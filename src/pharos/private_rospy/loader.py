@@ -121,6 +121,7 @@ class PrivateModules:
         spec, code = _find(name, path)
         self.modules[name] = module = module_from_spec(spec)
         vars(module)['__builtins__'] = self.builtins
+        is_added = sys.modules.setdefault(name, module) is module  # @dataclass looks there
         try:
             if code is None and spec.loader and spec.has_location:
                 spec.loader.exec_module(module)
@@ -129,6 +130,9 @@ class PrivateModules:
         except BaseException:
             del self.modules[name]
             raise
+        finally:
+            if is_added:
+                del sys.modules[name]
         self._patch(module)
 
     def _import_module(self, name, package=None):
