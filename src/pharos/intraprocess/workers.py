@@ -66,6 +66,8 @@ class Turns:
             finally:
                 self.runner = None
                 self._running.release()
+        if self.closed:  # meanwhile
+            self.forget()
 
     def call(self, block):
         """Run ``block()`` between two callbacks."""
@@ -148,8 +150,6 @@ class _Worker:
             began, waiting = perf_counter(), len(turns.jobs)
             turns.run()
             turns.is_fast = perf_counter() - began < FAST * waiting
-            if turns.closed:
-                turns.forget()
         _wake_worker()
 
 
