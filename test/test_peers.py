@@ -383,6 +383,8 @@ def test_nodelet_load_starts_program_in_compose(master, node, tmp_path, monkeypa
         node.wait_for_service('/compose/list', TIMEOUT)
         with running(master, NODELET, *load):
             assert box.next().data == 'here'
+            bond = master.topic('/compose/bond')
+            until(lambda: '/talker' in bond.publishers)  # it handles SIGINT now
         until(lambda: '/talker' not in [each.name for each in master.nodes()], TIMEOUT)
 
 
