@@ -65,7 +65,8 @@ class Channel(Opened):
         if not impl or impl.closed:
             return []
         impl.check()  # rospy looks now and then who has left (ros_comm #927)
-        return impl.connections
+        with impl.c_lock:  # the watcher may be removing one
+            return impl.connections
 
     @property
     def connections(self) -> list[tuple[str, str]]:

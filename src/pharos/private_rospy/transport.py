@@ -367,7 +367,7 @@ def receive(connection, address, port, uri, subscription, run):
 
 
 class Sender:
-    """A bounded queue before a connection. A thread writes what the socket does not take at once.
+    """A bounded queue before a connection. A thread writes what the socket does not take at once, and ends.
 
     Stands in for rospy's QueuedConnection, whose thread writes everything, and takes all out of its
     queue at once, so that it neither bounds nor flushes it.
@@ -377,24 +377,15 @@ class Sender:
         self._connection, self._limit = connection, queue_size or float('inf')
         self._queue, self.busy = collections.deque(), False
         self._rest = b''  # of a message whose beginning the socket has
-        self._changed = threading.Condition()
-        run.start_thread(self._send_all)
+        self._lock, self._run = threading.Lock(), run
 
     def __getattr__(self, name):
         return getattr(self._connection, name)
 
-    def set_cleanup_callback(self, callback):
-        def closed(connection):
-            callback(connection)
-            with self._changed:
-                self._changed.notify_all()
-
-        self._connection.set_cleanup_callback(closed)
-
     def write_data(self, data):
         """Send a message with its length; never waits for the subscriber."""
         connection = self._connection
-        with self._changed:
+        with self._lock:
             if not self.busy and len(data) <= AT_ONCE:
                 try:
                     sent = connection.socket.send(data, socket.MSG_DONTWAIT)
@@ -410,19 +401,17 @@ class Sender:
                 limit = min(self._limit, max(1, Inbox.queue_bytes // len(data)))
                 while len(self._queue) > limit:
                     self._queue.popleft()
-            self.busy = True
-            self._changed.notify_all()
+            if not self.busy:
+                self.busy = True
+                self._run.start_thread(self._send_all)
         time.sleep(0)  # or a busy publisher keeps the interpreter for 5 ms
 
     def _send_all(self):
         connection = self._connection
         while True:
-            with self._changed:
-                while not (self._rest or self._queue or connection.done):
-                    self.busy = False
-                    self._changed.wait()
-                if connection.done:
-                    self.busy = False
+            with self._lock:
+                self.busy = bool(self._rest or self._queue) and not connection.done
+                if not self.busy:
                     return
                 data, self._rest = self._rest or self._queue.popleft(), b''
             try:
