@@ -1,7 +1,9 @@
 """Masters, nodes, peers and programs that the tests of several files need."""
+import contextlib
 import os
 import pathlib
 import pickle
+import random
 import signal
 import socket
 import subprocess
@@ -47,12 +49,19 @@ class InProcessMaster:
         self._master.stop()
 
 
+def free_port():
+    """Return a port that no server of another test gets, and that can so be taken again."""
+    while True:
+        port = random.randrange(20000, 32000)  # below those that the system hands out
+        with contextlib.suppress(OSError), socket.create_server(('127.0.0.1', port)):
+            return port
+
+
 class MortalMaster:
     """A rosmaster in a process of its own, which can be killed and started again at its URL."""
 
     def __init__(self):
-        with socket.create_server(('127.0.0.1', 0)) as free:
-            self.url = f'http://127.0.0.1:{free.getsockname()[1]}/'
+        self.url = f'http://127.0.0.1:{free_port()}/'
         self.master = Master(self.url)
         self.come_back()
 

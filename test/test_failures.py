@@ -1,6 +1,5 @@
 """Exceptions of blocks, which end nothing else; and the errors of the package."""
 import contextlib
-import socket
 import threading
 import time
 
@@ -9,7 +8,7 @@ import pytest
 import rospy
 
 import pharos
-from helpers import PYTHON, TIMEOUT, create, registrations
+from helpers import PYTHON, TIMEOUT, create, free_port, registrations
 from pharos import BlockNode, Transcript
 from pharos.testing import Mailbox, until
 
@@ -327,17 +326,9 @@ def test_exports_are_the_contract():
     assert [name for name in EXPORTS if not hasattr(pharos, name)] == []
 
 
-class Far:
-    """A master that nobody has started."""
-
-    def __init__(self):
-        with socket.create_server(('127.0.0.1', 0)) as free:
-            self.url = f'http://127.0.0.1:{free.getsockname()[1]}/'
-
-
 TEXTS = {
     'no master': (
-        lambda node: pharos.Master(Far().url).create(BlockNode, named='/n'),
+        lambda node: create(pharos.Master(f'http://127.0.0.1:{free_port()}/')),
         pharos.MasterUnreachableError,
         ['http://127.0.0.1', 'roscore'],
     ),

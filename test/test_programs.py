@@ -2,14 +2,13 @@
 import contextlib
 import re
 import signal
-import socket
 import subprocess
 import threading
 
 import pytest
 
 import pharos
-from helpers import PYTHON, TIMEOUT, Program, create
+from helpers import PYTHON, TIMEOUT, Program, create, free_port
 from pharos import BlockNode, Master, Transcript
 from pharos.testing import Mailbox, until
 
@@ -90,8 +89,7 @@ def test_turtle_driver_drives_again_and_again(master, turtle):
 
 
 def test_turtle_driver_has_address_and_port(master, turtle):
-    with socket.create_server(('127.0.0.1', 0)) as free:
-        port = free.getsockname()[1]
+    port = free_port()
     with running(master.url, 'turtle_driver', '--domain', '127.0.0.1', '--xmlrpc-port', str(port)):
         assert speeds(turtle) == (2.0, 1.0)
         assert master.node('/my_turtle_driver').uri == f'http://127.0.0.1:{port}/'

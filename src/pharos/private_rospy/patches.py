@@ -189,12 +189,6 @@ def is_shutdown(original, run):
     return run.stopping.is_set() or original()
 
 
-@replace('rospy.impl.init', 'time')
-def poll_often(original, run):
-    """Looks every 0.1 s whether the node is registered."""
-    return Shim(original, sleep=lambda seconds: original.sleep(min(seconds, 0.001)))
-
-
 @replace('rosgraph.roslogging', 'rospkg')
 def packages(original, run):
     """Searches all packages for rosgraph's configuration of the log, again for each node."""
@@ -255,6 +249,13 @@ def subscription(original, run):
     return overlay(original, transport.SubscriptionOverlay)
 
 
+@patch('rospy.topics', 'Subscriber.__init__')
+def subscribe(original, run, self, *args, **kwargs):
+    """Connects before it has its callback: a message that comes between is lost."""
+    original(self, *args, **kwargs)
+    run.connect_all(self.resolved_name)
+
+
 @patch('rospy.topics', 'QueuedConnection')
 def queued(original, run, connection, queue_size):
     """See Sender."""
@@ -288,7 +289,8 @@ def reg_added(original, run, self, name, data, kind):
 def publisher_update(original, run, self, name, uris):
     """Leaves it to its thread; is called once for each publisher."""
     if uris != run.publishers.get(name):
-        run.update_publishers(name, uris)
+        run.publishers[name] = uris
+        run.connect_all(name)
 
 
 @patch('rospy.impl.masterslave', 'ROSHandler.publisherUpdate')

@@ -175,19 +175,16 @@ class Run:
         with suppress(MasterUnreachableError):
             value = self.node.master.call(_METHODS[kind], name, data, self.uri, caller_id=self.name)
             if kind == 'sub' and value:
-                self.update_publishers(name, value)
+                self.publishers[name] = value
         for other in list(runs.values()) if kind == 'pub' else ():  # the master takes 0.1 s
             if other.master_url == self.master_url:
                 other.connect(name, self.uri)
 
-    def update_publishers(self, topic, uris):
-        """Connect to the publishers of a topic that the master names."""
-        self.publishers[topic] = uris
-        for uri in uris:
-            if uri in runs:
-                self.connect(topic, uri)
-            else:
-                self.start_thread(lambda uri=uri: self.connect(topic, uri))
+    def connect_all(self, topic):
+        """Connect to the publishers of a topic that the master has named."""
+        for uri in self.publishers.get(topic, ()):
+            connect = functools.partial(self.connect, topic, uri)
+            connect() if uri in runs else self.start_thread(connect)
 
     def connect(self, topic, uri):
         """Connect a subscription to a publisher, unless it is or is about to be."""
@@ -214,8 +211,9 @@ class Run:
         """Connect once more after a while, if the master still names the publisher."""
         if not self.stopping.wait(transport.RETRY_DELAY) and uri in self.publishers.get(topic, ()):
             if error:
-                text = f'{topic}: no connection to {uri}, it is tried again: {error}'
-                self.ros.logwarn_throttle_identical(60, text)
+                self.ros.logwarn_throttle_identical(
+                    60, f'{topic}: no connection to {uri}, it is tried again: {error}'
+                )
             self.connect(topic, uri)
 
     def register_missing(self, state):
@@ -234,6 +232,7 @@ class Run:
             missing = [each for each in own if each[:2] in self.known - known]
             for each in missing:
                 self.stopping.is_set() or self.register(*each)
+                self.connect_all(each[1])
             self.known = {each[:2] for each in own}
         if missing and not self.stopping.is_set():
             self.modules.load('rospy.client')._init_node_params(self.argv, self.name)

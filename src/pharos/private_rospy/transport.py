@@ -328,10 +328,8 @@ def receive(connection, address, port, uri, subscription, run):
     """Connect to a publisher and receive its messages until the connection ends."""
     connection.connect(address, port, uri, timeout=CONNECT_LIMIT)
     sock = connection.socket
-    if sock is None:
-        return
-    run.sockets.add(sock)
     keep_alive(sock)
+    run.sockets.add(sock)
     sock.settimeout(None)
     cls, header = subscription.data_class, connection.header
     share = _shares.get((subscription.resolved_name, uri, cls))
