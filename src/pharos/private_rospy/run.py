@@ -32,8 +32,6 @@ _end_of_watch = threading.Event()
 
 
 class _Transport(xmlrpc_client.Transport):
-    limit = MASTER_LIMIT
-
     def make_connection(self, host):
         connection = super().make_connection(host)
         connection.timeout = self.limit
@@ -86,7 +84,7 @@ class Run:
         patch = functools.partial(patches.apply, run=self)
         self.modules = PrivateModules(self.substitutes(), patch)
         self.ros = self.modules.load('rospy')
-        self.core = self.modules.load('rospy.core')
+        self.core = self.ros.core
         registration = self.modules.load('rospy.impl.registration')
         self.topics = registration.get_topic_manager()
         self.services = registration.get_service_manager()
@@ -273,7 +271,9 @@ class Run:
         for sock in list(self.sockets):
             transport.shut(sock)
         join(set(self.threads) - set(self.node.souls), STOP_LIMIT)
-        self.modules.load('logging').shutdown()
+        log = self.modules.load('logging')
+        log.disable()  # or a thread that is late opens the file again
+        log.shutdown()
         for sock in list(self.sockets):
             sock.close()
         gc.collect(1)

@@ -23,7 +23,7 @@ LARGEST_MESSAGE = 1_000_000_000  # bytes, as roscpp has it
 AT_ONCE = 1 << 16  # bytes; copying more into the socket would hold up the publisher
 CONNECT_LIMIT = 10.0  # seconds for one attempt to connect
 RETRY_DELAY = 1.0  # seconds until the next one
-NEVER = float('inf')
+INFINITE = float('inf')
 _length = struct.Struct('<I')
 #: the runs of this process by the URI of their node
 runs = {}
@@ -225,7 +225,7 @@ class PublisherOverlay:
                 self.write(message, remote)
         if inboxes:
             # actionlib keeps a goal only when publish() has returned: no yield to who answers it
-            self.last_wake = hand_over(inboxes, NEVER if latch_key is None else self.last_wake)
+            self.last_wake = hand_over(inboxes, INFINITE if latch_key is None else self.last_wake)
         return True
 
     def write(self, message, connections):
@@ -372,7 +372,7 @@ class Sender:
     """
 
     def __init__(self, connection, queue_size, run):
-        self._connection, self._limit = connection, queue_size or float('inf')
+        self._connection, self._limit = connection, queue_size or INFINITE
         self._queue, self.busy = collections.deque(), False
         self._rest = b''  # of a message whose beginning the socket has
         self._lock, self._run = threading.Lock(), run
