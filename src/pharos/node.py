@@ -122,12 +122,12 @@ class Node(Receiver):
                 for each in opened if type(self).start is Node.start else ():
                     each.open()
             except BaseException:
-                self._end(0)
+                self._end()  # a program may go on to register until it is waited for
                 self.opened = opened
                 raise
 
-    def _end(self, timeout):
-        self.run.stop(timeout)
+    def _end(self):
+        self.run.stop(self.stop_timeout)
         for each in self.opened:  # rospy has closed it
             each.closed = True
         self._senders, self.lifecycle = {}, Lifecycle.STOPPED
@@ -142,7 +142,7 @@ class Node(Receiver):
         with self._life:
             if self.is_running:
                 self.lifecycle = Lifecycle.STOPPING
-                self._end(self.stop_timeout)
+                self._end()
 
     def end_now(self):
         """Stop the node, whatever the stop() of its class raises; two threads may ask for it."""
