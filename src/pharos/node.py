@@ -30,7 +30,7 @@ from pharos.transcript import Transcript
 if TYPE_CHECKING:
     from pharos.master import Master
 
-_LEVELS = {'warn': 'warning', 'err': 'error', 'fatal': 'critical'}
+_LEVELS = 'debug', 'info', 'warning', 'error', 'fatal'
 
 
 class Lifecycle(enum.Enum):
@@ -370,8 +370,8 @@ class Node(Receiver):
 
         :param level: 'debug', 'info', 'warning' (or 'warn'), 'error' or 'fatal'
         """
-        level = _LEVELS.get(level, level)
-        if level not in ('debug', 'info', *_LEVELS.values()):
+        level = 'warning' if level == 'warn' else level
+        if level not in _LEVELS:
             raise ValueError(f'unknown level {level!r}: give info or error, and one text')
         if self.lifecycle not in (Lifecycle.RUNNING, Lifecycle.STOPPING):
             return Transcript.show(f'[{level.upper()}] {self.name}: {text}')

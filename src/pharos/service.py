@@ -4,6 +4,7 @@ import socket
 import struct
 from contextlib import suppress
 from time import monotonic
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -154,12 +155,17 @@ class Service:
 
     def _call_here(self, service, request):
         """Have a rospy.Service of this process answer in this thread."""
-        taker = _Taker()
+        answers = []
+        connection = SimpleNamespace(
+            write_buff=io.BytesIO(),
+            send_message=lambda response, seq: answers.append(copied(response)),
+            write_data=lambda data: answers.append(ServiceException(data[5:].decode())),
+        )
         request._connection_header = {'callerid': self.caller_id, 'service': self.name}
-        service._handle_request(taker, request)
-        if taker.error:
-            raise ServiceException(taker.error)
-        return taker.response
+        service._handle_request(connection, request)
+        if isinstance(answers[0], Exception):
+            raise answers[0]
+        return answers[0]
 
     def _call(self, cls, data, timeout):
         end = timeout and monotonic() + timeout
@@ -195,21 +201,6 @@ class Service:
 
     def __repr__(self):
         return f'<Service {self.name} ({self.type}) at {self.uri}>'
-
-
-class _Taker:
-    """Takes what a rospy.Service answers; stands in for a connection."""
-
-    error = None
-
-    def __init__(self):
-        self.write_buff = io.BytesIO()
-
-    def send_message(self, response, seq):
-        self.response = copied(response)
-
-    def write_data(self, data):
-        self.error = data[5:].decode()
 
 
 def _read(sock, size, end):

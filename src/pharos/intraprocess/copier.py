@@ -155,15 +155,12 @@ class _Source:
         return name
 
     def pack_numbers(self):
-        """Send all single numbers through one pack and unpack, so that they come out as the wire's.
-
-        Returns the code that packs them, and the names that they have then.
-        """
+        """Send all single numbers through one pack and unpack, so that they come out as the wire's."""
         bases, fields, names = zip(*self.numbers)
         codes = '<' + ''.join(CODES[base] for base in bases)
         arriving = '<' + ''.join('?' if base == 'bool' else CODES[base] for base in bases)
         self.scope.update(pack=struct.Struct(codes).pack, unpack=struct.Struct(arriving).unpack)
-        return f'pack({", ".join(fields)})', f'{", ".join(names)},'
+        self.reads.append(f'{", ".join(names)}, = unpack(pack({", ".join(fields)}))')
 
     def add_fields(self, cls, owner, depth):
         if cls in _TIMES.values():
@@ -219,19 +216,18 @@ def nested_class(base, cls):
 @functools.cache
 def _generate(cls, depth=0):
     source = _Source(cls, depth)
+    if source.numbers:
+        source.pack_numbers()
     made, values = source.refer(cls), ''.join(f'{value}, ' for value in source.values)
-    frozen, unpack = f'({values})', [
+    freeze = ['def freeze_fields(m):', *source.reads, f'return ({values})']
+    thaw = [
+        'def thaw(frozen):',
         f'if type(frozen) is bytes: return {made}().deserialize(frozen)',
         f'{values or "_"} = frozen',
+        f'm = new({made})',
+        *source.builds,
+        'return m',
     ]
-    if source.numbers:
-        packed, names = source.pack_numbers()
-        if len(source.numbers) == len(source.values):  # it is on the wire as it is packed
-            frozen, unpack = packed, [f'{names} = unpack(frozen)']
-        else:
-            source.reads.append(f'{names} = unpack({packed})')
-    lines = ['def freeze_fields(m):', *source.reads, f'return {frozen}']
-    lines += ['def thaw(frozen):', *unpack, f'm = new({made})', *source.builds, 'return m']
-    text = '\n'.join(line if line.startswith('def ') else f'    {line}' for line in lines)
+    text = '\n'.join(map('\n    '.join, (freeze, thaw)))
     exec(compile(text, f'<copier of {cls.__name__}>', 'exec'), source.scope)
     return source.scope['freeze_fields'], source.scope['thaw']

@@ -259,7 +259,7 @@ def subscribe(original, run, self, *args, **kwargs):
 @patch('rospy.topics', 'QueuedConnection')
 def queued(original, run, connection, queue_size):
     """See Sender."""
-    is_link = connection.transport_type == 'INTRAPROCESS'
+    is_link = isinstance(connection, transport.Link)
     return connection if is_link else transport.Sender(connection, queue_size, run)
 
 

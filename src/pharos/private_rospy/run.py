@@ -69,7 +69,6 @@ class Run:
         self.deadlines = {}  # socket of a client that is to say something -> until when
         self.publishers = {}  # topic -> URIs, as the master last said
         self.connecting = set()  # (topic, URI, ...)
-        self.known = set()  # (kind, name) of what is registered
         self.uri, self.turns = '', Turns()
         namespace, _, self.base = node.name.rpartition('/')
         self.environ = {
@@ -226,13 +225,11 @@ class Run:
         ours = topics.get_publications, topics.get_subscriptions, services.get_services
         with topics.lock, services.lock:  # what is closed meanwhile stays closed
             own = [(kind, *each) for kind, get in zip(_METHODS, ours) for each in get()]
-            # what was there at the last look: all else may be about to be registered
-            missing = [each for each in own if each[:2] in self.known - known]
-            for each in missing:
-                self.stopping.is_set() or self.register(*each)
-                self.connect_all(each[1])
-            self.known = {each[:2] for each in own}
-        if missing and not self.stopping.is_set():
+            for each in own:
+                if each[:2] not in known and not self.stopping.is_set():
+                    self.register(*each)
+                    self.connect_all(each[1])
+        if not known and not self.stopping.is_set():  # the master has begun anew
             self.modules.load('rospy.client')._init_node_params(self.argv, self.name)
             for parameter in self.node.parameters:
                 parameter.subscribe()

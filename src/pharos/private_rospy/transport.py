@@ -30,14 +30,22 @@ runs = {}
 guard = threading.Lock()  # of runs and _shares
 
 
+def peer_of(connection):
+    """Return the name of the node at the other end; None if it has not said it yet."""
+    if connection.direction == 'o':
+        return connection.endpoint_id
+    return connection.header and connection.header['callerid']
+
+
 class Link(Transport):
     """One end of a link; ``subscription`` is at the other one, if this is the publisher's."""
 
-    transport_type = 'INTRAPROCESS'
     subscription = latch = None
+    header = property(lambda self: self.publisher.header)
+    callerid_pub = property(peer_of)  # actionlib asks for it
 
     def get_transport_info(self):
-        return f'INTRAPROCESS connection to [{self.endpoint_id}]'
+        return f'{self.transport_type} connection to [{self.endpoint_id}]'
 
     def close(self):
         """Close both ends; rospy never drops a link because of a publisherUpdate."""
@@ -48,64 +56,37 @@ class Link(Transport):
                     end.cleanup_cb(end)
 
 
-class Follower(Transport):
-    """The share of a subscription in the connection of another node."""
-
-    transport_type = 'TCPROS'
-    header = property(lambda self: self.share.connection and self.share.connection.header)
-    latch = property(lambda self: self.share.connection and self.share.connection.latch)
-
-    def get_transport_info(self):
-        return f'TCPROS connection of {self.share.leader.name}'
-
-
-class Share:
-    """A connection to an external publisher that several nodes of this process share.
-
-    The first that connects has it, and hands its messages to the ``followers``; when it ends, these
-    connect anew.
-    """
-
-    connection = None
-
-    def __init__(self, leader):
-        self.leader, self.followers = leader, []
-
-
-_shares = {}  # (topic, URI, message class) -> Share
+_shares = {}  # (topic, URI, message class) -> (run, relay)
 
 
 def follow(run, topic, uri, subscription):
     """True if another node of this process has the connection, which the subscription now shares.
 
-    If nobody has, this one is the first.
+    If nobody has, this one is the first; its relay publishes what it receives to the others.
     """
-    key = topic, uri, subscription.data_class
+    cls = subscription.data_class
     with guard:
-        share = _shares.get(key)
-        if share is None or share.leader is run:
-            _shares[key] = Share(run)
+        first, relay = _shares.get((topic, uri, cls), (run, None))
+        if first is run:
+            relay = run.modules.load('rospy.topics')._PublisherImpl(topic, cls)
+            relay.has_header = False  # or it would count anew
+            _shares[topic, uri, cls] = run, relay
             return False
-        follower = Follower('i', topic)
-        follower.endpoint_id, follower.share, follower.run = uri, share, run
-        follower.subscription = subscription
-        subscription.add_connection(follower)
-        share.followers = [*(each for each in share.followers if not each.done), follower]
-    for inbox in subscription.inboxes() if follower.latch else ():
-        inbox.receive(copied(follower.latch), 0)
+        join(relay, uri, subscription, run, 'TCPROS')
     return True
 
 
 def end_share(topic, uri, cls, run):
     """Have those that share a connection that has ended connect anew."""
     with guard:
-        share = _shares.get((topic, uri, cls))
-        if share is None or share.leader is not run:
+        first, relay = _shares.get((topic, uri, cls), (None, None))
+        if first is not run:
             return
         del _shares[topic, uri, cls]
-    for follower in share.followers:
-        follower.close()
-        follower.run.start_thread(lambda run=follower.run: run.connect(topic, uri))
+    links = relay.connections
+    relay.close()
+    for link in links:
+        link.receiver.start_thread(lambda run=link.receiver: run.connect(topic, uri))
 
 
 def link(sender, receiver, topic):
@@ -123,16 +104,22 @@ def link(sender, receiver, topic):
             protocol = sender.modules.load('rospy.impl.tcpros_pubsub').TCPROSPub
             options = topic, sent, publisher.is_latch, publisher.headers
             publisher.header = protocol(*options).get_header_fields()
-        out, end = Link('o', topic), Link('i', topic)
-        out.endpoint_id, end.endpoint_id = receiver.name, sender.uri
+        join(publisher, sender.uri, subscription, receiver, 'INTRAPROCESS')
+
+
+def join(publisher, uri, subscription, receiver, transport_type):
+    """Make a link."""
+    with publisher.lock:
+        out, end = Link('o', publisher.name), Link('i', publisher.name)
+        out.endpoint_id, end.endpoint_id = receiver.name, uri
         out.other, end.other, out.subscription = end, out, subscription
         for each in out, end:
-            each.publisher, each.thaw = publisher, thawer(sent, wanted)
-            each.header = publisher.header
-            each.callerid_pub = sender.name  # actionlib asks for it
+            each.publisher, each.receiver = publisher, receiver
+            each.transport_type = transport_type
+            each.thaw = thawer(publisher.data_class, subscription.data_class)
         with subscription.c_lock:
-            if subscription.closed or publisher.closed or subscription.has_connection(sender.uri):
-                return None
+            if subscription.closed or publisher.closed or subscription.has_connection(uri):
+                return
             subscription.add_connection(end)
             inboxes = subscription.inboxes()
         publisher.rospy_add_connection(out)
@@ -296,16 +283,9 @@ class SubscriptionOverlay:
             self.plain.turns.close(0)
 
 
-def peer_of(connection):
-    """Return the name of the node at the other end; None if it has not said it yet."""
-    if connection.direction == 'o':
-        return connection.endpoint_id
-    return connection.header and connection.header['callerid']
-
-
 def by_kind(connections):
     """Return the links and the others of some connections."""
-    links = [each for each in connections if each.transport_type == 'INTRAPROCESS']
+    links = [each for each in connections if isinstance(each, Link)]
     return links, [each for each in connections if each not in links]
 
 
@@ -332,9 +312,9 @@ def receive(connection, address, port, uri, subscription, run):
     run.sockets.add(sock)
     sock.settimeout(None)
     cls, header = subscription.data_class, connection.header
-    share = _shares.get((subscription.resolved_name, uri, cls))
-    if share:
-        share.connection = connection
+    first, relay = _shares.get((subscription.resolved_name, uri, cls), (None, None))
+    if first is run:
+        relay.header, relay.is_latch = header, connection.is_latched
     with sock.makefile('rb', 1 << 16) as stream:
         while not connection.done:
             head = stream.read(4)
@@ -352,10 +332,9 @@ def receive(connection, address, port, uri, subscription, run):
             logger = subscription.statistics_logger
             if logger:
                 logger.callback(message, connection.callerid_pub, connection.stat_bytes)
+            if first is run:
+                relay.publish(message)
             inboxes = subscription.inboxes()
-            for follower in share.followers if share else ():
-                if not follower.done:
-                    inboxes = [*inboxes, *follower.subscription.inboxes()]
             copies = [copied(message) for _ in inboxes[1:]]  # which share its bytes
             for each, inbox in zip([message, *copies], inboxes):
                 each._connection_header = header
