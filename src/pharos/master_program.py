@@ -17,15 +17,14 @@ from pharos import BlockNode, Master
 def main(port):
     """Run rosmaster, and a /rosout that passes log lines on to /rosout_agg, as roscore does."""
     answers, sys.stdout = sys.stdout, sys.stderr
-    for name in 'rosmaster', 'xmlrpc':  # they complain of every node that stops
-        logging.getLogger(name).addHandler(logging.NullHandler())
+    logging.disable()  # rosmaster complains of every node that stops
     try:  # rosmaster waits for ever if its port is taken
         socket.create_server((rosgraph.network.get_bind_address(), port)).close()
     except OSError:
         return
     server = rosmaster.master.Master(port=port)
     server.start()
-    master = Master(f'http://{os.environ["ROS_HOSTNAME"]}:{server.master_node.port}/')
+    master = Master(server.uri)
     rosout = master.create(BlockNode, named='/rosout')
     aggregate = rosout.output_channel('/rosout_agg', Log)
     rosout.interested_in('/rosout', Log, delegate=lambda log: aggregate.publish(log))

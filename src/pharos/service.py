@@ -171,11 +171,8 @@ class Service:
         end = timeout and monotonic() + timeout
         try:
             sock, _ = self._connect(self.md5sum, timeout)
-        except ConnectionError as error:
-            uri = self.master.call('lookupService', self.name)
-            if uri in (None, self.uri):  # else it has moved
-                raise ServiceCallError(f'{self.name} at {self.uri} refused: {error}') from None
-            self.uri = uri
+        except ConnectionError:  # it may have moved
+            self.uri = self.master.call('lookupService', self.name) or self.uri
             sock, _ = self._connect(self.md5sum, timeout)
         with sock:
             sock.sendall(struct.pack('<I', len(data)) + data)
