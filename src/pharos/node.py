@@ -93,7 +93,6 @@ class Node(Receiver):
         self.tcp_port, self.xmlrpc_port = ports
         self.failures = Failures()
         self._life = threading.RLock()  # held by a start, stop or restart
-        self._opening = threading.RLock()  # of two threads that send first, one opens the channel
         self.opened = []  # channels, services and parameters, also while it is stopped
         self._senders = {}  # (topic, type) as given to send_to
         self.souls = {}
@@ -465,14 +464,13 @@ class Node(Receiver):
         channel = self._senders.get((topic, typed_as))
         was_open = channel and not channel.closed
         if not was_open:
-            with self._opening:
-                name = self.resolve(topic)
-                given = type(block) if isinstance(block, Message) else None
-                cls = self._class_of(name, typed_as or given)
-                was_open = self._open_on(name, OutputChannel)
-                new = name, cls, False, QUEUE_SIZE
-                channel = was_open[0] if was_open else OutputChannel(self, *new)
-                self._senders[topic, typed_as] = channel
+            name = self.resolve(topic)
+            given = type(block) if isinstance(block, Message) else None
+            cls = self._class_of(name, typed_as or given)
+            was_open = self._open_on(name, OutputChannel)
+            new = name, cls, False, QUEUE_SIZE
+            channel = was_open[0] if was_open else OutputChannel(self, *new)
+            self._senders[topic, typed_as] = channel
         try:
             return channel.send(block, to=to, **fields)
         except Exception:

@@ -64,8 +64,7 @@ def thawer(sent, wanted):
         return thaw
 
     def thaw_as_wanted(frozen):
-        data = frozen if type(frozen) is bytes else serialize(thaw(frozen))
-        return wanted().deserialize(data)
+        return wanted().deserialize(serialize(thaw(frozen)))
 
     return thaw_as_wanted
 
@@ -194,10 +193,7 @@ class _Source:
             self.reads.append(f'{local} = {base}_array({field})')
             fresh = f'list({local})' if base in ('bool', 'string') else local
         elif base == 'string':
-            self.reads.append(f'{local} = {field}')
-            self.reads.append(
-                f'if type({local}) is not str or not {local}.isascii(): text({local})'
-            )
+            self.reads.append(f'{local} = text({field})')
         else:
             self.numbers.append((base, field, local))
         if length is not None:

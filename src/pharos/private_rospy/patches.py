@@ -272,7 +272,7 @@ def receive(original, run, connection, address, port, uri, callback, topic):
     except Exception as problem:
         error = str(problem)
     connection.close()
-    transport.end_share(topic, uri, subscription.data_class, run)
+    transport.end_share(run, topic, uri, subscription.data_class)
     if error and ('md5sum' in error or 'do not match' in error):  # rospy compares the names, too
         run.node.refused(topic, error)
     elif not subscription.closed:

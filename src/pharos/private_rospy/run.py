@@ -69,6 +69,7 @@ class Run:
         self.deadlines = {}  # socket of a client that is to say something -> until when
         self.publishers = {}  # topic -> URIs, as the master last said
         self.connecting = set()  # (topic, URI, ...)
+        self.relays = {}  # (topic, URI, message class) -> publisher to those that share a connection
         self.uri, self.turns = '', Turns()
         namespace, _, self.base = node.name.rpartition('/')
         self.environ = {

@@ -27,7 +27,7 @@ INFINITE = float('inf')
 _length = struct.Struct('<I')
 #: the runs of this process by the URI of their node
 runs = {}
-guard = threading.Lock()  # of runs and _shares
+guard = threading.Lock()  # of runs and their relays
 
 
 def peer_of(connection):
@@ -56,7 +56,6 @@ class Link(Transport):
                     end.cleanup_cb(end)
 
 
-_shares = {}  # (topic, URI, message class) -> (run, relay)
 
 
 def follow(run, topic, uri, subscription):
@@ -65,28 +64,25 @@ def follow(run, topic, uri, subscription):
     If nobody has, this one is the first; its relay publishes what it receives to the others.
     """
     cls = subscription.data_class
+    key = topic, uri, cls
     with guard:
-        first, relay = _shares.get((topic, uri, cls), (run, None))
-        if first is run:
-            relay = run.modules.load('rospy.topics')._PublisherImpl(topic, cls)
-            relay.has_header = False  # or it would count anew
-            _shares[topic, uri, cls] = run, relay
-            return False
-        join(relay, uri, subscription, run, 'TCPROS')
-    return True
+        for other in runs.values():
+            if other is not run and key in other.relays:
+                join(other.relays[key], uri, subscription, run, 'TCPROS')
+                return True
+        run.relays[key] = run.modules.load('rospy.topics')._PublisherImpl(topic, cls)
+        run.relays[key].has_header = False  # or it would count anew
+    return False
 
 
-def end_share(topic, uri, cls, run):
+def end_share(run, *key):
     """Have those that share a connection that has ended connect anew."""
     with guard:
-        first, relay = _shares.get((topic, uri, cls), (None, None))
-        if first is not run:
-            return
-        del _shares[topic, uri, cls]
-    links = relay.connections
-    relay.close()
+        relay = run.relays.pop(key, None)
+        links = relay.connections if relay else ()
+        relay and relay.close()
     for link in links:
-        link.receiver.start_thread(lambda run=link.receiver: run.connect(topic, uri))
+        link.receiver.start_thread(lambda run=link.receiver: run.connect(*key[:2]))
 
 
 def link(sender, receiver, topic):
@@ -312,8 +308,8 @@ def receive(connection, address, port, uri, subscription, run):
     run.sockets.add(sock)
     sock.settimeout(None)
     cls, header = subscription.data_class, connection.header
-    first, relay = _shares.get((subscription.resolved_name, uri, cls), (None, None))
-    if first is run:
+    relay = run.relays.get((subscription.resolved_name, uri, cls))
+    if relay:
         relay.header, relay.is_latch = header, connection.is_latched
     with sock.makefile('rb', 1 << 16) as stream:
         while not connection.done:
@@ -332,7 +328,7 @@ def receive(connection, address, port, uri, subscription, run):
             logger = subscription.statistics_logger
             if logger:
                 logger.callback(message, connection.callerid_pub, connection.stat_bytes)
-            if first is run:
+            if relay:
                 relay.publish(message)
             inboxes = subscription.inboxes()
             copies = [copied(message) for _ in inboxes[1:]]  # which share its bytes
