@@ -123,7 +123,7 @@ class OutputChannel(Channel):
     :ivar sent: how many messages were sent
     """
 
-    def __init__(self, node, topic, message_class, latch, queue_size):
+    def __init__(self, node, topic, message_class, latch=False, queue_size=QUEUE_SIZE):
         self.latch, self.queue_size, self.sent = latch, queue_size, 0
         self._key = latch and self  # under which rospy's publisher keeps what is latched
         self._begin(node, topic, message_class)
@@ -245,8 +245,8 @@ class Topic:
     @property
     def channels(self) -> list[Channel]:
         """The channels of nodes of this process."""
-        nodes = self.master.own_nodes()
-        return [each for node in nodes for each in node.channels if each.topic == self.name]
+        ends = [each for node in self.master.own_nodes() for each in node.channels]
+        return [each for each in ends if each.topic == self.name]
 
     def hz(self, seconds: float = 1.0):
         """Measure for some seconds how often messages come, and how large they are."""

@@ -39,13 +39,16 @@ class Failure:
         self.message = self._again = self._frames = None
         self.error.__traceback__ = self.error.__context__ = self.error.__cause__ = None
 
+    def _check_whole(self):
+        if self._frames is None:
+            raise PharosError(f'{self}: only the newest {WHOLE} keep messages and frames')
+
     def retry(self) -> None:
         """Run the block again, as it is now, on the same message, in the node's turn.
 
         :raises PharosError: if the message is not kept any more
         """
-        if self._again is None:
-            raise PharosError(f'{self} cannot be run again: only the newest {WHOLE} keep messages')
+        self._check_whole()
         self._again(self.message)
 
     def debug(self) -> None:
@@ -53,8 +56,7 @@ class Failure:
 
         :raises PharosError: if the frames are not kept any more
         """
-        if self._frames is None:
-            raise PharosError(f'{self} has no frames: only the newest {WHOLE} keep them')
+        self._check_whole()
         module = 'IPython.core.debugger' if 'IPython' in sys.modules else 'pdb'
         debugger = importlib.import_module(module).Pdb()
         debugger.reset()

@@ -1,7 +1,6 @@
 """The Master: the proxy of a ROS master, which creates nodes and finds those of others."""
 from __future__ import annotations
 
-import atexit
 import collections.abc
 import contextlib
 import os
@@ -108,12 +107,10 @@ class Master:
             )
         master = cls(url)
         master._process = process
-        atexit.register(master.stop)
         return master
 
     def stop(self) -> None:
         """End an embedded master, and do nothing to another."""
-        atexit.unregister(self.stop)
         process, self._process = self._process, None
         if process:
             for node in self.own_nodes():
@@ -154,7 +151,7 @@ class Master:
         :param timeout: seconds, None: without limit
         :raises MasterUnreachableError: if it does not answer in time
         """
-        return bool(program.wait_for(lambda: self.call('getPid'), timeout))
+        return bool(program.wait_for(lambda: self.pid, timeout))
 
     @property
     def pid(self) -> int:

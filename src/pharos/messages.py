@@ -285,7 +285,7 @@ def _fill(message, fields):
         base = types[name].partition('[')[0]
         if type(value) is dict:
             value = _fill(nested_class(base, cls)(), value)
-        elif type(value) is list and value and type(value[0]) is dict:
+        elif type(value) is list and dict in map(type, value[:1]):
             value = [_fill(nested_class(base, cls)(), each) for each in value]
         setattr(message, name, value)
     return message

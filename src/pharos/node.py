@@ -5,7 +5,6 @@ import enum
 import functools
 import threading
 import types
-from collections import Counter
 from contextlib import suppress
 from typing import TYPE_CHECKING, Iterator
 
@@ -91,11 +90,9 @@ class Node(Receiver):
         self.master, self.name, self.uri, self.domain = master, name, None, domain
         self.soul, self.delegate, self.remappings = soul, delegate, remappings
         self.tcp_port, self.xmlrpc_port = ports
-        self.failures = Failures()
         self._life = threading.RLock()  # held by a start, stop or restart
         self.opened = []  # channels, services and parameters, also while it is stopped
         self._senders = {}  # (topic, type) as given to send_to
-        self.souls = {}
 
     # -- life
 
@@ -129,7 +126,7 @@ class Node(Receiver):
         self.run.stop(self.stop_timeout)
         for each in self.opened:  # rospy has closed it
             each.closed = True
-        self._senders, self.lifecycle = {}, Lifecycle.STOPPED
+        self.lifecycle = Lifecycle.STOPPED
         nodes.remove(self)
 
     def stop(self) -> None:
@@ -250,17 +247,9 @@ class Node(Receiver):
 
     def told(self):
         """Return what :meth:`health` knows without the master; top asks for it by XML-RPC."""
-        kinds = [info[3] for info in self.run.topics.get_pub_sub_info()]
-        ended = [soul.name for soul in self.souls if not soul.is_alive()]
-        return {
-            'kind': type(self).__name__,
-            'connections': dict(Counter(kinds)),
-            'dropped': sum(getattr(channel, 'dropped', 0) for channel in self.channels),
-            'errors': self.failures.total,
-            'threads': sum(thread.is_alive() for thread in list(self.run.threads)),
-            'souls': len(self.souls) - len(ended),
-            'ended_souls': ended,
-        }
+        from pharos.live.snapshot import told
+
+        return told(self)
 
     describe = ExternalNode.describe
 
@@ -468,8 +457,7 @@ class Node(Receiver):
             given = type(block) if isinstance(block, Message) else None
             cls = self._class_of(name, typed_as or given)
             was_open = self._open_on(name, OutputChannel)
-            new = name, cls, False, QUEUE_SIZE
-            channel = was_open[0] if was_open else OutputChannel(self, *new)
+            channel = was_open[0] if was_open else OutputChannel(self, name, cls)
             self._senders[topic, typed_as] = channel
         try:
             return channel.send(block, to=to, **fields)

@@ -17,7 +17,6 @@ from catkin.find_in_workspaces import find_in_workspaces
 
 from pharos.errors import PharosError, UnknownNodeError
 
-KEPT_LINES = 10_000
 _COLOURS = re.compile(r'\x1b\[[0-9;]*[A-Za-z]|\x1b\]0;[^\x07]*\x07')
 
 
@@ -31,7 +30,7 @@ class RosProcess(subprocess.Popen):
     """
 
     def __init__(self, command, master_url, on_line=None):
-        self._lines, self._on_line = collections.deque(maxlen=KEPT_LINES), on_line
+        self._lines, self._on_line = collections.deque(maxlen=10_000), on_line
         terminal, slave = os.openpty()
         tty.setraw(slave)
         self._terminal = open(terminal, errors='replace')

@@ -6,7 +6,6 @@ from contextlib import suppress
 from time import monotonic
 from types import SimpleNamespace
 from typing import Any
-from urllib.parse import urlsplit
 
 from rosgraph.network import (
     ROSHandshakeException,
@@ -14,13 +13,13 @@ from rosgraph.network import (
     write_ros_handshake_header,
 )
 from rospy import ServiceException
+from rospy.core import parse_rosrpc_uri
 
 from pharos import messages
 from pharos.blocks import taking
 from pharos.channels import Opened
 from pharos.errors import (
     MessageTypeError,
-    NodeStoppedError,
     PharosError,
     ServiceCallError,
     ServiceTypeError,
@@ -145,11 +144,8 @@ class Service:
         except ServiceException as error:
             raise ServiceCallError(f'{self.name} failed: {error}') from error
         except (OSError, ROSHandshakeException) as error:
-            node = here.node
-            if node and not node.is_running:
-                raise NodeStoppedError(f'{node.name} stops, and the call with it') from None
             raise ServiceCallError(
-                f'{self.name} at {self.uri} did not answer: {error!r}'
+                f'the call of {self.name} at {self.uri} failed: {error!r}'
             ) from error
         return self.response
 
@@ -184,8 +180,7 @@ class Service:
 
     def _connect(self, md5sum, timeout, **more):
         """Return a socket to the provider, and the header that it answers."""
-        parts = urlsplit(self.uri)
-        sock = socket.create_connection((parts.hostname, parts.port), timeout)
+        sock = socket.create_connection(parse_rosrpc_uri(self.uri), timeout)
         keep_alive(sock)
         if here.node:  # whose stop ends the call
             here.node.run.calls.add(sock)

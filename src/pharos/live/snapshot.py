@@ -104,6 +104,21 @@ def _ask(master, node):
             node.problem = str(error)
 
 
+def told(node):
+    """Return what a node of pharos tells of itself: what :meth:`Node.health` knows without the master."""
+    kinds = [info[3] for info in node.run.topics.get_pub_sub_info()]
+    ended = [soul.name for soul in node.souls if not soul.is_alive()]
+    return {
+        'kind': type(node).__name__,
+        'connections': dict(collections.Counter(kinds)),
+        'dropped': sum(getattr(channel, 'dropped', 0) for channel in node.channels),
+        'errors': node.failures.total,
+        'threads': sum(thread.is_alive() for thread in list(node.run.threads)),
+        'souls': len(node.souls) - len(ended),
+        'ended_souls': ended,
+    }
+
+
 def _links(nodes):
     """Return the connections that one end at least tells, with the greater count of both.
 

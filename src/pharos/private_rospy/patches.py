@@ -19,7 +19,6 @@ from pharos.private_rospy.loader import Shim
 LARGEST = 1 << 20  # bytes of a connection header, and of an XML-RPC request
 #: module -> [(target, function that makes the replacement)]
 TABLE = {}
-_packages = functools.cache(rospkg.RosPack)
 
 
 class _Client(threading.local):
@@ -192,7 +191,7 @@ def is_shutdown(original, run):
 @replace('rosgraph.roslogging', 'rospkg')
 def packages(original, run):
     """Searches all packages for rosgraph's configuration of the log, again for each node."""
-    return Shim(original, RosPack=_packages)
+    return Shim(original, RosPack=rospkg.RosPack.get_instance)
 
 
 @patch('rospy.impl.masterslave', 'ROSHandler._ready')

@@ -25,6 +25,7 @@ from pharos.private_rospy.transport import runs
 
 MASTER_LIMIT = 5.0  # seconds for each question to a master or node
 STOP_LIMIT = 2.0  # seconds that a stop waits for threads of rospy
+RETRY_DELAY = 1.0  # seconds until the next attempt to connect
 WATCH_PERIOD = 0.25  # seconds between two looks; each fourth is at the masters, too
 UNREACHABLE = OSError, xmlrpc_client.Error, HTTPException, ExpatError
 _METHODS = {'pub': 'registerPublisher', 'sub': 'registerSubscriber', 'srv': 'registerService'}
@@ -69,7 +70,7 @@ class Run:
         self.deadlines = {}  # socket of a client that is to say something -> until when
         self.publishers = {}  # topic -> URIs, as the master last said
         self.connecting = set()  # (topic, URI, ...)
-        self.relays = {}  # (topic, URI, message class) -> publisher to those that share a connection
+        self.relays = {}  # (topic, URI, class) -> publisher to those that share a connection
         self.uri, self.turns = '', Turns()
         namespace, _, self.base = node.name.rpartition('/')
         self.environ = {
@@ -207,7 +208,7 @@ class Run:
 
     def connect_again(self, topic, uri, error=None):
         """Connect once more after a while, if the master still names the publisher."""
-        if not self.stopping.wait(transport.RETRY_DELAY) and uri in self.publishers.get(topic, ()):
+        if not self.stopping.wait(RETRY_DELAY) and uri in self.publishers.get(topic, ()):
             if error:
                 self.ros.logwarn_throttle_identical(
                     60, f'{topic}: no connection to {uri}, it is tried again: {error}'
@@ -243,7 +244,7 @@ class Run:
 
     def end_node(self):
         """Stop the node, in another thread."""
-        threading.Thread(target=self.node.end_now, name=f'stop {self.name}', daemon=True).start()
+        self.start_thread(self.node.end_now)
 
     def stop(self, timeout):
         """Send what is under way, unregister, free ports and threads; log what is left behind.

@@ -22,7 +22,6 @@ from pharos.intraprocess.workers import Inbox, Turns, hand_over
 LARGEST_MESSAGE = 1_000_000_000  # bytes, as roscpp has it
 AT_ONCE = 1 << 16  # bytes; copying more into the socket would hold up the publisher
 CONNECT_LIMIT = 10.0  # seconds for one attempt to connect
-RETRY_DELAY = 1.0  # seconds until the next one
 INFINITE = float('inf')
 _length = struct.Struct('<I')
 #: the runs of this process by the URI of their node
@@ -56,8 +55,6 @@ class Link(Transport):
                     end.cleanup_cb(end)
 
 
-
-
 def follow(run, topic, uri, subscription):
     """True if another node of this process has the connection, which the subscription now shares.
 
@@ -79,8 +76,10 @@ def end_share(run, *key):
     """Have those that share a connection that has ended connect anew."""
     with guard:
         relay = run.relays.pop(key, None)
-        links = relay.connections if relay else ()
-        relay and relay.close()
+        if not relay:
+            return
+        links = relay.connections
+        relay.close()
     for link in links:
         link.receiver.start_thread(lambda run=link.receiver: run.connect(*key[:2]))
 
