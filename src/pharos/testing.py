@@ -56,8 +56,8 @@ class Mailbox:
         try:
             return self._waiting.get(timeout=TIMEOUT if timeout is None else max(0, timeout))
         except queue.Empty:
-            count = len(self._came)
-            raise TimeoutError(f'no message came in time, after {count} others') from None
+            others = f'{len(self._came)} others: {str(self._came[-1:])[:300]}'
+            raise TimeoutError(f'no message came in time, after {others}') from None
 
     def wait_for(self, predicate: Callable[[Any], Any], timeout: float | None = None) -> Any:
         """Take messages until ``predicate(message)`` is true, and return that one."""

@@ -101,6 +101,7 @@ def workspace(words):
     app.force_interact = True
     load_ipython_extension(app.shell, namespace(sys.argv))
     app.start()
+    pharos.program.stop_all()  # while their blocks still find the names of the session
 
 
 def main():
