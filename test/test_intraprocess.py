@@ -330,3 +330,6 @@ def test_nodes_share_an_external_connection(master, peer):
     nodes[0].stop()
     left = boxes[1:]
     until(lambda: (peer.run("out.publish('more')"), all(len(box.all()) > 1 for box in left))[1])
+    peer.run('out.unregister()')
+    peer.run("out = rospy.Publisher('/a', message_class('std_msgs/String'), queue_size=10)")
+    until(lambda: (peer.run("out.publish('!')"), all(b.all()[-1].data == '!' for b in left))[1])

@@ -125,7 +125,7 @@ class OutputChannel(Channel):
 
     def __init__(self, node, topic, message_class, latch=False, queue_size=QUEUE_SIZE):
         self.latch, self.queue_size, self.sent = latch, queue_size, 0
-        self._key = latch and self  # under which rospy's publisher keeps what is latched
+        self._key = latch and self  # its place in publisher.latches; False: keep nothing
         self._begin(node, topic, message_class)
 
     def open(self):

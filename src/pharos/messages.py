@@ -18,7 +18,6 @@ from pharos.errors import MessageTypeError, UnknownTypeError
 from pharos.intraprocess.copier import copied, nested_class
 
 _TYPE = re.compile(r'[A-Za-z][A-Za-z0-9_]{0,127}/[A-Za-z][A-Za-z0-9_]{0,127}')
-_RULE = '=' * 80
 #: turtlesim's types as in ROS Fuerte, which the report uses; Debian has none
 _TURTLESIM = '''
 msg turtlesim/Color
@@ -175,7 +174,7 @@ def _read(type_, text):
 
     for part in re.split(r'^---.*$', own, flags=re.M):  # of a service there are two
         add_nested(type_, part)
-    tail = ''.join(f'\n{_RULE}\nMSG: {name}\n{text}' for name, text in nested.items())
+    tail = ''.join(f'\n{"=" * 80}\nMSG: {name}\n{text}' for name, text in nested.items())
     return context, own[1:], tail, nested
 
 

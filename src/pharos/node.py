@@ -29,8 +29,6 @@ from pharos.transcript import Transcript
 if TYPE_CHECKING:
     from pharos.master import Master
 
-_LEVELS = 'debug', 'info', 'warning', 'error', 'fatal'
-
 
 class Lifecycle(enum.Enum):
     """The states of a node; see :attr:`Node.lifecycle`."""
@@ -118,7 +116,7 @@ class Node(Receiver):
                 for each in opened if type(self).start is Node.start else ():
                     each.open()
             except BaseException:
-                self._end()  # a program may go on to register until it is waited for
+                self._end()  # waits for a ScriptNode's thread, which may still register
                 self.opened = opened
                 raise
 
@@ -161,7 +159,7 @@ class Node(Receiver):
         with self._life:
             self.master.call('getPid')
             souls = {soul: block for soul, block in self.souls.items() if soul.is_alive()}
-            nodes.append(self)  # spin() waits for it meanwhile
+            nodes.append(self)  # stop() removes one; spin() must not find none
             try:
                 self.stop()
                 self.start()
@@ -358,8 +356,7 @@ class Node(Receiver):
 
         :param level: 'debug', 'info', 'warning' (or 'warn'), 'error' or 'fatal'
         """
-        level = 'warning' if level == 'warn' else level
-        if level not in _LEVELS:
+        if level not in ('debug', 'info', 'warn', 'warning', 'error', 'fatal'):
             raise ValueError(f'unknown level {level!r}: give info or error, and one text')
         if self.lifecycle not in (Lifecycle.RUNNING, Lifecycle.STOPPING):
             return Transcript.show(f'[{level.upper()}] {self.name}: {text}')

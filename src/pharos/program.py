@@ -72,7 +72,7 @@ def spin() -> None:
     """Block until every node of this process has stopped. Ctrl-C, SIGTERM and SIGHUP stop them."""
     handle_signals()
     with contextlib.suppress(KeyboardInterrupt), quiet_wait():
-        while nodes and not rospy.is_shutdown():  # a signal has ended rospy's own node
+        while nodes and not rospy.is_shutdown():  # that of the process, which its own signal ended
             time.sleep(0.01)
             workers.relieve()
     stop_all()
@@ -101,7 +101,7 @@ def _end(number, frame):
     global signalled
     signalled = True
     signal.signal(number, signal.SIG_DFL)  # a second one ends the program at once
-    if _exiting:  # and stops the nodes already
+    if _exiting:  # _exit() stops the nodes already
         return
     threading.Thread(target=stop_all, name='pharos end').start()
     raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(128 + number)

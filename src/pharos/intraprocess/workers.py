@@ -13,7 +13,7 @@ from time import monotonic, perf_counter, sleep
 
 from pharos.intraprocess.copier import size_of
 
-BURST = 100e-6  # seconds; a publisher that comes again within them does not wait for a receiver
+BURST = 100e-6  # seconds; a publisher that woke a worker less than this ago does not wait for it
 YIELD_LIMIT = 1e-3  # seconds that a publisher waits at most until the receiver's thread runs
 YIELD_PAUSE = 0.02  # seconds without such a wait after one that was in vain
 FAST = 50e-6  # seconds; a callback that takes less may run in the thread that reads the socket
@@ -42,7 +42,7 @@ class Turns:
             _turns.add(self)
 
     def run(self):
-        """Run what waits, unless another thread does so; that one then runs this, too."""
+        """Run what waits. If another thread is in here, return: that one runs this, too."""
         jobs = self.jobs
         while jobs and not self.closed and self._running.acquire(False):
             self.runner = get_ident()
@@ -99,7 +99,7 @@ class Turns:
         self.closed = True
         ended = self.runner == get_ident() or self._running.acquire(True, timeout)
         self.jobs.clear()
-        if ended:  # else it keeps its worker, and others need one more
+        if ended:  # else it still counts, so that its blocked worker is replaced
             self.forget()
         return ended
 
@@ -114,6 +114,7 @@ class _Worker:
     """A thread of the pool."""
 
     def __init__(self):
+        # released to wake the thread; held from the wake until the thread runs
         self._wake, self._awake = allocate_lock(), allocate_lock()
         self._wake.acquire()
         threading.Thread(target=self._loop, name='pharos worker', daemon=True).start()
@@ -196,7 +197,7 @@ class Inbox:
         """
         queue = self.queue
         waiting = len(queue)
-        if waiting >= self.limit or waiting and not waiting & (waiting - 1):  # a power of two
+        if waiting >= self.limit or waiting and not waiting & (waiting - 1):  # at 1, 2, 4 ...
             most = max(1, self.queue_bytes // (size or size_of(item[0])))
             self.limit = min(self.queue_size, most)
             if waiting >= self.limit and self.taken != self._taken_at_yield:

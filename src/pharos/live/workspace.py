@@ -72,6 +72,8 @@ def load_ipython_extension(shell, names=None):
     """Make a session of IPython a workspace."""
     names = names or namespace()
     shell.push(names)
+    end = shell._atexit_once  # which clears the names
+    shell._atexit_once = lambda: (pharos.program.stop_all(), end())
     shell.set_hook(
         'complete_command',
         lambda _, event: completions(event.text_until_cursor, names['master']),
@@ -101,7 +103,6 @@ def workspace(words):
     app.force_interact = True
     load_ipython_extension(app.shell, namespace(sys.argv))
     app.start()
-    pharos.program.stop_all()  # while their blocks still find the names of the session
 
 
 def main():

@@ -1,6 +1,6 @@
 """Load rospy once more, with globals of its own: one process, many nodes.
 
-``sys.modules`` stays untouched. Each private module has a ``__builtins__`` whose ``__import__`` finds
+``sys.modules`` is as before afterwards. Each private module has a ``__builtins__`` whose ``__import__`` finds
 rospy, rosgraph and what is written on rospy in the private set, and all else as usual.
 """
 import builtins

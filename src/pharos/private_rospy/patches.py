@@ -204,7 +204,7 @@ def ready(original, run, self, uri):
 
 @patch('rospy.impl.registration', 'RegManager.run')
 def run_registration(original, run, self):
-    """Is that thread's loop; the watcher does its work for all nodes."""
+    """Looks for new publishers in a thread for each node; the watcher does so for all."""
 
 
 @patch('rospy.impl.masterslave', 'ROSHandler._shutdown')
@@ -271,7 +271,7 @@ def receive(original, run, connection, address, port, uri, callback, topic):
     except Exception as problem:
         error = str(problem)
     connection.close()
-    transport.end_share(run, topic, uri, subscription.data_class)
+    transport.end_share(run, topic, uri, subscription)
     if error and ('md5sum' in error or 'do not match' in error):  # rospy compares the names, too
         run.node.refused(topic, error)
     elif not subscription.closed:
@@ -294,7 +294,7 @@ def publisher_update(original, run, self, name, uris):
 
 @patch('rospy.impl.masterslave', 'ROSHandler.publisherUpdate')
 def publishers_changed(original, run, self, *args):  # it checks their number and types
-    """Does not hear that there is none."""
+    """Does not hear that the last publisher has left."""
     for topic in args[1:2]:
         run.publishers.pop(topic, None)
     return original(self, *args)

@@ -2,7 +2,6 @@
 import atexit
 import errno
 import functools
-import gc
 import os
 import socket
 import sys
@@ -175,7 +174,7 @@ class Run:
             value = self.node.master.call(_METHODS[kind], name, data, self.uri, caller_id=self.name)
             if kind == 'sub' and value:
                 self.publishers[name] = value
-        for other in list(runs.values()) if kind == 'pub' else ():  # the master takes 0.1 s
+        for other in list(runs.values()) if kind == 'pub' else ():  # sooner than the master
             if other.master_url == self.master_url:
                 other.connect(name, self.uri)
 
@@ -194,17 +193,20 @@ class Run:
         if attempt in self.connecting:
             return
         self.connecting.add(attempt)
+        code = 0
         try:
             if uri in runs:
                 transport.link(runs[uri], self, topic)
             elif self.node.master.share_connections and transport.follow(self, *key, subscription):
                 pass
-            elif self.handler._connect_topic(*key)[0] != 1:
+            elif (code := self.handler._connect_topic(*key)[0]) != 1:
                 self.start_thread(lambda: self.connect_again(*key))
         except (AttributeError, UnboundLocalError):  # rospy's, if it was closed meanwhile
             pass
         finally:
             self.connecting.discard(attempt)
+            if code != 1:
+                transport.end_share(self, *key, subscription)
 
     def connect_again(self, topic, uri, error=None):
         """Connect once more after a while, if the master still names the publisher."""
@@ -275,7 +277,6 @@ class Run:
         log.shutdown()
         for sock in list(self.sockets):
             sock.close()
-        gc.collect(1)
 
 
 def join(threads, timeout):

@@ -1,10 +1,11 @@
 """Connect topics: INTRAPROCESS links, publishing, and receiving from sockets.
 
 A link is two ends, one in the list of connections of rospy's publisher and one in that of its
-subscription, so that rosnode info, closing and duplicates are rospy's own matter.
+subscription. rospy itself lists links, closes them, and refuses a second one to the same peer.
 """
 import collections
 import contextlib
+import functools
 import io
 import socket
 import struct
@@ -47,7 +48,7 @@ class Link(Transport):
         return f'{self.transport_type} connection to [{self.endpoint_id}]'
 
     def close(self):
-        """Close both ends; rospy never drops a link because of a publisherUpdate."""
+        """Close both ends: nothing else closes a link, a publisherUpdate closes no connection."""
         if not self.done:
             self.done = self.other.done = True
             for end in self, self.other:
@@ -56,32 +57,32 @@ class Link(Transport):
 
 
 def follow(run, topic, uri, subscription):
-    """True if another node of this process has the connection, which the subscription now shares.
+    """Link the subscription to the relay of the node that has the connection, and return True.
 
-    If nobody has, this one is the first; its relay publishes what it receives to the others.
+    If no node of this process has it, this one is to connect: make its relay, and return False.
     """
-    cls = subscription.data_class
-    key = topic, uri, cls
+    key = topic, uri, subscription.data_class
     with guard:
         for other in runs.values():
-            if other is not run and key in other.relays:
-                join(other.relays[key], uri, subscription, run, 'TCPROS')
+            if key in other.relays:
+                make_link(other.relays[key], uri, subscription, run, 'TCPROS')
                 return True
-        run.relays[key] = run.modules.load('rospy.topics')._PublisherImpl(topic, cls)
-        run.relays[key].has_header = False  # or it would count anew
+        relay = run.modules.load('rospy.topics')._PublisherImpl(topic, subscription.data_class)
+        relay.has_header = False  # keeps the publisher's header.seq
+        run.relays[key] = relay
     return False
 
 
-def end_share(run, *key):
-    """Have those that share a connection that has ended connect anew."""
+def end_share(run, topic, uri, subscription):
+    """Close the relay of a connection that has ended, or never began: its followers connect anew."""
     with guard:
-        relay = run.relays.pop(key, None)
+        relay = run.relays.pop((topic, uri, subscription.data_class), None)
         if not relay:
             return
         links = relay.connections
         relay.close()
     for link in links:
-        link.receiver.start_thread(lambda run=link.receiver: run.connect(*key[:2]))
+        link.run.start_thread(functools.partial(link.run.connect, topic, uri))
 
 
 def link(sender, receiver, topic):
@@ -99,17 +100,17 @@ def link(sender, receiver, topic):
             protocol = sender.modules.load('rospy.impl.tcpros_pubsub').TCPROSPub
             options = topic, sent, publisher.is_latch, publisher.headers
             publisher.header = protocol(*options).get_header_fields()
-        join(publisher, sender.uri, subscription, receiver, 'INTRAPROCESS')
+        make_link(publisher, sender.uri, subscription, receiver, 'INTRAPROCESS')
 
 
-def join(publisher, uri, subscription, receiver, transport_type):
-    """Make a link."""
+def make_link(publisher, uri, subscription, receiver, transport_type):
+    """Link a publisher, which has a URI, and a subscription of the run ``receiver``."""
     with publisher.lock:
         out, end = Link('o', publisher.name), Link('i', publisher.name)
         out.endpoint_id, end.endpoint_id = receiver.name, uri
         out.other, end.other, out.subscription = end, out, subscription
         for each in out, end:
-            each.publisher, each.receiver = publisher, receiver
+            each.publisher, each.run = publisher, receiver
             each.transport_type = transport_type
             each.thaw = thawer(publisher.data_class, subscription.data_class)
         with subscription.c_lock:
@@ -158,7 +159,7 @@ class PublisherOverlay:
 
     release = acquire
 
-    def enable_latch(self):  # rospy calls it when its first links are made
+    def enable_latch(self):  # rospy calls it after registering, when links may exist
         self.is_latch = True
         if self.header:
             self.header['latching'] = '1'
@@ -206,7 +207,7 @@ class PublisherOverlay:
             if remote:
                 self.write(message, remote)
         if inboxes:
-            # actionlib keeps a goal only when publish() has returned: no yield to who answers it
+            # for plain rospy, never wait for a receiver: actionlib keeps a goal after publish() only
             self.last_wake = hand_over(inboxes, INFINITE if latch_key is None else self.last_wake)
         return True
 
@@ -238,8 +239,8 @@ class PublisherOverlay:
 class SubscriptionOverlay:
     """Methods for a node's own rospy.topics._SubscriberImpl.
 
-    Callbacks that are an Inbox get messages directly. All others of a topic share one, which takes
-    turns by itself, for they may wait for each other.
+    Callbacks that are an Inbox get messages directly. All others of a topic share one, and run one
+    after another. Those of two topics run side by side: one may wait for the other.
     """
 
     def __init__(self, name, data_class):
@@ -285,7 +286,7 @@ def by_kind(connections):
 
 
 def close(impl):
-    """Close a publisher or subscription: its links before rospy holds the lock, and rospy's epoll."""
+    """Close a publisher or subscription: links without rospy's lock, then all else, then its epoll."""
     for link in by_kind(impl.connections or [])[0]:
         link.close()
     impl.rospy_close()
