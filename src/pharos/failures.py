@@ -8,7 +8,6 @@ import traceback
 from pharos.blocks import name_of
 from pharos.errors import PharosError
 
-_HEAD = f'{"raised":60}  {"by":30}  {"on":20}  times  last'
 KEPT = 100  # failures of a node; the oldest go
 WHOLE = 5  # of them, the newest, whose messages and frames are kept
 
@@ -96,4 +95,5 @@ class Failures(list):
             f'  {time.strftime("%H:%M:%S", time.localtime(each.time))}'
             for each in self
         ]
-        return '\n'.join([_HEAD, *rows]) if self else '[]'
+        table = '\n'.join([f'{"raised":60}  {"by":30}  {"on":20}  times  last', *rows])
+        return table if self else '[]'

@@ -282,7 +282,7 @@ class Node(Receiver):
         try:
             return taking(block, 'soul', 1, 0)(self)
         except BaseException as error:
-            if self.is_running or not isinstance(error, rospy.ROSException):  # else the stop's
+            if self.is_running or not isinstance(error, rospy.ROSException):  # else by the stop
                 self.report(
                     error,
                     block,

@@ -29,7 +29,6 @@ from pharos.intraprocess.copier import copied, serialize
 from pharos.private_rospy.transport import keep_alive, local_service
 from pharos.program import here
 
-PROBE_LIMIT = 5.0  # seconds until a provider that is called must have said its type
 PATIENCE = 0.25  # seconds that a look-up waits for that; a call asks again
 
 
@@ -121,7 +120,7 @@ class Service:
         self.response = None
         try:
             if self.type is None:
-                self._ask(timeout or PROBE_LIMIT)
+                self._ask(timeout or 5.0)
             cls = messages.service_class(self.type)
             request = messages.build(cls._request_class, block, fields)
             if request._md5sum != cls._request_class._md5sum:

@@ -58,6 +58,8 @@ class Turns:
                         value = thaw(value)
                         value._connection_header = header
                         inbox.callback(value)
+                    elif inbox.inline:
+                        inbox.callback(value)
                     else:
                         began = perf_counter()
                         inbox.callback(value)
@@ -204,13 +206,11 @@ class Inbox:
                 self._taken_at_yield = self.taken  # the receiver got on since
                 sleep(1e-6)  # a publisher that never sleeps would starve it
         queue.append(item)
-        is_full = False
+        if waiting < self.limit:
+            self.turns.jobs.append(self)
         while len(queue) > self.limit:  # after append(), or the receiver finds it empty
             queue.popleft()
             self.dropped += 1
-            is_full = True
-        if not is_full:
-            self.turns.jobs.append(self)
 
     def receive(self, message, size):
         """Take a message from the thread that reads a socket.

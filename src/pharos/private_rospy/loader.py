@@ -21,8 +21,8 @@ SHARED = sys.stdlib_module_names.union(
     'genpy genmsg roslib rospkg rosmaster catkin catkin_pkg pharos'.split(),
     'numpy yaml matplotlib cv2 PIL'.split(),
 )
-#: rospy's configuration strips the log of handlers, and smach keeps the log and what is being built in its
-#: classes; the others use sys.argv, sys.path, os.environ or threads
+#: logging: rospy takes its handlers away; smach: it keeps what is being built in its classes;
+#: the others use sys.argv, sys.path, os.environ or threads
 PRIVATE = 'logging argparse optparse subprocess concurrent pkgutil smach'.split()
 MOST_FILES = 300  # of a package that could be written on rospy
 

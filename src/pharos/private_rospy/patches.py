@@ -2,7 +2,8 @@
 
 Over ``def f(original, run, *args)``, ``@patch(module, target)`` has ``f`` called instead of the
 target; ``run`` is the Run whose copy is patched. Over ``def f(original, run)``, ``@replace(module,
-target)`` puts what it returns in the target's place. Each docstring says what is wrong with rospy.
+target)`` puts what it returns in the target's place. Each docstring says what is wrong with
+rospy: read it after the word 'rospy'.
 """
 import functools
 import socket
@@ -287,8 +288,8 @@ def reg_added(original, run, self, name, data, kind):
 @patch('rospy.impl.registration', 'RegManager.publisher_update')
 def publisher_update(original, run, self, name, uris):
     """Leaves it to its thread; is called once for each publisher."""
-    if uris != run.publishers.get(name):
-        run.publishers[name] = uris
+    if uris != run.publisher_uris.get(name):
+        run.publisher_uris[name] = uris
         run.connect_all(name)
 
 
@@ -296,7 +297,7 @@ def publisher_update(original, run, self, name, uris):
 def publishers_changed(original, run, self, *args):  # it checks their number and types
     """Does not hear that the last publisher has left."""
     for topic in args[1:2]:
-        run.publishers.pop(topic, None)
+        run.publisher_uris.pop(topic, None)
     return original(self, *args)
 
 

@@ -67,7 +67,7 @@ class Run:
         self.threads = WeakSet()
         self.sockets, self.calls = WeakSet(), WeakSet()
         self.deadlines = {}  # socket of a client that is to say something -> until when
-        self.publishers = {}  # topic -> URIs, as the master last said
+        self.publisher_uris = {}  # topic -> URIs, as the master last said
         self.connecting = set()  # (topic, URI, ...)
         self.relays = {}  # (topic, URI, class) -> publisher to those that share a connection
         self.uri, self.turns = '', Turns()
@@ -173,14 +173,14 @@ class Run:
         with suppress(MasterUnreachableError):
             value = self.node.master.call(_METHODS[kind], name, data, self.uri, caller_id=self.name)
             if kind == 'sub' and value:
-                self.publishers[name] = value
+                self.publisher_uris[name] = value
         for other in list(runs.values()) if kind == 'pub' else ():  # sooner than the master
             if other.master_url == self.master_url:
                 other.connect(name, self.uri)
 
     def connect_all(self, topic):
         """Connect to the publishers of a topic that the master has named."""
-        for uri in self.publishers.get(topic, ()):
+        for uri in self.publisher_uris.get(topic, ()):
             connect = functools.partial(self.connect, topic, uri)
             connect() if uri in runs else self.start_thread(connect)
 
@@ -210,7 +210,7 @@ class Run:
 
     def connect_again(self, topic, uri, error=None):
         """Connect once more after a while, if the master still names the publisher."""
-        if not self.stopping.wait(RETRY_DELAY) and uri in self.publishers.get(topic, ()):
+        if not self.stopping.wait(RETRY_DELAY) and uri in self.publisher_uris.get(topic, ()):
             if error:
                 self.ros.logwarn_throttle_identical(
                     60, f'{topic}: no connection to {uri}, it is tried again: {error}'

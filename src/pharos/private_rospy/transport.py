@@ -21,8 +21,6 @@ from pharos.intraprocess.copier import copied, copier_for, thawer
 from pharos.intraprocess.workers import Inbox, Turns, hand_over
 
 LARGEST_MESSAGE = 1_000_000_000  # bytes, as roscpp has it
-AT_ONCE = 1 << 16  # bytes; copying more into the socket would hold up the publisher
-CONNECT_LIMIT = 10.0  # seconds for one attempt to connect
 INFINITE = float('inf')
 _length = struct.Struct('<I')
 #: the runs of this process by the URI of their node
@@ -302,7 +300,7 @@ def keep_alive(sock):
 
 def receive(connection, address, port, uri, subscription, run):
     """Connect to a publisher and receive its messages until the connection ends."""
-    connection.connect(address, port, uri, timeout=CONNECT_LIMIT)
+    connection.connect(address, port, uri, timeout=10.0)
     sock = connection.socket
     keep_alive(sock)
     run.sockets.add(sock)
@@ -359,7 +357,7 @@ class Sender:
         """Send a message with its length; never waits for the subscriber."""
         connection = self._connection
         with self._lock:
-            if not self.busy and len(data) <= AT_ONCE:
+            if not self.busy and len(data) <= 1 << 16:  # more would hold up the publisher
                 try:
                     sent = connection.socket.send(data, socket.MSG_DONTWAIT)
                 except BlockingIOError:
