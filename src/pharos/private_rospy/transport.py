@@ -36,9 +36,9 @@ def peer_of(connection):
 
 
 class Link(Transport):
-    """One end of a link; ``subscription`` is at the other one, if this is the publisher's."""
+    """One end of a link; the publisher's has the ``inboxes`` of the subscription."""
 
-    subscription = latch = None
+    latch = None
     header = property(lambda self: self.publisher.header)
     callerid_pub = property(peer_of)  # actionlib asks for it
 
@@ -106,7 +106,7 @@ def make_link(publisher, uri, subscription, receiver, transport_type):
     with publisher.lock:
         out, end = Link('o', publisher.name), Link('i', publisher.name)
         out.endpoint_id, end.endpoint_id = receiver.name, uri
-        out.other, end.other, out.subscription = end, out, subscription
+        out.other, end.other, out.inboxes = end, out, subscription.inboxes
         for each in out, end:
             each.publisher, each.run = publisher, receiver
             each.transport_type = transport_type
@@ -115,7 +115,7 @@ def make_link(publisher, uri, subscription, receiver, transport_type):
             if subscription.closed or publisher.closed or subscription.has_connection(uri):
                 return
             subscription.add_connection(end)
-            inboxes = subscription.inboxes()
+            inboxes = [*subscription.inboxes]
         publisher.rospy_add_connection(out)
         for inbox in inboxes if publisher.latches else ():
             for frozen in publisher.latches.values():
@@ -197,11 +197,9 @@ class PublisherOverlay:
                 for link in links:
                     link.stat_num_msg += 1
                     item = own if link.thaw is self.thaw else (frozen, link.thaw, self.header)
-                    end = link.subscription
-                    received = end.known if end.callbacks is end.seen else end.inboxes()
-                    for inbox in received:
+                    for inbox in link.inboxes:
                         inbox.put((message, None, None) if inbox.shared else item)
-                    inboxes += received
+                    inboxes += link.inboxes
             if remote:
                 self.write(message, remote)
         if inboxes:
@@ -243,19 +241,17 @@ class SubscriptionOverlay:
 
     def __init__(self, name, data_class):
         self.rospy___init__(name, data_class)
-        self.tcp_nodelay, self.seen, self.known, self.plain = True, None, [], None
+        self.tcp_nodelay, self.inboxes, self.plain = True, [], None
 
-    def inboxes(self):
-        """Return the inboxes of all callbacks; rospy makes another list if these change."""
-        callbacks = self.callbacks
-        if callbacks is not self.seen:
-            known = [callback for callback, _ in callbacks or () if isinstance(callback, Inbox)]
-            if callbacks and len(known) < len(callbacks):
-                if self.plain is None:
-                    self.plain = Inbox(Turns(), self.call_plain, self.queue_size)
-                known.append(self.plain)
-            self.seen, self.known = callbacks, known
-        return self.known
+    def find_inboxes(self):
+        """Find the inboxes of all callbacks anew; the links have this very list."""
+        callbacks = self.callbacks or ()
+        found = [callback for callback, _ in callbacks if isinstance(callback, Inbox)]
+        if len(found) < len(callbacks):
+            if self.plain is None:
+                self.plain = Inbox(Turns(), self.call_plain, self.queue_size)
+            found.append(self.plain)
+        self.inboxes[:] = found
 
     def call_plain(self, message):
         for callback, args in self.callbacks or ():
@@ -265,11 +261,16 @@ class SubscriptionOverlay:
 
     def add_callback(self, callback, args):
         self.rospy_add_callback(callback, args)
+        self.find_inboxes()
         for link in by_kind(self.connections)[0]:
             for frozen in list(link.publisher.latches.values()):
                 message = link.thaw(frozen)
                 message._connection_header = link.header
                 self._invoke_callback(message, callback, args)
+
+    def remove_callback(self, callback, args):
+        self.rospy_remove_callback(callback, args)
+        self.find_inboxes()
 
     def close(self):
         close(self)
@@ -328,7 +329,7 @@ def receive(connection, address, port, uri, subscription, run):
                 logger.callback(message, connection.callerid_pub, connection.stat_bytes)
             if relay:
                 relay.publish(message)
-            inboxes = subscription.inboxes()
+            inboxes = [*subscription.inboxes]
             copies = [copied(message) for _ in inboxes[1:]]  # which share its bytes
             for each, inbox in zip([message, *copies], inboxes):
                 each._connection_header = header
