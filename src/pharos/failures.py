@@ -38,16 +38,16 @@ class Failure:
         self.message = self._again = self._frames = None
         self.error.__traceback__ = self.error.__context__ = self.error.__cause__ = None
 
-    def _check_whole(self):
-        if self._frames is None:
-            raise PharosError(f'{self}: only the newest {WHOLE} keep messages and frames')
+    def _check(self, kept):
+        if kept is None:
+            raise PharosError(f'{self}: only the newest {WHOLE} of blocks can be run or shown')
 
     def retry(self) -> None:
         """Run the block again, as it is now, on the same message, in the node's turn.
 
         :raises PharosError: if the message is not kept any more
         """
-        self._check_whole()
+        self._check(self._again)
         self._again(self.message)
 
     def debug(self) -> None:
@@ -55,7 +55,7 @@ class Failure:
 
         :raises PharosError: if the frames are not kept any more
         """
-        self._check_whole()
+        self._check(self._frames)
         module = 'IPython.core.debugger' if 'IPython' in sys.modules else 'pdb'
         debugger = importlib.import_module(module).Pdb()
         debugger.reset()

@@ -206,11 +206,13 @@ class Inbox:
                 self._taken_at_yield = self.taken  # the receiver got on since
                 sleep(1e-6)  # a publisher that never sleeps would starve it
         queue.append(item)
-        if waiting < self.limit:
-            self.turns.jobs.append(self)
+        is_full = False
         while len(queue) > self.limit:  # after append(), or the receiver finds it empty
             queue.popleft()
             self.dropped += 1
+            is_full = True
+        if not is_full:  # the receiver may have taken one meanwhile
+            self.turns.jobs.append(self)
 
     def receive(self, message, size):
         """Take a message from the thread that reads a socket.
