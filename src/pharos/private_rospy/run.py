@@ -246,7 +246,7 @@ class Run:
 
     def end_node(self):
         """Stop the node, in another thread."""
-        self.start_thread(self.node.end_now)
+        threading.Thread(target=self.node.end_now).start()  # no stop waits for it
 
     def stop(self, timeout):
         """Send what is under way, unregister, free ports and threads; log what is left behind.

@@ -115,7 +115,7 @@ def make_link(publisher, uri, subscription, receiver, transport_type):
             if subscription.closed or publisher.closed or subscription.has_connection(uri):
                 return
             subscription.add_connection(end)
-            inboxes = [*subscription.inboxes]
+            inboxes = subscription.inboxes
         publisher.rospy_add_connection(out)
         for inbox in inboxes if publisher.latches else ():
             for frozen in publisher.latches.values():
