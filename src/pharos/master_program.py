@@ -27,7 +27,7 @@ def main(port):
     master = Master(server.uri)
     rosout = master.create(BlockNode, named='/rosout')
     aggregate = rosout.output_channel('/rosout_agg', Log)
-    rosout.interested_in('/rosout', Log, delegate=lambda log: aggregate.publish(log))
+    rosout.interested_in('/rosout', Log, delegate=aggregate.send)
     print(master.url, file=answers, flush=True)
     sys.stdin.read()
     os._exit(0)  # nothing of it has to be unregistered

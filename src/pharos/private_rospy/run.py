@@ -131,8 +131,8 @@ class Run:
 
         :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: stop() undoes the rest
         """
-        base, port = self.modules.load('rospy.impl.tcpros_base'), self.node.tcp_port
-        taken = self.node.master.call('lookupNode', self.name)
+        base, node = self.modules.load('rospy.impl.tcpros_base'), self.node
+        taken, port = node.master.call('lookupNode', self.name), node.tcp_port
         with suppress(*UNREACHABLE):
             if taken and ServerProxy(taken, 1.0).getPid('/pharos'):
                 raise NodeNameInUseError(
@@ -143,7 +143,7 @@ class Run:
             tcp = server.tcp_ros_server = base.TCPServer(server._tcp_server_callback, port)
             tcp.server_sock.listen(128)  # rospy lets five clients wait
             tcp.start()
-            port_taken, port = tcp.port, self.node.xmlrpc_port
+            port_taken, port = tcp.port, node.xmlrpc_port
             options.update(xmlrpc_port=port, tcpros_port=port_taken, disable_signals=True)
             self.modules.load('rospy.client').init_node(self.base, self.argv, **options)
         except OSError as error:
@@ -152,7 +152,7 @@ class Run:
             raise PortInUseError(
                 f'{self.name}: port {port} is in use: choose another one, or 0 for any'
             ) from None
-        node, address = self.node, urlsplit(self.uri)
+        address = urlsplit(self.uri)
         node.uri, node.tcp_port, node.xmlrpc_port = self.uri, port_taken, address.port
         node.domain = node.domain or address.hostname
 

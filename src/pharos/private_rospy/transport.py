@@ -41,6 +41,8 @@ class Link(Transport):
     latch = None
     header = property(lambda self: self.publisher.header)
     callerid_pub = property(peer_of)  # actionlib asks for it
+    # not counted for each message: to touch ten links took as long as to run ten delegates
+    stat_num_msg = property(lambda self: self.publisher.seq - self.begin, lambda self, zero: None)
 
     def get_transport_info(self):
         return f'{self.transport_type} connection to [{self.endpoint_id}]'
@@ -108,19 +110,18 @@ def make_link(publisher, uri, subscription, receiver, transport_type):
         out.endpoint_id, end.endpoint_id = receiver.name, uri
         out.other, end.other, out.inboxes = end, out, subscription.inboxes
         for each in out, end:
-            each.publisher, each.run = publisher, receiver
+            each.publisher, each.begin, each.run = publisher, publisher.seq, receiver
             each.transport_type = transport_type
             each.thaw = thawer(publisher.data_class, subscription.data_class)
         with subscription.c_lock:
             if subscription.closed or publisher.closed or subscription.has_connection(uri):
                 return
             subscription.add_connection(end)
-            inboxes = subscription.inboxes
         publisher.rospy_add_connection(out)
-        for inbox in inboxes if publisher.latches else ():
-            for frozen in publisher.latches.values():
+        for frozen in publisher.latches.values():
+            for inbox in out.inboxes:
                 inbox.put((frozen, out.thaw, out.header))
-    for inbox in inboxes:
+    for inbox in out.inboxes:
         inbox.turns.wake()
 
 
@@ -150,7 +151,7 @@ class PublisherOverlay:
         self.lock, self.latches, self.last_wake = self.publock, {}, 0.0
         self.freeze, self.thaw = copier_for(data_class)
         self.has_header = getattr(data_class, '_has_header', False)
-        self.seen, self.links, self.remote, self.header = None, (), (), None
+        self.seen = self.header = None
 
     def acquire(self):
         """Do nothing: publish() locks, but not while it runs inline delegates."""
@@ -174,7 +175,6 @@ class PublisherOverlay:
 
         :param latch_key: whose latch it is, if the topic latches; False: nobody's; None: of plain rospy
         """
-        inboxes = []
         with self.lock:
             if self.closed:
                 raise rospy.ROSException('publish() to a closed topic')
@@ -182,29 +182,26 @@ class PublisherOverlay:
                 self.seq += 1
                 if self.connections is not self.seen:
                     self.seen = self.connections
-                    self.links, self.remote = by_kind(self.seen)
-                links, remote = self.links, self.remote
+                    self.ways = ways_to(self.seen)
+                inboxes, remote = self.ways
             else:
-                links, remote = by_kind([connection_override])
+                inboxes, remote = ways_to([connection_override])
             if self.has_header:  # as serialize_message does
                 message.header.seq = self.seq
             is_latched = self.is_latch and latch_key is not False and connection_override is None
-            if links or is_latched or not remote:  # if nobody hears it, this checks it
+            if inboxes or is_latched or not remote:  # if nobody hears it, this checks it
                 frozen = self.freeze(message)
                 if is_latched:
                     self.latches[latch_key] = frozen
-                own = frozen, self.thaw, self.header
-                for link in links:
-                    link.stat_num_msg += 1
-                    item = own if link.thaw is self.thaw else (frozen, link.thaw, self.header)
-                    for inbox in link.inboxes:
+                for thaw, group in inboxes.items():
+                    item = frozen, thaw, self.header
+                    for inbox in group:
                         inbox.put((message, None, None) if inbox.shared else item)
-                    inboxes += link.inboxes
             if remote:
                 self.write(message, remote)
-        if inboxes:
+        for group in inboxes.values():
             # for plain rospy, never wait for a receiver: actionlib keeps a goal after publish() only
-            self.last_wake = hand_over(inboxes, INFINITE if latch_key is None else self.last_wake)
+            self.last_wake = hand_over(group, INFINITE if latch_key is None else self.last_wake)
         return True
 
     def write(self, message, connections):
@@ -223,8 +220,9 @@ class PublisherOverlay:
 
     def flush(self, deadline):
         """Wait until all is with the sockets."""
-        senders = [each for each in self.connections if isinstance(each, Sender)]
-        while any(each.busy for each in senders) and time.monotonic() < deadline:
+        while any(getattr(each, 'busy', False) for each in self.connections):
+            if time.monotonic() > deadline:
+                break
             time.sleep(0.001)
 
     def close(self):
@@ -244,14 +242,17 @@ class SubscriptionOverlay:
         self.tcp_nodelay, self.inboxes, self.plain = True, [], None
 
     def find_inboxes(self):
-        """Find the inboxes of all callbacks anew; the links have this very list."""
+        """Find the inboxes of all callbacks anew; returns the links, whose publishers do so, too."""
         callbacks = self.callbacks or ()
         found = [callback for callback, _ in callbacks if isinstance(callback, Inbox)]
         if len(found) < len(callbacks):
-            if self.plain is None:
-                self.plain = Inbox(Turns(), self.call_plain, self.queue_size)
+            self.plain = self.plain or Inbox(Turns(), self.call_plain, self.queue_size)
             found.append(self.plain)
-        self.inboxes[:] = found
+        self.inboxes[:] = found  # the links have this very list
+        links = links_of(self.connections)
+        for link in links:
+            link.publisher.seen = None
+        return links
 
     def call_plain(self, message):
         for callback, args in self.callbacks or ():
@@ -261,8 +262,7 @@ class SubscriptionOverlay:
 
     def add_callback(self, callback, args):
         self.rospy_add_callback(callback, args)
-        self.find_inboxes()
-        for link in by_kind(self.connections)[0]:
+        for link in self.find_inboxes():
             for frozen in list(link.publisher.latches.values()):
                 message = link.thaw(frozen)
                 message._connection_header = link.header
@@ -278,15 +278,22 @@ class SubscriptionOverlay:
             self.plain.turns.close(0)
 
 
-def by_kind(connections):
-    """Return the links and the others of some connections."""
-    links = [each for each in connections if isinstance(each, Link)]
-    return links, [each for each in connections if each not in links]
+def links_of(connections):
+    """Return the links of some connections."""
+    return [each for each in connections if isinstance(each, Link)]
+
+
+def ways_to(connections):
+    """Return {thaw: inboxes} for the links of some connections, and the other connections."""
+    inboxes, links = {}, links_of(connections)
+    for link in links:
+        inboxes[link.thaw] = inboxes.get(link.thaw, []) + link.inboxes
+    return inboxes, [each for each in connections if each not in links]
 
 
 def close(impl):
     """Close a publisher or subscription: links without rospy's lock, then all else, then its epoll."""
-    for link in by_kind(impl.connections or [])[0]:
+    for link in links_of(impl.connections):
         link.close()
     impl.rospy_close()
     impl.connection_poll.poller.close()
