@@ -21,7 +21,7 @@ MODULES = {
     'compose': 'pharos.compose.command',
     'top': 'pharos.live.top',
     'graph': 'pharos.live.graph',
-    'create_package': 'pharos.create_package',
+    'create_package': 'pharos.commands.create_package',
 }
 
 
@@ -33,7 +33,3 @@ def main():
         return importlib.import_module(MODULES[command]).main()
     print(f'pharos {pharos.__version__}' if command == '--version' else __doc__)
     return not command.startswith('-')
-
-
-if __name__ == '__main__':
-    sys.exit(main())
