@@ -157,7 +157,7 @@ def drive():
     """The outcome of turtle.launch without a window, and of a second turtle."""
     with Master.embedded() as master, master.create(BlockNode, named='/ear') as ear:
         poses = Mailbox(ear, '/turtle1/pose', 'turtlesim/Pose')
-        args = {'window': 'false', 'picture': '', 'period': 0.1, 'linear': 1.5}
+        args = {'window': 'false', 'period': 0.1, 'linear': 1.5}
         with master.launch('pharos', 'turtle.launch', **args) as process:
             first = poses.next()
             driven = poses.wait_for(lambda pose: pose.theta > 0.1)
@@ -183,12 +183,12 @@ def test_simulator_spawns_another_turtle(drive):
     assert (drive['leo'].x, drive['leo'].y) == (1.0, 2.0)
 
 
-def test_simulator_saves_a_picture(master, tmp_path):
-    path = tmp_path / 'turtle.png'
-    with running(master.url, 'turtle_simulator', '_window:=false', f'_picture:={path}'):
-        name = master.wait_for_node('/turtlesim', TIMEOUT).name
-        assert master.wait_for_service(f'{name}/save_picture', TIMEOUT).call().success
-        assert path.read_bytes().startswith(b'\x89PNG')
+def test_simulator_saves_a_picture(master, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with running(master.url, 'turtle_simulator', '_window:=false'):
+        saved = master.wait_for_service('/turtlesim/save_picture', TIMEOUT).call()
+        assert saved.success and saved.message == f'{tmp_path}/turtlesim.png'
+        assert (tmp_path / 'turtlesim.png').read_bytes().startswith(b'\x89PNG')
 
 
 # -- bridge

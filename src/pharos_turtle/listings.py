@@ -8,6 +8,8 @@ import argparse
 import os
 import sys
 
+import rospy
+
 from pharos import PharosError
 from pharos.program import wait
 
@@ -53,6 +55,11 @@ def parser_of(description):
     for option in '--tcp-port', '--xmlrpc-port':
         parser.add_argument(option, type=int, help='by default any free one')
     return parser
+
+
+def options_of(parser):
+    """Return what the command line says, as keywords of ``Master.create``."""
+    return {'argv': sys.argv, **vars(parser.parse_args(rospy.myargv()[1:]))}
 
 
 def run(main):
