@@ -85,9 +85,11 @@ class InputChannel(Receiver, Channel, Inbox):
     :ivar dropped: how many were dropped since the queue was full
     """
 
+    received = 0
+
     def __init__(self, node, topic, message_class, delegate, queue_size, inline, shared, from_):
         Inbox.__init__(self, None, self._deliver, queue_size, inline, shared)
-        self.queue_bytes, self.received, self.from_ = node.queue_bytes, 0, from_
+        self.queue_bytes, self.from_ = node.queue_bytes, from_
         self.delegate = delegate
         self._begin(node, topic, message_class)
 
@@ -123,8 +125,10 @@ class OutputChannel(Channel):
     :ivar sent: how many messages were sent
     """
 
+    sent = 0
+
     def __init__(self, node, topic, message_class, latch=False, queue_size=QUEUE_SIZE):
-        self.latch, self.queue_size, self.sent = latch, queue_size, 0
+        self.latch, self.queue_size = latch, queue_size
         self._key = latch and self  # its place in publisher.latches; False: keep nothing
         self._begin(node, topic, message_class)
 

@@ -25,9 +25,11 @@ class Failure:
     :ivar traceback: the traceback as text
     """
 
+    count = 1
+
     def __init__(self, error, block, message, channel, again):
         self.error, self.block, self.message, self.channel = error, block, message, channel
-        self.count, self.time, self._again = 1, time.time(), again
+        self.time, self._again = time.time(), again
         self.traceback = ''.join(traceback.format_exception(error))
         self._frames = error.__traceback__
         #: is equal for failures of one kind

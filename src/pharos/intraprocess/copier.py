@@ -35,19 +35,9 @@ def serialize(message):
 def copier_for(cls):
     """Return ``freeze(message)``, which raises what ``serialize`` raises, and ``thaw(frozen)``."""
     try:
-        freeze_fields, thaw = _generate(cls)
+        return _generate(cls)
     except Exception:  # a class that is not understood costs time, never a wrong copy
         return serialize, lambda frozen: cls().deserialize(frozen)
-
-    def freeze(message):
-        if message.__class__ is cls:
-            try:
-                return freeze_fields(message)
-            except Exception:  # the serializer says what is wrong
-                pass
-        return serialize(message)
-
-    return freeze, thaw
 
 
 def copied(message):
@@ -130,6 +120,7 @@ _SCOPE.update(
     bool_array=_booleans,
     uint8_array=_octets,
     char_array=_octets,
+    serialize=serialize,
 )
 
 
@@ -215,7 +206,14 @@ def _generate(cls, depth=0):
     if source.numbers:
         source.pack_numbers()
     made, values = source.refer(cls), ''.join(f'{value}, ' for value in source.values)
-    freeze = ['def freeze_fields(m):', *source.reads, f'return ({values})']
+    freeze = [
+        'def freeze(m):',
+        f'if m.__class__ is not {made}: return serialize(m)',
+        'try:',
+        *(f'    {line}' for line in source.reads or ['pass']),
+        'except Exception: return serialize(m)',  # which says what is wrong
+        f'return ({values})',
+    ]
     thaw = [
         'def thaw(frozen):',
         f'if type(frozen) is bytes: return {made}().deserialize(frozen)',
@@ -226,4 +224,4 @@ def _generate(cls, depth=0):
     ]
     text = '\n'.join(map('\n    '.join, (freeze, thaw)))
     exec(compile(text, f'<copier of {cls.__name__}>', 'exec'), source.scope)
-    return source.scope['freeze_fields'], source.scope['thaw']
+    return source.scope['freeze'], source.scope['thaw']

@@ -17,7 +17,6 @@ BURST = 100e-6  # seconds; a publisher that woke a worker less than this ago doe
 YIELD_LIMIT = 1e-3  # seconds that a publisher waits at most until the receiver's thread runs
 YIELD_PAUSE = 0.02  # seconds without such a wait after one that was in vain
 FAST = 50e-6  # seconds; a callback that takes less may run in the thread that reads the socket
-QUEUE_BYTES = 64 << 20
 
 _ready = collections.deque()
 _idle = []
@@ -33,10 +32,11 @@ class Turns:
     ``jobs`` has an Inbox once for each of its messages, or more often if some were dropped.
     """
 
+    scheduled = is_fast = False
+    runner = None  # the identifier of the thread that runs it
+
     def __init__(self):
-        self.jobs = collections.deque()
-        self.scheduled = self.closed = self.is_fast = False
-        self.runner = None  # the identifier of the thread that runs it
+        self.jobs, self.closed = collections.deque(), False
         self._running = allocate_lock()
         with _guard:
             _turns.add(self)
@@ -182,14 +182,14 @@ class Inbox:
     :param queue_size: number of messages; None or 0: as many as ``queue_bytes`` hold
     """
 
-    queue_bytes = QUEUE_BYTES
+    queue_bytes = 64 << 20
+    dropped = taken = fast_in_a_row = 0
+    _taken_at_yield = -1
 
     def __init__(self, turns, callback, queue_size=None, inline=False, shared=False):
         self.turns, self.callback, self.inline, self.shared = turns, callback, inline, shared
         self.queue = collections.deque()
         self.limit = self.queue_size = queue_size or float('inf')
-        self.dropped = self.taken = 0
-        self._taken_at_yield, self.fast_in_a_row = -1, 0
 
     def put(self, item, size=0):
         """Add ``(value, thaw, header)``; ``turns`` are to be woken or run then.
@@ -199,7 +199,10 @@ class Inbox:
         """
         queue = self.queue
         waiting = len(queue)
-        if waiting >= self.limit or waiting and not waiting & (waiting - 1):  # at 1, 2, 4 ...
+        if not waiting:
+            queue.append(item)
+            return self.turns.jobs.append(self)
+        if waiting >= self.limit or not waiting & (waiting - 1):  # at 1, 2, 4 ...
             most = max(1, self.queue_bytes // (size or size_of(item[0])))
             self.limit = min(self.queue_size, most)
             if waiting >= self.limit and self.taken != self._taken_at_yield:
@@ -227,21 +230,18 @@ class Inbox:
             self.turns.wake()
 
 
-def hand_over(inboxes, last):
-    """Have the callbacks of filled inboxes run: in workers, or here all of a node with an inline one.
+def hand_over(filled, last):
+    """Have workers run what some Turns have got.
 
     :param last: when the same publisher last did so
     :returns: the time, if a worker was woken, else ``last``
     """
     is_due = False
-    for inbox in inboxes:
-        turns = inbox.turns
-        if inbox.inline:
-            turns.run()
-        elif not turns.scheduled:
+    for turns in filled:
+        if not turns.scheduled:
             is_due |= turns.schedule()
-    woken = _wake_worker() if is_due else None  # which wakes another one, if there is more
-    if woken is None:
+    woken = is_due and _wake_worker()  # which wakes another one, if there is more
+    if not woken:
         return last
     now = perf_counter()
     if now - last > BURST:

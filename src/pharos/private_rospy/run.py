@@ -60,6 +60,8 @@ class Run:
         ROS ends it, ``read_parameters()``, ``refused(topic, reason)``
     """
 
+    uri = ''
+
     def __init__(self, node):
         self.node, self.name = node, node.name
         self.master_url = node.master.url
@@ -70,7 +72,7 @@ class Run:
         self.publisher_uris = {}  # topic -> URIs, as the master last said
         self.connecting = set()  # (topic, URI, ...)
         self.relays = {}  # (topic, URI, class) -> publisher to those that share a connection
-        self.uri, self.turns = '', Turns()
+        self.turns = Turns()
         namespace, _, self.base = node.name.rpartition('/')
         self.environ = {
             'ROSCONSOLE_FORMAT': '[${severity}] [${time}]: ${node}: ${message}',

@@ -41,8 +41,8 @@ class Link(Transport):
     latch = None
     header = property(lambda self: self.publisher.header)
     callerid_pub = property(peer_of)  # actionlib asks for it
-    # not counted for each message: to touch ten links took as long as to run ten delegates
-    stat_num_msg = property(lambda self: self.publisher.seq - self.begin, lambda self, zero: None)
+    # not counted for each message: to touch ten links takes as long as to run ten delegates
+    stat_num_msg = property(lambda self: self.publisher.seq, lambda self, zero: None)
 
     def get_transport_info(self):
         return f'{self.transport_type} connection to [{self.endpoint_id}]'
@@ -110,7 +110,7 @@ def make_link(publisher, uri, subscription, receiver, transport_type):
         out.endpoint_id, end.endpoint_id = receiver.name, uri
         out.other, end.other, out.inboxes = end, out, subscription.inboxes
         for each in out, end:
-            each.publisher, each.begin, each.run = publisher, publisher.seq, receiver
+            each.publisher, each.run = publisher, receiver
             each.transport_type = transport_type
             each.thaw = thawer(publisher.data_class, subscription.data_class)
         with subscription.c_lock:
@@ -183,9 +183,9 @@ class PublisherOverlay:
                 if self.connections is not self.seen:
                     self.seen = self.connections
                     self.ways = ways_to(self.seen)
-                inboxes, remote = self.ways
+                inboxes, inline, others, remote = self.ways
             else:
-                inboxes, remote = ways_to([connection_override])
+                inboxes, inline, others, remote = ways_to([connection_override])
             if self.has_header:  # as serialize_message does
                 message.header.seq = self.seq
             is_latched = self.is_latch and latch_key is not False and connection_override is None
@@ -199,9 +199,11 @@ class PublisherOverlay:
                         inbox.put((message, None, None) if inbox.shared else item)
             if remote:
                 self.write(message, remote)
-        for group in inboxes.values():
+        for turns in inline:
+            turns.run()
+        if others:
             # for plain rospy, never wait for a receiver: actionlib keeps a goal after publish() only
-            self.last_wake = hand_over(group, INFINITE if latch_key is None else self.last_wake)
+            self.last_wake = hand_over(others, INFINITE if latch_key is None else self.last_wake)
         return True
 
     def write(self, message, connections):
@@ -284,11 +286,14 @@ def links_of(connections):
 
 
 def ways_to(connections):
-    """Return {thaw: inboxes} for the links of some connections, and the other connections."""
+    """Return {thaw: inboxes} for some links; the Turns that are inline; other Turns; the sockets."""
     inboxes, links = {}, links_of(connections)
     for link in links:
         inboxes[link.thaw] = inboxes.get(link.thaw, []) + link.inboxes
-    return inboxes, [each for each in connections if each not in links]
+    found = sum(inboxes.values(), [])
+    inline = [each.turns for each in found if each.inline]
+    others = [each.turns for each in found if not each.inline]
+    return inboxes, inline, others, [each for each in connections if each not in links]
 
 
 def close(impl):
@@ -352,10 +357,12 @@ class Sender:
     queue at once, so that it neither bounds nor flushes it.
     """
 
+    busy = False
+    _rest = b''  # of a message whose beginning the socket has
+
     def __init__(self, connection, queue_size, run):
         self._connection, self._limit = connection, queue_size or INFINITE
-        self._queue, self.busy = collections.deque(), False
-        self._rest = b''  # of a message whose beginning the socket has
+        self._queue = collections.deque()
         self._lock, self._run = threading.Lock(), run
 
     def __getattr__(self, name):
