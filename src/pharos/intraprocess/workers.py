@@ -9,7 +9,7 @@ thread.
 import collections
 import threading
 from _thread import allocate_lock, get_ident
-from time import monotonic, perf_counter, sleep
+from time import perf_counter, sleep
 
 from pharos.intraprocess.copier import size_of
 
@@ -117,19 +117,9 @@ class _Worker:
 
     def __init__(self):
         # released to wake the thread; held from the wake until the thread runs
-        self._wake, self._awake = allocate_lock(), allocate_lock()
-        self._wake.acquire()
+        self.wake, self.awake = allocate_lock(), allocate_lock()
+        self.wake.acquire()
         threading.Thread(target=self._loop, name='pharos worker', daemon=True).start()
-
-    def wake(self):
-        self._awake.acquire(False)
-        self._wake.release()
-
-    def wait_until_awake(self):
-        """Let the woken thread have the interpreter, which takes 5 ms if this one keeps busy."""
-        global _no_yield_before
-        if monotonic() > _no_yield_before and not self._awake.acquire(True, YIELD_LIMIT):
-            _no_yield_before = monotonic() + YIELD_PAUSE
 
     def _loop(self):
         while True:
@@ -143,9 +133,9 @@ class _Worker:
                 _idle.append(self)
                 if _ready or not _turns:  # since then; nobody may have seen this one
                     _wake_worker()
-                self._wake.acquire()
-                if self._awake.locked():
-                    self._awake.release()
+                self.wake.acquire()
+                if self.awake.locked():
+                    self.awake.release()
                 continue
             if _ready and not turns.is_fast:
                 _wake_worker()
@@ -165,7 +155,8 @@ def _wake_worker():
             if len(_workers) < len(_turns):
                 _workers.add(_Worker())
         return None
-    worker.wake()
+    worker.awake.acquire(False)
+    worker.wake.release()
     return worker
 
 
@@ -236,6 +227,7 @@ def hand_over(filled, last):
     :param last: when the same publisher last did so
     :returns: the time, if a worker was woken, else ``last``
     """
+    global _no_yield_before
     is_due = False
     for turns in filled:
         if not turns.scheduled:
@@ -244,8 +236,9 @@ def hand_over(filled, last):
     if not woken:
         return last
     now = perf_counter()
-    if now - last > BURST:
-        woken.wait_until_awake()
+    # let the worker have the interpreter, which takes 5 ms if this thread keeps busy
+    if now - last > BURST and now > _no_yield_before and not woken.awake.acquire(True, YIELD_LIMIT):
+        _no_yield_before = now + YIELD_PAUSE
     return now
 
 
