@@ -5,7 +5,6 @@ target; ``run`` is the Run whose copy is patched. Over ``def f(original, run)``,
 target)`` puts what it returns in the target's place. Each docstring says what is wrong with
 rospy: read it after the word 'rospy'.
 """
-import functools
 import socket
 import threading
 from urllib.parse import urlsplit
@@ -44,8 +43,7 @@ def patch(module, target):
 
     def enter(function):
         def make(original, run):
-            wrap = functools.wraps(original)
-            return wrap(lambda *args, **kwargs: function(original, run, *args, **kwargs))
+            return lambda *args, **kwargs: function(original, run, *args, **kwargs)
 
         replace(module, target)(make)
         return function
@@ -177,10 +175,11 @@ def limit_request(original, run, self):
 # -- life
 
 
-@patch('rospy.core', 'signal_shutdown')
-def signal_shutdown(original, run, reason):
+@replace('rospy.core', 'signal_shutdown')
+def signal_shutdown(original, run):
     """Ends rospy alone: rosnode kill and the like are to stop the node as its user would."""
-    run.end_node()
+    run.shut_down = original
+    return lambda reason: run.end_node()
 
 
 @patch('rospy.core', 'is_shutdown')

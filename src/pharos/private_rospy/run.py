@@ -270,7 +270,7 @@ class Run:
         deadline = monotonic() + timeout
         for publisher in list(self.topics.pubs.values()):
             publisher.flush(deadline)
-        self.core.signal_shutdown.__wrapped__('stop')  # rospy's: the patch calls end_node()
+        self.shut_down('stop')  # rospy's own; its name calls end_node()
         for sock in list(self.sockets):
             transport.shut(sock)
         join(set(self.threads) - set(self.node.souls), STOP_LIMIT)
