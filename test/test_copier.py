@@ -14,7 +14,7 @@ import numpy
 import pytest
 import std_msgs.msg
 from genmsg.msgs import parse_type
-from geometry_msgs.msg import Twist, Vector3
+from geometry_msgs.msg import Point, Polygon, Twist, Vector3
 from rospy.numpy_msg import numpy_msg
 from sensor_msgs.msg import Image
 from tf2_msgs.msg import TFMessage
@@ -175,6 +175,10 @@ def test_odd_nested_values_arrive_alike():
     for value in [*ODD[:3], types.SimpleNamespace(x=1, y=2, z=3), Vector3(x='a')]:
         for message in Twist(linear=value), TFMessage([value]), TFMessage(value):
             assert_as_on_the_wire(message)
+
+
+def test_elements_of_a_similar_class_arrive_alike():
+    assert_as_on_the_wire(Polygon([Point(0.1, 2, 3), Vector3(4, 5, 6)]))
 
 
 # -- independent copies

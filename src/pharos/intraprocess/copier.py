@@ -206,14 +206,15 @@ def _generate(cls, depth=0):
     if source.numbers:
         source.pack_numbers()
     made, values = source.refer(cls), ''.join(f'{value}, ' for value in source.values)
-    freeze = [
-        'def freeze(m):',
-        f'if m.__class__ is not {made}: return serialize(m)',
-        'try:',
-        *(f'    {line}' for line in source.reads or ['pass']),
-        'except Exception: return serialize(m)',  # which says what is wrong
-        f'return ({values})',
-    ]
+    reads = source.reads
+    if depth == 0:  # an element of an array may be of a similar class
+        reads = [
+            f'if m.__class__ is not {made}: return serialize(m)',
+            'try:',
+            *(f'    {line}' for line in reads or ['pass']),
+            'except Exception: return serialize(m)',  # which says what is wrong
+        ]
+    freeze = ['def freeze(m):', *reads, f'return ({values})']
     thaw = [
         'def thaw(frozen):',
         f'if type(frozen) is bytes: return {made}().deserialize(frozen)',
