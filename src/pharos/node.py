@@ -540,7 +540,7 @@ class Node(Receiver):
     def serve(self, name: str, typed_as: str | type, block: Block) -> OfferedService:
         """Offer a service; returns a handle with ``close()``.
 
-        ``block(request)`` or ``block()`` runs in a thread of the caller. It returns a response, a
+        ``block(request)`` runs in a thread of the caller's connection. It returns a response, a
         dict, tuple or list of its fields, or its only field; None for an empty response.
         """
         return OfferedService(self, self.resolve(name), messages.service_class(typed_as), block)

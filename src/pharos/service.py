@@ -40,7 +40,7 @@ class OfferedService(Opened):
 
     def __init__(self, node, name, cls, block):
         self.node, self.name, self.service_class = node, name, cls
-        self.delegate = taking(block, 'block of a service', 1, 0)
+        self.delegate = taking(block, 'block of a service', 1)
         self.open()
 
     def _open(self):

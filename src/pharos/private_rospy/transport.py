@@ -178,11 +178,11 @@ class PublisherOverlay:
         with self.lock:
             if self.closed:
                 raise rospy.ROSException('publish() to a closed topic')
+            self.seq += 1
             if connection_override is None:
-                self.seq += 1
                 if self.connections is not self.seen:
                     self.seen = self.connections
-                    self.ways = ways_to(self.seen)
+                    self.ways = ways_to(self.connections)
                 inboxes, inline, others, remote = self.ways
             else:
                 inboxes, inline, others, remote = ways_to([connection_override])
