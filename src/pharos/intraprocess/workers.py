@@ -222,7 +222,7 @@ class Inbox:
 
 
 def hand_over(filled, last):
-    """Have workers run what some Turns have got.
+    """Have workers run what waits in some Turns.
 
     :param last: when the same publisher last did so
     :returns: the time, if a worker was woken, else ``last``

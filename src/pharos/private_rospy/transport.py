@@ -182,10 +182,10 @@ class PublisherOverlay:
             if connection_override is None:
                 if self.connections is not self.seen:
                     self.seen = self.connections
-                    self.ways = ways_to(self.connections)
-                inboxes, inline, others, remote = self.ways
+                    self.receivers = receivers_of(self.connections)
+                inboxes, inline, others, remote = self.receivers
             else:
-                inboxes, inline, others, remote = ways_to([connection_override])
+                inboxes, inline, others, remote = receivers_of([connection_override])
             if self.has_header:  # as serialize_message does
                 message.header.seq = self.seq
             is_latched = self.is_latch and latch_key is not False and connection_override is None
@@ -244,7 +244,7 @@ class SubscriptionOverlay:
         self.tcp_nodelay, self.inboxes, self.plain = True, [], None
 
     def find_inboxes(self):
-        """Find the inboxes of all callbacks anew; returns the links, whose publishers do so, too."""
+        """Find the inboxes of all callbacks anew, have the publishers do so, and return the links."""
         callbacks = self.callbacks or ()
         found = [callback for callback, _ in callbacks if isinstance(callback, Inbox)]
         if len(found) < len(callbacks):
@@ -285,8 +285,12 @@ def links_of(connections):
     return [each for each in connections if isinstance(each, Link)]
 
 
-def ways_to(connections):
-    """Return {thaw: inboxes} for some links; the Turns that are inline; other Turns; the sockets."""
+def receivers_of(connections):
+    """Find who gets what is published to some connections.
+
+    :returns: lists of inboxes by the function that thaws for them, the Turns of those that are
+        inline, the Turns of the others, and the connections that are no links
+    """
     inboxes, links = {}, links_of(connections)
     for link in links:
         inboxes[link.thaw] = inboxes.get(link.thaw, []) + link.inboxes
