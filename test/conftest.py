@@ -17,6 +17,10 @@ ROOT = pathlib.Path(__file__).resolve().parent.parent
 SRC = str(ROOT / 'src')
 sys.path.insert(0, SRC)
 os.environ['PYTHONPATH'] = f'{SRC}:{os.environ.get("PYTHONPATH", "")}'.rstrip(':')
+# in a clone with nothing built, rosrun finds this package, too
+PATHS = os.environ.get('ROS_PACKAGE_PATH', '/usr/share')
+if not any('pharos' in path for path in PATHS.split(':')):
+    os.environ['ROS_PACKAGE_PATH'] = f'{ROOT}:{PATHS}'
 
 import pytest  # noqa: E402
 

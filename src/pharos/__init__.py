@@ -1,6 +1,18 @@
 """PhaROS for Python: many ROS nodes in one process, written with blocks."""
 import importlib
+import sys
 from typing import TYPE_CHECKING
+
+try:
+    import rospy as _rospy  # noqa: F401
+except ModuleNotFoundError as _error:
+    if _error.name != 'rospy':
+        raise
+    raise ModuleNotFoundError(
+        f'{sys.executable} has no rospy: start this with the Python that ROS is installed for,'
+        ' on Debian and Ubuntu /usr/bin/python3',
+        name='rospy',
+    ) from None
 
 from pharos.channels import InputChannel, OutputChannel, Topic
 from pharos.errors import (

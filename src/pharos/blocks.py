@@ -6,33 +6,52 @@ from typing import Any, Callable
 Block = Callable[..., Any]
 
 
-def taking(block, what, *counts):
-    """Return a block that takes the first of ``counts`` arguments, made from one that may take fewer.
+def taking(block, what, least, most):
+    """Return a block that takes ``most`` arguments, and passes on as many as the block needs.
+
+    Parameters with a default keep it: ``lambda message, side=side: ...`` gets the message alone.
 
     :param what: what it is, for the error
-    :raises TypeError: if it is not callable, or takes none of these numbers of arguments
+    :param least: so many arguments it gets at least
+    :raises TypeError: if it is not callable, takes another number of arguments, or is an ``async def``
     """
     if block is None:
         return None
     if not callable(block):
         raise TypeError(f'a {what} is a callable, not {block!r}')
+    if inspect.iscoroutinefunction(block):
+        raise TypeError(
+            f'a {what} runs in a thread, and cannot be async def: write def, and asyncio.run() in it'
+        )
     try:
         signature = inspect.signature(block)
     except ValueError:  # of a function in C, such as deque.append
         signature = inspect.signature(lambda value: None)
-    for count in counts:
-        try:
-            signature.bind(*[None] * count)
-        except TypeError:
-            continue
-        return block if count == counts[0] else lambda *values: block(*values[:count])
-    raise TypeError(f'a {what} takes {" or ".join(map(str, counts))} arguments, not {signature}')
+    count = _needed(signature, least, most)
+    try:
+        signature.bind(*[None] * count)
+    except TypeError:
+        numbers = ' or '.join(str(number) for number in range(least, most + 1))
+        raise TypeError(f'a {what} takes {numbers} arguments, not {signature}') from None
+    if count == most:
+        return block
+    return lambda *values: block(*values[:count])
+
+
+def _needed(signature, least, most):
+    """Return how many arguments to pass: all if there is ``*args``, else those without a default."""
+    parameters = signature.parameters.values()
+    if any(each.kind is each.VAR_POSITIONAL for each in parameters):
+        return most
+    kinds = inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD
+    needed = [each for each in parameters if each.kind in kinds and each.default is each.empty]
+    return min(max(len(needed), least), most)
 
 
 class Receiver:
     """Runs a delegate for each message."""
 
-    delegate_runs: Block | None = None  #: the delegate, as a block that takes two arguments
+    _delegate_runs: Block | None = None  # the delegate, as a block that takes two arguments
     _delegate: Block | None = None
 
     @property
@@ -46,7 +65,7 @@ class Receiver:
 
     @delegate.setter
     def delegate(self, block: Block | None) -> None:
-        self.delegate_runs = taking(block, 'delegate', 2, 1)
+        self._delegate_runs = taking(block, 'delegate', 1, 2)
         self._delegate = block
 
 

@@ -35,17 +35,20 @@ class Opened:
 
     def open(self):
         """Have the subclass register it, by _open(); the node's next start calls this again."""
-        self.node.master.call('getPid')  # raises if it does not answer
+        self.node._master.call('getPid')  # raises if it does not answer
         self._open()
-        self.node.opened = [*self.node.opened, self]
+        self.node._opened = [*self.node._opened, self]
         self.closed = False
 
     def close(self) -> None:
         """Receive, send or offer no more, and unregister."""
-        self.node.opened = [each for each in self.node.opened if each is not self]
+        self.node._opened = [each for each in self.node._opened if each is not self]
         if not self.closed:
             self.closed = True
-            (getattr(self.end, 'unregister', None) or self.end.shutdown)()
+            self._close()
+
+    def _close(self):
+        self.end.unregister()
 
 
 class Channel(Opened):
@@ -75,7 +78,7 @@ class Channel(Opened):
 
     def __repr__(self):
         state = 'closed ' if self.closed else ''
-        return f'<{state}{type(self).__name__} {self.topic} ({self.type}) of {self.node.name}>'
+        return f'<{state}{type(self).__name__} {self.topic} ({self.type}) of {self.node._name}>'
 
 
 class InputChannel(Receiver, Channel, Inbox):
@@ -95,7 +98,7 @@ class InputChannel(Receiver, Channel, Inbox):
 
     def _open(self):
         self.queue.clear()  # what came while the node stopped was never scheduled
-        self.turns, self.closed = self.node.run.turns, False
+        self.turns, self.closed = self.node._run.turns, False
         self.end = self.node.ros.Subscriber(self.topic, self.message_class, self)
 
     def __call__(self, message):
@@ -107,15 +110,15 @@ class InputChannel(Receiver, Channel, Inbox):
             if self.closed or self.from_ and message._connection_header['callerid'] != self.from_:
                 return
             self.received += 1
-            delegate = self.delegate_runs or self.node.delegate_runs
+            delegate = self._delegate_runs or self.node._delegate_runs
             delegate and delegate(message, self)
         except BaseException as error:
             delegate = self.delegate or self.node.delegate
-            self.node.report(error, delegate, 'delegate', message, self, self._retry)
+            self.node._report(error, delegate, 'delegate', message, self, self._retry)
 
     def _retry(self, message):
         """Run the delegate on a message once more, in the node's turn."""
-        self.node.check_running()
+        self.node._check_running()
         self.turns.call(lambda: self._deliver(message))
 
 
@@ -134,7 +137,7 @@ class OutputChannel(Channel):
 
     def open(self):
         """Advertise, and wait for the subscribers that the master knows."""
-        known = set(Topic(self.node.master, self.topic).subscribers)
+        known = set(Topic(self.node._master, self.topic).subscribers)
         latched = self.end and self._impl.latches.get(self)  # before the node stopped
         super().open()
         if latched is not None:
@@ -156,7 +159,7 @@ class OutputChannel(Channel):
         def missing():
             return names.difference(map(peer_of, self._impl.connections))
 
-        names = set(filter(node.master.may_live, missing()))
+        names = set(filter(node._master.may_live, missing()))
         is_ready = wait(lambda: not missing(), node.connect_timeout, node)
         if not is_ready and node.connect_timeout and node.is_running:
             node.log(
@@ -194,7 +197,7 @@ class OutputChannel(Channel):
         :returns: the message
         """
         message = messages.build(self.message_class, block, fields)
-        self.publish(message, to and self._connection_to(self.node.peer_name(to)))
+        self.publish(message, to and self._connection_to(self.node._peer_name(to)))
         return message
 
     def _connection_to(self, peer):

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import collections.abc
 import contextlib
+import inspect
 import os
 import re
 import subprocess
@@ -24,7 +25,6 @@ from pharos.ros_process import RosProcess, find_launch_file, find_program
 from pharos.service import Service
 
 CALLER_ID = '/pharos'
-_first_with = {}  # argv -> the first node that was created with it
 
 
 class Parameters(collections.abc.MutableMapping):
@@ -70,6 +70,9 @@ class Master:
     :raises ValueError: if the URL is malformed
     """
 
+    _environ = os.environ
+    _first_with: dict = {}  # argv -> the first node that was created with it
+
     def __init__(self, url: str | None = None, share_connections: bool = False):
         url = url or os.environ.get('ROS_MASTER_URI') or 'http://localhost:11311/'
         parts = re.fullmatch(r'http://(\[[\w:]+\]|[\w.-]+):([1-6]?\d{1,4})/?', str(url).lower())
@@ -114,7 +117,7 @@ class Master:
         process, self._process = self._process, None
         if process:
             for node in self.own_nodes():
-                node.end_now()
+                node._end_now()
             with process:  # waits for it
                 process.stdin.close()
 
@@ -213,28 +216,35 @@ class Master:
         name = self._full_name(node, node_name(named), tuple(mappings))
         mappings = [arg for arg in mappings if not arg.startswith(('__name:=', '__ns:='))]
         node._configure(self, name, soul, delegate, domain, (tcp_port, xmlrpc_port), mappings)
+        try:
+            inspect.signature(node.__init__).bind(**kwargs)  # type: ignore[misc]
+        except TypeError as error:
+            raise TypeError(
+                f'{node_class.__name__} cannot be created with {", ".join(kwargs) or "so little"}:'
+                f" its __init__ says {error} (a unique name: named=anonymous_name('driver'))"
+            ) from None
         node.__init__(**kwargs)  # type: ignore[misc]
         try:
-            node.start()
+            node._begin()
         except BaseException:
-            node.end_now()
+            node._end_now()
             raise
         return node
 
     def _full_name(self, node, name, mappings):
         """Return the full name of a new node; of those with equal mappings, one has ``__name``."""
         given = load_mappings(mappings)
-        first = _first_with.get(mappings)
+        first = self._first_with.get(mappings)
         if '__name' in given and not (first and first.is_running and first.master == self):
-            _first_with[mappings] = node
+            self._first_with[mappings] = node
             name = name[: name.rfind('/') + 1] + node_name(given['__name'])
         if '__ns' in given and name.startswith('/'):
             name = name[name.rfind('/') + 1 :]
-        return ns_join(get_ros_namespace(argv=mappings), name)
+        return ns_join(get_ros_namespace(self._environ, mappings), name)
 
     def own_nodes(self):
         """Return the nodes of this process that run at this master, or start or stop."""
-        return [node for node in program.nodes if node.master == self]
+        return [node for node in program.nodes if node._master == self]
 
     def nodes(self) -> list[Node | ExternalNode]:
         """Return all nodes, of this process and others."""
@@ -247,11 +257,14 @@ class Master:
         :raises UnknownNodeError: if there is none
         """
         found = self._named(full_name(node_name(name)))
-        return found.uri and found  # type: ignore[return-value]
+        if isinstance(found, ExternalNode):
+            found.uri  # raises if the master does not know it
+        return found
 
     def _named(self, name):
-        own = [node for node in self.own_nodes() if node.name == name]
-        return own[0] if own else ExternalNode(self, name)
+        own = [node for node in self.own_nodes() if node._name == name]
+        registered = [node for node in own if node._run.uri]  # not a program that creates its nodes
+        return (registered or own or [ExternalNode(self, name)])[0]
 
     def may_live(self, name):
         """False if the node of that name refuses connections, or is not registered."""

@@ -8,6 +8,7 @@ from typing import Callable
 
 import genmsg
 import rospkg
+from catkin_pkg.package import InvalidPackage
 from genmsg.msg_loader import load_depends, load_msg_from_string, load_srv_from_string
 from genmsg.msgs import bare_msg_type, is_builtin
 from genpy.dynamic import generate_dynamic
@@ -132,7 +133,10 @@ def _installed(kind, type_):
             f"malformed type {type_!r}: give 'package/Type', such as 'std_msgs/String', or a class"
         )
     get = get_message_class if kind == 'msg' else get_service_class
-    return get(type_)
+    try:
+        return get(type_)
+    except InvalidPackage:  # genpy reads package.xml; there may be a file of the type all the same
+        return None
 
 
 def _text_of(kind, type_, ask=None):
@@ -283,11 +287,17 @@ def _fill(message, fields):
             raise MessageTypeError(f'{cls._type} has no field {name!r}; it has {describe(cls)}')
         base = types[name].partition('[')[0]
         if type(value) is dict:
-            value = _fill(nested_class(base, cls)(), value)
+            value = _fill(_nested_class(base, cls)(), value)
         elif type(value) is list and dict in map(type, value[:1]):
-            value = [_fill(nested_class(base, cls)(), each) for each in value]
+            value = [_fill(_nested_class(base, cls)(), each) for each in value]
         setattr(message, name, value)
     return message
+
+
+def _nested_class(base, cls):
+    """Return the class of a nested field; genpy.dynamic puts them into one module, under such names."""
+    beside = cls.serialize.__globals__.get('_' + base.replace('/', '__'))
+    return beside or nested_class(base, cls)
 
 
 def explain(message, error):

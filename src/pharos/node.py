@@ -54,12 +54,13 @@ class Node(Receiver):
             def on_pose(self, pose):
                 self.send_to('/cmd_vel', typed_as='turtlesim/Velocity', linear=1.0)
 
-    All methods may be called from any thread. A node's delegates run one at a time.
+    All methods may be called from any thread. A node's delegates run one at a time, and the first
+    one when :meth:`start` has returned. All that this class has inside begins with an underscore: a
+    class of your own may have a ``run``, ``report`` or ``state``.
 
     :ivar name: the full name, as the master knows it: '/robot1/driver'
     :ivar master: its :class:`Master`
     :ivar soul: the block that says what the node does, called as ``soul(node)``, or None
-    :ivar lifecycle: its state, a :class:`Lifecycle`
     :ivar uri: the URI of its XML-RPC server, None before the first start, as ``domain``, the
         address that it advertises, unless it was given
     :ivar tcp_port: its port for messages; before the first start the one asked for
@@ -78,18 +79,50 @@ class Node(Receiver):
     #: True if any host may end the node by ROS's shutdown call, not only this one and the master's
     allow_remote_shutdown = False
 
-    run_class = Run
-    lifecycle = Lifecycle.NEW
     master: Master
-    run: Run
+    name: str
+    failures: Failures
+    _run_class = Run
+    _lifecycle = Lifecycle.NEW
+    _run: Run
+    _is_beginning = False  # True while a start() runs after which delegates are let run
+    _master: Master = None  # type: ignore[assignment]
+
+    def __init__(self, *args, **kwargs):
+        """Do nothing: :meth:`Master.create` has given the node its name and all else.
+
+        :raises PharosError: if the class is called, or this method with arguments
+        """
+        if args or kwargs or not self._master:
+            kind = type(self).__name__
+            given = (
+                f'{kind} takes no {", ".join([*map(repr, args), *kwargs])}'
+                if args or kwargs
+                else kind
+            )
+            raise PharosError(
+                f"{given}: write Master().create({kind}, named='{kind.lower()}'), and"
+                ' super().__init__() without a name'
+            )
 
     def _configure(self, master, name, soul, delegate, domain, ports, remappings):
-        taking(soul, 'soul', 1, 0)
-        self.master, self.name, self.uri, self.domain = master, name, None, domain
-        self.soul, self.delegate, self.remappings = soul, delegate, remappings
+        taking(soul, 'soul', 0, 1)
+        self._name = name
+        self._master = master
+        self._domain = domain
+        self._ports = ports
+        self._remappings = remappings
+        # what users read; their class may set these names to something else
+        self.name = name
+        self.master = master
+        self.uri = None
+        self.domain = domain
         self.tcp_port, self.xmlrpc_port = ports
+        self.soul = soul
+        self.delegate = delegate
         self._life = threading.RLock()  # held by a start, stop or restart
-        self.opened = []  # channels, services and parameters, also while it is stopped
+        self._opening = threading.Lock()  # held while send_to() opens a channel
+        self._opened = []  # channels, services and parameters, also while it is stopped
         self._senders = {}  # (topic, type) as given to send_to
 
     # -- life
@@ -103,28 +136,51 @@ class Node(Receiver):
         :raises PharosError: if the node runs already
         :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: and nothing is left
         """
+        if not self._master:
+            Node.__init__(self)  # says how a node is made
         with self._life:
-            if self.lifecycle not in (Lifecycle.NEW, Lifecycle.STOPPED):
-                raise PharosError(f'{self.name} is {self.lifecycle.value} already')
-            self.failures, self.souls = Failures(), {}
-            self.lifecycle, self.run = Lifecycle.STARTING, self.run_class(self)
+            if self._lifecycle not in (Lifecycle.NEW, Lifecycle.STOPPED):
+                raise PharosError(f'{self._name} is {self._lifecycle.value} already')
+            self._failures = self.failures = Failures()
+            self._souls = {}
+            run = self._run_class(self)  # raises if a script cannot be read
+            self._run = run
+            self._lifecycle = Lifecycle.STARTING
             nodes.append(self)
-            opened, self.opened = self.opened, []
+            opened = self._opened
+            self._opened = []
             try:
-                self.run.start()
-                self.lifecycle = Lifecycle.RUNNING
-                for each in opened if type(self).start is Node.start else ():
-                    each.open()
+                run.start()
+                self._lifecycle = Lifecycle.RUNNING
+                if not self._opens_channels():
+                    for each in opened:
+                        each.open()
+                    run.turns.release()
             except BaseException:
                 self._end()  # waits for a ScriptNode's thread, which may still register
-                self.opened = opened
+                self._opened = opened
                 raise
 
+    def _opens_channels(self):
+        """True if the start() of its class opens its channels itself."""
+        return type(self).start is not Node.start
+
+    def _begin(self):
+        """Start, and let delegates run when the class's start() has returned."""
+        self._is_beginning = True
+        try:
+            self.start()
+        finally:
+            self._is_beginning = False
+        if self._lifecycle is Lifecycle.NEW:
+            raise PharosError(f'{type(self).__name__}.start() must call super().start() first')
+        self._run.turns.release()
+
     def _end(self):
-        self.run.stop(self.stop_timeout)
-        for each in self.opened:  # rospy has closed it
+        self._run.stop(self.stop_timeout)
+        for each in self._opened:  # rospy has closed it
             each.closed = True
-        self.lifecycle = Lifecycle.STOPPED
+        self._lifecycle = Lifecycle.STOPPED
         nodes.remove(self)
 
     def stop(self) -> None:
@@ -134,18 +190,18 @@ class Node(Receiver):
         for messages under way; what goes on then is left behind, and named in the log.
         """
         with self._life:
-            if self.is_running:
-                self.lifecycle = Lifecycle.STOPPING
+            if self._lifecycle is Lifecycle.RUNNING:
+                self._lifecycle = Lifecycle.STOPPING
                 self._end()
 
-    def end_now(self):
+    def _end_now(self):
         """Stop the node, whatever the stop() of its class raises; two threads may ask for it."""
         with self._life:
             try:
-                if self.is_running:
+                if self._lifecycle is Lifecycle.RUNNING:
                     self.stop()
             except Exception as error:
-                self.report(error, self.stop, 'method')
+                self._report(error, self.stop, 'method')
             finally:
                 Node.stop(self)
 
@@ -157,16 +213,17 @@ class Node(Receiver):
         :raises MasterUnreachableError: if the master does not answer, and the node runs on
         """
         with self._life:
-            self.master.call('getPid')
-            souls = {soul: block for soul, block in self.souls.items() if soul.is_alive()}
+            self._master.call('getPid')
+            souls = {soul: block for soul, block in self._souls.items() if soul.is_alive()}
             nodes.append(self)  # stop() removes one; spin() must not find none
             try:
                 self.stop()
-                self.start()
+                self._begin()
             finally:
                 nodes.remove(self)
-            for soul, block in souls.items() if type(self).start is Node.start else ():
-                self.fork(block, soul.name)
+            if not self._opens_channels():
+                for soul, block in souls.items():
+                    Node.fork(self, block, soul.name)
 
     def become(self, node_class: type[Node]) -> None:
         """Be a node of another class from now on; name, ports, connections and attributes stay.
@@ -178,22 +235,22 @@ class Node(Receiver):
         :raises AttributeError: if it lacks a method that is a block of the node
         """
         check_class(node_class)
-        self.check_running()
+        self._check_running()
 
         def change():
-            receivers = self, *self.opened
+            receivers = self, *self._opened
             soul = rebound(self.soul, self, node_class)
             blocks = [rebound(each.delegate, self, node_class) for each in receivers]
             self.__class__, self.soul = node_class, soul
             for receiver, block in zip(receivers, blocks):
                 receiver.delegate = block
 
-        self.run.turns.call(change)
+        self._run.turns.call(change)
 
-    def abandon(self):
+    def _abandon(self):
         """Be stopped in a forked child: the node runs in the parent."""
-        self.lifecycle = Lifecycle.STOPPED
-        for each in self.opened:
+        self._lifecycle = Lifecycle.STOPPED
+        for each in self._opened:
             each.closed = True
 
     def __enter__(self):
@@ -202,33 +259,38 @@ class Node(Receiver):
     def __exit__(self, *error):
         self.stop()
 
-    def check_running(self):
+    def _check_running(self):
         """Raise NodeStoppedError if the node has not started, or has stopped."""
-        if self.lifecycle not in (Lifecycle.RUNNING, Lifecycle.STOPPING):
+        if self._lifecycle not in (Lifecycle.RUNNING, Lifecycle.STOPPING):
             raise NodeStoppedError(
-                f'{self.name} is {self.lifecycle.value}: start() it, by super() in a class of your own'
+                f'{self._name} is {self._lifecycle.value}: start() it, by super() in a class of your own'
             )
 
     @property
     def is_running(self) -> bool:
         """True if the node is started and no stop has begun."""
-        return self.lifecycle is Lifecycle.RUNNING
+        return self._lifecycle is Lifecycle.RUNNING
+
+    @property
+    def lifecycle(self) -> Lifecycle:
+        """Its state."""
+        return self._lifecycle
 
     @property
     def channels(self) -> list[Channel]:
         """The channels that are open."""
-        return [each for each in self.opened if isinstance(each, Channel) and not each.closed]
+        return [each for each in self._opened if isinstance(each, Channel) and not each.closed]
 
     @property
     def ros(self):
         """The node's own rospy in this run, whole: ``node.ros.Timer``, ``node.ros.Time.now()``."""
-        self.check_running()
-        return self.run.ros
+        self._check_running()
+        return self._run.ros
 
     def ros_import(self, name: str):
         """Return a library written on rospy, such as 'actionlib', bound to this run of the node."""
-        self.check_running()
-        return self.run.modules.load(name)
+        self._check_running()
+        return self._run.modules.load(name)
 
     def health(self) -> types.SimpleNamespace:
         """Return how the node is doing; asks the master.
@@ -240,10 +302,10 @@ class Node(Receiver):
         """
         registered = None
         with suppress(MasterUnreachableError):
-            registered = self.master.call('lookupNode', self.name) == self.uri
-        return types.SimpleNamespace(registered=registered, **self.told())
+            registered = self._master.call('lookupNode', self._name) == self._run.uri
+        return types.SimpleNamespace(registered=registered, **self._told())
 
-    def told(self):
+    def _told(self):
         """Return what :meth:`health` knows without the master; top asks for it by XML-RPC."""
         from pharos.live.snapshot import told
 
@@ -252,7 +314,7 @@ class Node(Receiver):
     describe = ExternalNode.describe
 
     def __repr__(self):
-        return f'<{type(self).__name__} {self.name} {self.lifecycle.value}>'
+        return f'<{type(self).__name__} {self._name} {self._lifecycle.value}>'
 
     def execute(self):
         """Run the soul once, in this thread, and return its value (``node execute`` in the report)."""
@@ -265,25 +327,26 @@ class Node(Receiver):
         :meth:`sleep` or turn of :meth:`every`.
         """
         runs = self._soul_or(block)
-        soul = self.run.Thread(target=self._run_soul, args=[runs], name=name or name_of(runs))
-        self.souls[soul] = block
+        soul = self._run.Thread(target=self._run_soul, args=[runs], name=name or name_of(runs))
+        self._souls[soul] = block
         soul.start()
         return soul
 
     def _soul_or(self, block):
-        self.check_running()
+        self._check_running()
         block = block or self.soul
-        if taking(block, 'soul', 1, 0) is None:
-            raise PharosError(f'{self.name} has no soul to run: give it one, node.soul = block')
+        if taking(block, 'soul', 0, 1) is None:
+            raise PharosError(f'{self._name} has no soul to run: give it one, node.soul = block')
         return block
 
     def _run_soul(self, block):
         before, here.node, is_own = here.node, self, block is self.soul
         try:
-            return taking(block, 'soul', 1, 0)(self)
+            return taking(block, 'soul', 0, 1)(self)
         except BaseException as error:
-            if self.is_running or not isinstance(error, rospy.ROSException):  # else by the stop
-                self.report(
+            is_by_stop = self._run.stopping.is_set() and isinstance(error, rospy.ROSException)
+            if not is_by_stop:
+                self._report(
                     error,
                     block,
                     'soul',
@@ -296,9 +359,11 @@ class Node(Receiver):
     def sleep(self, seconds: float) -> None:
         """Sleep for some seconds of ROS time; the stop of the node ends it, and its soul."""
         with quiet_wait():
-            self.ros.sleep(seconds)
-        if not self.is_running and here.node is self:
-            raise NodeStoppedError(f'{self.name} stops, and this soul with it')
+            self._check_running()
+            self._run.turns.release()  # a start() that waits lets delegates run
+            self._run.ros.sleep(seconds)
+        if self._run.stopping.is_set() and here.node is self:
+            raise NodeStoppedError(f'{self._name} stops, and this soul with it')
 
     def every(self, seconds: float) -> Iterator[int]:
         """Return an iterator that turns every so many seconds of ROS time, until the node stops.
@@ -309,13 +374,16 @@ class Node(Receiver):
         """
         if not seconds > 0:
             raise ValueError(f'a period is a number of seconds above 0, not {seconds!r}')
-        rate, stopping = self.ros.Rate(1 / seconds, reset=True), self.run.stopping
+        self._check_running()
+        run = self._run
+        rate = run.ros.Rate(1 / seconds, reset=True)
 
         def turns():
             turn = 0
-            while not stopping.is_set():
+            while not run.stopping.is_set():
                 yield turn
                 turn += 1
+                run.turns.release()  # a start() that waits lets delegates run
                 with quiet_wait():
                     rate.sleep()
 
@@ -326,30 +394,35 @@ class Node(Receiver):
     @property
     def errors(self) -> list[BaseException]:
         """The exceptions of blocks in this run of the node, the newest last; 100 kinds at most."""
-        return [failure.error for failure in self.failures]
+        return [failure.error for failure in self._failures]
 
-    def report(self, error, block, what, message=None, channel=None, again=None):
+    def _report(self, error, block, what, message=None, channel=None, again=None):
         """Keep what a block raised, and tell it at the 1st, 10th, 100th time; Ctrl-C goes on."""
         if isinstance(error, (KeyboardInterrupt, SystemExit)) and is_signalled():
             raise error
-        failure = Failure(error, block, message, channel, again)
-        self.failures.keep(failure)
+        failure = self._keep_failure(error, block, message, channel, again)
         if str(failure.count).strip('0') != '1':
             return
         with suppress(Exception):  # neither log nor Transcript can be written
-            line = f'{what} {name_of(block)} of {self.name}'
+            line = f'{what} {name_of(block)} of {self._name}'
             line += f' on {channel.topic}' if channel else ''
             line += f' raised {type(error).__name__}: {error}'
             line += f' ({failure.count} times)' if failure.count > 1 else ''
             try:
-                self.log(f'{line}\n{failure.traceback}', 'error')
+                Node.log(self, f'{line}\n{failure.traceback}', 'error')
             finally:
                 Transcript.show(line)
 
-    def refused(self, topic, reason):
+    def _keep_failure(self, error, block, message=None, channel=None, again=None):
+        """Keep what a block raised, without telling it, and return the Failure."""
+        failure = Failure(error, block, message, channel, again)
+        self._failures.keep(failure)
+        return failure
+
+    def _refused(self, topic, reason):
         """Take note that a publisher sends another type."""
-        error = MessageTypeError(f'{self.name} does not receive from {topic}: {reason}')
-        self.report(error, topic, 'connection')
+        error = MessageTypeError(f'{self._name} does not receive from {topic}: {reason}')
+        self._report(error, topic, 'connection')
 
     def log(self, text, level: str = 'info') -> None:
         """Log a line to the screen, the log file and /rosout.
@@ -358,25 +431,28 @@ class Node(Receiver):
         """
         if level not in ('debug', 'info', 'warn', 'warning', 'error', 'fatal'):
             raise ValueError(f'unknown level {level!r}: give info or error, and one text')
-        if self.lifecycle not in (Lifecycle.RUNNING, Lifecycle.STOPPING):
-            return Transcript.show(f'[{level.upper()}] {self.name}: {text}')
+        if self._lifecycle not in (Lifecycle.RUNNING, Lifecycle.STOPPING):
+            return Transcript.show(f'[{level.upper()}] {self._name}: {text}')
         # no wrapper between: rospy looks for the caller of this method
-        self.run.core._base_logger('%s', (text,), {}, level=level)
+        self._run.core._base_logger('%s', (text,), {}, level=level)
 
     # -- topics
 
-    def resolve(self, name: str) -> str:
+    def _resolve(self, name: str) -> str:
         """Return the full name of a topic, service or parameter, remapped as the node's are.
 
         :raises ValueError: if it cannot be a name
         """
-        self.check_running()
-        return self.run.ros.resolve_name(legal_name(name).replace('~/', '~'))
+        self._check_running()
+        return self._run.ros.resolve_name(legal_name(name).replace('~/', '~'))
 
-    def peer_name(self, peer):
+    def _peer_name(self, peer):
         """Return the full name of a Node, an ExternalNode, or a node given by its name."""
-        name = getattr(peer, 'name', None)
-        return name or rosgraph.names.resolve_name(node_name(peer), self.name)
+        if isinstance(peer, Node):
+            return peer._name
+        if isinstance(peer, ExternalNode):
+            return peer.name
+        return rosgraph.names.resolve_name(node_name(peer), self._name)
 
     def interested_in(
         self,
@@ -401,8 +477,8 @@ class Node(Receiver):
         :raises UnknownTopicError, UnknownTypeError: if the type is not known
         :raises MasterUnreachableError: if the master does not answer; nothing is left behind
         """
-        topic = self.resolve(topic)
-        peer = from_ and self.peer_name(from_)
+        topic = self._resolve(topic)
+        peer = from_ and self._peer_name(from_)
         cls = self._class_of(topic, typed_as, is_receiver=True)
         return InputChannel(self, topic, cls, delegate, queue_size, inline, shared, peer)
 
@@ -418,7 +494,7 @@ class Node(Receiver):
         :param latch: the last message goes to subscribers that come later, too
         :param queue_size: messages that wait for each subscriber at most
         """
-        topic = self.resolve(topic)
+        topic = self._resolve(topic)
         return OutputChannel(self, topic, self._class_of(topic, typed_as), latch, queue_size)
 
     def send_to(
@@ -448,29 +524,34 @@ class Node(Receiver):
         if isinstance(block, type) and issubclass(block, Message):
             typed_as, block = block, fill
         channel = self._senders.get((topic, typed_as))
-        was_open = channel and not channel.closed
-        if not was_open:
-            name = self.resolve(topic)
-            given = type(block) if isinstance(block, Message) else None
+        if channel and not channel.closed:
+            return channel.send(block, to=to, **fields)
+        name = self._resolve(topic)
+        given = type(block) if isinstance(block, Message) else None
+        with self._opening:  # two threads that send first open one channel
             cls = self._class_of(name, typed_as or given)
-            was_open = self._open_on(name, OutputChannel)
-            channel = was_open[0] if was_open else OutputChannel(self, name, cls)
+            known = self._open_on(name, OutputChannel)
+            channel = known[0] if known else OutputChannel(self, name, cls)
             self._senders[topic, typed_as] = channel
         try:
             return channel.send(block, to=to, **fields)
         except Exception:
-            if not was_open:
+            if not known:
                 channel.close()
             raise
 
     def _open_on(self, topic, kind=Channel):
-        return [each for each in self.channels if each.topic == topic and isinstance(each, kind)]
+        return [
+            each
+            for each in self._opened
+            if isinstance(each, kind) and each.topic == topic and not each.closed
+        ]
 
     def _class_of(self, topic, typed_as, is_receiver=False):
         known = [each.message_class for each in self._open_on(topic)]
         if typed_as is None and known:
             return known[0]
-        type_ = typed_as or self.master.topic_type(topic)
+        type_ = typed_as or self._master.topic_type(topic)
         if type_ in (None, '*'):
             raise UnknownTopicError(
                 f'the master knows no type of {topic}: give typed_as=, such as "std_msgs/String"'
@@ -479,25 +560,27 @@ class Node(Receiver):
         cls = messages.message_class(type_, ask)
         if known and known[0]._md5sum != cls._md5sum:
             raise MessageTypeError(
-                f'{self.name} has {topic} open as {known[0]._type}, not as {cls._type}'
+                f'{self._name} has {topic} open as {known[0]._type}, not as {cls._type}'
             )
         return cls
 
     def _definition_of_publisher(self, topic, type_):
         """Return the definition that a publisher sends when it is connected."""
-        if not self.master.topic(topic).publishers:
+        if not self._master.topic(topic).publishers:
             return None
 
         def find(end):
             headers = [each.header or {} for each in end.impl.connections]
             return [each['message_definition'] for each in headers if each.get('type') == type_]
 
-        return (self._subscribed(find, self.connect_timeout, topic, self.ros.AnyMsg) or [None])[0]
+        return (
+            self._subscribed(find, self.connect_timeout, topic, self._run.ros.AnyMsg) or [None]
+        )[0]
 
     def _subscribed(self, find, timeout, *options):
         """Wait until ``find(subscriber)`` is true of a subscriber of rospy, and return what it is."""
         # not through a channel: a delegate may call this, whose turn it is
-        end = self.ros.Subscriber(*options)
+        end = self._run.ros.Subscriber(*options)
         try:
             return wait(lambda: find(end), timeout, self)
         finally:
@@ -518,22 +601,22 @@ class Node(Receiver):
         :raises UnknownTopicError, TimeoutError: if none comes in time
         :raises NodeStoppedError: if the node stops meanwhile
         """
-        came, topic = [], self.resolve(topic)
+        came, topic = [], self._resolve(topic)
 
         def find(end):
             while came and where and not where(came[0]):
                 del came[0]
             return came
 
-        self.master.call('getPid')  # raises if it does not answer
+        self._master.call('getPid')  # raises if it does not answer
         if timeout and not typed_as:
-            typed_as = wait(lambda: self.master.topic_type(topic), timeout, self)
+            typed_as = wait(lambda: self._master.topic_type(topic), timeout, self)
         cls = self._class_of(topic, typed_as, True)
         if self._subscribed(find, timeout, topic, cls, came.append):
             return came[0]
-        if self.is_running:
+        if not self._run.stopping.is_set():
             raise TimeoutError(f'no message on {topic} came within {timeout:g} s: is it published?')
-        raise NodeStoppedError(f'{self.name} stopped while it waited for {topic}')
+        raise NodeStoppedError(f'{self._name} stopped while it waited for {topic}')
 
     # -- services and parameters
 
@@ -543,11 +626,11 @@ class Node(Receiver):
         ``block(request)`` runs in a thread of the caller's connection. It returns a response, a
         dict, tuple or list of its fields, or its only field; None for an empty response.
         """
-        return OfferedService(self, self.resolve(name), messages.service_class(typed_as), block)
+        return OfferedService(self, self._resolve(name), messages.service_class(typed_as), block)
 
     def lookup_service(self, name: str) -> Service:
         """Return the service of that name, resolved as the node's names are."""
-        return self.master.lookup_service(self.resolve(name), self.name)
+        return self._master.lookup_service(self._resolve(name), self._name)
 
     def wait_for_service(self, name: str, timeout: float | None = None) -> Service:
         """Wait until a service of that name is offered, and return it."""
@@ -558,18 +641,18 @@ class Node(Receiver):
 
         :param initialized: the value that it gets if it has none
         """
-        name = self.resolve(name)
-        known = [each for each in self.parameters if each.name == name]
+        name = self._resolve(name)
+        known = [each for each in self._parameters if each.name == name]
         return known[0] if known else Parameter(self, name, initialized)
 
     @property
-    def parameters(self) -> list[Parameter]:
+    def _parameters(self) -> list[Parameter]:
         """The parameters that :meth:`parameter` has returned."""
-        return [each for each in self.opened if isinstance(each, Parameter)]
+        return [each for each in self._opened if isinstance(each, Parameter)]
 
-    def read_parameters(self):
+    def _read_parameters(self):
         """Have the parameters read their values."""
-        for each in self.parameters:
+        for each in self._parameters:
             each.read()
 
 

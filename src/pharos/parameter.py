@@ -21,18 +21,23 @@ class Parameter(Opened):
 
     def subscribe(self):
         """Hear of changes, and set the value that the node knows if the master has none."""
-        master = self.node.master
-        master.call('subscribeParam', self.node.run.uri, self.name, caller_id=self.node.name)
+        master = self.node._master
+        master.call('subscribeParam', self.node._run.uri, self.name, caller_id=self.node._name)
         if self._value is not None and self.name not in master.parameters:
             self.set(self._value)
         self.read()
 
     _open = subscribe
 
+    def _close(self):
+        """Hear of no more changes."""
+        uri = self.node._run.uri
+        self.node._master.call('unsubscribeParam', uri, self.name, caller_id=self.node._name)
+
     @property
     def value(self):
         """The value: a bool, int, float, str, list or dict; None if it has none."""
-        self.node.check_running()
+        self.node._check_running()
         return deepcopy(self._value)
 
     def set(self, value) -> None:
@@ -41,14 +46,14 @@ class Parameter(Opened):
         :raises ValueError: if the server cannot hold such a value
         :raises MasterUnreachableError: if the master does not answer
         """
-        self.node.check_running()
-        self.node.master.parameters[self.name] = value
-        self.node.read_parameters()
+        self.node._check_running()
+        self.node._master.parameters[self.name] = value
+        self.node._read_parameters()
 
     def read(self):
         """Take the value that the server has, and tell of a change."""
         with self._reading:
-            before, self._value = self._value, self.node.master.parameters.get(self.name)
+            before, self._value = self._value, self.node._master.parameters.get(self.name)
             value = self._value
         if not self.closed and (value, type(value)) != (before, type(before)):
             for block in self.delegate:
@@ -56,7 +61,7 @@ class Parameter(Opened):
 
     def on_change(self, block: Block) -> Block:
         """Have ``block(value)`` run when it changes, also by others."""
-        self.delegate = [*self.delegate, taking(block, 'block of on_change', 1)]
+        self.delegate = [*self.delegate, taking(block, 'block of on_change', 1, 1)]
         return block
 
     def _run(self, block, value):
@@ -64,4 +69,4 @@ class Parameter(Opened):
             block(value)
         except BaseException as error:
             run = functools.partial(self._run, block)
-            self.node.report(error, block, 'block of on_change', value, again=run)
+            self.node._report(error, block, 'block of on_change', value, again=run)

@@ -21,7 +21,10 @@ class _Here(threading.local):
 here = _Here()
 #: the nodes of this process that run or restart
 nodes = []
+SAME_SIGNAL = 1.0  # seconds; people press Ctrl-C twice, and `timeout -s INT` sends two signals
+
 signalled = False  # after a signal that ends the program
+_first_signal = 0.0  # when it came, as time.monotonic()
 _exiting = False  # at its end
 
 
@@ -34,9 +37,8 @@ def wait(predicate, timeout=None, node=None):
     """
     end = float('inf') if timeout is None else time.monotonic() + timeout
     node, pause = node or here.node, 0.002
-    sleep = node.run.stopping.wait if node else time.sleep
+    sleep = node._run.stopping.wait if node else time.sleep
     while not (value := predicate()) and time.monotonic() < end and not sleep(pause):
-        workers.relieve()
         pause = min(pause * 1.2, 0.02)
     return value
 
@@ -65,7 +67,7 @@ def quiet_wait():
 def stop_all():
     """Stop every node of this process, whatever the stop() of a class of its own raises."""
     for node in nodes[:]:
-        node.end_now()
+        node._end_now()
 
 
 def spin() -> None:
@@ -74,8 +76,7 @@ def spin() -> None:
     with contextlib.suppress(KeyboardInterrupt), quiet_wait():
         while nodes and not rospy.is_shutdown():  # that of the process, which its own signal ended
             time.sleep(0.01)
-            workers.relieve()
-    stop_all()
+        stop_all()
 
 
 def handle_signals():
@@ -98,9 +99,14 @@ def is_signalled():
 
 
 def _end(number, frame):
-    global signalled
+    global signalled, _first_signal
+    if signalled:
+        if time.monotonic() - _first_signal > SAME_SIGNAL:
+            signal.signal(number, signal.SIG_DFL)
+            signal.raise_signal(number)  # ends the program at once
+        return
     signalled = True
-    signal.signal(number, signal.SIG_DFL)  # a second one ends the program at once
+    _first_signal = time.monotonic()
     if _exiting:  # _exit() stops the nodes already
         return
     threading.Thread(target=stop_all, name='pharos end').start()
@@ -116,7 +122,7 @@ def _exit():
 def _forget():
     """Have no nodes in a forked child."""
     for node in nodes:
-        node.abandon()
+        node._abandon()
     nodes.clear()
     runs.clear()
     workers.forget()

@@ -40,21 +40,24 @@ class OfferedService(Opened):
 
     def __init__(self, node, name, cls, block):
         self.node, self.name, self.service_class = node, name, cls
-        self.delegate = taking(block, 'block of a service', 1)
+        self.delegate = taking(block, 'block of a service', 1, 1)
         self.open()
 
     def _open(self):
         try:
             self.end = self.node.ros.Service(self.name, self.service_class, self._answer)
         except ServiceException as error:
-            raise PharosError(f'{self.node.name} offers {self.name} already: {error}') from None
+            raise PharosError(f'{self.node._name} offers {self.name} already: {error}') from None
+
+    def _close(self):
+        self.end.shutdown()
 
     def _answer(self, request):
         try:
             return messages.response(self.service_class._response_class, self.delegate(request))
         except BaseException as error:
             where = f'service {self.name}'
-            self.node.report(error, self.delegate, where, request, again=self._answer_again)
+            self.node._report(error, self.delegate, where, request, again=self._answer_again)
             raise ServiceException(f'{type(error).__name__}: {error}') from error
 
     def _answer_again(self, request):
@@ -182,7 +185,7 @@ class Service:
         sock = socket.create_connection(parse_rosrpc_uri(self.uri), timeout)
         keep_alive(sock)
         if here.node:  # whose stop ends the call
-            here.node.run.calls.add(sock)
+            here.node._run.calls.add(sock)
         header = {'callerid': self.caller_id, 'service': self.name, 'md5sum': md5sum, **more}
         write_ros_handshake_header(sock, header)
         header = read_ros_handshake_header(sock, io.BytesIO(), 1 << 16)

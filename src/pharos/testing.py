@@ -129,7 +129,7 @@ def create_node(master: Master) -> Iterator[Callable[..., Any]]:
     _expects_failures = False
     yield create
     for node in nodes:
-        node.end_now()
+        node._end_now()
     told = [f'{failure}\n{failure.traceback}' for node in nodes for failure in node.failures]
     if told and not _expects_failures:
         told.insert(0, 'blocks of its nodes failed (or say expect_failures()):')

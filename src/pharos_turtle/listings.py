@@ -26,13 +26,13 @@ def find_commands(node):
     """
 
     def others(topic):
-        return {*node.master.topic(node.resolve(topic)).subscribers} - {node.name}
+        return {*node.master.topic(node.ros.resolve_name(topic)).subscribers} - {node.name}
 
     def heard():
         return [each for each in COMMANDS if others(each[0])]
 
     topic, type_name = (wait(heard, PATIENCE, node) or COMMANDS)[0]
-    node.log(f'drives {node.resolve(topic)} ({type_name})')
+    node.log(f'drives {node.ros.resolve_name(topic)} ({type_name})')
     return topic, type_name
 
 

@@ -3,5 +3,5 @@ import pathlib
 import sys
 
 pytest_plugins = ['pharos.testing']
-# the tests run before anything is built, too
-sys.path.insert(0, str(pathlib.Path(__file__).resolve().parent.parent / 'src'))
+# the tests run before anything is built, too; what is built comes first, since it has the messages
+sys.path.append(str(pathlib.Path(__file__).resolve().parent.parent / 'src'))

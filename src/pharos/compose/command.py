@@ -5,7 +5,7 @@
   compose --script PKG/EXECUTABLE ...          programs, as rosrun finds them
   compose                                      none at first
 
-Programs that use pharos themselves run apart. It is a node, /compose by default (__name:= names it
+Programs with windows run in processes of their own. It is a node, /compose by default (__name:= names it
 otherwise), with the services of a nodelet manager: `rosrun nodelet nodelet load PKG/EXECUTABLE
 compose __name:=talker` loads one more. It ends when all nodes have ended, or by Ctrl-C.
 """
@@ -14,13 +14,13 @@ import contextlib
 import os
 import sys
 
+import rospkg
 from rosgraph.names import anonymous_name
 
 from pharos import Master, NodeNameInUseError, PharosError, spin
 from pharos.compose.composition import Composition
 from pharos.compose.container import Container
 from pharos.compose.launch_file import LaunchFile
-from pharos.compose.script import load
 
 
 def main(argv=None):
@@ -32,6 +32,9 @@ def main(argv=None):
     parser.add_argument('--script', nargs='+', default=[], help='programs to run')
     parser.add_argument('--only', nargs='+', default=[], help='of the file, these nodes alone')
     parser.add_argument('--apart', nargs='+', default=[], help='these in processes of their own')
+    parser.add_argument(
+        '--here', nargs='+', default=[], help='these here, though they show windows'
+    )
     parser.add_argument(
         '--share-connections', action='store_true', help='one connection to each other publisher'
     )
@@ -69,17 +72,15 @@ def _run(stack, options, mappings):
     if options.file:
         args = dict(word.split(':=', 1) for word in mappings if not word.startswith('_'))
         package = options.file[0] if len(options.file) == 2 else None
-        names = options.only, options.apart
-        composition.launch(LaunchFile(master.url, package, options.file[-1], args, *names))
+        names = options.only, options.apart, options.here
+        file = LaunchFile(master.url, package, options.file[-1], args, *names)
+        home = rospkg.get_ros_home()  # where roslaunch runs its nodes
+        os.makedirs(home, exist_ok=True)
+        os.chdir(home)
+        composition.launch(file)
         return composition.wait()
-    for text in options.script:
-        package, _, executable = text.partition('/')
-        is_file = os.path.isfile(text) or not executable
-        with composition.telling(text):
-            composition.nodes.append(
-                load(master, text if is_file else package, None if is_file else executable)
-            )
     if options.script:
+        composition.run_scripts(options.script, options.here)
         return composition.wait()
     spin()
     return 0

@@ -7,14 +7,16 @@ import tempfile
 import threading
 
 import roslaunch.core
+import rospkg
 
 from pharos import program
 from pharos.compose import apart_program
 from pharos.compose.launch_file import LaunchFile
-from pharos.compose.script import ScriptNode, wait_for_end
+from pharos.compose.script import ScriptNode, load, needs_main_thread, wait_for_end
 from pharos.errors import PharosError
+from pharos.master import Master
 from pharos.node import Lifecycle
-from pharos.ros_process import RosProcess
+from pharos.ros_process import RosProcess, find_program
 from pharos.transcript import Transcript
 
 PATIENCE = 2.0  # seconds that a node may take to start before the next one does
@@ -32,9 +34,16 @@ class Composition:
     """
 
     def __init__(self, master):
-        self.master, self.process = master, None
+        self.master = master
+        self.process = None
         self.nodes: list[ScriptNode] = []
-        self._ending, self._status, self._required = threading.Event(), 0, False
+        self._processes: list[RosProcess] = []  # of scripts that need one each
+        self._ended: set[ScriptNode] = set()  # these were named
+        self._ending = threading.Event()
+        self._watcher = threading.Thread(target=self._watch, name='composition', daemon=True)
+        self._is_required = False  # True if a required node runs apart
+        self._has_started = False  # True if one node was started
+        self._has_lost = False  # True if a required node has ended
 
     def launch(self, file):
         """Set the parameters of a launch file, and start its nodes.
@@ -45,16 +54,43 @@ class Composition:
         file.set_parameters(run_id)
         for text in file.config.config_errors:
             Transcript.show(text)
+        for name, reason in file.reasons.items():
+            Transcript.show(f'{name} runs in a process of its own: {reason}')
         if file.apart:
             with tempfile.NamedTemporaryFile('wb', suffix='.launch', delete=False) as pickled:
                 pickle.dump(file.config_apart(), pickled)
             command = [sys.executable, apart_program.__file__, pickled.name, str(os.getpid())]
-            self._required = any(node.required for node in file.apart)
+            self._is_required = any(node.required for node in file.apart)
+            self._has_started = True
             self.process = RosProcess(command, self.master.url, Transcript.show)
-        for name, *program_and_node in file.here:
+        logs = os.path.join(rospkg.get_log_dir(), run_id)
+        for number, (name, path, args, launched) in enumerate(file.here, 1):
+            log = f'{name[1:].replace("/", "-")}-{number}.log'  # as roslaunch names it
             with self.telling(name):
-                self.start(name, *program_and_node)
-        threading.Thread(target=self._watch, name='composition', daemon=True).start()
+                self.start(name, path, [*args, f'__log:={logs}/{log}'], launched)
+        self._watcher.start()
+
+    def run_scripts(self, texts, here):
+        """Run programs; why one does not start is shown."""
+        for text in texts:
+            with self.telling(text):
+                self._run_script(text, text in here)
+        self._watcher.start()
+
+    def _run_script(self, text, is_here):
+        """Run a program given as PACKAGE/EXECUTABLE or by its path, in a process if it needs one."""
+        package, _, executable = text.partition('/')
+        path = text
+        if not os.path.isfile(text):
+            path = find_program(package, executable)
+        reason = '' if is_here else needs_main_thread(path)
+        if not reason:
+            self._add(load(self.master, path, here=True))
+            return
+        Transcript.show(f'{text} runs in a process of its own: {reason}')
+        self._has_started = True
+        command = [sys.executable, os.path.abspath(path)]
+        self._processes.append(RosProcess(command, self.master.url, Transcript.show))
 
     @contextlib.contextmanager
     def telling(self, name):
@@ -62,7 +98,6 @@ class Composition:
         try:
             yield
         except PharosError as error:
-            self._status = 1
             Transcript.show(f'{name} is not started: {error}')
 
     def start(self, name, path, args, launched=None):
@@ -75,45 +110,66 @@ class Composition:
         node.__init__(path, args, None, launched.env_args if launched else ())
         node.init_timeout, node.launched = PATIENCE, launched
         self.nodes.append(node)
-        node.start()
-        self._status = 0
+        node._begin()
+        self._tell_start(node)
         return node
+
+    def _add(self, node):
+        self.nodes.append(node)
+        self._tell_start(node)
+
+    def _tell_start(self, node):
+        self._has_started = True
+        Transcript.show(f'{node._name} has started')
 
     @property
     def is_over(self):
         """True if all that it started has ended."""
-        goes_on = [
-            node.lifecycle is not Lifecycle.STOPPED or (node.launched and node.launched.respawn)
-            for node in self.nodes
-        ]
-        return not any(goes_on) and (self.process is None or self.process.poll() is not None)
+        for node in self.nodes:
+            respawns = node.launched and node.launched.respawn
+            if respawns or node._lifecycle is not Lifecycle.STOPPED:
+                return False
+        return not any(process.poll() is None for process in self._all_processes())
+
+    def _all_processes(self):
+        return [*self._processes, self.process] if self.process else self._processes
 
     def _watch(self):
         """Start again what respawns, and end all if a required node has ended."""
         while not self._ending.wait(POLL) and not self.is_over:
-            self.look()
-        self.look()
+            self._look()
+        self._look()
 
-    def look(self):
-        """Look once what has ended."""
-        for node in [node for node in self.nodes if node.lifecycle is Lifecycle.STOPPED]:
-            launched = node.launched
-            if self._ending.is_set() or not launched:
+    def _look(self):
+        for node in self.nodes:
+            if self._ending.is_set():
                 return
-            if launched.required:
-                return self._end(node.name)
-            if launched.respawn and not self._ending.wait(float(launched.respawn_delay)):
-                with self.telling(node.name):
-                    node.start()
-                if self._ending.is_set():  # since it looked
-                    node.end_now()
-        if self._required and self.process.poll() is not None:  # all of it has ended
+            if node._lifecycle is Lifecycle.STOPPED:
+                self._look_at_ended(node)
+        if self._is_required and self.process.poll() is not None:  # all of it has ended
             self._end('a node in a process of its own')
+
+    def _look_at_ended(self, node):
+        if node not in self._ended:
+            self._ended.add(node)
+            Transcript.show(f'{node._name} has ended, with exit code {node.exit_code}')
+        launched = node.launched
+        if not launched:
+            return
+        if launched.required:
+            self._end(node._name)
+        elif launched.respawn and not self._ending.wait(float(launched.respawn_delay)):
+            with self.telling(node._name):
+                node._begin()
+                self._ended.discard(node)
+                Transcript.show(f'{node._name} has come back')
+            if self._ending.is_set():  # since it looked
+                node._end_now()
 
     def _end(self, name):
         if not self._ending.is_set():
             Transcript.show(f'{name}, which is required, has ended: all others end')
-            self._status = 1
+            self._has_lost = True
             self.stop()
 
     def wait(self, timeout: float | None = None) -> int:
@@ -123,9 +179,10 @@ class Composition:
         :raises TimeoutError: if they have not in that time
         """
         wait_for_end(self._is_to_end, timeout, 'the composition')
-        self.look()
+        if self.is_over:
+            self._watcher.join()  # it has seen all
         self.stop()
-        return self._status
+        return 1 if self._has_lost or not self._has_started else 0
 
     def _is_to_end(self):
         return self.is_over or self._ending.is_set() or program.signalled
@@ -133,11 +190,11 @@ class Composition:
     def stop(self) -> None:
         """End all nodes, those apart, too."""
         self._ending.set()
-        threads = [threading.Thread(target=node.end_now) for node in self.nodes]
+        threads = [threading.Thread(target=node._end_now) for node in self.nodes]
         for thread in threads:
             thread.start()
-        if self.process:
-            self.process.terminate(APART_PATIENCE)
+        for process in self._all_processes():
+            process.terminate(APART_PATIENCE)
         for thread in threads:
             thread.join()
 
@@ -148,10 +205,10 @@ class Composition:
         self.stop()
 
 
-def compose(master, package, file, *, only=(), apart=(), share_connections=False, **args):
+def compose(master, package, file, *, only=(), apart=(), here=(), share_connections=False, **args):
     """Do what :meth:`Master.compose` does."""
-    launch_file = LaunchFile(master.url, package, file, args, only, apart)
+    launch_file = LaunchFile(master.url, package, file, args, only, apart, here)
     share_connections = share_connections or master.share_connections
-    composition = Composition(type(master)(master.url, share_connections))
+    composition = Composition(Master(master.url, share_connections))
     composition.launch(launch_file)
     return composition

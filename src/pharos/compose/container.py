@@ -5,8 +5,7 @@ from typing import Any
 import rosgraph.names
 
 from pharos.compose.composition import Composition
-from pharos.compose.launch_file import can_run_here
-from pharos.compose.script import ScriptNode, source_of
+from pharos.compose.script import ScriptNode, source_of, why_apart
 from pharos.errors import PharosError, UnknownNodeError, UnknownTypeError
 from pharos.node import Node
 from pharos.ros_process import find_program
@@ -37,10 +36,9 @@ class Container(Node):
     def _load(self, request):
         package, _, executable = request.type.partition('/')
         path = find_program(package, executable)
-        if not can_run_here(path):
-            raise PharosError(
-                f'{path} is not in Python, or uses pharos itself: run it as a process'
-            )
+        reason = why_apart(path)
+        if reason:
+            raise PharosError(f'{path} cannot run here, since {reason}: run it as a process')
         name = full = self._full(request.name)
         if name in self._running():
             raise PharosError(f'{name} is loaded already: unload it first, or name another')
@@ -70,6 +68,6 @@ class Container(Node):
     def _drop(self, name):
         node, bond = self.loaded.pop(name, None), self._bonds.pop(name, None)
         if node:
-            node.end_now()
+            node._end_now()
         if bond:
             bond.shutdown()

@@ -1,7 +1,6 @@
 """Launch files, read by roslaunch itself, and which of their nodes can run in this process."""
 import copy
 import os
-import re
 
 import rosgraph.names
 import roslaunch.config
@@ -11,13 +10,10 @@ import roslaunch.node_args
 import roslaunch.pmon
 import roslaunch.xmlloader
 
-from pharos.compose.script import source_of
+from pharos.compose.script import source_of, why_apart
 from pharos.errors import PharosError, UnknownNodeError
 from pharos.ros_process import find_launch_file
 from pharos.transcript import Transcript
-
-_PYTHON = re.compile(r'#!.*\bpython(3(\.\d+)?)?\b')
-_USES_PHAROS = re.compile(r'^\s*(from|import) pharos\b', re.MULTILINE)
 
 
 class LaunchFile:
@@ -26,14 +22,16 @@ class LaunchFile:
     :param args: its arguments
     :param only: the names of the nodes that are wanted; none: all
     :param apart: the names of those that are to run in processes of their own
+    :param in_here: the names of those that are to run in this process though they show windows
     :ivar config: roslaunch's configuration
     :ivar here: a tuple for each node of this process: name, program, arguments, roslaunch's node
     :ivar apart: roslaunch's nodes for other processes
+    :ivar reasons: names of these -> why
     :raises UnknownNodeError: if there is no such package, file, argument or node
     :raises PharosError: if roslaunch cannot read it
     """
 
-    def __init__(self, url, package, file, args, only, apart):
+    def __init__(self, url, package, file, args, only=(), apart=(), in_here=()):
         self.path = find_launch_file(package, file)
         loader = roslaunch.xmlloader.XmlLoader()
         given = [f'{name}:={value}' for name, value in args.items()]
@@ -47,14 +45,17 @@ class LaunchFile:
         self.config.master.uri = url
         self.here = []
         self.apart = []
+        self.reasons = {}
         nodes = {
             rosgraph.names.ns_join(node.namespace, node.name): node for node in self.config.nodes
         }
         names = {name: {name, name[1:], name.rpartition('/')[2]} for name in nodes}
-        self._check([*only, *apart], set().union(*names.values()), 'node')
+        self._check([*only, *apart, *in_here], set().union(*names.values()), 'node')
         for name, node in nodes.items():
-            if names[name] & set(only) or not only:
-                self._sort(name, node, bool(names[name] & set(apart)))
+            if not only or names[name] & set(only):
+                is_apart = not names[name].isdisjoint(apart)
+                is_here = not names[name].isdisjoint(in_here)
+                self._sort(name, node, is_apart, is_here)
 
     def _check(self, names, known, kind):
         for name in names:
@@ -62,19 +63,34 @@ class LaunchFile:
                 has = ', '.join(sorted(known)) or 'none'
                 raise UnknownNodeError(f'{self.path} has no {kind} {name!r}; it has {has}')
 
-    def _sort(self, name, node, is_apart):
-        is_apart |= bool(node.launch_prefix or node.cwd)
-        if is_apart or not roslaunch.core.is_machine_local(node.machine):
-            return self.apart.append(node)
+    def _sort(self, name, node, is_apart, is_here):
         try:
-            command = roslaunch.node_args.create_local_process_args(
-                node, node.machine, env=os.environ
-            )
+            reason = self._why_apart(node, is_apart)
+            if not reason:
+                command = roslaunch.node_args.create_local_process_args(
+                    node, node.machine, env=os.environ
+                )
+                reason = why_apart(command[0], is_here)
         except Exception as error:  # roslaunch's, or of what it asks
-            return Transcript.show(f'{name} is not started: {error}')
-        if not can_run_here(command[0]):
-            return self.apart.append(node)
-        self.here.append((name, source_of(command[0]), command[1:], node))
+            Transcript.show(f'{name} is not started: {error}')
+            return
+        if reason:
+            self.reasons[name] = reason
+            self.apart.append(node)
+        else:
+            self.here.append((name, source_of(command[0]), command[1:], node))
+
+    def _why_apart(self, node, is_apart):
+        """Return why the launch file or --apart wants a process for a node; '' if nothing does."""
+        if is_apart:
+            return 'as --apart says'
+        if node.launch_prefix:
+            return 'it has a launch-prefix'
+        if node.cwd:
+            return 'it has a cwd'
+        if not roslaunch.core.is_machine_local(node.machine):
+            return f'it belongs to the machine {node.machine.name}'
+        return ''
 
     def set_parameters(self, run_id):
         """Run what is to run before, clear and set the parameters, as roslaunch does.
@@ -96,12 +112,3 @@ class LaunchFile:
         rest.nodes, rest.nodes_core, rest.tests, rest.executables = self.apart, [], [], []
         rest.params, rest.clear_params, rest.config_errors = {}, [], []
         return rest
-
-
-def can_run_here(path):
-    """True if a program is written in Python, and does not make its nodes itself with pharos."""
-    with open(path, errors='replace') as file:
-        if not _PYTHON.match(file.readline(256)):
-            return False
-    with open(source_of(path), errors='replace') as file:
-        return not _USES_PHAROS.search(file.read())

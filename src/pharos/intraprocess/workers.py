@@ -4,7 +4,7 @@ A publisher puts a message into the Inbox of each receiver and wakes a worker. A
 next node that has something to run, and wakes another worker for the rest, unless the callbacks of
 that node were fast. There are at most as many workers as nodes, so that a callback that blocks
 holds up its own node alone. They end with the last node. Inline inboxes are run by the publisher's
-thread.
+thread. A subscription of plain rospy has a thread of its own, as with rospy.
 """
 import collections
 import threading
@@ -17,6 +17,13 @@ BURST = 100e-6  # seconds; a publisher that woke a worker less than this ago doe
 YIELD_LIMIT = 1e-3  # seconds that a publisher waits at most until the receiver's thread runs
 YIELD_PAUSE = 0.02  # seconds without such a wait after one that was in vain
 FAST = 50e-6  # seconds; a callback that takes less may run in the thread that reads the socket
+LATE = 4e-3  # seconds that a callback may hold up those of other nodes
+SENTRY_REST = 1.0  # seconds without such callbacks until the sentry rests
+FIRST_PAUSE = (
+    0.05  # seconds that a connection between processes takes: rospy's first callback waits
+)
+
+INFINITE = float('inf')
 
 _ready = collections.deque()
 _idle = []
@@ -24,6 +31,7 @@ _workers = set()
 _turns = set()
 _guard = allocate_lock()  # of _workers and _turns
 _no_yield_before = 0.0
+_sentry = None
 
 
 class Turns:
@@ -32,14 +40,33 @@ class Turns:
     ``jobs`` has an Inbox once for each of its messages, or more often if some were dropped.
     """
 
-    scheduled = is_fast = False
+    is_pooled = True
+    scheduled = is_fast = is_held = closed = False
+    thread = None  # its own, if it has one
     runner = None  # the identifier of the thread that runs it
 
     def __init__(self):
-        self.jobs, self.closed = collections.deque(), False
+        self.jobs = collections.deque()
         self._running = allocate_lock()
+        self._enter()
+
+    def _enter(self):
         with _guard:
             _turns.add(self)
+
+    def hold(self):
+        """Run nothing until release(), but what this thread itself calls."""
+        self._running.acquire()
+        self.runner = get_ident()
+        self.is_held = True
+
+    def release(self):
+        """Run what waits; for any thread."""
+        if self.is_held:
+            self.is_held = False
+            self.runner = None
+            self._running.release()
+            self.wake()
 
     def run(self):
         """Run what waits. If another thread is in here, return: that one runs this, too."""
@@ -84,7 +111,7 @@ class Turns:
         self.wake()
 
     def schedule(self):
-        """Have a worker take it; True if none is about to."""
+        """Have a worker take it; True if one of the pool is to be woken for that."""
         if self.scheduled or not self.jobs:
             return False
         self.scheduled = True
@@ -99,6 +126,7 @@ class Turns:
     def close(self, timeout):
         """Forget what has not run, and wait for the callback that runs; True if it ended in time."""
         self.closed = True
+        self.release()
         ended = self.runner == get_ident() or self._running.acquire(True, timeout)
         self.jobs.clear()
         if ended:  # else it still counts, so that its blocked worker is replaced
@@ -109,17 +137,93 @@ class Turns:
         with _guard:
             _turns.discard(self)
         if not _turns:
-            _wake_worker()
+            _end_pool()
 
 
-class _Worker:
+class OwnTurns(Turns):
+    """The callbacks of one subscription of plain rospy: all run in one thread, which ends with them.
+
+    What a callback has made in its thread (a base of SQLite, a context of CUDA) it finds again.
+    The first one runs some time after the subscription: the constructor that has subscribed may not
+    have made yet what its callback uses.
+    """
+
+    is_pooled = False
+
+    def __init__(self):
+        super().__init__()
+        self._begin = perf_counter() + FIRST_PAUSE
+
+    def _enter(self):
+        """Stay out of the pool."""
+
+    def schedule(self):
+        """Wake its thread; the pool has nothing to do."""
+        if not self.scheduled and self.jobs:
+            self.scheduled = True
+            if self.thread:
+                self.thread.rouse()
+            else:
+                self._start_thread()
+        return False
+
+    def _start_thread(self):
+        with _guard:  # two publishers may be here
+            if not self.thread:
+                self.thread = _Thread(self._loop, 'pharos callbacks')
+                self.thread.start()
+
+    def call(self, block):
+        """Run ``block()`` between two callbacks."""
+        self._wait_for_begin()
+        if not self.closed:
+            super().call(block)
+
+    def _wait_for_begin(self):
+        sleep(max(0.0, self._begin - perf_counter()))
+
+    def _loop(self):
+        self._wait_for_begin()
+        while not self.closed:
+            self.scheduled = False
+            self.run()
+            self.thread.rest()
+
+    def forget(self):
+        """Let its thread end."""
+        if self.thread:
+            self.thread.rouse()
+
+
+class _Thread:
+    """A thread that rests until it is roused."""
+
+    def __init__(self, loop, name):
+        # released to wake the thread; held from the wake until the thread runs
+        self._resting, self.awake = allocate_lock(), allocate_lock()
+        self._resting.acquire()
+        self.start = threading.Thread(target=loop, name=name, daemon=True).start
+
+    def rouse(self):
+        """End its rest, or its next one."""
+        self.awake.acquire(False)
+        try:
+            self._resting.release()
+        except RuntimeError:  # it is roused already
+            pass
+
+    def rest(self):
+        """Wait until it is roused."""
+        self._resting.acquire()
+        if self.awake.locked():
+            self.awake.release()
+
+
+class _Worker(_Thread):
     """A thread of the pool."""
 
     def __init__(self):
-        # released to wake the thread; held from the wake until the thread runs
-        self.wake, self.awake = allocate_lock(), allocate_lock()
-        self.wake.acquire()
-        threading.Thread(target=self._loop, name='pharos worker', daemon=True).start()
+        super().__init__(self._loop, 'pharos worker')
 
     def _loop(self):
         while True:
@@ -133,12 +237,13 @@ class _Worker:
                 _idle.append(self)
                 if _ready or not _turns:  # since then; nobody may have seen this one
                     _wake_worker()
-                self.wake.acquire()
-                if self.awake.locked():
-                    self.awake.release()
+                self.rest()
                 continue
-            if _ready and not turns.is_fast:
-                _wake_worker()
+            if _ready:
+                if turns.is_fast:
+                    _watch()
+                else:
+                    _wake_worker()
             turns.scheduled = False
             began, waiting = perf_counter(), len(turns.jobs)
             turns.run()
@@ -153,17 +258,54 @@ def _wake_worker():
     except IndexError:
         with _guard:
             if len(_workers) < len(_turns):
-                _workers.add(_Worker())
+                worker = _Worker()
+                _workers.add(worker)
+                worker.start()
         return None
-    worker.awake.acquire(False)
-    worker.wake.release()
+    worker.rouse()
     return worker
 
 
-def relieve():
-    """Have another worker run what waits behind a callback that was fast so far, and now blocks."""
-    if _ready:
-        _wake_worker()
+class _Sentry(_Thread):
+    """Has another worker run what waits behind a callback that was fast so far, and now blocks.
+
+    It looks as often as need be while such callbacks run, and rests else.
+    """
+
+    is_needed = is_looking = False
+
+    def __init__(self):
+        super().__init__(self._loop, 'pharos sentry')
+
+    def _loop(self):
+        global _sentry
+        while _turns and _sentry is self:
+            self.is_looking = True
+            since = perf_counter()
+            while _turns and perf_counter() - since < SENTRY_REST:
+                sleep(LATE)
+                if self.is_needed:
+                    self.is_needed = False
+                    since = perf_counter()
+                if _ready:
+                    _wake_worker()
+            self.is_looking = False
+            if _turns:
+                self.rest()
+        if _sentry is self:
+            _sentry = None
+
+
+def _watch():
+    """Have the sentry look after what a worker has left for later."""
+    global _sentry
+    sentry = _sentry
+    if sentry is None:
+        sentry = _sentry = _Sentry()
+        sentry.start()
+    sentry.is_needed = True
+    if not sentry.is_looking:
+        sentry.rouse()
 
 
 class Inbox:
@@ -174,13 +316,14 @@ class Inbox:
     """
 
     queue_bytes = 64 << 20
+    more = 0  # messages that wait besides these bytes
     dropped = taken = fast_in_a_row = 0
     _taken_at_yield = -1
 
     def __init__(self, turns, callback, queue_size=None, inline=False, shared=False):
         self.turns, self.callback, self.inline, self.shared = turns, callback, inline, shared
         self.queue = collections.deque()
-        self.limit = self.queue_size = queue_size or float('inf')
+        self.limit = self.queue_size = queue_size or INFINITE
 
     def put(self, item, size=0):
         """Add ``(value, thaw, header)``; ``turns`` are to be woken or run then.
@@ -194,7 +337,7 @@ class Inbox:
             queue.append(item)
             return self.turns.jobs.append(self)
         if waiting >= self.limit or not waiting & (waiting - 1):  # at 1, 2, 4 ...
-            most = max(1, self.queue_bytes // (size or size_of(item[0])))
+            most = max(1, self.queue_bytes // (size or size_of(item[0]))) + self.more
             self.limit = min(self.queue_size, most)
             if waiting >= self.limit and self.taken != self._taken_at_yield:
                 self._taken_at_yield = self.taken  # the receiver got on since
@@ -212,10 +355,13 @@ class Inbox:
         """Take a message from the thread that reads a socket.
 
         That thread runs the callback, too, if it was fast ten times running: waking another takes
-        longer.
+        longer. It runs one of plain rospy without a queue_size, as rospy has it: meanwhile messages
+        wait in the sockets, and in the publisher, and none is lost.
         """
+        if not self.turns.is_pooled and self.queue_size == INFINITE:
+            return self.turns.call(lambda: self.callback(message))
         self.put((message, None, None), size)
-        if self.inline or self.fast_in_a_row >= 10:
+        if self.inline or self.turns.is_pooled and self.fast_in_a_row >= 10:
             self.turns.run()
         else:
             self.turns.wake()
@@ -229,10 +375,13 @@ def hand_over(filled, last):
     """
     global _no_yield_before
     is_due = False
+    woken = None
     for turns in filled:
         if not turns.scheduled:
             is_due |= turns.schedule()
-    woken = is_due and _wake_worker()  # which wakes another one, if there is more
+            woken = turns.thread
+    if is_due:
+        woken = _wake_worker()  # which wakes another one, if there is more
     if not woken:
         return last
     now = perf_counter()
@@ -242,7 +391,17 @@ def hand_over(filled, last):
     return now
 
 
+def _end_pool():
+    global _sentry
+    _wake_worker()
+    if _sentry:
+        _sentry.rouse()
+        _sentry = None
+
+
 def forget():
     """Have no workers in a forked child."""
+    global _sentry
     for known in _ready, _idle, _workers, _turns:
         known.clear()
+    _sentry = None

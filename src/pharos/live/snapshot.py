@@ -106,15 +106,15 @@ def _ask(master, node):
 
 def told(node):
     """Return what a node of pharos tells of itself: what :meth:`Node.health` knows without the master."""
-    kinds = [info[3] for info in node.run.topics.get_pub_sub_info()]
-    ended = [soul.name for soul in node.souls if not soul.is_alive()]
+    kinds = [info[3] for info in node._run.topics.get_pub_sub_info()]
+    ended = [soul.name for soul in node._souls if not soul.is_alive()]
     return {
         'kind': type(node).__name__,
         'connections': dict(collections.Counter(kinds)),
         'dropped': sum(getattr(channel, 'dropped', 0) for channel in node.channels),
-        'errors': node.failures.total,
-        'threads': sum(thread.is_alive() for thread in list(node.run.threads)),
-        'souls': len(node.souls) - len(ended),
+        'errors': node._failures.total,
+        'threads': sum(thread.is_alive() for thread in list(node._run.threads)),
+        'souls': len(node._souls) - len(ended),
         'ended_souls': ended,
     }
 

@@ -5,17 +5,22 @@ rospy, rosgraph and what is written on rospy in the private set, and all else as
 """
 import builtins
 import importlib
+import inspect
 import itertools
+import os
 import pathlib
 import re
 import sys
 import threading
+import weakref
+from contextlib import suppress
 from functools import cache
 from importlib.machinery import PathFinder
 from importlib.util import module_from_spec, resolve_name
 from types import ModuleType
 
 import rospy.exceptions
+import rospy.impl.transport
 
 SHARED = sys.stdlib_module_names.union(
     'genpy genmsg roslib rospkg rosmaster catkin catkin_pkg pharos'.split(),
@@ -37,25 +42,66 @@ class Shim:
         return getattr(self._real, name)
 
 
+def own_path():
+    """Return a copy of sys.path, with the source folders that catkin put in front of it at its end.
+
+    The ``__init__`` of a package in a devel space puts its source folder in front. Whoever then
+    imports the package anew would find it there, without its messages.
+    """
+    path = list(sys.path)
+    for package in list(sys.modules.values()):
+        folders = getattr(package, '__dict__', {}).get('__path__') or ['']
+        home, *others = map(os.path.dirname, folders)
+        for folder in others:
+            if home in path and folder in path[: path.index(home)]:
+                path.remove(folder)
+                path.append(folder)
+    return path
+
+
 @cache
-def _find(name, path):
+def _spec_of(name, path):
     spec = PathFinder.find_spec(name, path)
     if spec is None:
         raise ModuleNotFoundError(f'No module named {name!r}', name=name)
-    return spec, spec.loader.get_code(name) if spec.has_location else None
+    return spec
+
+
+@cache
+def _code_of(loader, name, changed):
+    return loader.get_code(name)
+
+
+def _find(name, path):
+    """Return the spec of a module, and its code, which is read again if the file has changed."""
+    spec = _spec_of(name, path)
+    if not spec.has_location:
+        return spec, None
+    changed = os.stat(spec.origin).st_mtime_ns if os.path.isfile(spec.origin) else 0
+    return spec, _code_of(spec.loader, name, changed)
+
+
+def home_of(top):
+    """Return the file of a top-level module of Python, and its folders if it is a package."""
+    spec = getattr(sys.modules.get(top), '__spec__', None) or PathFinder.find_spec(top)
+    if top in SHARED or spec is None or not str(spec.origin).endswith('.py'):
+        return None, []
+    file = pathlib.Path(spec.origin)
+    folders = list(spec.submodule_search_locations or ())
+    # catkin's devel space leads to the source
+    source = re.search(r'__extended_path = [\'"]([^\'"]*)', file.read_text(errors='replace'))
+    if source:
+        folders.append(f'{source[1]}/{top}')
+    return file, folders
 
 
 @cache
 def _imports_of(top):
     """Return what a module or package of Python imports; nothing of a large one or one in C."""
-    spec = PathFinder.find_spec(top)
-    if top in SHARED or spec is None or not str(spec.origin).endswith('.py'):
+    file, folders = home_of(top)
+    if file is None:
         return set()
-    init = pathlib.Path(spec.origin).read_bytes()
-    folders = list(spec.submodule_search_locations or ())
-    # catkin's devel space leads to the source
-    source = re.search(r'__extended_path = [\'"]([^\'"]*)', init.decode(errors='replace'))
-    folders += [f'{source[1]}/{top}'] if source else []
+    init = file.read_bytes()
     found = (file for folder in folders for file in pathlib.Path(folder).rglob('*.py'))
     files = [file.read_bytes() for file in itertools.islice(found, MOST_FILES + 1)]
     text = b'\n'.join([init, *files]) if len(files) <= MOST_FILES else b''
@@ -65,40 +111,103 @@ def _imports_of(top):
 
 @cache
 def _reaches_rospy(top):
-    """True if the code of a package says rospy, or imports a package that does, and so on."""
+    """True if the code of a package says rospy, or imports a package that does, and so on.
+
+    A package that uses pharos does, too.
+    """
     names, new = set(), {top}
-    while new and new.isdisjoint(('rospy', 'rosgraph')):
+    while new and new.isdisjoint(('rospy', 'rosgraph', 'pharos')):
         names |= new
-        new = set().union(*map(_imports_of, new)) - names
+        found = set()
+        for name in new:
+            found |= _imports_of(name)
+        new = found - names
     return bool(new)
 
 
-def is_private(name):
-    """True if each node has a copy of the module. Generated messages are shared."""
+def _is_generated(name):
+    """True for generated messages, which are shared."""
     top, *rest = name.split('.')
-    is_generated = rest[:1] in (['msg'], ['srv']) and top not in ('rospy', 'rosgraph')
-    return top in PRIVATE or not is_generated and _reaches_rospy(top)
+    return rest[:1] in (['msg'], ['srv']) and top not in ('rospy', 'rosgraph')
+
+
+def is_private(name):
+    """True if each node has a copy of the module."""
+    top = name.partition('.')[0]
+    if top in SHARED or _is_generated(name):
+        return top in PRIVATE
+    return _reaches_rospy(top)
+
+
+#: class of a private module -> its PrivateModules, as a weak reference
+_owners = weakref.WeakKeyDictionary()
+
+
+def _private_module(thing):
+    """Return the private module of a class, function, method or frame; None if it has none."""
+    if inspect.isclass(thing):
+        name = thing.__module__
+        owner = None
+        with suppress(TypeError):  # its metaclass has no hash
+            owner = _owners.get(thing, lambda: None)()
+    else:
+        names = getattr(thing, 'f_globals', None) or getattr(thing, '__globals__', None) or {}
+        name = names.get('__name__')
+        own_builtins = names.get('__builtins__')
+        is_private = type(own_builtins) is dict  # of others it is a module
+        owner = getattr(own_builtins.get('__import__'), '__self__', None) if is_private else None
+    return owner.modules.get(name) if isinstance(owner, PrivateModules) else None
+
+
+def _getmodule(thing, filename=None, original=inspect.getmodule):
+    """Find private modules, too: inspect looks through all of sys.modules, in vain, each time."""
+    return _private_module(thing) or original(thing, filename)
+
+
+def _getfile(thing, original=inspect.getfile):
+    """Find the files of private modules' classes, too: inspect looks for them in sys.modules."""
+    module = inspect.isclass(thing) and _private_module(thing)
+    return getattr(module, '__file__', None) or original(thing)
+
+
+inspect.getmodule, inspect.getfile = _getmodule, _getfile
 
 
 class PrivateModules:
     """A set of private modules.
 
     :param substitutes: what private modules import under some names of Python's modules
+    :param path: the folders that are searched, as ``sys.path``
     :param patch: ``patch(module)`` is called right after the code of each private module
     """
 
-    def __init__(self, substitutes, patch):
-        # one rospy.exceptions for all, so that ``except rospy.ROSException`` catches every node's
-        self.modules = {**substitutes, 'rospy.exceptions': rospy.exceptions}
+    def __init__(self, substitutes, path, patch):
+        self.modules = {
+            **substitutes,
+            # one for all, so that ``except rospy.ROSException`` catches every node's
+            'rospy.exceptions': rospy.exceptions,
+            # it numbers the connections, INTRAPROCESS and TCPROS ones
+            'rospy.impl.transport': rospy.impl.transport,
+        }
         self.modules['importlib'] = Shim(importlib, import_module=self._import_module)
-        self._patch, self._lock = patch, threading.RLock()
-        self.path = None  # a program's sys.path, which begins with its own folder
-        self.builtins = {**vars(builtins), '__import__': self._import}
+        self._patch = patch
+        self._lock = threading.RLock()
+        self.path = path
+        self.folder = None  # of the program, if this is one
+        self.builtins = {
+            **vars(builtins),
+            '__import__': self._import,
+            '__build_class__': self._build_class,
+        }
 
     def _is_private(self, name):
-        """True also for what lies in the folder of the program."""
-        top = name.partition('.')[0]
-        return is_private(name) or self.path and PathFinder.find_spec(top, self.path[:1])
+        """True also for what lies in folders of sys.path that the process does not search."""
+        if _is_generated(name):
+            return False
+        if is_private(name):
+            return True
+        folders = [each for each in self.path if each == self.folder or each not in sys.path]
+        return PathFinder.find_spec(name.partition('.')[0], folders) is not None
 
     def load(self, name):
         """Return the module of that name, as private modules import it."""
@@ -110,9 +219,10 @@ class PrivateModules:
             return module
         with self._lock:  # or another thread would see a module that is half loaded
             if name not in self.modules:
-                path = self.load(parent).__path__ if parent else self.path
+                # what the process has searched since the start of the run comes last
+                path = self.load(parent).__path__ if parent else [*self.path, *sys.path]
                 if name not in self.modules:  # the parent may have imported it
-                    self._execute(name, path and tuple(path))
+                    self._execute(name, tuple(path))
             if parent in self.modules:
                 setattr(self.modules[parent], leaf, self.modules[name])
             return self.modules[name]
@@ -134,6 +244,15 @@ class PrivateModules:
             if is_added:
                 del sys.modules[name]
         self._patch(module)
+
+    def _build_class(self, function, name, *bases, **options):
+        cls = builtins.__build_class__(function, name, *bases, **options)
+        if not str(function.__module__).startswith(
+            'rospy'
+        ):  # of these, sys.modules has the same files
+            with suppress(TypeError):  # its metaclass has no hash
+                _owners[cls] = weakref.ref(self)
+        return cls
 
     def _import_module(self, name, package=None):
         return self.load(resolve_name(name, package))

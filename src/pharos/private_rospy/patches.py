@@ -59,8 +59,12 @@ def apply(module, run):
         setattr(owner, name, make(getattr(owner, name), run))
 
 
-def overlay(cls, methods):
-    """Set the methods of a plain class on a private class; ``rospy_NAME`` is what was there."""
+def overlay(cls, methods, run):
+    """Set the methods of a plain class on a private class; ``rospy_NAME`` is what was there.
+
+    A subclass would recurse: rospy calls ``super(_PublisherImpl, self)``, and would find it.
+    """
+    cls.run = run
     for name, method in vars(methods).items():
         if callable(method):
             setattr(cls, f'rospy_{name}', getattr(cls, name, None))
@@ -179,12 +183,13 @@ def limit_request(original, run, self):
 def signal_shutdown(original, run):
     """Ends rospy alone: rosnode kill and the like are to stop the node as its user would."""
     run.shut_down = original
-    return lambda reason: run.end_node()
+    return run.signal_shutdown
 
 
 @patch('rospy.core', 'is_shutdown')
 def is_shutdown(original, run):
     """Is true too late: a stop waits for the loops that ask it."""
+    run.checkpoint()
     return run.stopping.is_set() or original()
 
 
@@ -239,20 +244,21 @@ def start_timer(original, run, self, period, callback, *args, **kwargs):
 @replace('rospy.topics', '_PublisherImpl')
 def publisher(original, run):
     """See PublisherOverlay."""
-    return overlay(original, transport.PublisherOverlay)
+    return overlay(original, transport.PublisherOverlay, run)
 
 
 @replace('rospy.topics', '_SubscriberImpl')
 def subscription(original, run):
     """See SubscriptionOverlay."""
-    return overlay(original, transport.SubscriptionOverlay)
+    return overlay(original, transport.SubscriptionOverlay, run)
 
 
 @patch('rospy.topics', 'Subscriber.__init__')
 def subscribe(original, run, self, *args, **kwargs):
     """Connects before it has its callback: a message that comes between is lost."""
     original(self, *args, **kwargs)
-    run.connect_all(self.resolved_name)
+    if self.callback is None:  # else add_callback() has connected it
+        run.connect_all(self.resolved_name)
 
 
 @patch('rospy.topics', 'QueuedConnection')
@@ -273,7 +279,7 @@ def receive(original, run, connection, address, port, uri, callback, topic):
     connection.close()
     transport.end_share(run, topic, uri, subscription)
     if error and ('md5sum' in error or 'do not match' in error):  # rospy compares the names, too
-        run.node.refused(topic, error)
+        run.node._refused(topic, error)
     elif not subscription.closed:
         run.connect_again(topic, uri, error)
 
@@ -323,7 +329,7 @@ def keep_goal(original, run, self, *args, **kwargs):
 @patch('rospy.impl.masterslave', 'ROSHandler.paramUpdate')
 def parameter_changed(original, run, self, *args):
     """Tells its own cache alone."""
-    run.node.read_parameters()
+    run.node._read_parameters()
     return original(self, *args)
 
 
@@ -332,7 +338,7 @@ def parameter_changed(original, run, self, *args):
 def set_parameter(original, run, self, key, *value):
     """Tells others of the change, and not the node itself."""
     original(self, key, *value)
-    run.node.read_parameters()
+    run.node._read_parameters()
 
 
 @replace('rospy.impl.rosout', 'rospy')

@@ -17,13 +17,15 @@ from xml.parsers.expat import ExpatError
 from xmlrpc import client as xmlrpc_client
 
 from pharos.errors import MasterUnreachableError, NodeNameInUseError, PharosError, PortInUseError
-from pharos.intraprocess.workers import Turns, relieve
+from pharos.intraprocess.workers import Turns
 from pharos.private_rospy import patches, transport
-from pharos.private_rospy.loader import PrivateModules, Shim
+from pharos.private_rospy.loader import PrivateModules, Shim, own_path
 from pharos.private_rospy.transport import runs
 
 MASTER_LIMIT = 5.0  # seconds for each question to a master or node
 STOP_LIMIT = 2.0  # seconds that a stop waits for threads of rospy
+HOLD_LIMIT = 2.0  # seconds that delegates wait for the end of start(), which may wait for them
+PAUSE = 0.01  # seconds that a thread of a script sleeps at most once its node stops
 RETRY_DELAY = 1.0  # seconds until the next attempt to connect
 WATCH_PERIOD = 0.25  # seconds between two looks; each fourth is at the masters, too
 UNREACHABLE = OSError, xmlrpc_client.Error, HTTPException, ExpatError
@@ -56,15 +58,16 @@ class ServerProxy(xmlrpc_client.ServerProxy):
 class Run:
     """A rospy with a node.
 
-    :param node: a Node, with a name, ports, settings, and methods that are called: ``end_now()`` if
-        ROS ends it, ``read_parameters()``, ``refused(topic, reason)``
+    :param node: a Node, with a name, ports, settings, and methods that are called: ``_end_now()`` if
+        ROS ends it, ``_read_parameters()``, ``_refused(topic, reason)``
     """
 
     uri = ''
+    is_over = False  # True after the stop
 
     def __init__(self, node):
-        self.node, self.name = node, node.name
-        self.master_url = node.master.url
+        self.node, self.name = node, node._name
+        self.master_url = node._master.url
         self.stopping = threading.Event()
         self.threads = WeakSet()
         self.sockets, self.calls = WeakSet(), WeakSet()
@@ -73,18 +76,21 @@ class Run:
         self.connecting = set()  # (topic, URI, ...)
         self.relays = {}  # (topic, URI, class) -> publisher to those that share a connection
         self.turns = Turns()
-        namespace, _, self.base = node.name.rpartition('/')
+        self.turns.hold()  # until the node's start() has returned
+        self.hold_deadline = monotonic() + (HOLD_LIMIT if node._is_beginning else 0.0)
+        namespace, _, self.base = node._name.rpartition('/')
         self.environ = {
             'ROSCONSOLE_FORMAT': '[${severity}] [${time}]: ${node}: ${message}',
             **os.environ,
-            'ROS_MASTER_URI': node.master.url,
+            'ROS_MASTER_URI': node._master.url,
             'ROS_NAMESPACE': namespace or '/',
         }
-        if node.domain:  # it comes before ROS_IP
-            self.environ['ROS_HOSTNAME'] = node.domain
-        self.argv = [self.base, *node.remappings]
+        if node._domain:  # it comes before ROS_IP
+            self.environ['ROS_HOSTNAME'] = node._domain
+        self.argv = [self.base, *node._remappings]
+        self.path = own_path()
         patch = functools.partial(patches.apply, run=self)
-        self.modules = PrivateModules(self.substitutes(), patch)
+        self.modules = PrivateModules(self.substitutes(), self.path, patch)
         self.ros = self.modules.load('rospy')
         self.core = self.ros.core
         registration = self.modules.load('rospy.impl.registration')
@@ -103,26 +109,38 @@ class Run:
                 super().start()
                 run.threads.add(self)
 
-        def sleep(seconds):
-            if seconds <= 0 or not run.stopping.wait(seconds):
-                time.sleep(0)
-
         self.Thread = Thread
         client = Shim(xmlrpc_client, ServerProxy=ServerProxy)
         return {
             'os': Shim(os, environ=self.environ, register_at_fork=lambda **hooks: None),
-            'sys': Shim(sys, argv=self.argv),
+            'sys': Shim(sys, argv=self.argv, path=self.path),
             'atexit': Shim(atexit, register=lambda function, *args, **kwargs: function),
             'threading': Shim(threading, Thread=Thread),
-            'time': Shim(time, sleep=sleep),
+            'time': Shim(time, sleep=self.sleep),
             'socket': Shim(socket, setdefaulttimeout=lambda seconds: None),
             'xmlrpc': Shim(xmlrpc, client=client),
             'xmlrpc.client': client,
         }
 
     def start_thread(self, target):
-        """Start a thread of the node's."""
-        self.Thread(target=target).start()
+        """Start a thread of the node's, and return it."""
+        thread = self.Thread(target=target)
+        thread.start()
+        return thread
+
+    def sleep(self, seconds):
+        """Stand in for ``time.sleep``: the stop of the node ends it."""
+        if self.is_over:
+            raise SystemExit  # in a thread that was left behind
+        if seconds <= 0 or not self.stopping.wait(seconds):
+            time.sleep(0)
+
+    def checkpoint(self):
+        """Do what a signal asks for; rospy's loops call it when they publish or look for their end."""
+
+    def signal_shutdown(self, reason):
+        """Stop the node; stands in for ``rospy.signal_shutdown``."""
+        self.end_node()
 
     # -- start
 
@@ -134,7 +152,8 @@ class Run:
         :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: stop() undoes the rest
         """
         base, node = self.modules.load('rospy.impl.tcpros_base'), self.node
-        taken, port = node.master.call('lookupNode', self.name), node.tcp_port
+        taken = node._master.call('lookupNode', self.name)
+        port, xmlrpc_port = node._ports
         with suppress(*UNREACHABLE):
             if taken and ServerProxy(taken, 1.0).getPid('/pharos'):
                 raise NodeNameInUseError(
@@ -145,8 +164,13 @@ class Run:
             tcp = server.tcp_ros_server = base.TCPServer(server._tcp_server_callback, port)
             tcp.server_sock.listen(128)  # rospy lets five clients wait
             tcp.start()
-            port_taken, port = tcp.port, node.xmlrpc_port
-            options.update(xmlrpc_port=port, tcpros_port=port_taken, disable_signals=True)
+            port = xmlrpc_port
+            options = {
+                'disable_signals': True,
+                **options,
+                'xmlrpc_port': port,
+                'tcpros_port': tcp.port,
+            }
             self.modules.load('rospy.client').init_node(self.base, self.argv, **options)
         except OSError as error:
             if error.errno != errno.EADDRINUSE:
@@ -155,13 +179,16 @@ class Run:
                 f'{self.name}: port {port} is in use: choose another one, or 0 for any'
             ) from None
         address = urlsplit(self.uri)
-        node.uri, node.tcp_port, node.xmlrpc_port = self.uri, port_taken, address.port
-        node.domain = node.domain or address.hostname
+        node._ports = tcp.port, address.port
+        node._domain = node._domain or address.hostname
+        node.uri = self.uri
+        node.tcp_port, node.xmlrpc_port = node._ports
+        node.domain = node._domain
 
     def ready(self, handler, uri):
         """Be found and watched: the servers run, and nothing is registered yet."""
         self.handler, self.uri = handler, uri
-        handler.pharosHealth = lambda caller_id: (1, '', self.node.told())
+        handler.pharosHealth = lambda caller_id: (1, '', self.node._told())
         with transport.guard:
             if not runs:
                 _end_of_watch.clear()
@@ -173,7 +200,9 @@ class Run:
     def register(self, kind, name, data):
         """Tell the master of a topic or service; the watcher repairs what it does not hear of."""
         with suppress(MasterUnreachableError):
-            value = self.node.master.call(_METHODS[kind], name, data, self.uri, caller_id=self.name)
+            value = self.node._master.call(
+                _METHODS[kind], name, data, self.uri, caller_id=self.name
+            )
             if kind == 'sub' and value:
                 self.publisher_uris[name] = value
         for other in list(runs.values()) if kind == 'pub' else ():  # sooner than the master
@@ -199,7 +228,7 @@ class Run:
         try:
             if uri in runs:
                 transport.link(runs[uri], self, topic)
-            elif self.node.master.share_connections and transport.follow(self, *key, subscription):
+            elif self.node._master.share_connections and transport.follow(self, *key, subscription):
                 pass
             elif (code := self.handler._connect_topic(*key)[0]) != 1:
                 self.start_thread(lambda: self.connect_again(*key))
@@ -237,7 +266,7 @@ class Run:
                     self.connect_all(each[1])
         if not known and not self.stopping.is_set():  # the master has begun anew
             self.modules.load('rospy.client')._init_node_params(self.argv, self.name)
-            for parameter in self.node.parameters:
+            for parameter in self.node._parameters:
                 parameter.subscribe()
 
     def limit(self, sock):
@@ -248,12 +277,12 @@ class Run:
 
     def end_node(self):
         """Stop the node, in another thread."""
-        threading.Thread(target=self.node.end_now).start()  # no stop waits for it
+        threading.Thread(target=self.node._end_now).start()  # no stop waits for it
 
-    def stop(self, timeout):
-        """Send what is under way, unregister, free ports and threads; log what is left behind.
+    def shut_rospy_down(self, timeout):
+        """Send what is under way, unregister, and close all topics and services.
 
-        :param timeout: seconds for souls, and as long for what is under way
+        :param timeout: seconds for what is under way
         """
         self.stopping.set()
         with transport.guard:
@@ -262,18 +291,29 @@ class Run:
                 _end_of_watch.set()
         for sock in list(self.calls):
             transport.shut(sock)
-        left = [thread.name for thread in join(self.node.souls, timeout)]
+        deadline = monotonic() + timeout
+        for publisher in list(self.topics.pubs.values()):
+            publisher.flush(deadline)
+        self.shut_down('stop')  # rospy's own; its name calls signal_shutdown()
+
+    def stop(self, timeout):
+        """Send what is under way, unregister, free ports and threads; log what is left behind.
+
+        :param timeout: seconds for souls, and as long for what is under way
+        """
+        self.stopping.set()
+        for sock in list(self.calls):
+            transport.shut(sock)
+        left = [thread.name for thread in join(self.node._souls, timeout)]
         if not self.turns.close(timeout):
             left.append('a delegate')
         if left:
             self.ros.logwarn(f'left behind, since they did not end in time: {", ".join(left)}')
-        deadline = monotonic() + timeout
-        for publisher in list(self.topics.pubs.values()):
-            publisher.flush(deadline)
-        self.shut_down('stop')  # rospy's own; its name calls end_node()
+        self.shut_rospy_down(timeout)
         for sock in list(self.sockets):
             transport.shut(sock)
-        join(set(self.threads) - set(self.node.souls), STOP_LIMIT)
+        join(set(self.threads) - set(self.node._souls), STOP_LIMIT)
+        self.is_over = True
         log = self.modules.load('logging')
         log.disable()  # or a thread that is late opens the file again
         log.shutdown()
@@ -295,10 +335,11 @@ def _watch():
     looks = 0
     while not _end_of_watch.wait(WATCH_PERIOD):
         looks += 1
-        relieve()
         nodes = list(runs.values())
         for run in nodes:
             run.topics.check_all()  # who has left (ros_comm #927)
+            if monotonic() > run.hold_deadline:
+                run.turns.release()
             for sock, deadline in list(run.deadlines.items()):
                 if monotonic() > deadline:
                     run.deadlines.pop(sock, None)

@@ -18,10 +18,12 @@ from rospy.msg import serialize_message
 from rospy.names import TOPIC_ANYTYPE
 
 from pharos.intraprocess.copier import copied, copier_for, thawer
-from pharos.intraprocess.workers import Inbox, Turns, hand_over
+from pharos.intraprocess.workers import Inbox, OwnTurns, hand_over
 
 LARGEST_MESSAGE = 1_000_000_000  # bytes, as roscpp has it
 INFINITE = float('inf')
+SOCKET_BYTES = 6 << 20  # that the sockets between a publisher and a subscriber hold about
+AT_ONCE = 256 << 10  # bytes of a message that a publisher writes itself; more would hold it up
 _length = struct.Struct('<I')
 #: the runs of this process by the URI of their node
 runs = {}
@@ -92,7 +94,7 @@ def link(sender, receiver, topic):
         return
     sent, wanted = publisher.data_class, subscription.data_class
     if wanted._md5sum not in (sent._md5sum, TOPIC_ANYTYPE):
-        return receiver.node.refused(
+        return receiver.node._refused(
             topic, f'{sender.name} publishes {sent._type}, not {wanted._type}'
         )
     with publisher.lock:
@@ -154,9 +156,12 @@ class PublisherOverlay:
         self.seen = self.header = None
 
     def acquire(self):
-        """Do nothing: publish() locks, but not while it runs inline delegates."""
+        """Wait while a signal is handled. publish() locks, but not while it runs inline delegates."""
+        if self.resolved_name != '/rosout':  # the log's lock is held
+            self.run.checkpoint()
 
-    release = acquire
+    def release(self):
+        """Do nothing."""
 
     def enable_latch(self):  # rospy calls it after registering, when links may exist
         self.is_latch = True
@@ -170,6 +175,10 @@ class PublisherOverlay:
                 self.write(self.thaw(frozen), self.connections[-1:])
         return True
 
+    def remove_connection(self, connection):
+        if not self.closed:  # else rospy trips over what the close has taken away
+            self.rospy_remove_connection(connection)
+
     def publish(self, message, connection_override=None, latch_key=None):
         """Publish to the links, then to the sockets.
 
@@ -177,6 +186,8 @@ class PublisherOverlay:
         """
         with self.lock:
             if self.closed:
+                if latch_key is None and self.run.stopping.is_set():  # rospy's ends quietly, too
+                    return False
                 raise rospy.ROSException('publish() to a closed topic')
             self.seq += 1
             if connection_override is None:
@@ -248,13 +259,30 @@ class SubscriptionOverlay:
         callbacks = self.callbacks or ()
         found = [callback for callback, _ in callbacks if isinstance(callback, Inbox)]
         if len(found) < len(callbacks):
-            self.plain = self.plain or Inbox(Turns(), self.call_plain, self.queue_size)
+            if not self.plain:
+                self.plain = Inbox(OwnTurns(), self.call_plain, self.queue_size)
+                self.limit_plain()
             found.append(self.plain)
         self.inboxes[:] = found  # the links have this very list
         links = links_of(self.connections)
         for link in links:
             link.publisher.seen = None
         return links
+
+    def limit_plain(self):
+        """Let as much wait as with processes: in the publishers' queues, and in sockets."""
+        if not self.plain:
+            return
+        sizes = [link.publisher.queue_size for link in links_of(self.connections)]
+        self.plain.queue_bytes = self.run.node.queue_bytes
+        if None not in sizes:  # such a publisher waits for sockets, and loses nothing
+            self.plain.queue_bytes = min(SOCKET_BYTES, self.plain.queue_bytes)
+            self.plain.more = sum(sizes)
+
+    def add_connection(self, connection):
+        is_added = self.rospy_add_connection(connection)
+        self.limit_plain()
+        return is_added
 
     def call_plain(self, message):
         for callback, args in self.callbacks or ():
@@ -269,6 +297,7 @@ class SubscriptionOverlay:
                 message = link.thaw(frozen)
                 message._connection_header = link.header
                 self._invoke_callback(message, callback, args)
+        self.run.connect_all(self.resolved_name)
 
     def remove_callback(self, callback, args):
         self.rospy_remove_callback(callback, args)
@@ -376,7 +405,7 @@ class Sender:
         """Send a message with its length; never waits for the subscriber."""
         connection = self._connection
         with self._lock:
-            if not self.busy and len(data) <= 1 << 16:  # more would hold up the publisher
+            if not self.busy and len(data) <= AT_ONCE:
                 try:
                     sent = connection.socket.send(data, socket.MSG_DONTWAIT)
                 except BlockingIOError:
@@ -388,7 +417,7 @@ class Sender:
                 self._rest = data[sent:]
             else:
                 self._queue.append(data)
-                limit = min(self._limit, max(1, Inbox.queue_bytes // len(data)))
+                limit = min(self._limit, max(1, self._run.node.queue_bytes // len(data)))
                 while len(self._queue) > limit:
                     self._queue.popleft()
             if not self.busy:
