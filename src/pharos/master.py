@@ -325,11 +325,13 @@ class Master:
     def load(self, *args, **options):
         """Run a program of rospy, unmodified, as a node of this process: a :class:`ScriptNode`.
 
-        ``load(package, executable=None, *args, name=None, namespace=None, remap=None, params=None)``
+        ``load(package, executable=None, *args, name=None, namespace=None, remap=None, params=None,
+        here=False)``
 
         :param package: without ``executable``, the path of the program
         :param args: its arguments
         :param name: default: the one that it gives to ``init_node``
+        :param here: True: it runs here though it shows windows
         :raises UnknownNodeError: if there is no such program
         :raises PharosError: if it cannot run here, or failed before it was a node
         """
@@ -340,13 +342,14 @@ class Master:
     def compose(self, package: str | None, file: str, **options):
         """Run the Python nodes of a launch file in this process: a :class:`Composition`.
 
-        ``compose(package, file, only=(), apart=(), share_connections=False, **args)``
+        ``compose(package, file, only=(), apart=(), here=(), share_connections=False, **args)``
 
-        The rest (C++, other machines, with a launch-prefix or cwd) runs as roslaunch starts it.
+        The rest (C++, other machines, with a launch-prefix, cwd or windows) runs as roslaunch starts it.
 
         :param package: None: ``file`` is a path
         :param only: the names of the nodes that are wanted; none: all
         :param apart: the names of nodes that are to run in processes of their own
+        :param here: the names of nodes that are to run in this process though they show windows
         :param args: the arguments of the launch file
         :raises UnknownNodeError: if there is no such file, argument or node
         :raises PharosError: if roslaunch cannot read it

@@ -85,7 +85,9 @@ class Composition:
             path = find_program(package, executable)
         reason = '' if is_here else needs_main_thread(path)
         if not reason:
-            self._add(load(self.master, path, here=True))
+            Transcript.show(f'{text} starts')
+            self.nodes.append(load(self.master, path, here=True))
+            self._has_started = True
             return
         Transcript.show(f'{text} runs in a process of its own: {reason}')
         self._has_started = True
@@ -110,17 +112,10 @@ class Composition:
         node.__init__(path, args, None, launched.env_args if launched else ())
         node.init_timeout, node.launched = PATIENCE, launched
         self.nodes.append(node)
+        Transcript.show(f'{name} starts')
         node._begin()
-        self._tell_start(node)
-        return node
-
-    def _add(self, node):
-        self.nodes.append(node)
-        self._tell_start(node)
-
-    def _tell_start(self, node):
         self._has_started = True
-        Transcript.show(f'{node._name} has started')
+        return node
 
     @property
     def is_over(self):
@@ -160,9 +155,9 @@ class Composition:
             self._end(node._name)
         elif launched.respawn and not self._ending.wait(float(launched.respawn_delay)):
             with self.telling(node._name):
-                node._begin()
+                Transcript.show(f'{node._name} comes back')
                 self._ended.discard(node)
-                Transcript.show(f'{node._name} has come back')
+                node._begin()
             if self._ending.is_set():  # since it looked
                 node._end_now()
 

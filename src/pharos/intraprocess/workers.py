@@ -316,7 +316,6 @@ class Inbox:
     """
 
     queue_bytes = 64 << 20
-    more = 0  # messages that wait besides these bytes
     dropped = taken = fast_in_a_row = 0
     _taken_at_yield = -1
 
@@ -337,8 +336,7 @@ class Inbox:
             queue.append(item)
             return self.turns.jobs.append(self)
         if waiting >= self.limit or not waiting & (waiting - 1):  # at 1, 2, 4 ...
-            most = max(1, self.queue_bytes // (size or size_of(item[0]))) + self.more
-            self.limit = min(self.queue_size, most)
+            self.limit = min(self.queue_size, self.most(size or size_of(item[0])))
             if waiting >= self.limit and self.taken != self._taken_at_yield:
                 self._taken_at_yield = self.taken  # the receiver got on since
                 sleep(1e-6)  # a publisher that never sleeps would starve it
@@ -350,6 +348,10 @@ class Inbox:
             is_full = True
         if not is_full:  # the receiver may have taken one meanwhile
             self.turns.jobs.append(self)
+
+    def most(self, size):
+        """Return how many messages of a size may wait."""
+        return max(1, self.queue_bytes // size)
 
     def receive(self, message, size):
         """Take a message from the thread that reads a socket.

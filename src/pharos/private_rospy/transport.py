@@ -243,6 +243,23 @@ class PublisherOverlay:
         self.headers, self.subscriber_listeners = {}, []
 
 
+class PlainInbox(Inbox):
+    """The messages that wait for the callbacks of plain rospy of a subscription."""
+
+    def __init__(self, subscription):
+        super().__init__(OwnTurns(), subscription.call_plain, subscription.queue_size)
+        self.subscription = subscription
+        self.queue_bytes = subscription.run.node.queue_bytes
+
+    def most(self, size):
+        """Let as many wait as with processes: in the queues of publishers, and in sockets."""
+        links = links_of(self.subscription.connections)
+        waiting = [link.publisher.queue_size for link in links]
+        if None in waiting:  # such a publisher waits for the socket, and loses nothing
+            return super().most(size)
+        return sum(waiting) + max(1, min(SOCKET_BYTES, self.queue_bytes) // size)
+
+
 class SubscriptionOverlay:
     """Methods for a node's own rospy.topics._SubscriberImpl.
 
@@ -259,30 +276,13 @@ class SubscriptionOverlay:
         callbacks = self.callbacks or ()
         found = [callback for callback, _ in callbacks if isinstance(callback, Inbox)]
         if len(found) < len(callbacks):
-            if not self.plain:
-                self.plain = Inbox(OwnTurns(), self.call_plain, self.queue_size)
-                self.limit_plain()
+            self.plain = self.plain or PlainInbox(self)
             found.append(self.plain)
         self.inboxes[:] = found  # the links have this very list
         links = links_of(self.connections)
         for link in links:
             link.publisher.seen = None
         return links
-
-    def limit_plain(self):
-        """Let as much wait as with processes: in the publishers' queues, and in sockets."""
-        if not self.plain:
-            return
-        sizes = [link.publisher.queue_size for link in links_of(self.connections)]
-        self.plain.queue_bytes = self.run.node.queue_bytes
-        if None not in sizes:  # such a publisher waits for sockets, and loses nothing
-            self.plain.queue_bytes = min(SOCKET_BYTES, self.plain.queue_bytes)
-            self.plain.more = sum(sizes)
-
-    def add_connection(self, connection):
-        is_added = self.rospy_add_connection(connection)
-        self.limit_plain()
-        return is_added
 
     def call_plain(self, message):
         for callback, args in self.callbacks or ():
