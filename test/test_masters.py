@@ -4,13 +4,14 @@ import os
 import signal
 import socket
 import threading
+import xmlrpc.client
 
 import psutil
 import pytest
 
 from helpers import TIMEOUT, InProcessMaster, Program, create, stop_nodes
 import pharos
-from pharos import BlockNode, ExternalNode, Master, RosProcess
+from pharos import BlockNode, ExternalNode, Master, Node, RosProcess
 from pharos.testing import Mailbox, until
 
 STRING = 'std_msgs/String'
@@ -164,6 +165,40 @@ def test_nodes_are_own_and_external(master, peer):
 def test_unknown_node_raises_its_error(master):
     with pytest.raises(pharos.UnknownNodeError):
         master.node('/nobody')
+
+
+def test_starting_node_is_found(master):
+    class Asking(Node):
+        def start(self):
+            super().start()
+            found.append(self.master.node(self.name))
+
+    def look():
+        while not found:
+            with contextlib.suppress(pharos.UnknownNodeError):
+                found.append(master.node('/asking'))
+
+    found, thread = [], threading.Thread(target=look, daemon=True)
+    thread.start()
+    node = create(master, '/asking', Asking)
+    thread.join(TIMEOUT)
+    assert set(found) == {node}
+
+
+def test_connections_have_own_numbers(master, peer):
+    """They are those that rosnode info shows, of a node in a process that has made few others."""
+    create_node = 'pharos.Master().create(pharos.BlockNode, named=name)'
+    peer.run(f'import pharos; talker, *hearers = [{create_node} for name in "tabc"]')
+    node = create(master, '/node')
+    for topic in '/one', '/two', '/three':
+        peer.run(f'talker.output_channel({topic!r}, {STRING!r})')
+        peer.run(f'for hearer in hearers: hearer.interested_in({topic!r})')
+        node.interested_in(topic)
+    ask = xmlrpc.client.ServerProxy(peer.value('talker.uri')).getBusInfo
+    until(lambda: len(ask('/test')[2]) == 12)
+    numbers, _, _, transports, *_ = zip(*ask('/test')[2])
+    assert set(transports) == {'INTRAPROCESS', 'TCPROS'}
+    assert len(set(numbers)) == 12
 
 
 def test_system_state_lists_users_by_name(master):

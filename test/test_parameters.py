@@ -243,6 +243,21 @@ def test_initial_value_returns_with_start(node, server):
     assert rate.value == 1
 
 
+def test_closed_parameter_hears_no_more(master, ros_master, node, server):
+    rate, heard = node.parameter('~rate', 1), []
+    rate.on_change(heard.append)
+    other = create(master, '/other')
+    changes = Changes(other.parameter(rate.name))
+    rate.close()
+    subscribers = ros_master._master.handler.reg_manager.param_subscribers
+    for value in 2, 3:
+        server.setParam(rate.name, value)
+        assert changes.next() == value
+        assert subscribers.get_apis(f'{rate.name}/') == [other.uri]
+        node.restart()
+    assert heard == []
+
+
 class Driver(Node):
     def start(self):
         super().start()

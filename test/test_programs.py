@@ -1,6 +1,8 @@
 """The programs that rosrun starts, pharos.testing, spin() and the Transcript."""
 import contextlib
+import os
 import re
+import shutil
 import signal
 import subprocess
 import threading
@@ -63,6 +65,13 @@ def test_missing_master_is_named(failed):
         assert code == 1
         assert NOWHERE.rstrip('/') in output
         assert 'Traceback' not in output
+
+
+def test_python_without_rospy_is_named():
+    with Program("import sys; sys.modules['rospy'] = None; import pharos", NOWHERE) as program:
+        assert program.wait() == 1
+        assert f'{PYTHON} has no rospy: ' in program.output
+        assert program.output.endswith('/usr/bin/python3\n')
 
 
 # -- the listings of the report, with a node in the turtle's place
@@ -269,6 +278,22 @@ def test_made_package_passes_its_tests(made):
         [PYTHON, '-m', 'pytest', '-q', 'test'], cwd=made, text=True, stdout=subprocess.PIPE
     )
     assert done.returncode == 0, done.stdout
+
+
+def test_made_package_tests_its_messages(made, tmp_path):
+    """They are in a devel space, as catkin_make writes it."""
+    package, devel = tmp_path / 'my_robot', tmp_path / 'devel' / 'my_robot'
+    shutil.copytree(made, package)
+    (devel / 'msg').mkdir(parents=True)
+    (devel / 'msg' / '__init__.py').write_text('from std_msgs.msg import String as Blob\n')
+    (devel / '__init__.py').write_text(
+        f'import sys\nfrom pkgutil import extend_path\nsys.path.insert(0, "{package}/src")\n'
+        '__path__ = extend_path(__path__, __name__)\n'
+    )
+    module = package / 'src' / 'my_robot' / 'camera.py'
+    module.write_text(f'from my_robot.msg import Blob\n{module.read_text()}')
+    environ = {**os.environ, 'PYTHONPATH': f'{devel.parent}:{os.environ["PYTHONPATH"]}'}
+    subprocess.run([PYTHON, '-m', 'pytest', '-q', 'test'], cwd=package, env=environ, check=True)
 
 
 def test_made_package_builds_and_runs(made, master):

@@ -6,7 +6,7 @@ import io
 import pathlib
 import shutil
 
-import genpy
+import genpy.dynamic
 import geometry_msgs.msg
 import pytest
 import std_msgs.msg
@@ -137,6 +137,16 @@ def test_definition_comes_before_shipped_type(peer):
     """In a process of its own, as it changes a type for good."""
     peer.run("import pharos; pharos.define_message('turtlesim/Velocity', 'float64 speed')")
     assert peer.value("message_class('turtlesim/Velocity').__slots__") == ['speed']
+
+
+def test_refused_package_has_its_types(package, tmp_path, peer):
+    """Its package.xml lacks what catkin asks for; in a process that looks into this path first."""
+    package('odd_msgs', 'msg/Leg.msg', 'Knee knee\n')
+    package('odd_msgs', 'msg/Knee.msg', 'float64 angle\n')
+    (tmp_path / 'odd_msgs' / 'package.xml').write_text('<package><name>odd_msgs</name></package>')
+    assert peer.value("message_class('odd_msgs/Leg')().knee.angle") == 0
+    with pytest.raises(RuntimeError, match='UnknownTypeError.*odd_msgs/Hip'):
+        peer.run("message_class('odd_msgs/Hip')")
 
 
 @pytest.mark.parametrize('find, define', [(message_class, 'message'), (service_class, 'service')])
@@ -330,6 +340,18 @@ def test_defined_type_goes_between_nodes(master):
     )
     message = box.next()
     assert (message.name, [each.length for each in message.legs]) == ('bob', [1, 2])
+
+
+def test_dynamic_class_is_filled_by_dicts(master):
+    nested = 'MSG: car_msgs/Wheel\nTyre tyre\n', 'MSG: car_msgs/Tyre\nint8 size\n'
+    text = f'\n{SEPARATOR}\n'.join(['Wheel front\nWheel[] wheels', *nested])
+    cls = genpy.dynamic.generate_dynamic('car_msgs/Car', text)['car_msgs/Car']
+    box, node = Mailbox(create(master, '/hears'), '/cars', cls), create(master, '/sends')
+    fields = {'front': {'tyre': {'size': 1}}, 'wheels': [{'tyre': {'size': 2}}, {}]}
+    node.send_to('/cars', cls, **fields)
+    node.output_channel('/cars', cls).send(fields)
+    for car in box.next(), box.next():
+        assert [wheel.tyre.size for wheel in [car.front, *car.wheels]] == [1, 2, 0]
 
 
 def test_class_is_given_for_its_name(master):

@@ -19,7 +19,7 @@ def taking(block, what, least, most):
         return None
     if not callable(block):
         raise TypeError(f'a {what} is a callable, not {block!r}')
-    if inspect.iscoroutinefunction(block):
+    if any(map(inspect.iscoroutinefunction, (block, getattr(block, '__call__', None)))):
         raise TypeError(
             f'a {what} runs in a thread, and cannot be async def: write def, and asyncio.run() in it'
         )

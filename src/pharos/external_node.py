@@ -86,7 +86,7 @@ class ExternalNode:
         """Return as text what it publishes, receives and offers, its peers, and how often."""
         from pharos.live.words import describe
 
-        return describe(self, seconds)
+        return describe(self.master, self.name, seconds)
 
     def shutdown(self) -> None:
         """Ask it to end, as rosnode kill does."""

@@ -85,6 +85,7 @@ class Node(Receiver):
     _run_class = Run
     _lifecycle = Lifecycle.NEW
     _run: Run
+    _failures = Failures()
     _is_beginning = False  # True while a start() runs after which delegates are let run
     _master: Master = None  # type: ignore[assignment]
 
@@ -311,7 +312,11 @@ class Node(Receiver):
 
         return told(self)
 
-    describe = ExternalNode.describe
+    def describe(self, seconds: float = 1.0) -> str:
+        """Return as text what it publishes, receives and offers, its peers, and how often."""
+        from pharos.live.words import describe
+
+        return describe(self._master, self._name, seconds)
 
     def __repr__(self):
         return f'<{type(self).__name__} {self._name} {self._lifecycle.value}>'
@@ -360,7 +365,7 @@ class Node(Receiver):
         """Sleep for some seconds of ROS time; the stop of the node ends it, and its soul."""
         with quiet_wait():
             self._check_running()
-            self._run.turns.release()  # a start() that waits lets delegates run
+            self._run.turns.pause()  # a start() that waits lets delegates run
             self._run.ros.sleep(seconds)
         if self._run.stopping.is_set() and here.node is self:
             raise NodeStoppedError(f'{self._name} stops, and this soul with it')
@@ -383,7 +388,7 @@ class Node(Receiver):
             while not run.stopping.is_set():
                 yield turn
                 turn += 1
-                run.turns.release()  # a start() that waits lets delegates run
+                run.turns.pause()  # a start() that waits lets delegates run
                 with quiet_wait():
                     rate.sleep()
 

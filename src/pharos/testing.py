@@ -130,7 +130,7 @@ def create_node(master: Master) -> Iterator[Callable[..., Any]]:
     yield create
     for node in nodes:
         node._end_now()
-    told = [f'{failure}\n{failure.traceback}' for node in nodes for failure in node.failures]
+    told = [f'{failure}\n{failure.traceback}' for node in nodes for failure in node._failures]
     if told and not _expects_failures:
         told.insert(0, 'blocks of its nodes failed (or say expect_failures()):')
         pytest.fail('\n'.join(told), False)

@@ -62,11 +62,18 @@ class Turns:
 
     def release(self):
         """Run what waits; for any thread."""
-        if self.is_held:
+        with _guard:
+            was_held = self.is_held
             self.is_held = False
+        if was_held:
             self.runner = None
             self._running.release()
             self.wake()
+
+    def pause(self):
+        """Release it if this is the thread that holds it, and is about to sleep."""
+        if self.runner == get_ident():
+            self.release()
 
     def run(self):
         """Run what waits. If another thread is in here, return: that one runs this, too."""

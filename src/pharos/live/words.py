@@ -56,14 +56,14 @@ class Description(str):
     __repr__ = str.__str__
 
 
-def describe(node, seconds):
+def describe(master, name, seconds):
     """Return a node in words; its rates are counted for so many seconds.
 
     :raises UnknownNodeError: if the master does not know the node
     """
-    before = snapshot.take(node.master)
+    before = snapshot.take(master)
     time.sleep(seconds)
-    now, name = snapshot.take(node.master), node.name
+    now = snapshot.take(master)
     if name not in now.nodes:
         raise UnknownNodeError(f'no node {name} is known at {now.master}: see rosnode list')
     seen, rates = now.nodes[name], now.rates_since(before)

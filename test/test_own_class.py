@@ -1,0 +1,230 @@
+"""Classes and blocks of users: their names, parameters, mistakes, and the order of their start."""
+import collections
+import concurrent.futures
+import functools
+import threading
+
+import pytest
+from std_msgs.msg import String
+
+from helpers import TIMEOUT, create, registrations
+from pharos import Node, NodeStoppedError, PharosError
+from pharos.testing import Mailbox, until
+
+STRING, TRIGGER = 'std_msgs/String', 'std_srvs/Trigger'
+NAMES = '''
+    abandon battery bridge buffer callback check_running client close config count data
+    delegate_runs enabled end_now error goal image init listener lock loop mission mode motor opened
+    parameters peer_name pose publish queue rate read_parameters refused remappings report reset
+    resolve run run_class sensor server setup shutdown souls speed state status step subscribe thread
+    tick timer told update
+'''.split()
+
+
+@pytest.fixture
+def sender(master):
+    return create(master, '/sender')
+
+
+@pytest.fixture
+def other(master):
+    return create(master, '/other')
+
+
+# -- names
+
+
+class Robot(Node):
+    own = {}  # attributes that it gives itself
+
+    def start(self):
+        super().start()
+        vars(self).update(self.own)
+        self.interested_in('/orders', STRING, delegate=self.obey)
+        self.serve('/ask', TRIGGER, lambda request: (True, 'yes'))
+        self.fork(lambda: self.send_to('/greetings', typed_as=STRING, data='hello'))
+
+    def obey(self, message):
+        if message.data == 'fail':
+            raise KeyError('an order')
+        self.send_to('/done', typed_as=STRING, data=message.data)
+
+
+calls = []  # of the robot's own methods
+METHODS = {name: lambda self, *_, name=name, **__: calls.append(name) for name in NAMES}
+ATTRIBUTES = {'own': dict.fromkeys(NAMES, 'of the robot')}
+PUBLIC = {'own': {'name': 'left', 'failures': 0, 'uri': 'rtsp://x', 'master': 'x', 'domain': 0}}
+
+
+@pytest.mark.parametrize('names', [METHODS, ATTRIBUTES, PUBLIC], ids='methods own public'.split())
+def test_robot_has_own_names(master, sender, other, names):
+    greetings, done = Mailbox(other, '/greetings', STRING), Mailbox(other, '/done', STRING)
+    robot = create(master, '/robot', type('Own', (Robot,), names))
+    for run in 'first', 'second':
+        assert greetings.next().data == 'hello'
+        for order in run, 'fail', run:
+            sender.send_to('/orders', data=order)
+        assert [done.next().data for _ in range(2)] == [run, run]
+        assert master.lookup_service('/ask').call().message == 'yes'
+        assert list(map(repr, robot.errors)) == ["KeyError('an order')"]
+        assert names is PUBLIC or robot.failures[0].message.data == 'fail'
+        assert master.node('/robot') is robot and robot.health().registered
+        robot.restart()
+    robot.stop()
+    assert registrations(master, '/robot') == [[], [], []]
+    assert calls == []
+    assert {name: getattr(robot, name) for name in robot.own} == robot.own
+
+
+@pytest.mark.parametrize('own', [{'report': print}, {'failures': 0}])
+def test_failing_delegate_silences_no_other(master, sender, other, own):
+    robot = create(master, '/robot', type('Robot', (Node,), own))
+    vars(robot).update(own)
+    robot.interested_in('/t', STRING, delegate=lambda message: 1 / 0)
+    box = Mailbox(other, '/t', STRING)
+    for number in range(20):
+        sender.send_to('/t', data=str(number))
+    assert [box.next().data for _ in range(20)] == [str(number) for number in range(20)]
+    until(lambda: robot.health().errors == 20)
+
+
+# -- the parameters of blocks
+
+
+class Camera(collections.deque):
+    def look(self, message, verbose=False):
+        self.append((message.data, verbose))
+
+
+DELEGATES = {
+    'channel': (lambda kept: lambda message, channel: kept.append(channel.topic), '/t'),
+    'loop': (lambda kept: [lambda message, i=i: kept.append(i) for i in range(3)][1], 1),
+    'method': (lambda kept: kept.look, ('x', False)),
+    'args': (lambda kept: lambda *values: kept.append(len(values)), 2),
+    'partial': (lambda kept: functools.partial(lambda i, message: kept.append(i), 1), 1),
+    'in C': (lambda kept: kept.append, String('x')),
+}
+
+
+@pytest.mark.parametrize('make, expected', DELEGATES.values(), ids=DELEGATES)
+def test_delegate_keeps_its_defaults(sender, other, make, expected):
+    kept = Camera()
+    other.interested_in('/t', STRING, delegate=make(kept))
+    sender.send_to('/t', data='x')
+    until(lambda: kept or other.errors)
+    assert list(kept) == [expected]
+
+
+def test_other_blocks_keep_defaults(master, other):
+    for soul, value in [
+        (lambda: 'none', 'none'),
+        (lambda number=7: number, 7),
+        (lambda me, number=7: (me, number), (other, 7)),
+        (lambda *values: len(values), 1),
+    ]:
+        other.soul = soul
+        assert other.execute() == value
+    other.serve('/ask', TRIGGER, lambda request, text='yes': (True, text))
+    assert master.lookup_service('/ask').call().message == 'yes'
+    rate, kept = other.parameter('~rate', 1), []
+    rate.on_change(lambda value, side='left': kept.append((value, side)))
+    rate.set(2)
+    assert kept == [(2, 'left')]
+
+
+# -- mistakes
+
+
+async def wait(*_):
+    pass
+
+
+Bare = type('Bare', (Node,), {})
+Named = type('Named', (Node,), {'__init__': lambda self: Node.__init__(self, 'named')})
+Wheeled = type('Wheeled', (Node,), {'__init__': lambda self, wheels=4: Node.__init__(self)})
+Superless = type('Superless', (Node,), {'start': lambda self: None})
+Early = type('Early', (Node,), {'start': lambda self: self.interested_in('/t', STRING)})
+MISTAKES = {
+    'call': (lambda m: Bare(), PharosError, r"create\(Bare, named='bare'\)"),
+    'argument': (lambda m: Bare('bare'), PharosError, r"create\(Bare, named='bare'\)"),
+    'name': (lambda m: create(m, '/n', Named), PharosError, r"'named'.*named=.*super"),
+    'anonymous': (lambda m: create(m, '/n', Bare, anonymous=True), PharosError, 'named='),
+    'keyword': (lambda m: create(m, '/n', Wheeled, anonymous=True), TypeError, 'named=anonymous'),
+    'no super': (lambda m: create(m, '/n', Superless), PharosError, 'super'),
+    'early': (lambda m: create(m, '/n', Early), NodeStoppedError, 'super'),
+    'soul': (lambda m: create(m, '/n', soul=wait), TypeError, 'async'),
+    'forked': (lambda m: create(m).fork(wait), TypeError, 'async'),
+    'delegate': (lambda m: create(m, '/n', delegate=wait), TypeError, 'async'),
+    'of channel': (lambda m: create(m).interested_in('/t', STRING, wait), TypeError, 'async'),
+    'of service': (lambda m: create(m).serve('/ask', TRIGGER, wait), TypeError, 'async'),
+    'of change': (lambda m: create(m).parameter('~x').on_change(wait), TypeError, 'async'),
+}
+
+
+@pytest.mark.parametrize('use, error, said', MISTAKES.values(), ids=MISTAKES)
+def test_mistake_says_what_to_write(master, use, error, said):
+    with pytest.raises(error, match=said):
+        use(master)
+    state = repr(master.system_state())
+    assert [name for name in ('/n', '/t', '/ask') if repr(name) in state] == []
+
+
+# -- the order of a start
+
+
+def test_delegate_waits_for_start(master, sender, other):
+    class Filter(Node):
+        def start(self):
+            super().start()
+            self.interested_in('/map', STRING, delegate=self.filter)
+            self.output_channel('/more', STRING)
+            self.filtered = self.output_channel('/filtered', STRING)
+
+        def filter(self, message):
+            self.filtered.send(data=message.data)
+
+    box = Mailbox(other, '/filtered', STRING)
+    sender.output_channel('/map', STRING, latch=True).send(data='map')
+    node = create(master, '/filter', Filter)
+    for _ in range(5):
+        assert box.next().data == 'map'
+        assert node.errors == []
+        node.restart()
+
+
+WAITS = {
+    'sleep': lambda me: me.sleep(0.001),
+    'every': lambda me: any(me.kept for _ in me.every(0.001)),
+    'wait_for_message': lambda me: me.kept.append(me.wait_for_message('/map', STRING, TIMEOUT)),
+}
+
+
+@pytest.mark.parametrize('wait', WAITS.values(), ids=WAITS)
+def test_start_waits_for_message(master, sender, wait):
+    class Waiter(Node):
+        def start(self):
+            super().start()
+            self.kept = []
+            self.interested_in('/map', STRING, delegate=self.kept.append)
+            while not self.kept:
+                wait(self)
+
+    sender.output_channel('/map', STRING, latch=True).send(data='map')
+    node = create(master, '/waiter', Waiter)
+    node.restart()
+    assert node.kept[0].data == 'map'
+
+
+def test_first_sends_open_one_channel(sender, other):
+    barrier, topics = threading.Barrier(2), [f'/t{number}' for number in range(10)]
+    boxes = [Mailbox(other, topic, STRING) for topic in topics]
+
+    def send(text):
+        for topic in topics:
+            barrier.wait(TIMEOUT)
+            sender.send_to(topic, typed_as=STRING, data=text)
+
+    with concurrent.futures.ThreadPoolExecutor(2) as pool:
+        list(pool.map(send, ['one', 'two']))
+    assert sorted(channel.topic for channel in sender.channels) == topics
+    assert [sorted(box.next().data for _ in 'ab') for box in boxes] == 10 * [['one', 'two']]
