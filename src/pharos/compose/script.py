@@ -27,7 +27,7 @@ from pharos.node import Lifecycle, Node
 from pharos.private_rospy import loader
 from pharos.private_rospy.loader import Shim
 from pharos.private_rospy.patches import patch
-from pharos.private_rospy.run import PAUSE, STOP_LIMIT, Run, join
+from pharos.private_rospy.run import STOP_LIMIT, Run, join
 from pharos.ros_process import find_program
 
 SIGNAL_PATIENCE = 0.2  # seconds that a signal waits for the main thread
@@ -126,9 +126,9 @@ class ScriptRun(Run):
     def _print(self, *values, file=None, **options):
         print(*values, file=file or self.modules.modules['sys'].stdout, **options)
 
-    def print_error(self, error):
+    def print_error(self, error, title=''):
         """Print a traceback, as Python does at the end of a program or thread."""
-        text = ''.join(traceback.format_exception(error))
+        text = title + ''.join(traceback.format_exception(error))
         self.modules.modules['sys'].stderr.write(text)
 
     def start(self):
@@ -172,8 +172,9 @@ class ScriptRun(Run):
         try:
             target()
         except Exception as error:
-            self.print_error(error)
-            self.node._keep_failure(error, target.__self__.name)
+            name = target.__self__.name
+            self.print_error(error, f'Exception in thread {name}:\n')
+            self.node._keep_failure(error, name)
 
     def run_main(self, code):
         """Run the program, and what Python does at its end."""
@@ -223,7 +224,7 @@ class ScriptRun(Run):
     def _wait_for_threads(self):
         """Wait for the threads that are no daemons; a signal ends this, as with Python."""
         with contextlib.suppress(KeyboardInterrupt, SystemExit):
-            while self.awaited and not self.is_over:
+            while self.awaited and not self.over.is_set():
                 self.checkpoint()
                 self.awaited[0].join(0.02)
                 self.awaited = [thread for thread in self.awaited if thread.is_alive()]
@@ -239,10 +240,10 @@ class ScriptRun(Run):
     def sleep(self, seconds):
         """Stand in for ``time.sleep``: a signal ends it; what comes after the end sleeps as usual."""
         if threading.current_thread() is not self.main:
-            if self.stopping.is_set() and not self.is_over:
-                time.sleep(min(seconds, PAUSE))
-            else:
+            if not self.stopping.is_set():
                 super().sleep(seconds)
+            elif self.over.wait(seconds):
+                raise SystemExit
         elif self.stopping.is_set() or seconds <= 0:
             time.sleep(seconds)
         else:
@@ -304,6 +305,8 @@ class ScriptRun(Run):
             try:
                 hook()
             except (Exception, SystemExit) as error:
+                if error is self.wanted:  # of exit_now()
+                    break
                 self.print_error(error)
                 self.node._keep_failure(error, hook)
         self.shut_rospy_down(STOP_LIMIT)
@@ -333,9 +336,10 @@ class ScriptRun(Run):
                 self.ros.logwarn(f'left behind, since it did not end in time: {self.node.path}')
                 self.raise_in_main(SystemExit())
                 self.node._souls.pop(self.main)
+                self.threads.discard(self.main)
         self.signal_shutdown('stop')
         self.end_created()
-        self.is_over = True  # what is left sleeps no more
+        self.over.set()  # threads that are left end at their next sleep
         super().stop(timeout)
 
 

@@ -106,13 +106,14 @@ class Turns:
             self.forget()
 
     def call(self, block):
-        """Run ``block()`` between two callbacks."""
+        """Run ``block()`` between two callbacks, unless this is closed."""
         if self.runner == get_ident():
             return block()
         with self._running:
             self.runner = get_ident()
             try:
-                block()
+                if not self.closed:
+                    block()
             finally:
                 self.runner = None
         self.wake()
@@ -134,7 +135,10 @@ class Turns:
         """Forget what has not run, and wait for the callback that runs; True if it ended in time."""
         self.closed = True
         self.release()
-        ended = self.runner == get_ident() or self._running.acquire(True, timeout)
+        ended = self.runner == get_ident()
+        if not ended and self._running.acquire(True, timeout):
+            self._running.release()  # call() may wait for it
+            ended = True
         self.jobs.clear()
         if ended:  # else it still counts, so that its blocked worker is replaced
             self.forget()
@@ -183,8 +187,7 @@ class OwnTurns(Turns):
     def call(self, block):
         """Run ``block()`` between two callbacks."""
         self._wait_for_begin()
-        if not self.closed:
-            super().call(block)
+        super().call(block)
 
     def _wait_for_begin(self):
         sleep(max(0.0, self._begin - perf_counter()))

@@ -134,9 +134,9 @@ def _is_generated(name):
 def is_private(name):
     """True if each node has a copy of the module."""
     top = name.partition('.')[0]
-    if top in SHARED or _is_generated(name):
-        return top in PRIVATE
-    return _reaches_rospy(top)
+    if top in PRIVATE:
+        return True
+    return top not in SHARED and not _is_generated(name) and _reaches_rospy(top)
 
 
 #: class of a private module -> its PrivateModules, as a weak reference

@@ -25,7 +25,6 @@ from pharos.private_rospy.transport import runs
 MASTER_LIMIT = 5.0  # seconds for each question to a master or node
 STOP_LIMIT = 2.0  # seconds that a stop waits for threads of rospy
 HOLD_LIMIT = 2.0  # seconds that delegates wait for the end of start(), which may wait for them
-PAUSE = 0.01  # seconds that a thread of a script sleeps at most once its node stops
 RETRY_DELAY = 1.0  # seconds until the next attempt to connect
 WATCH_PERIOD = 0.25  # seconds between two looks; each fourth is at the masters, too
 UNREACHABLE = OSError, xmlrpc_client.Error, HTTPException, ExpatError
@@ -63,12 +62,12 @@ class Run:
     """
 
     uri = ''
-    is_over = False  # True after the stop
 
     def __init__(self, node):
         self.node, self.name = node, node._name
         self.master_url = node._master.url
         self.stopping = threading.Event()
+        self.over = threading.Event()  # set when threads that are left have nothing more to do
         self.threads = WeakSet()
         self.sockets, self.calls = WeakSet(), WeakSet()
         self.deadlines = {}  # socket of a client that is to say something -> until when
@@ -130,7 +129,7 @@ class Run:
 
     def sleep(self, seconds):
         """Stand in for ``time.sleep``: the stop of the node ends it."""
-        if self.is_over:
+        if self.over.is_set():
             raise SystemExit  # in a thread that was left behind
         if seconds <= 0 or not self.stopping.wait(seconds):
             time.sleep(0)
@@ -313,7 +312,7 @@ class Run:
         for sock in list(self.sockets):
             transport.shut(sock)
         join(set(self.threads) - set(self.node._souls), STOP_LIMIT)
-        self.is_over = True
+        self.over.set()
         log = self.modules.load('logging')
         log.disable()  # or a thread that is late opens the file again
         log.shutdown()
