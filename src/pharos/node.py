@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import enum
 import functools
+import re
 import threading
 import types
 from contextlib import suppress
@@ -144,7 +145,8 @@ class Node(Receiver):
                 raise PharosError(f'{self._name} is {self._lifecycle.value} already')
             self._failures = self.failures = Failures()
             self._souls = {}
-            run = self._run_class(self)  # raises if a script cannot be read
+            self._lifecycle = Lifecycle.STOPPED  # it stays so if a script cannot be read
+            run = self._run_class(self)
             self._run = run
             self._lifecycle = Lifecycle.STARTING
             nodes.append(self)
@@ -665,6 +667,13 @@ def check_class(node_class):
     """Raise TypeError unless it is a class of nodes."""
     if not (isinstance(node_class, type) and issubclass(node_class, Node)):
         raise TypeError(f'a node is made of a subclass of Node, not {node_class!r}')
+    inside = {*vars(Node), *Node.__annotations__, '_name', '_opened', '_souls', '_life', '_end'}
+    for cls in node_class.__mro__[: node_class.__mro__.index(Node)]:
+        taken = [name for name in vars(cls) if name in inside and re.match('_[a-z]', name)]
+        if taken and not cls.__module__.startswith('pharos.'):
+            raise TypeError(
+                f'{cls.__name__} has {", ".join(taken)}, as Node has: choose another name'
+            )
 
 
 class BlockNode(Node):

@@ -52,6 +52,7 @@ class ScriptRun(Run):
     has_ended = False  # True when its main thread has nothing left to run
 
     def __init__(self, node):
+        node.exit_code = 1  # if it cannot be read
         code = _compiled(node.path)
         self.exits, self.thread_exits, self.awaited, self.handlers = [], [], [], {}
         self.created = []  # nodes that the program has created with pharos
@@ -102,8 +103,8 @@ class ScriptRun(Run):
         found['os']._exit = self.exit_now
         found['asyncio'] = _Asyncio(self)
         found['pharos'] = _Pharos(self)
-        for name in 'stdout', 'stderr':
-            vars(found['sys'])[name] = NamedLines(getattr(sys, f'__{name}__'), self)
+        self.streams = NamedLines(sys.__stdout__, self), NamedLines(sys.__stderr__, self)
+        found['sys'].stdout, found['sys'].stderr = self.streams
         # a line has the node's name in front
         self.environ['ROSCONSOLE_FORMAT'] = os.environ.get(
             'ROSCONSOLE_FORMAT', '[${severity}] [${time}]: ${message}'
@@ -128,8 +129,7 @@ class ScriptRun(Run):
 
     def print_error(self, error, title=''):
         """Print a traceback, as Python does at the end of a program or thread."""
-        text = title + ''.join(traceback.format_exception(error))
-        self.modules.modules['sys'].stderr.write(text)
+        self.streams[1].write(title + ''.join(traceback.format_exception(error)))
 
     def start(self):
         """Run the program until its node is registered, or it has ended, or ``init_timeout``.
@@ -196,22 +196,25 @@ class ScriptRun(Run):
                 self.error = error
             else:
                 self.node._keep_failure(error, self.node.path)
-        self._run_all(self.thread_exits)
-        self._wait_for_threads()
-        self._run_all(self.exits)  # rospy's own was the first to be registered, and comes last
-        for name in 'stdout', 'stderr':
-            getattr(self.modules.modules['sys'], name).flush()
-        self.node.exit_code = status if self.wanted is None else self._status(self.wanted)
-        self.has_ended = True
-        if not self.is_stopping:
-            self.end_node()
+        try:
+            self._run_all(self.thread_exits)
+            self._wait_for_threads()
+            self._run_all(self.exits)  # rospy's own was the first to be registered, and comes last
+        finally:
+            for stream in self.streams:
+                stream.flush()
+            if self.node._run is self:  # else a late one, and the node runs again
+                self.node.exit_code = status if self.wanted is None else self._status(self.wanted)
+            self.has_ended = True
+            if not self.is_stopping:
+                self.end_node()
 
     def _run_all(self, functions):
         while functions:
             function = functions.pop()
             try:
                 function()
-            except Exception as error:
+            except (Exception, SystemExit, KeyboardInterrupt) as error:
                 self.print_error(error)
                 self.node._keep_failure(error, function)
 
@@ -277,6 +280,14 @@ class ScriptRun(Run):
             return [signal.SIGINT, signal.SIGTERM]
         return [signal.SIGINT]
 
+    def _handle_beside(self):
+        """Have another thread handle the signal, and return the threads that do."""
+        try:
+            return [self.start_thread(self.handle_signal_beside)]
+        except RuntimeError:  # the interpreter ends, and starts none
+            self.handle_signal_beside()
+            return []
+
     def handle_signal_beside(self):
         """Do so while the main thread stands still, or is busy with something else."""
         try:
@@ -331,7 +342,7 @@ class ScriptRun(Run):
             self.signal_waits.set()
             threads = [self.main]
             if not self.signal_taken.wait(SIGNAL_PATIENCE):
-                threads.append(self.start_thread(self.handle_signal_beside))
+                threads += self._handle_beside()
             if join(threads, timeout):
                 self.ros.logwarn(f'left behind, since it did not end in time: {self.node.path}')
                 self.raise_in_main(SystemExit())
@@ -399,7 +410,6 @@ class NamedLines:
         *lines, self._begun = (self._begun + text).split('\n')
         if lines:
             self._write('\n'.join(lines) + '\n')
-            self._stream.flush()
         return len(text)
 
     def flush(self):
@@ -407,14 +417,17 @@ class NamedLines:
         if self._begun:
             self._write(self._begun)
             self._begun = ''
-        self._stream.flush()
 
     def _write(self, text):
         name = f'[{self._run.name}] '
         named = ''.join(f'{name}{line}' for line in text.splitlines(keepends=True))
         if self._is_within:
             named = named.removeprefix(name)
-        self._stream.write(named)
+        with contextlib.suppress(
+            OSError, ValueError
+        ):  # whoever reads it has gone: go on, and stop motors
+            self._stream.write(named)
+            self._stream.flush()
         self._is_within = not text.endswith('\n')
 
 
@@ -483,9 +496,10 @@ def _compiled(path):
 _PYTHON = re.compile(r'#!.*\bpython(3(\.\d+)?)?\b')
 #: what shows windows, or takes signals, and so needs the main thread of a process
 _NEEDS_MAIN = re.compile(
-    r'^[ \t]*(?:import|from)[ \t]+(?:tkinter|PyQt\d|PySide\d|python_qt_binding|gtk|wx|pygame)\b'
-    r'|\bgi\.require_version\(.Gtk|\bcv2\.(?:imshow|namedWindow)\(|\b(?:plt|pyplot)\.show\('
-    r'|\.add_signal_handler\(',
+    r'^[ \t]*(?:import|from)[ \t]+(?:tkinter|PyQt\d|PySide\d|python_qt_binding'
+    r'|rqt_\w+|qt_gui|gtk|wx|pygame|turtle)\b'
+    r'|\bgi\.require_version\(.Gtk|\bcv2\.(?:imshow|namedWindow)\(|\b(?:plt|pyplot)\.(?:show|pause)\('
+    r'|\.add_signal_handler\(|\bsignal\.(?:alarm|setitimer|pause)\(',
     re.MULTILINE,
 )
 _IMPORT = re.compile(

@@ -106,7 +106,7 @@ class Turns:
             self.forget()
 
     def call(self, block):
-        """Run ``block()`` between two callbacks, unless this is closed."""
+        """Run ``block()`` as if it were a callback, unless this is closed."""
         if self.runner == get_ident():
             return block()
         with self._running:
@@ -116,7 +116,10 @@ class Turns:
                     block()
             finally:
                 self.runner = None
-        self.wake()
+        if self.closed:  # meanwhile
+            self.forget()
+        else:
+            self.wake()
 
     def schedule(self):
         """Have a worker take it; True if one of the pool is to be woken for that."""
@@ -300,7 +303,7 @@ class _Sentry(_Thread):
                 if _ready:
                     _wake_worker()
             self.is_looking = False
-            if _turns:
+            if _turns and not self.is_needed:
                 self.rest()
         if _sentry is self:
             _sentry = None

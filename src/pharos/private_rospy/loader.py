@@ -154,14 +154,14 @@ def _private_module(thing):
         names = getattr(thing, 'f_globals', None) or getattr(thing, '__globals__', None) or {}
         name = names.get('__name__')
         own_builtins = names.get('__builtins__')
-        is_private = type(own_builtins) is dict  # of others it is a module
-        owner = getattr(own_builtins.get('__import__'), '__self__', None) if is_private else None
+        has_dict = type(own_builtins) is dict  # that of __main__ is a module
+        owner = getattr(own_builtins.get('__import__'), '__self__', None) if has_dict else None
     return owner.modules.get(name) if isinstance(owner, PrivateModules) else None
 
 
-def _getmodule(thing, filename=None, original=inspect.getmodule):
+def _getmodule(thing, _filename=None, original=inspect.getmodule):
     """Find private modules, too: inspect looks through all of sys.modules, in vain, each time."""
-    return _private_module(thing) or original(thing, filename)
+    return _private_module(thing) or original(thing, _filename)
 
 
 def _getfile(thing, original=inspect.getfile):
@@ -177,11 +177,10 @@ class PrivateModules:
     """A set of private modules.
 
     :param substitutes: what private modules import under some names of Python's modules
-    :param path: the folders that are searched, as ``sys.path``
     :param patch: ``patch(module)`` is called right after the code of each private module
     """
 
-    def __init__(self, substitutes, path, patch):
+    def __init__(self, substitutes, patch):
         self.modules = {
             **substitutes,
             # one for all, so that ``except rospy.ROSException`` catches every node's
@@ -192,7 +191,6 @@ class PrivateModules:
         self.modules['importlib'] = Shim(importlib, import_module=self._import_module)
         self._patch = patch
         self._lock = threading.RLock()
-        self.path = path
         self.folder = None  # of the program, if this is one
         self.builtins = {
             **vars(builtins),
@@ -200,14 +198,36 @@ class PrivateModules:
             '__build_class__': self._build_class,
         }
 
+    @property
+    def path(self):
+        """The folders that are searched, as the program's ``sys.path`` has them now."""
+        return self.modules['sys'].path
+
     def _is_private(self, name):
-        """True also for what lies in folders of sys.path that the process does not search."""
+        """True also for what lies beside the program, or in folders that it has put on sys.path."""
         if _is_generated(name):
             return False
-        if is_private(name):
+        top = name.partition('.')[0]
+        if is_private(name) or self.folder and PathFinder.find_spec(top, [self.folder]):
             return True
-        folders = [each for each in self.path if each == self.folder or each not in sys.path]
-        return PathFinder.find_spec(name.partition('.')[0], folders) is not None
+        return top not in SHARED and self._is_added(top)
+
+    def _is_added(self, top):
+        """True if a module lies in a folder that the process does not search."""
+        added = [folder for folder in self.path if folder not in sys.path]
+        spec = PathFinder.find_spec(top, [*self.path, *sys.path]) if added else None
+        if spec is None:
+            return False
+        places = spec.submodule_search_locations or [spec.origin]
+        folder = os.path.dirname(places[0])
+        if folder not in added:
+            return False
+        if (
+            os.path.basename(folder) == 'site-packages'
+        ):  # such as torch, which cannot be loaded twice
+            sys.path.append(folder)
+            return False
+        return True
 
     def load(self, name):
         """Return the module of that name, as private modules import it."""

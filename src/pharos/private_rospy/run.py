@@ -89,7 +89,7 @@ class Run:
         self.argv = [self.base, *node._remappings]
         self.path = own_path()
         patch = functools.partial(patches.apply, run=self)
-        self.modules = PrivateModules(self.substitutes(), self.path, patch)
+        self.modules = PrivateModules(self.substitutes(), patch)
         self.ros = self.modules.load('rospy')
         self.core = self.ros.core
         registration = self.modules.load('rospy.impl.registration')

@@ -253,11 +253,13 @@ class PlainInbox(Inbox):
 
     def most(self, size):
         """Let as many wait as with processes: in the queues of publishers, and in sockets."""
-        links = links_of(self.subscription.connections)
-        waiting = [link.publisher.queue_size for link in links]
-        if None in waiting:  # such a publisher waits for the socket, and loses nothing
-            return super().most(size)
-        return sum(waiting) + max(1, min(SOCKET_BYTES, self.queue_bytes) // size)
+        connections = self.subscription.connections
+        links = links_of(connections)
+        sizes = [link.publisher.queue_size for link in links]
+        is_bounded = all(sizes) and len(links) == len(connections)
+        if self.queue_size != INFINITE or not sizes or not is_bounded:
+            return super().most(size)  # nothing is lost between processes
+        return sum(sizes) + max(1, min(SOCKET_BYTES, self.queue_bytes) // size)
 
 
 class SubscriptionOverlay:

@@ -1,0 +1,575 @@
+"""Programs in one process do what each of them does in a process of its own."""
+import contextlib
+import io
+import itertools
+import os
+import pathlib
+import shutil
+import signal
+import textwrap
+import threading
+import time
+
+import pytest
+
+import pharos
+from helpers import PYTHON, TIMEOUT, Program, create
+from pharos.testing import Mailbox, until
+
+ROBOT = pathlib.Path(__file__).parent / 'robot'
+COMPOSE = ['rosrun', 'pharos', 'compose']
+STRING = 'std_msgs/String'
+HEAD = '''#!/usr/bin/python3
+import asyncio, atexit, inspect, os, pharos, rospy, signal, sys, threading, time
+from std_msgs.msg import String
+SAID = os.path.dirname(__file__) + '/said'
+def say(text):
+    with open(SAID, 'a') as file:
+        print(text, file=file)
+'''
+INIT = "rospy.init_node('program')\n"
+SPIN = INIT + "say('ready')\nrospy.spin()\n"
+DRIVE = '''
+from geometry_msgs.msg import Twist, Vector3
+def go(speed):
+    out.publish(Twist(linear=Vector3(speed, 0, 0)))
+def halt():
+    say(threading.current_thread() is threading.main_thread())
+    go(0.0)
+    {hook}
+rospy.init_node('program', disable_signals={disable})
+out = rospy.Publisher('/cmd_vel', Twist, queue_size=10)
+{disable} or rospy.on_shutdown(halt)
+try:
+    while not rospy.is_shutdown():
+        go(0.2)
+        {wait}
+        go(0.2)
+except rospy.ROSInterruptException: pass
+except KeyboardInterrupt: {disable} and halt()
+say('main')
+'''
+WORK = 'end = time.monotonic() + 1\n        while time.monotonic() < end: pass'
+DRIVES = {
+    'hook': DRIVE.format(hook='', wait='rospy.Rate(100).sleep()', disable=False),
+    'long hook': DRIVE.format(hook='rospy.sleep(0.3)', wait='rospy.sleep(0.01)', disable=False),
+    'interrupt': DRIVE.format(hook='', wait='while not time.sleep(0.01): go(0.2)', disable=True),
+    'busy': DRIVE.format(hook='', wait=WORK, disable=False),
+}
+TIMED = '''
+def measure(where):
+    begin = time.monotonic()
+    time.sleep(0.3)
+    say(f'{where} {time.monotonic() - begin > 0.29}')
+atexit.register(measure, 'atexit')
+rospy.init_node('program')
+rospy.on_shutdown(lambda: measure('hook'))
+say('ready')
+rospy.spin()
+measure('main')
+'''
+SERVE = '''
+import http.server
+server = http.server.HTTPServer(('127.0.0.1', 0), http.server.BaseHTTPRequestHandler)
+rospy.init_node('program', disable_signals=True)
+try:
+    say('ready')
+    server.serve_forever()
+except KeyboardInterrupt: say('interrupted')
+finally: server.server_close()
+'''
+QUIET = "rospy.init_node('program', disable_signals=True)\n"
+BYE = "def bye(number, frame):\n    say('handler')\n    sys.exit(7)\n"
+SET = 'signal.signal(signal.SIGINT, bye)\n'
+FOREVER = "say('ready')\nwhile True: time.sleep(0.01)\n"
+POLL = 'def poll():\n    while True: time.sleep(0.05)\n'
+STOPS = {
+    'sleeps': (TIMED, ['hook True', 'main True', 'atexit True'], 0),
+    'server': (SERVE, ['interrupted'], 0),
+    'handler after': (BYE + INIT + SET + FOREVER, ['handler'], 7),
+    'handler before': (BYE + SET + QUIET + FOREVER, ['handler'], 7),
+    'daemon': (POLL + 'threading.Thread(target=poll, daemon=True).start()\n' + SPIN, [], 0),
+}
+FAIL = INIT + 'def fail(event=None): raise ValueError("in vain")\n'
+FAILS = [
+    'rospy.on_shutdown(fail)',
+    'threading.Thread(target=fail).start()',
+    'rospy.Timer(rospy.Duration(0.01), fail, oneshot=True)',
+]
+CLOSE = '''
+def close():
+    say('closing')
+    time.sleep({})
+    say('closed')
+    time.sleep({})
+'''
+SLOW_NODE = '''
+class Slow(pharos.Node):
+    def stop(self):
+        close()
+        super().stop()
+pharos.Master().create(Slow, 'program')
+say('ready')
+pharos.spin()
+'''
+SLOW = {
+    'script': ([*COMPOSE, '--script'], f'{CLOSE}rospy.on_shutdown(close)\n{SPIN}'),
+    'program': ([PYTHON], CLOSE + SLOW_NODE),
+}
+ONCE = '''
+got = threading.Event()
+rospy.Subscriber('/camera', String, lambda message: got.set())
+got.wait()
+say('got')
+'''
+IDIOMS = 'inspect asyncio argparse star_import stdout subprocess rosparam message_filters'.split()
+VALUES = 'class Pose:', 42, 'idioms', '/idioms', 'kept\n', 'hello\n', 7, True
+HELPER = 'import inspect, rospy\nclass Lonely: pass\ndef look(): return inspect.stack()[0]\n'
+FINDS = [
+    ('inspect.getfile(Empty) == __file__ == inspect.stack()[0].filename', 'True'),
+    ('inspect.getsource(Empty)', 'class Empty: pass'),
+    ('inspect.getmodule(Empty) is sys.modules["__main__"]', 'True'),
+    ('inspect.getmodule(inspect.stack()[0].frame).__name__', '__main__'),
+    ('inspect.getfile(helper.Lonely) == helper.__file__ == helper.look().filename', 'True'),
+    ('inspect.getsource(helper.Lonely)', 'class Lonely: pass'),
+    ('inspect.getmodule(helper.Lonely) is helper', 'True'),
+    ('inspect.getmodule(helper.look().frame) is helper', 'True'),
+    ('asyncio.get_event_loop().run_until_complete(answer())', '42'),
+]
+FOLDERS = [
+    "sys.path.append(os.path.join(os.path.dirname(__file__), '..', 'lib'))",
+    "sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)) + '/../lib')",
+    "import rospkg; sys.path.append(rospkg.RosPack().get_path('bench') + '/lib')",
+]
+TEXTS = {
+    'early': "def read(): open('/no/such.yaml')\nread()",
+    'ticks': f'{FAIL}{FAILS[1]}\n{FAILS[2]}\nrospy.spin()',
+    'dots': INIT + "sys.stdout.write('half'); sys.stdout.flush(); rospy.spin()",
+    'ends': INIT + "sys.stderr.write('last words')",
+    'window': f'def show():\n    import tkinter\n{INIT}rospy.spin()',
+}
+RESPAWNED = '<node pkg="bench" type="dies" name="dies" respawn="true"/>'
+SHOWN = [
+    '/ticks starts',
+    f'bench/early", line {HEAD.count(chr(10)) + 1}, in read',
+    "[/early] FileNotFoundError: [Errno 2] No such file or directory: '/no/such.yaml'",
+    '/window runs in a process of its own: it has',
+    '[/dots] half',
+    '[/ends] last words',
+    '/dies has ended, with exit code 4',
+    '/dies comes back',
+]
+WINDOWS = [
+    ('cv2.imshow("x", image)', '', 'imshow'),
+    ('from tkinter import Tk', '', 'tkinter'),
+    ('loop.add_signal_handler(2, end)', '', 'add_signal_handler'),
+    ('pass  # cv2.imshow("x", image)', '', ''),
+    ('import helper', 'def show(x):\n    cv2.imshow("x", x)\n', 'imshow'),
+    ('import helper', '# cv2.imshow("x", x)\n', ''),
+]
+OWN = '''
+class Talker(pharos.Node):
+    def start(self):
+        super().start()
+        gain = self.parameter('~gain', 0).value
+        self.output_channel('words', 'std_msgs/String', latch=True).send(data=str(gain))
+master = pharos.Master()
+one = master.create(Talker, 'one', argv=sys.argv)
+two = master.create(pharos.BlockNode, 'two', argv=sys.argv)
+two.interested_in('/end', 'std_msgs/String', lambda message: [one.stop(), two.stop()])
+say('ready')
+pharos.spin()
+say('over')
+'''
+GROUP = '''<group ns="rig"><remap from="words" to="/speech"/><node pkg="bench" type="program"
+name="boss" respawn="true"><param name="gain" value="7"/></node></group>'''
+
+
+class Bench:
+    """A package of scripts, which tell the test by ``say(text)`` what they do."""
+
+    def __init__(self, folder, master):
+        self.folder, self.master = folder, master
+        self.write('<package><name>bench</name></package>', 'package.xml', '')
+
+    def write(self, text, name='program', head=HEAD):
+        """Write a script, or a file without a head; returns its path."""
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(head + textwrap.dedent(text))
+        path.chmod(0o755)
+        return str(path)
+
+    def load(self, text, **options):
+        """Load a script; the fixture of the master stops it."""
+        return self.master.load(self.write(text), **options)
+
+    @contextlib.contextmanager
+    def program(self, *words):
+        """Run rosrun pharos compose; Ctrl-C ends it."""
+        with Program([*COMPOSE, *words], self.master.url) as running:
+            try:
+                yield running
+            finally:
+                end(running)
+
+    def launch_file(self, xml='', **texts):
+        """Write a launch file, with a node for each of these scripts; returns its path."""
+        for name, text in texts.items():
+            self.write(text.replace("'program'", repr(name)), name)
+            xml += f'<node pkg="bench" type="{name}" name="{name}"/>'
+        return self.write(f'<launch>{xml}</launch>', 'a.launch', '')
+
+    def said(self):
+        """Return the lines that the scripts have said."""
+        file = self.folder / 'said'
+        return file.read_text().splitlines() if file.exists() else []
+
+
+@pytest.fixture
+def bench(master, tmp_path, monkeypatch):
+    """A Bench; ROS finds it and the package robot."""
+    shutil.copytree(ROBOT, tmp_path / 'robot', ignore=shutil.ignore_patterns('CATKIN_IGNORE'))
+    paths = [str(tmp_path), os.environ.get('ROS_PACKAGE_PATH', ''), '/usr/share']
+    monkeypatch.setenv('ROS_PACKAGE_PATH', os.pathsep.join(paths))
+    monkeypatch.setenv('ROS_HOME', str(tmp_path / 'home'))
+    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
+    return Bench(tmp_path / 'bench', master)
+
+
+def end(running):
+    """Press Ctrl-C if it runs, and return the exit code."""
+    if running.poll() is None:
+        running.signal(signal.SIGINT)
+    return running.wait()
+
+
+@pytest.mark.parametrize('way', ['Ctrl-C', 'stop', 'kill'])
+@pytest.mark.parametrize('drive', DRIVES)
+def test_robot_stands_at_end(master, peer, bench, drive, way):
+    """The base, another process, hears the zero last."""
+    peer.hear('/cmd_vel', 'geometry_msgs/Twist')
+    with contextlib.ExitStack() as stack:
+        path = bench.write(DRIVES[drive])
+        if way == 'Ctrl-C':
+            stack.enter_context(bench.program('--script', path))
+        else:
+            stack.callback(master.load(path).stop)
+        assert peer.heard('/cmd_vel')[-1].linear.x == 0.2
+        if way == 'kill':
+            with Program(['rosnode', 'kill', '/program'], master.url):
+                until(lambda: not master.own_nodes())
+    until(lambda: not peer.value('subscribers[0].get_num_connections()'))
+    assert peer.heard('/cmd_vel')[-1].linear.x == 0.0
+    assert bench.said()[-1] == 'main'
+    assert drive == 'busy' or bench.said()[0] == 'True'  # in the main thread
+
+
+# the end of a daemon thread is a SystemExit, which pytest takes for an error
+@pytest.mark.filterwarnings('ignore::pytest.PytestUnhandledThreadExceptionWarning')
+@pytest.mark.parametrize('text, lines, code', STOPS.values(), ids=STOPS)
+def test_stop_does_as_signal(bench, text, lines, code):
+    script = bench.load(text)
+    until(lambda: bench.said() == ['ready'])
+    begin = time.monotonic()
+    script.stop()
+    assert (bench.said()[1:], script.exit_code) == (lines, code)
+    assert time.monotonic() - begin < script.stop_timeout / 2
+
+
+@pytest.mark.parametrize('line', FAILS)
+def test_error_beside_main_is_failure(bench, line):
+    script = bench.load(f'{FAIL}{line}\nrospy.spin()')
+    until(lambda: script.failures or 'shutdown' in line)
+    script.stop()
+    assert [str(error) for error in script.errors] == ['in vain']
+
+
+def test_shutdown_in_callback_runs_hooks(bench):
+    text = '''
+        def shut_down(message):
+            rospy.signal_shutdown('enough')
+            say('returned')
+        rospy.init_node('program')
+        rospy.on_shutdown(lambda: say('hook'))
+        rospy.Subscriber('/words', String, shut_down)
+        rospy.Publisher('/words', String, queue_size=1, latch=True).publish('x')
+        rospy.spin()
+        '''
+    assert bench.load(text).wait(TIMEOUT) == 0
+    assert bench.said() == ['hook', 'returned']
+
+
+@pytest.mark.parametrize('last', ['os._exit(6)', 'exit(6)', 'quit(6)', 'sys.exit(6)'])
+def test_exit_ends_one_script(master, bench, monkeypatch, last):
+    """Its neighbour can still read the standard input."""
+    monkeypatch.setattr('sys.stdin', io.StringIO('line'))
+    waits = "while not rospy.has_param('/go'): time.sleep(0.01)\nsay(sys.stdin.readline())"
+    neighbour = master.load(bench.write("rospy.init_node('other')\n" + waits, 'other'))
+    assert bench.load(INIT + last).wait(TIMEOUT) == 6
+    master.parameters['/go'] = True
+    assert neighbour.wait(TIMEOUT) == 0
+    assert bench.said() == ['line']
+
+
+@pytest.mark.parametrize('command, text', SLOW.values(), ids=SLOW)
+def test_quick_signals_are_one(master, bench, command, text):
+    with Program([*command, bench.write(text.format(0.5, 0))], master.url) as running:
+        until(lambda: 'ready' in bench.said())
+        begin = time.monotonic()
+        running.signal(signal.SIGINT)
+        until(lambda: 'closing' in bench.said())
+        if time.monotonic() - begin < 0.8:  # else this computer is too busy for two
+            running.signal(signal.SIGINT)
+        running.wait()
+    assert bench.said() == ['ready', 'closing', 'closed']
+    assert not any(master.system_state())
+
+
+@pytest.mark.parametrize('command, text', SLOW.values(), ids=SLOW)
+def test_late_signal_ends_at_once(mortal, bench, command, text):
+    with Program([*command, bench.write(text.format(1.2, 60))], mortal.url) as running:
+        until(lambda: 'ready' in bench.said())
+        running.signal(signal.SIGINT)
+        until(lambda: 'closed' in bench.said())
+        assert end(running) in (-signal.SIGINT, 128 + signal.SIGINT)
+
+
+@pytest.mark.parametrize('last, code', [('', 0), ('sys.exit(3)', 3), ('1 / 0', 1)])
+def test_end_of_main_ends_node(master, peer, bench, last, code):
+    """A publisher in another process does not hold it up; required and respawn see it."""
+    peer.run(f"camera = rospy.Publisher('/camera', message_class('{STRING}'), latch=True)")
+    peer.run("camera.publish('image')")
+    assert bench.load(INIT + ONCE + last).wait(TIMEOUT) == code
+    node = '<node pkg="bench" type="program" name="program" {}="true"/>'
+    with master.compose(None, bench.launch_file(node.format('required'))) as composition:
+        assert composition.wait(TIMEOUT) == 1
+    with master.compose(None, bench.launch_file(node.format('respawn'))):
+        until(lambda: len(bench.said()) >= 4)
+
+
+@pytest.mark.parametrize('name, value', zip(IDIOMS, VALUES))
+def test_script_uses_idioms(master, bench, name, value):
+    script = master.load('robot', 'idioms', name)
+    assert (script.wait(TIMEOUT), script.errors) == (0, [])
+    assert master.parameters['/idioms/said'] == value
+
+
+@pytest.mark.parametrize('expression, found', FINDS)
+def test_script_finds_itself(bench, expression, found):
+    bench.write(HELPER, 'helper.py', '')
+    text = 'class Empty: pass\nasync def answer(): return 42\n'
+    script = bench.load(f'import helper\n{text}{INIT}say({expression})')
+    assert script.wait(TIMEOUT) == 0
+    assert bench.said()[0] == found
+
+
+@pytest.mark.parametrize('line', FOLDERS)
+def test_folders_on_path_are_searched(master, bench, line):
+    bench.write('NAME = 1', 'lib/wheel_math.py', '')
+    bench.write('NAME = 2', 'scripts/beside_it.py', '')
+    text = f'{line}\nimport wheel_math, beside_it\n{INIT}sys.exit(wheel_math.NAME + beside_it.NAME)'
+    assert master.load(bench.write(text, 'scripts/program')).wait(TIMEOUT) == 3
+
+
+@pytest.mark.parametrize('order', itertools.permutations(['detector', 'camera']))
+def test_devel_space_has_all_modules(master, bench, order):
+    """catkin spreads code, messages and cfg of a package over two folders."""
+    text = '''
+        import sys
+        from pkgutil import extend_path
+        sys.path.insert(0, '{}/src')
+        __path__ = extend_path(__path__, __name__)
+        '''
+    bench.write(text.format(bench.folder), 'devel/lab/__init__.py', '')
+    bench.write('class Blob: pass', 'devel/lab/msg/__init__.py', '')
+    bench.write('import rospy\nclass Config: pass', 'devel/lab/cfg/__init__.py', '')
+    bench.write('', 'src/lab/__init__.py', '')
+    bench.write('import rospy', 'src/lab/util.py', '')
+    bench.write('from lab.msg import Blob\nfrom lab import util\n' + SPIN, 'detector')
+    bench.write('from lab.cfg import Config\n' + SPIN.replace("'program'", "'camera'"), 'camera')
+    text = '''
+        import sys
+        sys.path.insert(0, '{0}/devel')
+        from pharos import BlockNode, Master
+        scripts = [Master().load('{0}/' + name) for name in {1}]
+        for script in scripts: script.restart()
+        node = Master().create(BlockNode, 'plain')
+        print(node.ros_import('lab.util').rospy is node.ros, node.ros_import('lab.msg').Blob)
+        '''
+    with Program(textwrap.dedent(text).format(bench.folder, order), master.url) as running:
+        running.expect("True <class 'lab.msg.Blob'>")
+        assert running.wait() == 0
+
+
+def test_edited_helper_is_read_anew(bench):
+    helper = bench.write('VERSION = 1', 'helper_of_test.py', '')
+    script = bench.load(f'import helper_of_test\nsay(helper_of_test.VERSION)\n{SPIN}')
+    bench.write('VERSION = 2', 'helper_of_test.py', '')
+    os.utime(helper, (1, 1))
+    script.restart()
+    assert bench.said()[0::2][:2] == ['1', '2']
+
+
+def test_script_has_roslaunchs_arguments(bench):
+    text = INIT + 'for each in [os.getcwd(), *sys.argv[1:]]: say(each)'
+    with bench.program(bench.launch_file(program=text)) as composed:
+        composed.wait()
+    folder, name, log = bench.said()
+    assert (folder, name) == (str(bench.folder.parent / 'home'), '__name:=program')
+    assert log.startswith('__log:=')
+    assert os.path.exists(log[7:])
+
+
+def test_callback_waits_for_constructor(master, bench):
+    mailbox = Mailbox(create(master, '/ear'), '/map_out', STRING)
+    bench.load(
+        f"{INIT}rospy.Publisher('/map', String, latch=True, queue_size=1).publish('m')\nrospy.spin()"
+    )
+    text = '''
+        class Relay:
+            def __init__(self):
+                rospy.Subscriber('/map', String, self.relay)
+                self.out = rospy.Publisher('/map_out', String, queue_size=1, latch=True)
+            def relay(self, message):
+                self.out.publish(message)
+        rospy.init_node('relay')
+        Relay()
+        rospy.spin()
+        '''
+    for number in range(10):
+        with master.load(bench.write(text, 'relay'), name=f'relay{number}') as relay:
+            assert mailbox.next().data == 'm'
+            assert not relay.errors
+
+
+@pytest.fixture(params=['here', 'another process'])
+def talk(peer, bench, request):
+    """``talk(topic)`` publishes 50 messages to one subscriber, by a script or by the peer."""
+
+    def talk(topic):
+        text = f'''out = rospy.Publisher('{topic}', String, queue_size=100)
+while not out.get_num_connections(): rospy.sleep(0.01)
+for _ in range(50): out.publish('x')'''
+        if request.param == 'here':
+            bench.master.load(bench.write("rospy.init_node('talker')\n" + text, 'talker')).wait(
+                TIMEOUT
+            )
+        else:
+            peer.run(f"String = message_class('{STRING}')\n{text}")
+
+    return talk
+
+
+def test_subscription_has_one_thread(bench, talk):
+    bench.load(
+        '''
+        threads = {'/a': [], '/b': []}
+        def hear(message, topic):
+            threads[topic].append(threading.get_ident())
+            if len(threads[topic]) == 50: say(len(set(threads[topic])))
+        rospy.init_node('program')
+        for topic in threads: rospy.Subscriber(topic, String, hear, topic)
+        rospy.spin()
+        '''
+    )
+    talk('/a')
+    talk('/b')
+    until(lambda: bench.said() == ['1', '1'])
+
+
+def test_subscription_is_switched_on_again(bench, talk):
+    bench.load(
+        '''
+        from rospy.impl.registration import get_topic_manager
+        rospy.init_node('program')
+        heard = rospy.Subscriber('/a', String, lambda message: say('off'))
+        kind, name = heard.reg_type, heard.resolved_name
+        heard.unregister()
+        heard.impl = get_topic_manager().acquire_impl(kind, name, String)
+        heard.impl.add_callback(lambda message: say('on'), None)
+        rospy.spin()
+        '''
+    )
+    talk('/a')
+    until(lambda: bench.said() == ['on'] * 50)
+
+
+def test_blocking_delegate_holds_nobody_up(master):
+    steps = threading.Barrier(2, timeout=TIMEOUT)
+    slow = create(master, '/slow')
+    slow.interested_in(
+        '/tick', STRING, lambda message: message.data == '20' and [steps.wait(), steps.wait()]
+    )
+    other = Mailbox(create(master, '/other'), '/tick', STRING)
+    channel = create(master, '/talker').output_channel('/tick', STRING)
+    until(lambda: len(channel.connections) == 2)
+    for number in range(1, 21):
+        channel.send(data=str(number))
+        other.next()
+    steps.wait()
+    channel.send(data='21')
+    assert other.next(5).data == '21'
+    steps.wait()
+
+
+def test_terminal_tells_of_each_node(bench):
+    bench.write("rospy.init_node('dies')\nsys.exit(4)", 'dies')
+    with bench.program(bench.launch_file(RESPAWNED, **TEXTS)) as composed:
+        for text in SHOWN:
+            composed.expect(text)
+        until(lambda: composed.output.count('ValueError: in vain') >= 2)
+        end(composed)
+    vain = [line for line in composed.output.splitlines() if 'in vain' in line]
+    assert all(line.startswith('[/ticks]') for line in vain), vain
+
+
+@pytest.mark.parametrize('order', itertools.permutations(['good', 'bad']))
+def test_status_is_independent_of_order(bench, order):
+    texts = {'good': SPIN, 'bad': 'import no_such_module'}
+    with bench.program(bench.launch_file(**{name: texts[name] for name in order})) as composed:
+        composed.expect('/bad is not started')
+        until(lambda: bench.said())
+        assert end(composed) == 0
+
+
+@pytest.mark.parametrize('line, helper, why', WINDOWS)
+def test_windows_need_own_process(bench, line, helper, why):
+    text = f'def show():\n    {line}\n{INIT}rospy.spin()'
+    bench.write(helper, 'helper.py', '')
+    if why:
+        with pytest.raises(pharos.PharosError, match=f'needs a process of its own.*{why}'):
+            bench.load(text)
+    assert bench.load(text, here=bool(why)).is_running
+
+
+def check_runs(master, bench, mailbox, names):
+    """Yield each time that OWN runs and its talker says its gain; all has ended at last."""
+    for runs in 1, 2:
+        until(lambda: bench.said().count('ready') == runs)
+        assert mailbox.next().data == '7'
+        assert {each.name for each in master.nodes()} == {'/ear', *names}
+        yield runs
+    assert {each.name for each in master.nodes()} == {'/ear'}
+    assert bench.said() == ['ready', 'over'] * 2
+
+
+def test_loaded_program_creates_nodes(master, bench):
+    mailbox = Mailbox(create(master, '/ear'), '/speech', STRING)
+    settings = {'name': 'arm', 'namespace': '/left', 'params': {'gain': 7}}
+    script = master.load(bench.write(OWN), remap={'words': '/speech'}, **settings)
+    for runs in check_runs(master, bench, mailbox, ['/left/arm', '/left/two']):
+        script.restart() if runs == 1 else script.stop()
+    assert script.exit_code == 0
+
+
+def test_launched_program_creates_nodes(master, bench):
+    """It comes back, as respawn says, when its nodes have ended; and ends at Ctrl-C."""
+    bench.write(OWN)
+    node = create(master, '/ear')
+    mailbox, channel = Mailbox(node, '/speech', STRING), node.output_channel('/end', STRING)
+    with bench.program(bench.launch_file(GROUP)) as composed:
+        for runs in check_runs(master, bench, mailbox, ['/rig/boss', '/rig/two', '/compose']):
+            assert master.node('/rig/boss').pid == composed.pid
+            channel.wait_for_subscribers(1, TIMEOUT)
+            channel.send(data='') if runs == 1 else end(composed)
