@@ -23,9 +23,8 @@ from pharos.compose.container import Container
 from pharos.compose.launch_file import LaunchFile
 
 
-SWITCH_INTERVAL = (
-    0.5e-3  # seconds; beside a node that computes, others wait ten times less than by default
-)
+#: seconds; beside a node that computes, others wait a tenth of the time that they do by default
+SWITCH_INTERVAL = 0.5e-3
 
 
 def main(argv=None):

@@ -5,6 +5,7 @@ import pickle
 import sys
 import tempfile
 import threading
+import time
 
 import roslaunch.core
 import rospkg
@@ -38,7 +39,7 @@ class Composition:
         self.process = None
         self.nodes: list[ScriptNode] = []
         self._processes: list[RosProcess] = []  # of scripts that need one each
-        self._ended: set[ScriptNode] = set()  # these were named
+        self._ended: dict[ScriptNode, float] = {}  # since when, as time.monotonic()
         self._ending = threading.Event()
         self._watcher = threading.Thread(target=self._watch, name='composition', daemon=True)
         self._is_required = False  # True if a required node runs apart
@@ -145,18 +146,19 @@ class Composition:
             self._end('a node in a process of its own')
 
     def _look_at_ended(self, node):
+        now = time.monotonic()
         if node not in self._ended:
-            self._ended.add(node)
+            self._ended[node] = now
             Transcript.show(f'{node._name} has ended, with exit code {node.exit_code}')
         launched = node.launched
         if not launched:
             return
         if launched.required:
             self._end(node._name)
-        elif launched.respawn and not self._ending.wait(float(launched.respawn_delay)):
+        elif launched.respawn and now - self._ended[node] >= float(launched.respawn_delay):
             with self.telling(node._name):
                 Transcript.show(f'{node._name} comes back')
-                self._ended.discard(node)
+                del self._ended[node]
                 node._begin()
             if self._ending.is_set():  # since it looked
                 node._end_now()

@@ -43,18 +43,30 @@ def start_child(original, run, self, *args, env=None, **kwargs):
 
 
 class ScriptRun(Run):
-    """One run of a program."""
+    """One run of a program.
 
-    is_registered, is_awaited, error, wanted = False, True, None, None
-    is_signalled = False  # True once a signal is to be handled
-    is_shut = False  # True once its hooks have begun
-    is_stopping = False  # True once a stop has begun
-    has_ended = False  # True when its main thread has nothing left to run
+    At its end these are set, in this order: ``is_stopping`` (somebody wants it to end),
+    ``is_signalled`` and ``signal_waits`` (a signal waits for the main thread), ``signal_taken`` (its
+    handlers run), ``is_shut`` (hooks run), ``stopping`` (they have run: ``is_shutdown()`` is True),
+    ``has_ended`` (the main thread has nothing left to run), ``over`` (threads that are left end).
+    """
+
+    error = None  # what the program raised before it was a node
+    wanted = None  # the SystemExit that a handler or os._exit() raised
+    is_registered = False  # True once rospy.init_node() has registered the node
+    is_awaited = True  # False once start() has returned
+    is_stopping = False
+    is_signalled = False
+    is_shut = False
+    has_ended = False
 
     def __init__(self, node):
         node.exit_code = 1  # if it cannot be read
         code = _compiled(node.path)
-        self.exits, self.thread_exits, self.awaited, self.handlers = [], [], [], {}
+        self.exits = []  # of atexit
+        self.thread_exits = []  # those before it, of threading
+        self.awaited = []  # threads that are no daemons
+        self.handlers = {}  # of signals
         self.created = []  # nodes that the program has created with pharos
         self.signal_waits, self.signal_taken = threading.Event(), threading.Event()
         self.handling = threading.RLock()  # held while a signal is handled

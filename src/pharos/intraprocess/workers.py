@@ -19,9 +19,8 @@ YIELD_PAUSE = 0.02  # seconds without such a wait after one that was in vain
 FAST = 50e-6  # seconds; a callback that takes less may run in the thread that reads the socket
 LATE = 4e-3  # seconds that a callback may hold up those of other nodes
 SENTRY_REST = 1.0  # seconds without such callbacks until the sentry rests
-FIRST_PAUSE = (
-    0.05  # seconds that a connection between processes takes: rospy's first callback waits
-)
+#: seconds until rospy's first callback: a connection between processes takes so long
+FIRST_PAUSE = 0.05
 
 INFINITE = float('inf')
 

@@ -255,7 +255,7 @@ def subscription(original, run):
 
 @patch('rospy.topics', 'Subscriber.__init__')
 def subscribe(original, run, self, *args, **kwargs):
-    """Connects before it has its callback: a message that comes between is lost."""
+    """Connects before it has its callback: add_callback() does so after; without one it is here."""
     original(self, *args, **kwargs)
     if self.callback is None:  # else add_callback() has connected it
         run.connect_all(self.resolved_name)
