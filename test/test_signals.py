@@ -89,11 +89,11 @@ ENDINGS += [(signal.SIGTERM, 'spin'), (signal.SIGHUP, 'spin'), (signal.SIGTERM, 
 def test_wait_ends_and_program_goes_on(program, number, wait):
     running = program(
         f'{BEGIN}ready_when_asleep()\n{WAITS[wait]}\npharos.spin()\n'
-        'print("went on", me.is_running, other.is_running)'
+        'print("went on", me.lifecycle.value, other.lifecycle.value)'
     )
     running.signal(number)
     assert running.wait() == 0
-    assert 'went on False False' in running.output
+    assert 'went on stopped stopped' in running.output
     assert (running.output.count('begun'), running.output.count('ended')) == (1, 1)
 
 

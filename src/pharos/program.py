@@ -76,7 +76,7 @@ def spin() -> None:
     with contextlib.suppress(KeyboardInterrupt), quiet_wait():
         while nodes and not rospy.is_shutdown():  # that of the process, which its own signal ended
             time.sleep(0.01)
-        stop_all()
+    stop_all()
 
 
 def handle_signals():

@@ -183,6 +183,8 @@ class ScriptRun(Run):
         """Run what a thread of the program runs."""
         try:
             target()
+        except SystemExit:  # ends a thread alone
+            pass
         except Exception as error:
             name = target.__self__.name
             self.print_error(error, f'Exception in thread {name}:\n')
