@@ -265,8 +265,6 @@ def test_robot_stands_at_end(master, peer, bench, drive, way):
     assert drive == 'busy' or bench.said()[0] == 'True'  # in the main thread
 
 
-# the end of a daemon thread is a SystemExit, which pytest takes for an error
-@pytest.mark.filterwarnings('ignore::pytest.PytestUnhandledThreadExceptionWarning')
 @pytest.mark.parametrize('text, lines, code', STOPS.values(), ids=STOPS)
 def test_stop_does_as_signal(bench, text, lines, code):
     script = bench.load(text)
