@@ -7,6 +7,7 @@ import builtins
 import importlib
 import inspect
 import itertools
+import linecache
 import os
 import pathlib
 import re
@@ -170,7 +171,16 @@ def _getfile(thing, original=inspect.getfile):
     return getattr(module, '__file__', None) or original(thing)
 
 
-inspect.getmodule, inspect.getfile = _getmodule, _getfile
+def _getsourcefile(thing, original=inspect.getsourcefile):
+    """Take the file of a frame as read: each look at the disk lets another thread have the interpreter."""
+    if inspect.isframe(thing) and thing.f_code.co_filename in linecache.cache:
+        return thing.f_code.co_filename
+    return original(thing)
+
+
+inspect.getmodule = _getmodule
+inspect.getfile = _getfile
+inspect.getsourcefile = _getsourcefile
 
 
 class PrivateModules:
