@@ -154,7 +154,7 @@ class Turns:
 
 
 class OwnTurns(Turns):
-    """The callbacks of one subscription of plain rospy: all run in one thread, which ends with them.
+    """The callbacks of one subscription of plain rospy. They run in one thread, which ends with them.
 
     What a callback has made in its thread (a base of SQLite, a context of CUDA) it finds again.
     The first one runs some time after the subscription: the constructor that has subscribed may not
@@ -187,7 +187,7 @@ class OwnTurns(Turns):
                 self.thread.start()
 
     def call(self, block):
-        """Run ``block()`` between two callbacks."""
+        """Run ``block()`` as if it were a callback, not before the first one may run."""
         self._wait_for_begin()
         super().call(block)
 
