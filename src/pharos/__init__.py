@@ -15,6 +15,7 @@ except ModuleNotFoundError as _error:
     ) from None
 
 from pharos.channels import InputChannel, OutputChannel, Topic
+from pharos.child_process import RosProcess
 from pharos.errors import (
     MasterUnreachableError,
     MessageTypeError,
@@ -33,11 +34,11 @@ from pharos.external_node import ExternalNode
 from pharos.failures import Failure
 from pharos.master import Master
 from pharos.messages import define_message, define_service, message_class, service_class
-from pharos.node import BlockNode, Lifecycle, Node
+from pharos.node import BlockNode, Node
 from pharos.parameter import Parameter
-from pharos.program import spin
-from pharos.ros_process import RosProcess
+from pharos.private_rospy.run import Lifecycle
 from pharos.service import Service
+from pharos.signals import spin
 from pharos.transcript import Transcript
 
 if TYPE_CHECKING:
@@ -82,7 +83,7 @@ __all__ = [
     'ServiceCallError',
     'NodeStoppedError',
 ]
-_EXTRAS = {
+_EXTRA_MODULES = {
     'Composition': 'compose.composition',
     'Graph': 'live.graph',
     'ScriptNode': 'compose.script',
@@ -91,8 +92,8 @@ _EXTRAS = {
 
 def __getattr__(name):
     """Load extras when they are used."""
-    if name in _EXTRAS:
-        return getattr(importlib.import_module(f'pharos.{_EXTRAS[name]}'), name)
+    if name in _EXTRA_MODULES:
+        return getattr(importlib.import_module(f'pharos.{_EXTRA_MODULES[name]}'), name)
     raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
 
 

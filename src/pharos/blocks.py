@@ -1,4 +1,6 @@
-"""Blocks: what they take, and which method they are."""
+"""Blocks: how many arguments they take, and which methods they are."""
+from __future__ import annotations
+
 import inspect
 import types
 from typing import Any, Callable
@@ -6,79 +8,85 @@ from typing import Any, Callable
 Block = Callable[..., Any]
 
 
-def taking(block, what, least, most):
+def with_arguments(block, role, least, most):
     """Return a block that takes ``most`` arguments, and passes on as many as the block needs.
 
     Parameters with a default keep it: ``lambda message, side=side: ...`` gets the message alone.
 
-    :param what: what it is, for the error
-    :param least: so many arguments it gets at least
+    :param role: the word for the block in an error, such as 'delegate'
+    :param least: the block gets at least so many arguments
     :raises TypeError: if it is not callable, takes another number of arguments, or is an ``async def``
     """
     if block is None:
         return None
     if not callable(block):
-        raise TypeError(f'a {what} is a callable, not {block!r}')
+        raise TypeError(f'a {role} is a callable, not {block!r}')
     if any(map(inspect.iscoroutinefunction, (block, getattr(block, '__call__', None)))):
         raise TypeError(
-            f'a {what} runs in a thread, and cannot be async def: write def, and asyncio.run() in it'
+            f'a {role} runs in a thread, and cannot be async def: write def, and asyncio.run() in it'
         )
     try:
         signature = inspect.signature(block)
-    except ValueError:  # of a function in C, such as deque.append
+    except ValueError:  # a function in C, such as deque.append, has no signature
         signature = inspect.signature(lambda value: None)
-    count = _needed(signature, least, most)
+    count = _count_needed(signature, least, most)
     try:
         signature.bind(*[None] * count)
     except TypeError:
         numbers = ' or '.join(str(number) for number in range(least, most + 1))
-        raise TypeError(f'a {what} takes {numbers} arguments, not {signature}') from None
+        raise TypeError(f'a {role} takes {numbers} arguments, not {signature}') from None
     if count == most:
         return block
     return lambda *values: block(*values[:count])
 
 
-def _needed(signature, least, most):
+def _count_needed(signature, least, most):
     """Return how many arguments to pass: all if there is ``*args``, else those without a default."""
     parameters = signature.parameters.values()
-    if any(each.kind is each.VAR_POSITIONAL for each in parameters):
+    if any(parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters):
         return most
-    kinds = inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD
-    needed = [each for each in parameters if each.kind in kinds and each.default is each.empty]
-    return min(max(len(needed), least), most)
+    count = 0
+    for parameter in parameters:
+        is_positional = parameter.kind in (
+            parameter.POSITIONAL_ONLY,
+            parameter.POSITIONAL_OR_KEYWORD,
+        )
+        if is_positional and parameter.default is parameter.empty:
+            count += 1
+    return min(max(count, least), most)
 
 
 class Receiver:
     """Runs a delegate for each message."""
 
-    _delegate_runs: Block | None = None  # the delegate, as a block that takes two arguments
     _delegate: Block | None = None
+    _delegate_block: Block | None = None  # the delegate, as a block that takes two arguments
 
     @property
     def delegate(self):
         """The block run for each message, as ``block(message, channel)`` or ``block(message)``.
 
-        That of a channel goes before that of its node. One that is set takes effect with the next
-        message. The report: ``self receiverDelegate: [:message :channel | ...]``.
+        A channel's delegate goes before its node's. A new one takes effect with the next message.
+        The report: ``self receiverDelegate: [:message :channel | ...]``.
         """
         return self._delegate
 
     @delegate.setter
     def delegate(self, block: Block | None) -> None:
-        self._delegate_runs = taking(block, 'delegate', 1, 2)
+        self._delegate_block = with_arguments(block, 'delegate', 1, 2)
         self._delegate = block
 
 
-def rebound(block, node, cls):
-    """Return the block; if it is a method of the node, that of the same name of another class."""
+def rebind(block, node, node_class):
+    """Return the block; if it is a method of the node, the method of that name of another class."""
     if isinstance(block, list):
-        return [rebound(each, node, cls) for each in block]
+        return [rebind(item, node, node_class) for item in block]
     if getattr(block, '__self__', None) is not node:
         return block
-    return types.MethodType(getattr(cls, block.__name__), node)
+    return types.MethodType(getattr(node_class, block.__name__), node)
 
 
-def name_of(block):
+def block_name(block):
     """Return the name of a block, for texts."""
     if isinstance(block, str):
         return block

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 from typing import TYPE_CHECKING, Any
 
 from genpy import Message
@@ -10,9 +9,10 @@ from genpy import Message
 from pharos import messages
 from pharos.blocks import Block, Receiver
 from pharos.errors import MessageTypeError, NodeStoppedError, UnknownNodeError
-from pharos.intraprocess.workers import Inbox
-from pharos.private_rospy.transport import peer_of
-from pharos.program import wait
+from pharos.intraprocess.callback_queues import Inbox
+from pharos.intraprocess.links import peer_of
+from pharos.private_rospy.topics import connections_of
+from pharos.waiting import wait
 
 if TYPE_CHECKING:
     from pharos.master import Master
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 QUEUE_SIZE = 1000
 
 
-class Opened:
-    """A thing that a node has opened: its stop closes it, its next start opens it again.
+class Endpoint:
+    """A channel, service or parameter of a node: its stop closes it, its next start opens it again.
 
     :ivar node: the node
     :ivar closed: True if it was closed, or the node is stopped
@@ -31,75 +31,77 @@ class Opened:
     node: Node
     closed = True
     delegate: Any = None  # its block or blocks
-    end: Any = None  # rospy's Publisher, Subscriber or Service
+    ros_object: Any = None  # rospy's Publisher, Subscriber or Service
+
+    @property
+    def _run(self):
+        return self.node._current_run
 
     def open(self):
-        """Have the subclass register it, by _open(); the node's next start calls this again."""
-        self.node._master.call('getPid')  # raises if it does not answer
+        """Register, by _open() of the subclass; the node's next start calls this again."""
+        self._run.master.call('getPid')  # raises if the master does not answer
         self._open()
-        self.node._opened = [*self.node._opened, self]
+        self._run.endpoints = [*self._run.endpoints, self]
         self.closed = False
 
     def close(self) -> None:
         """Receive, send or offer no more, and unregister."""
-        self.node._opened = [each for each in self.node._opened if each is not self]
+        run = self._run
+        run.endpoints = [endpoint for endpoint in run.endpoints if endpoint is not self]
         if not self.closed:
             self.closed = True
             self._close()
 
     def _close(self):
-        self.end.unregister()
+        self.ros_object.unregister()
 
 
-class Channel(Opened):
+class Channel(Endpoint):
     """Either kind of channel.
 
     :ivar topic: the full name of the topic
     :ivar type: the name of its message type
     """
 
-    def _begin(self, node, topic, message_class):
-        self.node, self.topic = node, topic
-        self.message_class, self.type = message_class, message_class._type
+    def _configure(self, node, topic, message_class):
+        self.node = node
+        self.topic = topic
+        self.message_class = message_class
+        self.type = message_class._type
         self.open()
-
-    def _connections(self):
-        impl = self.end.impl
-        if not impl or impl.closed:
-            return []
-        impl.check()  # rospy looks now and then who has left (ros_comm #927)
-        with impl.c_lock:  # the watcher may be removing one
-            return impl.connections
 
     @property
     def connections(self) -> list[tuple[str, str]]:
         """The peers: ``(name of the node, 'INTRAPROCESS' or 'TCPROS')``."""
-        return [(peer_of(end), end.transport_type) for end in filter(peer_of, self._connections())]
+        connections = [each for each in connections_of(self.ros_object) if peer_of(each)]
+        return [(peer_of(connection), connection.transport_type) for connection in connections]
 
     def __repr__(self):
         state = 'closed ' if self.closed else ''
-        return f'<{state}{type(self).__name__} {self.topic} ({self.type}) of {self.node._name}>'
+        return f'<{state}{type(self).__name__} {self.topic} ({self.type}) of {self._run.name}>'
 
 
 class InputChannel(Receiver, Channel, Inbox):
     """The end of a topic at which a node receives; see :meth:`Node.interested_in`.
 
-    :ivar received: how many messages the delegate was run on
-    :ivar dropped: how many were dropped since the queue was full
+    :ivar received: the number of messages that the delegate was run on
+    :ivar dropped: the number of messages that were dropped since the queue was full
     """
 
     received = 0
 
     def __init__(self, node, topic, message_class, delegate, queue_size, inline, shared, from_):
         Inbox.__init__(self, None, self._deliver, queue_size, inline, shared)
-        self.queue_bytes, self.from_ = node.queue_bytes, from_
+        self.queue_bytes = node.queue_bytes
+        self.from_ = from_
         self.delegate = delegate
-        self._begin(node, topic, message_class)
+        self._configure(node, topic, message_class)
 
     def _open(self):
-        self.queue.clear()  # what came while the node stopped was never scheduled
-        self.turns, self.closed = self.node._run.turns, False
-        self.end = self.node.ros.Subscriber(self.topic, self.message_class, self)
+        self.queue.clear()  # messages that came while the node stopped were never scheduled
+        self.callback_queue = self._run.callback_queue
+        self.closed = False  # the first message may come before the Subscriber is made
+        self.ros_object = self.node.ros.Subscriber(self.topic, self.message_class, self)
 
     def __call__(self, message):
         """Take a latched message; rospy calls this for a connection that was there before."""
@@ -107,63 +109,71 @@ class InputChannel(Receiver, Channel, Inbox):
 
     def _deliver(self, message):
         try:
-            if self.closed or self.from_ and message._connection_header['callerid'] != self.from_:
+            if self.closed:
+                return
+            if self.from_ and message._connection_header['callerid'] != self.from_:
                 return
             self.received += 1
-            delegate = self._delegate_runs or self.node._delegate_runs
-            delegate and delegate(message, self)
+            block = self._delegate_block or self.node._delegate_block
+            if block:
+                block(message, self)
         except BaseException as error:
             delegate = self.delegate or self.node.delegate
-            self.node._report(error, delegate, 'delegate', message, self, self._retry)
+            self._run.report_failure(error, delegate, 'delegate', message, self, self._retry)
 
     def _retry(self, message):
         """Run the delegate on a message once more, in the node's turn."""
         self.node._check_running()
-        self.turns.call(lambda: self._deliver(message))
+        self.callback_queue.call(lambda: self._deliver(message))
 
 
 class OutputChannel(Channel):
     """The end of a topic at which a node sends; see :meth:`Node.output_channel`.
 
-    :ivar sent: how many messages were sent
+    :ivar sent: the number of messages that were sent
     """
 
     sent = 0
 
     def __init__(self, node, topic, message_class, latch=False, queue_size=QUEUE_SIZE):
-        self.latch, self.queue_size = latch, queue_size
-        self._key = latch and self  # its place in publisher.latches; False: keep nothing
-        self._begin(node, topic, message_class)
+        self.latch = latch
+        self.queue_size = queue_size
+        self._configure(node, topic, message_class)
 
     def open(self):
         """Advertise, and wait for the subscribers that the master knows."""
-        known = set(Topic(self.node._master, self.topic).subscribers)
-        latched = self.end and self._impl.latches.get(self)  # before the node stopped
+        subscribers = set(Topic(self._run.master, self.topic).subscribers)
+        latched = None
+        if self.ros_object:  # the node has stopped since, and starts again
+            latched = self._publisher.latches.get(self)
         super().open()
         if latched is not None:
-            self._impl.publish(self._impl.thaw(latched), None, self)
-        self._wait_for(known)
+            self._publisher.publish(self._publisher.thaw(latched), channel=self)
+        self._wait_for(subscribers)
 
     def _open(self):
-        options = {'latch': self.latch, 'queue_size': self.queue_size}
-        self.end = self.node.ros.Publisher(self.topic, self.message_class, **options)
-        self._impl = self.end.impl
+        self.ros_object = self.node.ros.Publisher(
+            self.topic, self.message_class, latch=self.latch, queue_size=self.queue_size
+        )
+        self._publisher = self.ros_object.impl
 
-    def _wait_for(self, names):
-        """Wait until these subscribers are connected: rospy loses what is sent before (#176).
+    def _wait_for(self, subscribers):
+        """Wait until these nodes are connected: rospy loses messages sent before (#176).
 
-        Who refuses a connection is dead. Who does not connect in time is named in the log.
+        A node that refuses connections is dead. A node that does not connect in time is logged.
         """
         node = self.node
 
-        def missing():
-            return names.difference(map(peer_of, self._impl.connections))
+        def connected():
+            return {peer_of(connection) for connection in self._publisher.connections}
 
-        names = set(filter(node._master.may_live, missing()))
-        is_ready = wait(lambda: not missing(), node.connect_timeout, node)
+        may_live = self._run.master.may_live
+        alive = {name for name in subscribers - connected() if may_live(name)}
+        is_ready = wait(lambda: alive <= connected(), node.connect_timeout, node)
         if not is_ready and node.connect_timeout and node.is_running:
+            missing = sorted(alive - connected())
             node.log(
-                f'{self.topic}: {", ".join(sorted(missing()))} did not connect within'
+                f'{self.topic}: {", ".join(missing)} did not connect within'
                 f' {node.connect_timeout:g} s, and may miss the first messages: can they reach'
                 ' this host, and are they of the same type? A longer connect_timeout waits longer',
                 'warning',
@@ -176,14 +186,17 @@ class OutputChannel(Channel):
         :raises MessageTypeError: if it is of another type, or cannot be serialized
         :raises NodeStoppedError: if the channel is closed
         """
-        cls, kind = self.message_class, type(message)
-        if kind is not cls and getattr(kind, '_md5sum', None) not in (cls._md5sum, '*'):
-            found = getattr(kind, '_type', repr(message)[:80])
-            raise MessageTypeError(f'{self.topic} carries {self.type}, not {found}')
+        wanted_class = self.message_class
+        sent_class = type(message)
+        if sent_class is not wanted_class:
+            # AnyMsg, for relays, has the md5sum '*'
+            if getattr(sent_class, '_md5sum', None) not in (wanted_class._md5sum, '*'):
+                sent_type = getattr(sent_class, '_type', repr(message)[:80])
+                raise MessageTypeError(f'{self.topic} carries {self.type}, not {sent_type}')
         if self.closed:
             raise NodeStoppedError(f'{self!r} cannot send: open another one, or start the node')
         try:
-            self._impl.publish(message, connection, self._key)
+            self._publisher.publish(message, connection, self)
         except Exception as error:
             if self.closed:
                 raise NodeStoppedError(f'{self!r} was closed while it sent') from error
@@ -197,23 +210,24 @@ class OutputChannel(Channel):
         :returns: the message
         """
         message = messages.build(self.message_class, block, fields)
-        self.publish(message, to and self._connection_to(self.node._peer_name(to)))
+        connection = self._connection_to(to) if to else None
+        self.publish(message, connection)
         return message
 
-    def _connection_to(self, peer):
-        for each in self._connections():
-            if peer_of(each) == peer:
-                return each
+    def _connection_to(self, node):
+        name = self.node._peer_name(node)
+        for connection in connections_of(self.ros_object):
+            if peer_of(connection) == name:
+                return connection
         raise UnknownNodeError(
-            f'{peer} is not connected to {self.topic}: rostopic info {self.topic} tells who is'
+            f'{name} is not connected to {self.topic}: rostopic info {self.topic} tells who is'
         )
 
     def close(self) -> None:
-        """Send no more, once what was published is with the sockets; unregister."""
+        """Send no more, once the sockets have taken all messages; unregister."""
         if not self.closed:
-            self._impl.latches.pop(self, None)
-            if self._impl.ref_count == 1:
-                self._impl.flush(time.monotonic() + self.node.stop_timeout)
+            self._publisher.latches.pop(self, None)
+            self._publisher.flush_for_last(self.node.stop_timeout)
         super().close()
 
     def wait_for_subscribers(self, count: int = 1, timeout: float | None = None) -> bool:
@@ -252,8 +266,8 @@ class Topic:
     @property
     def channels(self) -> list[Channel]:
         """The channels of nodes of this process."""
-        ends = [each for node in self.master.own_nodes() for each in node.channels]
-        return [each for each in ends if each.topic == self.name]
+        channels = [channel for node in self.master.own_nodes() for channel in node.channels]
+        return [channel for channel in channels if channel.topic == self.name]
 
     def hz(self, seconds: float = 1.0):
         """Measure for some seconds how often messages come, and how large they are."""

@@ -29,7 +29,7 @@ class ExternalNode:
     def uri(self) -> str:
         """The URI of its XML-RPC server, as the master knows it.
 
-        :raises UnknownNodeError: if it knows no such node any more
+        :raises UnknownNodeError: if the master knows no such node any more
         """
         uri = self.master.call('lookupNode', self.name)
         if not uri:
@@ -57,7 +57,7 @@ class ExternalNode:
         return self._call('getPid')
 
     def is_alive(self) -> bool:
-        """True if it answers."""
+        """True if the node answers."""
         try:
             return self.pid > 0
         except UnknownNodeError:
@@ -65,31 +65,33 @@ class ExternalNode:
 
     @property
     def publications(self) -> dict[str, str]:
-        """The topics that it publishes on, with their types, as the master knows them."""
-        return self._topics(0)
+        """The topics that the node publishes on, with their types, as the master knows them."""
+        return self._names_in_state(0)
 
     @property
     def subscriptions(self) -> dict[str, str]:
-        """The topics that it receives from, with their types, as the master knows them."""
-        return self._topics(1)
+        """The topics that the node receives from, with their types, as the master knows them."""
+        return self._names_in_state(1)
 
-    def _topics(self, kind):
-        types, names = dict(self.master.call('getTopicTypes')), self.master.system_state()[kind]
-        return {name: types.get(name) for name in sorted(names) if self.name in names[name]}
+    def _names_in_state(self, position):
+        """Return the topics or services of the node at a position of the master's system state."""
+        types = dict(self.master.call('getTopicTypes'))
+        users = self.master.system_state()[position]
+        return {name: types.get(name) for name in sorted(users) if self.name in users[name]}
 
     @property
     def services(self) -> list[str]:
-        """The names of the services that it offers."""
-        return list(self._topics(2))
+        """The names of the services that the node offers."""
+        return list(self._names_in_state(2))
 
     def describe(self, seconds: float = 1.0) -> str:
-        """Return as text what it publishes, receives and offers, its peers, and how often."""
+        """Return as text the node's topics, services, peers and rates, counted for some seconds."""
         from pharos.live.words import describe
 
         return describe(self.master, self.name, seconds)
 
     def shutdown(self) -> None:
-        """Ask it to end, as rosnode kill does."""
+        """Ask the node to end, as rosnode kill does."""
         self._call('shutdown', 'asked by pharos')
 
     def __repr__(self):

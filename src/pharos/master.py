@@ -8,23 +8,33 @@ import os
 import re
 import subprocess
 import sys
-from typing import Sequence
+from typing import TYPE_CHECKING, Any, Callable, Sequence, TypeVar
 from xmlrpc.client import dumps, loads
 
 from rosgraph.names import get_ros_namespace, is_legal_remap, load_mappings, ns_join
 
-from pharos import program
+from pharos import signals
 from pharos.blocks import Block
 from pharos.channels import Topic
+from pharos.child_process import RosProcess, find_launch_file, find_program
 from pharos.errors import MasterUnreachableError, PortInUseError
 from pharos.external_node import ExternalNode
 from pharos.names import full_name, node_name
-from pharos.node import Node, check_class
+from pharos.node import Node, Settings, check_node_class
 from pharos.private_rospy.run import UNREACHABLE, ServerProxy
-from pharos.ros_process import RosProcess, find_launch_file, find_program
 from pharos.service import Service
+from pharos.waiting import wait_for
+
+if TYPE_CHECKING:
+    from pharos.compose.composition import Composition
+    from pharos.compose.script import ScriptNode
+    from pharos.live.graph import Graph
 
 CALLER_ID = '/pharos'
+PEER_LIMIT = 0.5  # seconds that a node has to answer whether it lives
+_URL = re.compile(r'http://(\[[\w:]+\]|[\w.-]+):([1-6]?\d{1,4})/?')
+
+N = TypeVar('N', bound=Node)
 
 
 class Parameters(collections.abc.MutableMapping):
@@ -71,22 +81,23 @@ class Master:
     """
 
     _environ = os.environ
-    _first_with: dict = {}  # argv -> the first node that was created with it
+    _first_nodes: dict = {}  # argv -> the first node that was created with it
 
     def __init__(self, url: str | None = None, share_connections: bool = False):
         url = url or os.environ.get('ROS_MASTER_URI') or 'http://localhost:11311/'
-        parts = re.fullmatch(r'http://(\[[\w:]+\]|[\w.-]+):([1-6]?\d{1,4})/?', str(url).lower())
+        parts = _URL.fullmatch(str(url).lower())
         if not parts:
             raise ValueError(
                 f"{url!r} cannot be the URL of a master: give one such as 'http://127.0.0.1:11311/'"
             )
         host = parts[1].replace('localhost', '127.0.0.1')
-        self.url, self.share_connections = f'http://{host}:{parts[2]}/', share_connections
+        self.url = f'http://{host}:{parts[2]}/'
+        self.share_connections = share_connections
         self.parameters = Parameters(self.call)
         self._process = None
-        program.handle_signals()
+        signals.handle_signals()
 
-    # -- a master of one's own
+    # -- an embedded master
 
     @classmethod
     def embedded(cls, port: int = 0) -> Master:
@@ -97,10 +108,11 @@ class Master:
         :param port: 0: any free one
         :raises PortInUseError: if the port is taken
         """
-        environ = dict(os.environ, PYTHONPATH=os.pathsep.join(filter(None, sys.path)))
+        environ = dict(os.environ)
+        environ['PYTHONPATH'] = os.pathsep.join(folder for folder in sys.path if folder)
         environ.setdefault('ROS_HOSTNAME', environ.pop('ROS_IP', '127.0.0.1'))
         pipes = {'stdin': subprocess.PIPE, 'stdout': subprocess.PIPE, 'text': True}
-        command = [sys.executable, '-m', 'pharos.master_program', str(port)]
+        command = [sys.executable, '-m', 'pharos.embedded_master', str(port)]
         process = subprocess.Popen(command, env=environ, start_new_session=True, **pipes)  # type: ignore
         url = process.stdout.readline().strip()
         if not url:
@@ -114,11 +126,12 @@ class Master:
 
     def stop(self) -> None:
         """End an embedded master, and do nothing to another."""
-        process, self._process = self._process, None
+        process = self._process
+        self._process = None
         if process:
             for node in self.own_nodes():
-                node._end_now()
-            with process:  # waits for it
+                node._stop_safely()
+            with process:  # waits for its end
                 process.stdin.close()
 
     def __enter__(self) -> Master:
@@ -127,12 +140,12 @@ class Master:
     def __exit__(self, *error):
         self.stop()
 
-    # -- asking
+    # -- questions
 
-    def call(self, method, *args, caller_id=CALLER_ID):
-        """Call a method of the master's API; returns its value, None if it says no.
+    def call(self, method: str, *args, caller_id: str = CALLER_ID) -> Any:
+        """Call a method of the master's API; returns its value, None if the master refuses.
 
-        :raises MasterUnreachableError: if it does not answer within 5 s
+        :raises MasterUnreachableError: if the master does not answer within 5 s
         """
         try:
             code, _, value = getattr(ServerProxy(self.url), method)(caller_id, *args)
@@ -143,18 +156,18 @@ class Master:
         return value if code == 1 else None
 
     def is_reachable(self) -> bool:
-        """True if it answers."""
+        """True if the master answers."""
         with contextlib.suppress(MasterUnreachableError):
             return bool(self.pid)
         return False
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until it answers, and return True.
+        """Wait until the master answers, and return True.
 
         :param timeout: seconds, None: without limit
-        :raises MasterUnreachableError: if it does not answer in time
+        :raises MasterUnreachableError: if the master does not answer in time
         """
-        return bool(program.wait_for(lambda: self.pid, timeout))
+        return bool(wait_for(lambda: self.pid, timeout))
 
     @property
     def pid(self) -> int:
@@ -182,7 +195,7 @@ class Master:
 
     def create(
         self,
-        node_class: type[Node],
+        node_class: type[N],
         named: str,
         domain: str | None = None,
         tcp_port: int = 0,
@@ -191,7 +204,7 @@ class Master:
         delegate: Block | None = None,
         argv: Sequence[str] | None = None,
         **kwargs,
-    ):
+    ) -> N:
         """Create a node, register and start it, and return it.
 
         The report: ``master create: Driver named: '/driver' domain: '127.0.0.1' tcpPort: 8080
@@ -199,23 +212,24 @@ class Master:
 
         :param named: its name, perhaps with a namespace: '/robot1/driver'
         :param domain: the address that it advertises; if it is loopback, the only one that it
-            listens on; default: what ROS_HOSTNAME, ROS_IP or the host say
+            listens on; default: the one of ROS_HOSTNAME, ROS_IP or the host
         :param tcp_port: 0: any free one, as ``xmlrpc_port``
         :param argv: ROS's remappings and private parameters; a script passes ``sys.argv``
-        :param kwargs: what the ``__init__`` of the class takes
+        :param kwargs: the arguments of the ``__init__`` of the class
         :raises NodeNameInUseError, PortInUseError, MasterUnreachableError: and nothing is left
         """
-        check_class(node_class)
+        check_node_class(node_class)
         if not (domain is None or isinstance(domain, str) and re.fullmatch(r'[\w.:-]+', domain)):
             raise ValueError(f'{domain!r} cannot be an address: give one such as 127.0.0.1')
         for port in tcp_port, xmlrpc_port:
             if port not in range(65536):
                 raise ValueError(f'{port!r} cannot be a port: give 0 to 65535')
-        mappings = [arg for arg in argv or () if is_legal_remap(arg)]
+        mappings = [argument for argument in argv or () if is_legal_remap(argument)]
         node = node_class.__new__(node_class)
         name = self._full_name(node, node_name(named), tuple(mappings))
-        mappings = [arg for arg in mappings if not arg.startswith(('__name:=', '__ns:='))]
-        node._configure(self, name, soul, delegate, domain, (tcp_port, xmlrpc_port), mappings)
+        remappings = [each for each in mappings if not each.startswith(('__name:=', '__ns:='))]
+        settings = Settings(name, self, domain, (tcp_port, xmlrpc_port), remappings)
+        node._configure(settings, soul, delegate)
         try:
             inspect.signature(node.__init__).bind(**kwargs)  # type: ignore[misc]
         except TypeError as error:
@@ -225,62 +239,72 @@ class Master:
             ) from None
         node.__init__(**kwargs)  # type: ignore[misc]
         try:
-            node._begin()
+            node._start_and_release()
         except BaseException:
-            node._end_now()
+            node._stop_safely()
             raise
         return node
 
     def _full_name(self, node, name, mappings):
         """Return the full name of a new node; of those with equal mappings, one has ``__name``."""
-        given = load_mappings(mappings)
-        first = self._first_with.get(mappings)
-        if '__name' in given and not (first and first.is_running and first.master == self):
-            self._first_with[mappings] = node
-            name = name[: name.rfind('/') + 1] + node_name(given['__name'])
-        if '__ns' in given and name.startswith('/'):
+        special_names = load_mappings(mappings)
+        first = self._first_nodes.get(mappings)
+        is_name_taken = first and first.is_running and first.master == self
+        if '__name' in special_names and not is_name_taken:
+            self._first_nodes[mappings] = node
+            namespace = name[: name.rfind('/') + 1]
+            name = namespace + node_name(special_names['__name'])
+        if '__ns' in special_names and name.startswith('/'):
             name = name[name.rfind('/') + 1 :]
         return ns_join(get_ros_namespace(self._environ, mappings), name)
 
-    def own_nodes(self):
+    def own_nodes(self) -> list[Node]:
         """Return the nodes of this process that run at this master, or start or stop."""
-        return [node for node in program.nodes if node._master == self]
+        return [node for node in signals.own_nodes() if node._settings.master == self]
 
     def nodes(self) -> list[Node | ExternalNode]:
         """Return all nodes, of this process and others."""
-        names = {name for kind in self.system_state() for users in kind.values() for name in users}
-        return [self._named(name) for name in sorted(names)]
+        names: set[str] = set()
+        for registry in self.system_state():
+            names.update(*registry.values())
+        return [self._find_node(name) for name in sorted(names)]
 
     def node(self, name: str) -> Node | ExternalNode:
         """Return the node of that name.
 
         :raises UnknownNodeError: if there is none
         """
-        found = self._named(full_name(node_name(name)))
-        if isinstance(found, ExternalNode):
-            found.uri  # raises if the master does not know it
-        return found
+        node = self._find_node(full_name(node_name(name)))
+        if isinstance(node, ExternalNode):
+            node.uri  # raises if the master does not know it
+        return node
 
-    def _named(self, name):
-        own = [node for node in self.own_nodes() if node._name == name]
-        registered = [node for node in own if node._run.uri]  # not a program that creates its nodes
-        return (registered or own or [ExternalNode(self, name)])[0]
+    def _find_node(self, name):
+        nodes = [node for node in self.own_nodes() if node._settings.name == name]
+        if not nodes:
+            return ExternalNode(self, name)
+        for node in nodes:
+            if node._current_run.uri:  # not a script that creates its nodes with pharos
+                return node
+        return nodes[0]
 
-    def may_live(self, name):
+    def may_live(self, name: str) -> bool:
         """False if the node of that name refuses connections, or is not registered."""
         uri = self.call('lookupNode', name)
+        if not uri:
+            return False
         try:
-            uri and ServerProxy(uri, 0.5).getPid(CALLER_ID)
+            ServerProxy(uri, PEER_LIMIT).getPid(CALLER_ID)
         except UNREACHABLE as error:
             return not isinstance(error, ConnectionRefusedError)
-        return bool(uri)
+        return True
 
     def wait_for_node(self, name: str, timeout: float | None = None) -> Node | ExternalNode:
-        """Wait until a node of that name is there, and return it.
+        """Wait until a node of that name is registered, and return it.
 
-        :raises UnknownNodeError: if it does not come in time
+        :raises UnknownNodeError: if it is not in time
         """
-        return program.wait_for(lambda: self.node(name), timeout)
+        return wait_for(lambda: self.node(name), timeout)
 
     # -- services
 
@@ -289,7 +313,7 @@ class Master:
         return sorted(self.system_state()[2])
 
     def lookup_service(self, name: str, caller_id: str = CALLER_ID) -> Service:
-        """Return the service of that name, to be called.
+        """Return a service that can be called.
 
         The report: ``master lookupService: '/clear' with: '/myID'``.
 
@@ -304,14 +328,20 @@ class Master:
 
         :raises UnknownServiceError: if it is not in time
         """
-        return program.wait_for(lambda: self.lookup_service(name, caller_id), timeout)
+        return wait_for(lambda: self.lookup_service(name, caller_id), timeout)
 
     # -- programs
 
-    def run(self, package: str, executable: str, *args, on_line=None) -> RosProcess:
+    def run(
+        self,
+        package: str,
+        executable: str,
+        *args,
+        on_line: Callable[[str], Any] | None = None,
+    ) -> RosProcess:
         """Run a program of ROS at this master, as rosrun does.
 
-        :param on_line: ``on_line(text)`` is called for each line that it prints
+        :param on_line: ``on_line(text)`` is called for each line that the program prints
         """
         path = find_program(package, executable)
         return RosProcess([path, *map(str, args)], self.url, on_line)
@@ -322,43 +352,65 @@ class Master:
         arguments = [f'{name}:={value}' for name, value in args.items()]
         return RosProcess(['roslaunch', '--skip-log-check', path, *arguments], self.url)
 
-    def load(self, *args, **options):
-        """Run a program of rospy, unmodified, as a node of this process: a :class:`ScriptNode`.
-
-        ``load(package, executable=None, *args, name=None, namespace=None, remap=None, params=None,
-        here=False)``
+    def load(
+        self,
+        package: str,
+        executable: str | None = None,
+        *args,
+        name: str | None = None,
+        namespace: str | None = None,
+        remap: dict[str, str] | None = None,
+        params: dict[str, Any] | None = None,
+        here: bool = False,
+    ) -> ScriptNode:
+        """Run a program of rospy, unmodified, as a node of this process.
 
         :param package: without ``executable``, the path of the program
         :param args: its arguments
         :param name: default: the one that it gives to ``init_node``
-        :param here: True: it runs here though it shows windows
+        :param here: True: it runs in this process even if it shows windows
         :raises UnknownNodeError: if there is no such program
-        :raises PharosError: if it cannot run here, or failed before it was a node
+        :raises PharosError: if it cannot run in this process, or failed before it was a node
         """
         from pharos.compose.script import load
 
-        return load(self, *args, **options)
+        arguments = [*map(str, args)]
+        arguments += [f'{old_name}:={new_name}' for old_name, new_name in (remap or {}).items()]
+        return load(self, package, executable, arguments, name, namespace, params, here)
 
-    def compose(self, package: str | None, file: str, **options):
-        """Run the Python nodes of a launch file in this process: a :class:`Composition`.
-
-        ``compose(package, file, only=(), apart=(), here=(), share_connections=False, **args)``
+    def compose(
+        self,
+        package: str | None,
+        file: str,
+        *,
+        only: Sequence[str] = (),
+        apart: Sequence[str] = (),
+        here: Sequence[str] = (),
+        share_connections: bool = False,
+        **args,
+    ) -> Composition:
+        """Run the Python nodes of a launch file in this process.
 
         The rest (C++, other machines, with a launch-prefix, cwd or windows) runs as roslaunch starts it.
 
         :param package: None: ``file`` is a path
-        :param only: the names of the nodes that are wanted; none: all
-        :param apart: the names of nodes that are to run in processes of their own
-        :param here: the names of nodes that are to run in this process though they show windows
+        :param only: the names of the nodes that run; none: all
+        :param apart: the names of nodes that run in processes of their own
+        :param here: the names of nodes that run in this process even if they show windows
         :param args: the arguments of the launch file
         :raises UnknownNodeError: if there is no such file, argument or node
         :raises PharosError: if roslaunch cannot read it
         """
-        from pharos.compose.composition import compose
+        from pharos.compose.composition import Composition
+        from pharos.compose.launch_file import LaunchFile
 
-        return compose(self, package, file, **options)
+        launch_file = LaunchFile(self.url, package, file, args, only, apart, here)
+        master = Master(self.url, share_connections or self.share_connections)
+        composition = Composition(master)
+        composition.launch(launch_file)
+        return composition
 
-    def graph(self, seconds: float = 0):
+    def graph(self, seconds: float = 0) -> Graph:
         """Return the :class:`Graph` of all nodes and topics, with rates if it looks for a while."""
         from pharos.live.graph import graph_of
 

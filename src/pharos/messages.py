@@ -4,7 +4,7 @@ import pathlib
 import re
 import threading
 from contextlib import suppress
-from typing import Callable
+from typing import Any, Callable
 
 import genmsg
 import rospkg
@@ -13,10 +13,10 @@ from genmsg.msg_loader import load_depends, load_msg_from_string, load_srv_from_
 from genmsg.msgs import bare_msg_type, is_builtin
 from genpy.dynamic import generate_dynamic
 from genpy.message import Message, get_message_class, get_service_class
-from rospy.impl.tcpros_service import convert_return_to_response as as_rospy
+from rospy.impl.tcpros_service import convert_return_to_response
 
 from pharos.errors import MessageTypeError, UnknownTypeError
-from pharos.intraprocess.copier import copied, nested_class
+from pharos.intraprocess.copier import copy_of, nested_class
 
 _TYPE = re.compile(r'[A-Za-z][A-Za-z0-9_]{0,127}/[A-Za-z][A-Za-z0-9_]{0,127}')
 #: turtlesim's types as in ROS Fuerte, which the report uses; Debian has none
@@ -69,12 +69,12 @@ float32 angular
 ---
 
 '''
-#: (msg or srv, type) -> definition
-_shipped = {
-    (kind, type_): text
-    for kind, type_, text in re.findall(r'(\w+) (\S+)\n(.*?\n)\n', _TURTLESIM, re.S)
+#: (suffix, type) -> definition; the suffix is msg or srv
+_shipped_definitions = {
+    (suffix, type_name): text
+    for suffix, type_name, text in re.findall(r'(\w+) (\S+)\n(.*?\n)\n', _TURTLESIM, re.S)
 }
-_defined = {}
+_given_definitions = {}
 _lock = threading.RLock()  # genpy's generator is not thread-safe
 
 
@@ -89,14 +89,16 @@ def message_class(type_: str | type, ask: Callable | None = None) -> type[Messag
     """
     if isinstance(type_, type) and issubclass(type_, Message):
         return type_
-    return _installed('msg', type_) or _made_message(type_, _text_of('msg', type_, ask))
+    installed_class = _installed_class('msg', type_)
+    return installed_class or _make_message(type_, _find_definition('msg', type_, ask))
 
 
-def service_class(type_):
+def service_class(type_: Any) -> Any:
     """Return the class of a service type, sought as :func:`message_class` does."""
     if hasattr(type_, '_request_class'):
         return type_
-    return _installed('srv', type_) or _made_service(type_, _text_of('srv', type_))
+    installed_class = _installed_class('srv', type_)
+    return installed_class or _make_service(type_, _find_definition('srv', type_))
 
 
 def define_message(type_: str, text: str) -> type[Message]:
@@ -106,122 +108,160 @@ def define_message(type_: str, text: str) -> type[Message]:
 
     :raises MessageTypeError: if the type is known already, with other fields
     """
-    return _define('msg', type_, text, message_class, _made_message)
+    return _define('msg', type_, text, message_class, _make_message)
 
 
-def define_service(type_: str, text: str):
+def define_service(type_: str, text: str) -> Any:
     """Define a service type by the text of a ``.srv`` file, as :func:`define_message` does."""
-    return _define('srv', type_, text, service_class, _made_service)
+    return _define('srv', type_, text, service_class, _make_service)
 
 
-def _define(kind, type_, text, find, make):
-    cls = make(type_, text)
+def _define(suffix, type_name, text, find_class, make_class):
+    new_class = make_class(type_name, text)
+    key = suffix, type_name
     with suppress(UnknownTypeError):
-        if _fields(find(type_)) != _fields(cls) and (kind, type_) not in _shipped:
-            raise MessageTypeError(f'{type_} is known with other fields: define another type')
-    _defined.setdefault((kind, type_), text)
-    return find(type_)
+        known_class = find_class(type_name)
+        if _checksums(known_class) != _checksums(new_class) and key not in _shipped_definitions:
+            raise MessageTypeError(f'{type_name} is known with other fields: define another type')
+    _given_definitions.setdefault(key, text)
+    return find_class(type_name)
 
 
-def _fields(cls):
+def _checksums(cls):
+    """Return md5sums that are equal for equal fields; services are compared by their requests, too."""
     return cls._md5sum, getattr(cls, '_request_class', cls)._md5sum
 
 
-def _installed(kind, type_):
-    if not (isinstance(type_, str) and _TYPE.fullmatch(type_)):
+def _installed_class(suffix, type_name):
+    """Return the class of an installed Python package, or None."""
+    if not (isinstance(type_name, str) and _TYPE.fullmatch(type_name)):
         raise UnknownTypeError(
-            f"malformed type {type_!r}: give 'package/Type', such as 'std_msgs/String', or a class"
+            f"malformed type {type_name!r}: give 'package/Type', such as 'std_msgs/String', or a class"
         )
-    get = get_message_class if kind == 'msg' else get_service_class
+    get_class = get_message_class if suffix == 'msg' else get_service_class
     try:
-        return get(type_)
+        return get_class(type_name)
     except InvalidPackage:  # genpy reads package.xml; there may be a file of the type all the same
         return None
 
 
-def _text_of(kind, type_, ask=None):
+def _find_definition(suffix, type_name, ask=None):
     """Return the definition of a type that has no generated class."""
-    key, (package, name) = (kind, type_), type_.split('/')
+    package, name = type_name.split('/')
     with suppress(Exception):  # there is no file; or another package.xml cannot be parsed
-        folder = pathlib.Path(rospkg.RosPack().get_path(package), kind)
-        return (folder / f'{name}.{kind}').read_text('utf-8', 'replace')
-    asked = ask and key not in _shipped and ask(type_)
-    for text in asked, _defined.get(key), _shipped.get(key):
-        if isinstance(text, str):
-            return text
+        folder = pathlib.Path(rospkg.RosPack().get_path(package), suffix)
+        return (folder / f'{name}.{suffix}').read_text('utf-8', 'replace')
+    key = suffix, type_name
+    if ask and key not in _shipped_definitions:
+        definition = ask(type_name)
+        if isinstance(definition, str):
+            return definition
+    for definitions in _given_definitions, _shipped_definitions:
+        if key in definitions:
+            return definitions[key]
+    function_name = 'define_message' if suffix == 'msg' else 'define_service'
     raise UnknownTypeError(
-        f'unknown type {type_!r}: Python has no {package}.{kind}.{name}, there is no'
-        f' {package}/{kind}/{name}.{kind} on ROS_PACKAGE_PATH'
+        f'unknown type {type_name!r}: Python has no {package}.{suffix}.{name}, there is no'
+        f' {package}/{suffix}/{name}.{suffix} on ROS_PACKAGE_PATH'
         f' ({":".join(rospkg.get_ros_paths())}), and no definition was given; install {package}, source'
-        f' its workspace, or call define_{"message" if kind == "msg" else "service"}(type, text)'
+        f' its workspace, or call {function_name}(type, text)'
     )
 
 
-def _read(type_, text):
-    """Return genmsg's context of a definition, its own text, that of what it nests, and their names."""
-    context, nested = genmsg.MsgContext.create_default(), {}
-    own, *parts = re.split(r'\n=+[ \t]*\nMSG: *', f'\n{text}')
-    given = {part.partition('\n')[0].strip(): part.partition('\n')[2] for part in parts}
+class _Definition:
+    """A definition as genmsg reads it, with the definitions of all nested types.
 
-    def add_nested(name, text):
-        for field in map(bare_msg_type, load_msg_from_string(context, text, name).types):
-            field = 'std_msgs/Header' if field == 'Header' else field
-            if is_builtin(field) or field in nested:
+    :ivar context: genmsg's, with all types
+    :ivar text: of the type alone
+    :ivar nested_texts: names of nested types -> their texts
+    """
+
+    def __init__(self, type_name, text):
+        self.context = genmsg.MsgContext.create_default()
+        self.nested_texts = {}
+        own_text, *parts = re.split(r'\n=+[ \t]*\nMSG: *', f'\n{text}')
+        self.text = own_text[1:]
+        self._given_texts = {}
+        for part in parts:
+            name, _, nested_text = part.partition('\n')
+            self._given_texts[name.strip()] = nested_text
+        for part in re.split(r'^---.*$', own_text, flags=re.M):  # a service has two
+            self._add_nested(type_name, part)
+
+    def _add_nested(self, type_name, text):
+        """Read the text of a type, and add the types of its fields."""
+        spec = load_msg_from_string(self.context, text, type_name)
+        for field_type in map(bare_msg_type, spec.types):
+            name = 'std_msgs/Header' if field_type == 'Header' else field_type
+            if is_builtin(name) or name in self.nested_texts:
                 continue
-            if field not in given:
-                installed = _installed('msg', field)
-                full = installed._full_text if installed else _text_of('msg', field)
-                given[field] = re.split(r'\n=+[ \t]*\n', full)[0]
-            nested[field] = given[field]
-            _defined.setdefault(('msg', field), given[field])
-            add_nested(field, given[field])
+            nested_text = self._given_texts.get(name)
+            if nested_text is None:
+                nested_text = _nested_definition(name)
+            self.nested_texts[name] = nested_text
+            _given_definitions.setdefault(('msg', name), nested_text)
+            self._add_nested(name, nested_text)
 
-    for part in re.split(r'^---.*$', own, flags=re.M):  # of a service there are two
-        add_nested(type_, part)
-    tail = ''.join(f'\n{"=" * 80}\nMSG: {name}\n{text}' for name, text in nested.items())
-    return context, own[1:], tail, nested
+    @property
+    def nested_part(self):
+        """The texts of the nested types, as they follow in a full definition."""
+        texts = self.nested_texts.items()
+        return ''.join(f'\n{"=" * 80}\nMSG: {name}\n{text}' for name, text in texts)
 
 
-def _made(make):
+def _nested_definition(type_name):
+    """Return the definition of a nested type, without the types that are nested in it."""
+    installed_class = _installed_class('msg', type_name)
+    if installed_class:
+        text = installed_class._full_text
+    else:
+        text = _find_definition('msg', type_name)
+    return re.split(r'\n=+[ \t]*\n', text)[0]
+
+
+def _once(make_class):
     """Have a function run once for the same arguments, in one thread at a time."""
-    cached = functools.cache(make)
+    cached_function = functools.cache(make_class)
 
-    def made(type_, text):
+    def make_once(type_name, text):
         try:
             with _lock:
-                return cached(type_, text)
+                return cached_function(type_name, text)
         except Exception as error:
-            raise UnknownTypeError(f'{type_}: no class can be made of it: {error}') from error
+            raise UnknownTypeError(f'{type_name}: no class can be made of it: {error}') from error
 
-    return made
+    return make_once
 
 
-@_made
-def _made_message(type_, text):
-    _, own, tail, nested = _read(type_, text)
-    classes = generate_dynamic(type_, f'{own}{tail}\n')
-    cls = classes[type_]
-    cls._full_text, cls._classes = own + tail, classes  # these are for the copier
-    for name in nested:  # genpy has made classes of these, too
-        known = message_class(name)
-        if known._md5sum == classes[name]._md5sum:
-            classes[name] = known
-            cls.serialize.__globals__['_' + name.replace('/', '__')] = known
+@_once
+def _make_message(type_name, text):
+    definition = _Definition(type_name, text)
+    full_text = definition.text + definition.nested_part
+    classes = generate_dynamic(type_name, f'{full_text}\n')
+    cls = classes[type_name]
+    cls._full_text = full_text
+    cls._classes = classes  # for the copier
+    for name in definition.nested_texts:  # genpy has made classes of these, too
+        known_class = message_class(name)
+        if known_class._md5sum == classes[name]._md5sum:
+            classes[name] = known_class
+            cls.serialize.__globals__['_' + name.replace('/', '__')] = known_class
     return cls
 
 
-@_made
-def _made_service(type_, text):
-    context, own, tail, _ = _read(type_, text)
-    spec = load_srv_from_string(context, own, type_)
-    load_depends(context, spec, {})
-    md5sum = genmsg.compute_md5(context, spec)
-    request, response = (
-        _made_message(f'{type_}{kind}', part.text + tail)
-        for kind, part in (('Request', spec.request), ('Response', spec.response))
-    )
-    attributes = {'_request_class': request, '_response_class': response}
-    return type(spec.short_name, (), {'_type': type_, '_md5sum': md5sum, **attributes})
+@_once
+def _make_service(type_name, text):
+    definition = _Definition(type_name, text)
+    spec = load_srv_from_string(definition.context, definition.text, type_name)
+    load_depends(definition.context, spec, {})
+    nested_part = definition.nested_part
+    attributes = {
+        '_type': type_name,
+        '_md5sum': genmsg.compute_md5(definition.context, spec),
+        '_request_class': _make_message(f'{type_name}Request', spec.request.text + nested_part),
+        '_response_class': _make_message(f'{type_name}Response', spec.response.text + nested_part),
+    }
+    return type(spec.short_name, (), attributes)
 
 
 # -- filling
@@ -233,32 +273,34 @@ def describe(cls):
     return ', '.join(f'{name}: {type_}' for name, type_ in fields) or 'no fields'
 
 
-def build(cls, filler, fields):
-    """Return a message that ``filler(message)`` fills or returns, or ``filler``, if it is one.
+def build(cls, block, fields):
+    """Return a message that ``block(message)``, a dict or keywords fill, or a ready message.
 
-    Keywords fill it, too. Dicts fill nested messages, and a list of dicts an array of them. numpy arrays are taken for
-    arrays of numbers.
+    Dicts fill nested messages, and a list of dicts an array of them. numpy arrays are taken for arrays
+    of numbers. ``block(message)`` may return another message instead.
 
     :raises MessageTypeError: for a field that does not exist
     """
     message = cls()
-    if callable(filler):
-        made = filler(message)
-        filler = made if isinstance(made, Message) else None
-    if isinstance(filler, dict):
-        fields = {**filler, **fields}
-    elif isinstance(filler, Message):
-        message = filler
-    elif filler is not None:
+    if isinstance(block, Message):
+        message = block
+    elif isinstance(block, dict):
+        fields = {**block, **fields}
+    elif callable(block):
+        returned_value = block(message)
+        if isinstance(returned_value, Message):
+            message = returned_value
+    elif block is not None:
         raise MessageTypeError(
-            f'{cls._type} is filled by a block, a dict or keywords, or is a message; not {filler!r}'
+            f'{cls._type} is filled by a block, a dict or keywords, or is a message; not {block!r}'
         )
     return _fill(message, fields)
 
 
 def response(cls, value):
-    """Return the response for what the block of a service returned: a response, a dict, tuple or
-    list of its fields, or its only field; None if it has no fields.
+    """Return the response for the value that the block of a service returned.
+
+    That is a response, a dict, tuple or list of its fields, or its only field; None if it has none.
 
     :raises MessageTypeError: if it does not fit
     """
@@ -266,15 +308,18 @@ def response(cls, value):
     if value is None and not names:
         value = {}
     elif len(names) == 1 and type(value) is list and cls._slot_types[0].endswith(']'):
-        if not (value and type(value[0]) is list):
+        is_list_of_fields = bool(value) and type(value[0]) is list
+        if not is_list_of_fields:
             value = {names[0]: value}
-    return check(_fill(cls(), value) if type(value) is dict else as_rospy(value, cls))
+    if type(value) is dict:
+        return check(_fill(cls(), value))
+    return check(convert_return_to_response(value, cls))
 
 
 def check(message):
     """Return a copy of the message; raise MessageTypeError if it cannot be sent."""
     try:
-        return copied(message)
+        return copy_of(message)
     except Exception as error:
         raise explain(message, error) from error
 
@@ -285,25 +330,25 @@ def _fill(message, fields):
     for name, value in fields.items():
         if name not in types:
             raise MessageTypeError(f'{cls._type} has no field {name!r}; it has {describe(cls)}')
-        base = types[name].partition('[')[0]
+        base_type = types[name].partition('[')[0]
         if type(value) is dict:
-            value = _fill(_nested_class(base, cls)(), value)
-        elif type(value) is list and dict in map(type, value[:1]):
-            value = [_fill(_nested_class(base, cls)(), each) for each in value]
+            value = _fill(_class_of_field(base_type, cls)(), value)
+        elif type(value) is list and value and type(value[0]) is dict:
+            value = [_fill(_class_of_field(base_type, cls)(), item) for item in value]
         setattr(message, name, value)
     return message
 
 
-def _nested_class(base, cls):
-    """Return the class of a nested field; genpy.dynamic puts them into one module, under such names."""
-    beside = cls.serialize.__globals__.get('_' + base.replace('/', '__'))
-    return beside or nested_class(base, cls)
+def _class_of_field(base_type, cls):
+    """Return the class of a nested field; genpy.dynamic has these classes in one module."""
+    made_class = cls.serialize.__globals__.get('_' + base_type.replace('/', '__'))
+    return made_class or nested_class(base_type, cls)
 
 
 def explain(message, error):
     """Return our error for what serializing a message raised; genpy names the field."""
     try:
         message._check_types()
-    except Exception as found:
-        error = found
+    except Exception as type_error:
+        error = type_error
     return MessageTypeError(f'{message._type} cannot be sent: {error}: {str(message)[:200]!r}')

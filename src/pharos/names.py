@@ -1,10 +1,13 @@
 """Names of nodes, topics, services and parameters."""
 import re
+
 import rosgraph.names
+
+_NODE_NAME = re.compile(r'/?[A-Za-z]\w*(/[A-Za-z]\w*)*', re.ASCII)
 
 
 def legal_name(name):
-    """Return the name if it can be that of a topic, service or parameter, else raise ValueError."""
+    """Return the name if a topic, service or parameter can have it, else raise ValueError."""
     is_text = isinstance(name, str) and name.isascii() and name.strip('/~')
     if not (is_text and rosgraph.names.is_legal_name(name)):
         raise ValueError(
@@ -19,7 +22,7 @@ def full_name(name):
 
 
 def node_name(name):
-    """Return the name if it can be a node's, else raise ValueError."""
-    if isinstance(name, str) and re.fullmatch(r'/?[A-Za-z]\w*(/[A-Za-z]\w*)*', name, re.A):
+    """Return the name if a node can have it, else raise ValueError."""
+    if isinstance(name, str) and _NODE_NAME.fullmatch(name):
         return name
     raise ValueError(f'{name!r} cannot be the name of a node: give one such as /robot1/driver')

@@ -1,44 +1,50 @@
 """Nodes: real ROS nodes of this process, written with blocks."""
 from __future__ import annotations
 
-import enum
+import dataclasses
 import functools
 import re
 import threading
 import types
 from contextlib import suppress
-from typing import TYPE_CHECKING, Iterator
+from typing import TYPE_CHECKING, Any, Iterator, Sequence
 
 from genpy import Message
 import rosgraph.names
 import rospy
 
-from pharos import messages
-from pharos.blocks import Block, Receiver, name_of, rebound, taking
+from pharos import messages, signals
+from pharos.blocks import Block, Receiver, block_name, rebind, with_arguments
 from pharos.channels import QUEUE_SIZE, Channel, InputChannel, OutputChannel
 from pharos.errors import MasterUnreachableError, MessageTypeError, NodeStoppedError
 from pharos.errors import PharosError, UnknownTopicError
 from pharos.external_node import ExternalNode
-from pharos.failures import Failure, Failures
+from pharos.failures import Failures
 from pharos.names import legal_name, node_name
 from pharos.parameter import Parameter
-from pharos.private_rospy.run import Run
-from pharos.program import here, is_signalled, nodes, quiet_wait, wait, wait_for
+from pharos.private_rospy.run import Lifecycle, Run
 from pharos.service import OfferedService, Service
 from pharos.transcript import Transcript
+from pharos.waiting import current, wait, wait_for
 
 if TYPE_CHECKING:
     from pharos.master import Master
 
 
-class Lifecycle(enum.Enum):
-    """The states of a node; see :attr:`Node.lifecycle`."""
+@dataclasses.dataclass
+class Settings:
+    """The settings of a node that hold for all its runs.
 
-    NEW = 'new'
-    STARTING = 'starting'
-    RUNNING = 'running'
-    STOPPING = 'stopping'
-    STOPPED = 'stopped'
+    :ivar name: the full name
+    :ivar domain: the address that it advertises; None until the first run has found one
+    :ivar ports: for messages, and for ROS's calls; 0 until the first run has found one
+    """
+
+    name: str
+    master: Master
+    domain: str | None
+    ports: tuple[int, int]
+    remappings: Sequence[str]
 
 
 class Node(Receiver):
@@ -82,50 +88,43 @@ class Node(Receiver):
 
     master: Master
     name: str
-    failures: Failures
+    failures = Failures()
     _run_class = Run
-    _lifecycle = Lifecycle.NEW
-    _run: Run
-    _failures = Failures()
-    _is_beginning = False  # True while a start() runs after which delegates are let run
-    _master: Master = None  # type: ignore[assignment]
+    _current_run: Run = None  # type: ignore[assignment]
+    _settings: Settings = None  # type: ignore[assignment]
+    _releases_after_start = False  # True while start() runs, and lets no delegate run
 
     def __init__(self, *args, **kwargs):
         """Do nothing: :meth:`Master.create` has given the node its name and all else.
 
         :raises PharosError: if the class is called, or this method with arguments
         """
-        if args or kwargs or not self._master:
-            kind = type(self).__name__
-            given = (
-                f'{kind} takes no {", ".join([*map(repr, args), *kwargs])}'
-                if args or kwargs
-                else kind
-            )
-            raise PharosError(
-                f"{given}: write Master().create({kind}, named='{kind.lower()}'), and"
-                ' super().__init__() without a name'
-            )
+        if self._settings and not args and not kwargs:
+            return
+        class_name = type(self).__name__
+        mistake = class_name
+        if args or kwargs:
+            arguments = ', '.join([*map(repr, args), *kwargs])
+            mistake = f'{class_name} takes no {arguments}'
+        raise PharosError(
+            f"{mistake}: write Master().create({class_name}, named='{class_name.lower()}'), and"
+            ' super().__init__() without a name'
+        )
 
-    def _configure(self, master, name, soul, delegate, domain, ports, remappings):
-        taking(soul, 'soul', 0, 1)
-        self._name = name
-        self._master = master
-        self._domain = domain
-        self._ports = ports
-        self._remappings = remappings
-        # what users read; their class may set these names to something else
-        self.name = name
-        self.master = master
+    def _configure(self, settings, soul, delegate):
+        with_arguments(soul, 'soul', 0, 1)  # raises if it cannot be one
+        self._settings = settings
+        self._life_lock = threading.RLock()  # held by a start, stop or restart
+        self._send_lock = threading.Lock()  # held while send_to() opens a channel
+        self._send_channels = {}  # (topic, type) as given to send_to -> OutputChannel
+        # for users; their class may set these names to something else
+        self.name = settings.name
+        self.master = settings.master
+        self.domain = settings.domain
+        self.tcp_port, self.xmlrpc_port = settings.ports
         self.uri = None
-        self.domain = domain
-        self.tcp_port, self.xmlrpc_port = ports
         self.soul = soul
         self.delegate = delegate
-        self._life = threading.RLock()  # held by a start, stop or restart
-        self._opening = threading.Lock()  # held while send_to() opens a channel
-        self._opened = []  # channels, services and parameters, also while it is stopped
-        self._senders = {}  # (topic, type) as given to send_to
 
     # -- life
 
@@ -138,73 +137,66 @@ class Node(Receiver):
         :raises PharosError: if the node runs already
         :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: and nothing is left
         """
-        if not self._master:
+        if not self._settings:
             Node.__init__(self)  # says how a node is made
-        with self._life:
-            if self._lifecycle not in (Lifecycle.NEW, Lifecycle.STOPPED):
-                raise PharosError(f'{self._name} is {self._lifecycle.value} already')
-            self._failures = self.failures = Failures()
-            self._souls = {}
-            self._lifecycle = Lifecycle.STOPPED  # it stays so if a script cannot be read
-            run = self._run_class(self)
-            self._run = run
-            self._lifecycle = Lifecycle.STARTING
-            nodes.append(self)
-            opened = self._opened
-            self._opened = []
+        with self._life_lock:
+            if self.lifecycle not in (Lifecycle.NEW, Lifecycle.STOPPED):
+                raise PharosError(f'{self._settings.name} is {self.lifecycle.value} already')
+            endpoints = self._current_run.endpoints if self._current_run else []
+            run = self._run_class(self, self._settings)
+            self._current_run = run
+            self.failures = run.failures
+            signals.started_nodes.append(self)
             try:
                 run.start()
-                self._lifecycle = Lifecycle.RUNNING
-                if not self._opens_channels():
-                    for each in opened:
-                        each.open()
-                    run.turns.release()
+                run.lifecycle = Lifecycle.RUNNING
+                if not self._opens_own_endpoints:
+                    for endpoint in endpoints:
+                        endpoint.open()
+                    run.callback_queue.release()
             except BaseException:
-                self._end()  # waits for a ScriptNode's thread, which may still register
-                self._opened = opened
+                self._stop_run()
+                run.endpoints = endpoints  # the next start opens them
                 raise
 
-    def _opens_channels(self):
-        """True if the start() of its class opens its channels itself."""
+    @property
+    def _opens_own_endpoints(self):
+        """True if the start() of the node's class opens its channels itself."""
         return type(self).start is not Node.start
 
-    def _begin(self):
-        """Start, and let delegates run when the class's start() has returned."""
-        self._is_beginning = True
+    def _start_and_release(self):
+        """Start, and let delegates run when the start() of the node's class has returned."""
+        self._releases_after_start = True
         try:
             self.start()
         finally:
-            self._is_beginning = False
-        if self._lifecycle is Lifecycle.NEW:
+            self._releases_after_start = False
+        if self.lifecycle is Lifecycle.NEW:
             raise PharosError(f'{type(self).__name__}.start() must call super().start() first')
-        self._run.turns.release()
-
-    def _end(self):
-        self._run.stop(self.stop_timeout)
-        for each in self._opened:  # rospy has closed it
-            each.closed = True
-        self._lifecycle = Lifecycle.STOPPED
-        nodes.remove(self)
+        self._current_run.callback_queue.release()
 
     def stop(self) -> None:
-        """End the souls, send what is under way, unregister, free ports and threads.
+        """End the souls, send messages under way, unregister, free ports and threads.
 
         Does nothing if the node is stopped. Waits up to :attr:`stop_timeout` for souls, and as long
-        for messages under way; what goes on then is left behind, and named in the log.
+        for messages under way. The log names threads that go on after that.
         """
-        with self._life:
-            if self._lifecycle is Lifecycle.RUNNING:
-                self._lifecycle = Lifecycle.STOPPING
-                self._end()
+        with self._life_lock:
+            if self.is_running:
+                self._stop_run()
 
-    def _end_now(self):
-        """Stop the node, whatever the stop() of its class raises; two threads may ask for it."""
-        with self._life:
+    def _stop_run(self):
+        self._current_run.stop(self.stop_timeout)
+        signals.started_nodes.remove(self)
+
+    def _stop_safely(self):
+        """Stop the node, even if the stop() of its class raises; two threads may ask for it."""
+        with self._life_lock:
             try:
-                if self._lifecycle is Lifecycle.RUNNING:
+                if self.is_running:
                     self.stop()
             except Exception as error:
-                self._report(error, self.stop, 'method')
+                self._current_run.report_failure(error, self.stop, 'method')
             finally:
                 Node.stop(self)
 
@@ -215,18 +207,19 @@ class Node(Receiver):
 
         :raises MasterUnreachableError: if the master does not answer, and the node runs on
         """
-        with self._life:
-            self._master.call('getPid')
-            souls = {soul: block for soul, block in self._souls.items() if soul.is_alive()}
-            nodes.append(self)  # stop() removes one; spin() must not find none
+        with self._life_lock:
+            self._settings.master.call('getPid')  # raises if the master does not answer
+            souls = self._current_run.souls
+            blocks = {thread.name: souls[thread] for thread in souls if thread.is_alive()}
+            signals.restarting_nodes.append(self)  # spin() goes on
             try:
                 self.stop()
-                self._begin()
+                self._start_and_release()
             finally:
-                nodes.remove(self)
-            if not self._opens_channels():
-                for soul, block in souls.items():
-                    Node.fork(self, block, soul.name)
+                signals.restarting_nodes.remove(self)
+            if not self._opens_own_endpoints:
+                for name, block in blocks.items():
+                    Node.fork(self, block, name)
 
     def become(self, node_class: type[Node]) -> None:
         """Be a node of another class from now on; name, ports, connections and attributes stay.
@@ -237,24 +230,21 @@ class Node(Receiver):
         :raises TypeError: if it is not a subclass of Node
         :raises AttributeError: if it lacks a method that is a block of the node
         """
-        check_class(node_class)
+        check_node_class(node_class)
         self._check_running()
+        run = self._current_run
 
         def change():
-            receivers = self, *self._opened
-            soul = rebound(self.soul, self, node_class)
-            blocks = [rebound(each.delegate, self, node_class) for each in receivers]
-            self.__class__, self.soul = node_class, soul
-            for receiver, block in zip(receivers, blocks):
-                receiver.delegate = block
+            receivers = [self, *run.endpoints]
+            # all blocks are found before the first change: one may be missing
+            soul = rebind(self.soul, self, node_class)
+            delegates = [rebind(receiver.delegate, self, node_class) for receiver in receivers]
+            self.__class__ = node_class
+            self.soul = soul
+            for receiver, delegate in zip(receivers, delegates):
+                receiver.delegate = delegate
 
-        self._run.turns.call(change)
-
-    def _abandon(self):
-        """Be stopped in a forked child: the node runs in the parent."""
-        self._lifecycle = Lifecycle.STOPPED
-        for each in self._opened:
-            each.closed = True
+        run.callback_queue.call(change)
 
     def __enter__(self):
         return self
@@ -264,68 +254,66 @@ class Node(Receiver):
 
     def _check_running(self):
         """Raise NodeStoppedError if the node has not started, or has stopped."""
-        if self._lifecycle not in (Lifecycle.RUNNING, Lifecycle.STOPPING):
+        if not (self._current_run and self._current_run.is_active):
             raise NodeStoppedError(
-                f'{self._name} is {self._lifecycle.value}: start() it, by super() in a class of your own'
+                f'{self._settings.name} is {self.lifecycle.value}: start() it,'
+                ' by super() in a class of your own'
             )
 
     @property
     def is_running(self) -> bool:
         """True if the node is started and no stop has begun."""
-        return self._lifecycle is Lifecycle.RUNNING
+        return self.lifecycle is Lifecycle.RUNNING
 
     @property
     def lifecycle(self) -> Lifecycle:
-        """Its state."""
-        return self._lifecycle
+        """The node's state."""
+        return self._current_run.lifecycle if self._current_run else Lifecycle.NEW
 
     @property
     def channels(self) -> list[Channel]:
         """The channels that are open."""
-        return [each for each in self._opened if isinstance(each, Channel) and not each.closed]
+        return self._current_run.open_endpoints(Channel) if self._current_run else []
 
     @property
-    def ros(self):
+    def ros(self) -> Any:
         """The node's own rospy in this run, whole: ``node.ros.Timer``, ``node.ros.Time.now()``."""
         self._check_running()
-        return self._run.ros
+        return self._current_run.ros
 
-    def ros_import(self, name: str):
+    def ros_import(self, name: str) -> Any:
         """Return a library written on rospy, such as 'actionlib', bound to this run of the node."""
         self._check_running()
-        return self._run.modules.load(name)
+        return self._current_run.modules.load(name)
 
     def health(self) -> types.SimpleNamespace:
         """Return how the node is doing; asks the master.
 
         :returns: an object with ``registered`` (True if the master has the node, None if it does not
-            answer), ``kind`` (its class), ``connections`` ({transport: how many}), ``dropped`` (how
-            many messages), ``errors`` (how often blocks failed), ``threads``, ``souls`` (how many
-            run in threads), ``ended_souls`` (their names)
+            answer), ``kind`` (its class), ``connections`` ({transport: number}), ``dropped`` (number
+            of messages), ``errors`` (how often blocks failed), ``threads``, ``souls`` (number of
+            those that run in threads), ``ended_souls`` (their names)
         """
         registered = None
         with suppress(MasterUnreachableError):
-            registered = self._master.call('lookupNode', self._name) == self._run.uri
-        return types.SimpleNamespace(registered=registered, **self._told())
-
-    def _told(self):
-        """Return what :meth:`health` knows without the master; top asks for it by XML-RPC."""
-        from pharos.live.snapshot import told
-
-        return told(self)
+            uri = self._settings.master.call('lookupNode', self._settings.name)
+            registered = uri == self._current_run.uri
+        return types.SimpleNamespace(registered=registered, **self._current_run.health_facts())
 
     def describe(self, seconds: float = 1.0) -> str:
-        """Return as text what it publishes, receives and offers, its peers, and how often."""
+        """Return as text the node's topics, services, peers and rates, counted for some seconds."""
         from pharos.live.words import describe
 
-        return describe(self._master, self._name, seconds)
+        return describe(self._settings.master, self._settings.name, seconds)
 
     def __repr__(self):
-        return f'<{type(self).__name__} {self._name} {self._lifecycle.value}>'
+        return f'<{type(self).__name__} {self._settings.name} {self.lifecycle.value}>'
 
-    def execute(self):
+    # -- souls
+
+    def execute(self) -> Any:
         """Run the soul once, in this thread, and return its value (``node execute`` in the report)."""
-        return self._run_soul(self._soul_or(None))
+        return self._run_soul(self._check_soul(self.soul))
 
     def fork(self, block: Block | None = None, name: str | None = None) -> threading.Thread:
         """Run the soul, or ``block(node)``, in a thread of its own, and return the thread.
@@ -333,44 +321,45 @@ class Node(Receiver):
         The report (listing 3.8): ``[node execute] fork``. :meth:`stop` ends it at its next
         :meth:`sleep` or turn of :meth:`every`.
         """
-        runs = self._soul_or(block)
-        soul = self._run.Thread(target=self._run_soul, args=[runs], name=name or name_of(runs))
-        self._souls[soul] = block
-        soul.start()
-        return soul
+        soul = self._check_soul(block or self.soul)
+        run = self._current_run
+        thread = run.Thread(target=self._run_soul, args=[soul], name=name or block_name(soul))
+        run.souls[thread] = block
+        thread.start()
+        return thread
 
-    def _soul_or(self, block):
+    def _check_soul(self, block):
         self._check_running()
-        block = block or self.soul
-        if taking(block, 'soul', 0, 1) is None:
-            raise PharosError(f'{self._name} has no soul to run: give it one, node.soul = block')
+        if with_arguments(block, 'soul', 0, 1) is None:
+            raise PharosError(f'{self._settings.name} has no soul: give it one, node.soul = block')
         return block
 
     def _run_soul(self, block):
-        before, here.node, is_own = here.node, self, block is self.soul
+        former_node = current.node
+        current.node = self
+        is_node_soul = block is self.soul
+
+        def retry(message):
+            self._run_soul(self.soul if is_node_soul else block)
+
         try:
-            return taking(block, 'soul', 0, 1)(self)
+            return with_arguments(block, 'soul', 0, 1)(self)
         except BaseException as error:
-            is_by_stop = self._run.stopping.is_set() and isinstance(error, rospy.ROSException)
-            if not is_by_stop:
-                self._report(
-                    error,
-                    block,
-                    'soul',
-                    again=lambda _: self._run_soul(self.soul if is_own else block),
-                )
+            is_stopping = self._current_run.stopping.is_set()
+            if not (is_stopping and isinstance(error, rospy.ROSException)):
+                self._current_run.report_failure(error, block, 'soul', retry=retry)
         finally:
-            here.node = before
+            current.node = former_node
         return None
 
     def sleep(self, seconds: float) -> None:
         """Sleep for some seconds of ROS time; the stop of the node ends it, and its soul."""
-        with quiet_wait():
+        with signals.quiet_wait():
             self._check_running()
-            self._run.turns.pause()  # a start() that waits lets delegates run
-            self._run.ros.sleep(seconds)
-        if self._run.stopping.is_set() and here.node is self:
-            raise NodeStoppedError(f'{self._name} stops, and this soul with it')
+            self._current_run.callback_queue.release_before_sleep()
+            self._current_run.ros.sleep(seconds)
+        if self._current_run.stopping.is_set() and current.node is self:
+            raise NodeStoppedError(f'{self._settings.name} stops, and this soul with it')
 
     def every(self, seconds: float) -> Iterator[int]:
         """Return an iterator that turns every so many seconds of ROS time, until the node stops.
@@ -382,7 +371,7 @@ class Node(Receiver):
         if not seconds > 0:
             raise ValueError(f'a period is a number of seconds above 0, not {seconds!r}')
         self._check_running()
-        run = self._run
+        run = self._current_run
         rate = run.ros.Rate(1 / seconds, reset=True)
 
         def turns():
@@ -390,8 +379,8 @@ class Node(Receiver):
             while not run.stopping.is_set():
                 yield turn
                 turn += 1
-                run.turns.pause()  # a start() that waits lets delegates run
-                with quiet_wait():
+                run.callback_queue.release_before_sleep()
+                with signals.quiet_wait():
                     rate.sleep()
 
         return turns()
@@ -401,47 +390,22 @@ class Node(Receiver):
     @property
     def errors(self) -> list[BaseException]:
         """The exceptions of blocks in this run of the node, the newest last; 100 kinds at most."""
-        return [failure.error for failure in self._failures]
+        failures = self._current_run.failures if self._current_run else []
+        return [failure.error for failure in failures]
 
-    def _report(self, error, block, what, message=None, channel=None, again=None):
-        """Keep what a block raised, and tell it at the 1st, 10th, 100th time; Ctrl-C goes on."""
-        if isinstance(error, (KeyboardInterrupt, SystemExit)) and is_signalled():
-            raise error
-        failure = self._keep_failure(error, block, message, channel, again)
-        if str(failure.count).strip('0') != '1':
-            return
-        with suppress(Exception):  # neither log nor Transcript can be written
-            line = f'{what} {name_of(block)} of {self._name}'
-            line += f' on {channel.topic}' if channel else ''
-            line += f' raised {type(error).__name__}: {error}'
-            line += f' ({failure.count} times)' if failure.count > 1 else ''
-            try:
-                Node.log(self, f'{line}\n{failure.traceback}', 'error')
-            finally:
-                Transcript.show(line)
-
-    def _keep_failure(self, error, block, message=None, channel=None, again=None):
-        """Keep what a block raised, without telling it, and return the Failure."""
-        failure = Failure(error, block, message, channel, again)
-        self._failures.keep(failure)
-        return failure
-
-    def _refused(self, topic, reason):
-        """Take note that a publisher sends another type."""
-        error = MessageTypeError(f'{self._name} does not receive from {topic}: {reason}')
-        self._report(error, topic, 'connection')
-
-    def log(self, text, level: str = 'info') -> None:
+    def log(self, text: Any, level: str = 'info') -> None:
         """Log a line to the screen, the log file and /rosout.
 
         :param level: 'debug', 'info', 'warning' (or 'warn'), 'error' or 'fatal'
         """
         if level not in ('debug', 'info', 'warn', 'warning', 'error', 'fatal'):
             raise ValueError(f'unknown level {level!r}: give info or error, and one text')
-        if self._lifecycle not in (Lifecycle.RUNNING, Lifecycle.STOPPING):
-            return Transcript.show(f'[{level.upper()}] {self._name}: {text}')
-        # no wrapper between: rospy looks for the caller of this method
-        self._run.core._base_logger('%s', (text,), {}, level=level)
+        run = self._current_run
+        if run and run.is_active:
+            # no function between: rospy looks for the caller of this one
+            run.write_log('%s', (text,), {}, level=level)
+        else:
+            Transcript.show(f'[{level.upper()}] {self._settings.name}: {text}')
 
     # -- topics
 
@@ -451,15 +415,15 @@ class Node(Receiver):
         :raises ValueError: if it cannot be a name
         """
         self._check_running()
-        return self._run.ros.resolve_name(legal_name(name).replace('~/', '~'))
+        return self._current_run.ros.resolve_name(legal_name(name).replace('~/', '~'))
 
     def _peer_name(self, peer):
         """Return the full name of a Node, an ExternalNode, or a node given by its name."""
         if isinstance(peer, Node):
-            return peer._name
+            return peer._settings.name
         if isinstance(peer, ExternalNode):
             return peer.name
-        return rosgraph.names.resolve_name(node_name(peer), self._name)
+        return rosgraph.names.resolve_name(node_name(peer), self._settings.name)
 
     def interested_in(
         self,
@@ -485,9 +449,11 @@ class Node(Receiver):
         :raises MasterUnreachableError: if the master does not answer; nothing is left behind
         """
         topic = self._resolve(topic)
-        peer = from_ and self._peer_name(from_)
-        cls = self._class_of(topic, typed_as, is_receiver=True)
-        return InputChannel(self, topic, cls, delegate, queue_size, inline, shared, peer)
+        peer_name = self._peer_name(from_) if from_ else None
+        message_class = self._receiver_class(topic, typed_as)
+        return InputChannel(
+            self, topic, message_class, delegate, queue_size, inline, shared, peer_name
+        )
 
     def output_channel(
         self,
@@ -502,7 +468,7 @@ class Node(Receiver):
         :param queue_size: messages that wait for each subscriber at most
         """
         topic = self._resolve(topic)
-        return OutputChannel(self, topic, self._class_of(topic, typed_as), latch, queue_size)
+        return OutputChannel(self, topic, self._message_class(topic, typed_as), latch, queue_size)
 
     def send_to(
         self,
@@ -529,69 +495,83 @@ class Node(Receiver):
         :param fields: fill the message by name
         """
         if isinstance(block, type) and issubclass(block, Message):
-            typed_as, block = block, fill
-        channel = self._senders.get((topic, typed_as))
+            typed_as = block
+            block = fill
+        channel = self._send_channels.get((topic, typed_as))
         if channel and not channel.closed:
             return channel.send(block, to=to, **fields)
-        name = self._resolve(topic)
-        given = type(block) if isinstance(block, Message) else None
-        with self._opening:  # two threads that send first open one channel
-            cls = self._class_of(name, typed_as or given)
-            known = self._open_on(name, OutputChannel)
-            channel = known[0] if known else OutputChannel(self, name, cls)
-            self._senders[topic, typed_as] = channel
+        with self._send_lock:  # two threads that send first open one channel
+            channel, is_new = self._find_send_channel(topic, typed_as, block)
+            self._send_channels[topic, typed_as] = channel
         try:
             return channel.send(block, to=to, **fields)
         except Exception:
-            if not known:
+            if is_new:
                 channel.close()
             raise
 
-    def _open_on(self, topic, kind=Channel):
-        return [
-            each
-            for each in self._opened
-            if isinstance(each, kind) and each.topic == topic and not each.closed
-        ]
+    def _find_send_channel(self, topic, typed_as, block):
+        """Return an OutputChannel for send_to(), and True if it was opened for that."""
+        name = self._resolve(topic)
+        if isinstance(block, Message):
+            typed_as = typed_as or type(block)
+        message_class = self._message_class(name, typed_as)
+        for channel in self._current_run.open_endpoints(OutputChannel):
+            if channel.topic == name:
+                return channel, False
+        return OutputChannel(self, name, message_class), True
 
-    def _class_of(self, topic, typed_as, is_receiver=False):
-        known = [each.message_class for each in self._open_on(topic)]
-        if typed_as is None and known:
-            return known[0]
-        type_ = typed_as or self._master.topic_type(topic)
-        if type_ in (None, '*'):
+    def _receiver_class(self, topic, typed_as):
+        """Return the message class for a channel that receives: a publisher may define the type."""
+        ask_publisher = functools.partial(self._ask_definition, topic)
+        return self._message_class(topic, typed_as, ask_publisher)
+
+    def _message_class(self, topic, typed_as, ask_publisher=None):
+        known_class = None
+        for channel in self.channels:
+            if channel.topic == topic:
+                known_class = channel.message_class
+                break
+        if known_class and typed_as is None:
+            return known_class
+        type_name = typed_as or self._settings.master.topic_type(topic)
+        if type_name in (None, '*'):
             raise UnknownTopicError(
                 f'the master knows no type of {topic}: give typed_as=, such as "std_msgs/String"'
             )
-        ask = functools.partial(self._definition_of_publisher, topic) if is_receiver else None
-        cls = messages.message_class(type_, ask)
-        if known and known[0]._md5sum != cls._md5sum:
+        message_class = messages.message_class(type_name, ask_publisher)
+        if known_class and known_class._md5sum != message_class._md5sum:
             raise MessageTypeError(
-                f'{self._name} has {topic} open as {known[0]._type}, not as {cls._type}'
+                f'{self._settings.name} has {topic} open as {known_class._type},'
+                f' not as {message_class._type}'
             )
-        return cls
+        return message_class
 
-    def _definition_of_publisher(self, topic, type_):
-        """Return the definition that a publisher sends when it is connected."""
-        if not self._master.topic(topic).publishers:
+    def _ask_definition(self, topic, type_name):
+        """Return the definition that a publisher sends when it is connected, None if none does."""
+        if not self._settings.master.topic(topic).publishers:
             return None
 
-        def find(end):
-            headers = [each.header or {} for each in end.impl.connections]
-            return [each['message_definition'] for each in headers if each.get('type') == type_]
+        def definitions(subscriber):
+            headers = [connection.header or {} for connection in subscriber.impl.connections]
+            return [
+                header['message_definition']
+                for header in headers
+                if header.get('type') == type_name
+            ]
 
-        return (
-            self._subscribed(find, self.connect_timeout, topic, self._run.ros.AnyMsg) or [None]
-        )[0]
+        any_message = self._current_run.ros.AnyMsg
+        found = self._wait_subscribed(definitions, self.connect_timeout, topic, any_message)
+        return found[0] if found else None
 
-    def _subscribed(self, find, timeout, *options):
-        """Wait until ``find(subscriber)`` is true of a subscriber of rospy, and return what it is."""
-        # not through a channel: a delegate may call this, whose turn it is
-        end = self._run.ros.Subscriber(*options)
+    def _wait_subscribed(self, predicate, timeout, *arguments):
+        """Wait until ``predicate(subscriber)`` is true of a rospy.Subscriber, and return its value."""
+        # not through a channel: the delegate that calls this may hold the node's callback queue
+        subscriber = self._current_run.ros.Subscriber(*arguments)
         try:
-            return wait(lambda: find(end), timeout, self)
+            return wait(lambda: predicate(subscriber), timeout, self)
         finally:
-            end.unregister()
+            subscriber.unregister()
 
     def wait_for_message(
         self,
@@ -608,22 +588,24 @@ class Node(Receiver):
         :raises UnknownTopicError, TimeoutError: if none comes in time
         :raises NodeStoppedError: if the node stops meanwhile
         """
-        came, topic = [], self._resolve(topic)
+        topic = self._resolve(topic)
+        received = []
 
-        def find(end):
-            while came and where and not where(came[0]):
-                del came[0]
-            return came
+        def wanted(subscriber):
+            while received and where and not where(received[0]):
+                del received[0]
+            return received
 
-        self._master.call('getPid')  # raises if it does not answer
+        master = self._settings.master
+        master.call('getPid')  # raises if the master does not answer
         if timeout and not typed_as:
-            typed_as = wait(lambda: self._master.topic_type(topic), timeout, self)
-        cls = self._class_of(topic, typed_as, True)
-        if self._subscribed(find, timeout, topic, cls, came.append):
-            return came[0]
-        if not self._run.stopping.is_set():
+            typed_as = wait(lambda: master.topic_type(topic), timeout, self)
+        message_class = self._receiver_class(topic, typed_as)
+        if self._wait_subscribed(wanted, timeout, topic, message_class, received.append):
+            return received[0]
+        if not self._current_run.stopping.is_set():
             raise TimeoutError(f'no message on {topic} came within {timeout:g} s: is it published?')
-        raise NodeStoppedError(f'{self._name} stopped while it waited for {topic}')
+        raise NodeStoppedError(f'{self._settings.name} stopped while it waited for {topic}')
 
     # -- services and parameters
 
@@ -637,7 +619,7 @@ class Node(Receiver):
 
     def lookup_service(self, name: str) -> Service:
         """Return the service of that name, resolved as the node's names are."""
-        return self._master.lookup_service(self._resolve(name), self._name)
+        return self._settings.master.lookup_service(self._resolve(name), self._settings.name)
 
     def wait_for_service(self, name: str, timeout: float | None = None) -> Service:
         """Wait until a service of that name is offered, and return it."""
@@ -649,30 +631,29 @@ class Node(Receiver):
         :param initialized: the value that it gets if it has none
         """
         name = self._resolve(name)
-        known = [each for each in self._parameters if each.name == name]
-        return known[0] if known else Parameter(self, name, initialized)
+        for parameter in self._parameters:
+            if parameter.name == name:
+                return parameter
+        return Parameter(self, name, initialized)
 
     @property
     def _parameters(self) -> list[Parameter]:
         """The parameters that :meth:`parameter` has returned."""
-        return [each for each in self._opened if isinstance(each, Parameter)]
-
-    def _read_parameters(self):
-        """Have the parameters read their values."""
-        for each in self._parameters:
-            each.read()
+        endpoints = self._current_run.endpoints
+        return [endpoint for endpoint in endpoints if isinstance(endpoint, Parameter)]
 
 
-def check_class(node_class):
-    """Raise TypeError unless it is a class of nodes."""
+def check_node_class(node_class):
+    """Raise TypeError if it is not a class of nodes, or has attributes that Node needs itself."""
     if not (isinstance(node_class, type) and issubclass(node_class, Node)):
         raise TypeError(f'a node is made of a subclass of Node, not {node_class!r}')
-    inside = {*vars(Node), *Node.__annotations__, '_name', '_opened', '_souls', '_life', '_end'}
+    own_names = {name for name in vars(Node) if re.match('_[a-z]', name)}
     for cls in node_class.__mro__[: node_class.__mro__.index(Node)]:
-        taken = [name for name in vars(cls) if name in inside and re.match('_[a-z]', name)]
-        if taken and not cls.__module__.startswith('pharos.'):
+        taken_names = own_names.intersection(vars(cls))
+        if taken_names and not cls.__module__.startswith('pharos.'):
             raise TypeError(
-                f'{cls.__name__} has {", ".join(taken)}, as Node has: choose another name'
+                f'{cls.__name__} has {", ".join(sorted(taken_names))}, as Node has: choose another'
+                ' name'
             )
 
 

@@ -3,27 +3,29 @@ import functools
 import threading
 from copy import deepcopy
 
-from pharos.blocks import Block, taking
-from pharos.channels import Opened
+from pharos.blocks import Block, with_arguments
+from pharos.channels import Endpoint
 
 
-class Parameter(Opened):
+class Parameter(Endpoint):
     """A parameter of the server, as a node sees it; see :meth:`Node.parameter`.
 
     :ivar name: its full name
     """
 
     def __init__(self, node, name, initialized):
-        self.node, self.name, self._value = node, name, initialized
+        self.node = node
+        self.name = name
         self.delegate = []
-        self._reading = threading.Lock()
+        self._value = initialized
+        self._read_lock = threading.Lock()
         self.open()
 
     def subscribe(self):
         """Hear of changes, and set the value that the node knows if the master has none."""
-        master = self.node._master
-        master.call('subscribeParam', self.node._run.uri, self.name, caller_id=self.node._name)
-        if self._value is not None and self.name not in master.parameters:
+        run = self._run
+        run.master.call('subscribeParam', run.uri, self.name, caller_id=run.name)
+        if self._value is not None and self.name not in run.master.parameters:
             self.set(self._value)
         self.read()
 
@@ -31,8 +33,8 @@ class Parameter(Opened):
 
     def _close(self):
         """Hear of no more changes."""
-        uri = self.node._run.uri
-        self.node._master.call('unsubscribeParam', uri, self.name, caller_id=self.node._name)
+        run = self._run
+        run.master.call('unsubscribeParam', run.uri, self.name, caller_id=run.name)
 
     @property
     def value(self):
@@ -41,32 +43,35 @@ class Parameter(Opened):
         return deepcopy(self._value)
 
     def set(self, value) -> None:
-        """Set it on the server.
+        """Set the value on the server.
 
         :raises ValueError: if the server cannot hold such a value
         :raises MasterUnreachableError: if the master does not answer
         """
         self.node._check_running()
-        self.node._master.parameters[self.name] = value
-        self.node._read_parameters()
+        self._run.master.parameters[self.name] = value
+        self._run.read_parameters()
 
     def read(self):
-        """Take the value that the server has, and tell of a change."""
-        with self._reading:
-            before, self._value = self._value, self.node._master.parameters.get(self.name)
-            value = self._value
-        if not self.closed and (value, type(value)) != (before, type(before)):
-            for block in self.delegate:
-                self._run(block, deepcopy(value))
+        """Take the value that the server has, and run the blocks if it is another one."""
+        with self._read_lock:
+            former = self._value
+            value = self._run.master.parameters.get(self.name)
+            self._value = value
+        is_same = value == former and type(value) is type(former)
+        if is_same or self.closed:
+            return
+        for block in self.delegate:
+            self._run_block(block, deepcopy(value))
 
     def on_change(self, block: Block) -> Block:
-        """Have ``block(value)`` run when it changes, also by others."""
-        self.delegate = [*self.delegate, taking(block, 'block of on_change', 1, 1)]
+        """Have ``block(value)`` run when the value changes, also by others."""
+        self.delegate = [*self.delegate, with_arguments(block, 'block of on_change', 1, 1)]
         return block
 
-    def _run(self, block, value):
+    def _run_block(self, block, value):
         try:
             block(value)
         except BaseException as error:
-            run = functools.partial(self._run, block)
-            self.node._report(error, block, 'block of on_change', value, again=run)
+            retry = functools.partial(self._run_block, block)
+            self._run.report_failure(error, block, 'block of on_change', value, retry=retry)

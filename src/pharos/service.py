@@ -1,10 +1,11 @@
 """Services: offered by a node, or called by name alone."""
+from __future__ import annotations
+
 import io
 import socket
 import struct
 from contextlib import suppress
 from time import monotonic
-from types import SimpleNamespace
 from typing import Any
 
 from rosgraph.network import (
@@ -16,8 +17,8 @@ from rospy import ServiceException
 from rospy.core import parse_rosrpc_uri
 
 from pharos import messages
-from pharos.blocks import taking
-from pharos.channels import Opened
+from pharos.blocks import Block, with_arguments
+from pharos.channels import Endpoint
 from pharos.errors import (
     MessageTypeError,
     PharosError,
@@ -25,43 +26,51 @@ from pharos.errors import (
     ServiceTypeError,
     UnknownServiceError,
 )
-from pharos.intraprocess.copier import copied, serialize
-from pharos.private_rospy.transport import keep_alive, local_service
-from pharos.program import here
+from pharos.intraprocess.copier import serialize
+from pharos.private_rospy.run import call_local_service, find_local_service
+from pharos.private_rospy.tcpros import keep_alive
+from pharos.waiting import current
 
-PATIENCE = 0.25  # seconds that a look-up waits for that; a call asks again
+LOOK_UP_LIMIT = 0.25  # seconds that a look-up waits for the type; a call asks again
+TYPE_LIMIT = 5.0  # seconds that a call without a timeout waits for the type
+_MAX_HEADER = 1 << 16  # bytes
+_MAX_PART = 1 << 20  # bytes that are read at once
 
 
-class OfferedService(Opened):
+class OfferedService(Endpoint):
     """A service that a node offers; made by :meth:`Node.serve`.
 
     :ivar name: its full name
     """
 
-    def __init__(self, node, name, cls, block):
-        self.node, self.name, self.service_class = node, name, cls
-        self.delegate = taking(block, 'block of a service', 1, 1)
+    def __init__(self, node, name, service_class, block):
+        self.node = node
+        self.name = name
+        self.service_class = service_class
+        self.delegate = with_arguments(block, 'block of a service', 1, 1)
         self.open()
 
     def _open(self):
         try:
-            self.end = self.node.ros.Service(self.name, self.service_class, self._answer)
+            self.ros_object = self.node.ros.Service(self.name, self.service_class, self._answer)
         except ServiceException as error:
-            raise PharosError(f'{self.node._name} offers {self.name} already: {error}') from None
+            raise PharosError(f'{self._run.name} offers {self.name} already: {error}') from None
 
     def _close(self):
-        self.end.shutdown()
+        self.ros_object.shutdown()
 
     def _answer(self, request):
         try:
-            return messages.response(self.service_class._response_class, self.delegate(request))
+            value = self.delegate(request)
+            return messages.response(self.service_class._response_class, value)
         except BaseException as error:
-            where = f'service {self.name}'
-            self.node._report(error, self.delegate, where, request, again=self._answer_again)
+            role = f'service {self.name}'
+            retry = self._answer_again
+            self._run.report_failure(error, self.delegate, role, request, retry=retry)
             raise ServiceException(f'{type(error).__name__}: {error}') from error
 
     def _answer_again(self, request):
-        with suppress(ServiceException):  # it is reported
+        with suppress(ServiceException):  # _answer() has reported it
             self._answer(request)
 
 
@@ -71,10 +80,10 @@ class Service:
     The report: ``service := master lookupService: '/clear' with: '/myID'. service call``.
 
     :ivar name: its full name
-    :ivar caller_id: in whose name it is called
-    :ivar uri: where it is offered
+    :ivar caller_id: the name of the calling node
+    :ivar uri: the address of the provider
     :ivar type: the name of its type, as the provider says
-    :ivar md5sum: what is sent; it is the provider's unless it is set
+    :ivar md5sum: the md5sum sent with a call; the provider's unless it is set
     :ivar response: the response of the last call, or None
     """
 
@@ -83,13 +92,15 @@ class Service:
     response: Any = None
 
     def __init__(self, master, name, caller_id):
-        self.master, self.name, self.caller_id = master, name, caller_id
+        self.master = master
+        self.name = name
+        self.caller_id = caller_id
         self.look_up()
 
-    def look_up(self):
+    def look_up(self) -> None:
         """Ask the master for the provider, and the provider for the type.
 
-        :raises UnknownServiceError: if nobody offers it
+        :raises UnknownServiceError: if nobody offers the service
         """
         self.uri = self.master.call('lookupService', self.name)
         if not self.uri:
@@ -97,7 +108,7 @@ class Service:
                 f'no node offers the service {self.name} at {self.master.url}: see rosservice list'
             )
         try:
-            self._ask(PATIENCE)
+            self._ask_type(LOOK_UP_LIMIT)
         except ConnectionRefusedError:
             raise UnknownServiceError(
                 f'{self.name} was offered at {self.uri}, which has died: rosnode cleanup forgets it'
@@ -105,14 +116,15 @@ class Service:
         except (OSError, ROSHandshakeException):  # a call asks again
             pass
 
-    def _ask(self, limit):
-        """Ask the provider for its type."""
-        sock, header = self._connect('*', limit, probe='1')
-        self.type, self.md5sum = header['type'], header['md5sum']
+    def _ask_type(self, timeout):
+        """Ask the provider for the service's type."""
+        sock, header = self._connect('*', timeout, probe='1')
+        self.type = header['type']
+        self.md5sum = header['md5sum']
         sock.close()
 
-    def call(self, block=None, *, timeout: float | None = None, **fields):
-        """Call it, with a request that ``block(request)``, a dict or keywords fill, or a ready one.
+    def call(self, block: Block | None = None, *, timeout: float | None = None, **fields):
+        """Call the service. The request is ready, or filled by ``block(request)``, a dict or keywords.
 
         :param timeout: seconds for the whole call, None: without limit
         :returns: the response; also in :attr:`response`
@@ -123,26 +135,15 @@ class Service:
         self.response = None
         try:
             if self.type is None:
-                self._ask(timeout or 5.0)
-            cls = messages.service_class(self.type)
-            request = messages.build(cls._request_class, block, fields)
-            if request._md5sum != cls._request_class._md5sum:
-                raise MessageTypeError(
-                    f'{self.name} takes {cls._request_class._type}, not {request._type}'
-                )
-            request = messages.check(request)
-            if self.md5sum not in ('*', cls._md5sum):
-                raise ServiceTypeError(
-                    f'{self.name} is of type {self.type}, whose md5sum is {cls._md5sum} here (request'
-                    f' {messages.describe(cls._request_class)}; response'
-                    f' {messages.describe(cls._response_class)}), and not {self.md5sum}: use the'
-                    ' same definition at both ends, or leave md5sum as it is'
-                )
-            local = timeout is None and local_service(self.name, self.uri)
+                self._ask_type(timeout or TYPE_LIMIT)
+            service_class = messages.service_class(self.type)
+            request = self._build_request(service_class, block, fields)
+            self._check_md5sum(service_class)
+            local = find_local_service(self.name, self.uri) if timeout is None else None
             if local:
-                self.response = self._call_here(local, request)
+                self.response = call_local_service(local, request, self.caller_id)
             else:
-                self.response = self._call(cls, serialize(request), timeout)
+                self.response = self._call(service_class, serialize(request), timeout)
         except ServiceException as error:
             raise ServiceCallError(f'{self.name} failed: {error}') from error
         except (OSError, ROSHandshakeException) as error:
@@ -151,44 +152,47 @@ class Service:
             ) from error
         return self.response
 
-    def _call_here(self, service, request):
-        """Have a rospy.Service of this process answer in this thread."""
-        answers = []
-        connection = SimpleNamespace(
-            write_buff=io.BytesIO(),
-            send_message=lambda response, seq: answers.append(copied(response)),
-            write_data=lambda data: answers.append(ServiceException(data[5:].decode())),
-        )
-        request._connection_header = {'callerid': self.caller_id, 'service': self.name}
-        service._handle_request(connection, request)
-        if isinstance(answers[0], Exception):
-            raise answers[0]
-        return answers[0]
+    def _build_request(self, service_class, block, fields):
+        request_class = service_class._request_class
+        request = messages.build(request_class, block, fields)
+        if request._md5sum != request_class._md5sum:
+            raise MessageTypeError(f'{self.name} takes {request_class._type}, not {request._type}')
+        return messages.check(request)
 
-    def _call(self, cls, data, timeout):
-        end = timeout and monotonic() + timeout
+    def _check_md5sum(self, service_class):
+        if self.md5sum not in ('*', service_class._md5sum):
+            raise ServiceTypeError(
+                f'{self.name} is of type {self.type}, whose md5sum is {service_class._md5sum} here'
+                f' (request {messages.describe(service_class._request_class)}; response'
+                f' {messages.describe(service_class._response_class)}), and not {self.md5sum}: use'
+                ' the same definition at both ends, or leave md5sum as it is'
+            )
+
+    def _call(self, service_class, data, timeout):
+        """Call the provider by a socket."""
+        deadline = None if timeout is None else monotonic() + timeout
         try:
             sock, _ = self._connect(self.md5sum, timeout)
-        except ConnectionError:  # it may have moved
+        except ConnectionError:  # the provider may have moved
             self.uri = self.master.call('lookupService', self.name) or self.uri
             sock, _ = self._connect(self.md5sum, timeout)
         with sock:
             sock.sendall(struct.pack('<I', len(data)) + data)
-            is_ok, size = struct.unpack('<BI', _read(sock, 5, end))
-            data = _read(sock, size, end)
+            is_ok, size = struct.unpack('<BI', _read(sock, 5, deadline))
+            answer = _read(sock, size, deadline)
         if not is_ok:
-            raise ServiceException(data.decode(errors='replace'))
-        return cls._response_class().deserialize(data)
+            raise ServiceException(answer.decode(errors='replace'))
+        return service_class._response_class().deserialize(answer)
 
-    def _connect(self, md5sum, timeout, **more):
-        """Return a socket to the provider, and the header that it answers."""
+    def _connect(self, md5sum, timeout, **fields):
+        """Return a socket to the provider, and the header of its answer."""
         sock = socket.create_connection(parse_rosrpc_uri(self.uri), timeout)
         keep_alive(sock)
-        if here.node:  # whose stop ends the call
-            here.node._run.calls.add(sock)
-        header = {'callerid': self.caller_id, 'service': self.name, 'md5sum': md5sum, **more}
-        write_ros_handshake_header(sock, header)
-        header = read_ros_handshake_header(sock, io.BytesIO(), 1 << 16)
+        if current.node:  # its stop ends the call
+            current.node._current_run.calls.add(sock)
+        names = {'callerid': self.caller_id, 'service': self.name, 'md5sum': md5sum}
+        write_ros_handshake_header(sock, {**names, **fields})
+        header = read_ros_handshake_header(sock, io.BytesIO(), _MAX_HEADER)
         if 'error' in header:
             raise ConnectionError(header['error'])
         return sock, header
@@ -197,11 +201,12 @@ class Service:
         return f'<Service {self.name} ({self.type}) at {self.uri}>'
 
 
-def _read(sock, size, end):
+def _read(sock, size, deadline):
     data = bytearray()
     while len(data) < size:
-        sock.settimeout(end and max(end - monotonic(), 0.001))
-        part = sock.recv(min(size - len(data), 1 << 20))
+        if deadline is not None:
+            sock.settimeout(max(deadline - monotonic(), 0.001))
+        part = sock.recv(min(size - len(data), _MAX_PART))
         if not part:
             raise ConnectionError('it closed the connection')
         data += part

@@ -16,7 +16,7 @@ from typing import Any, Callable, Iterator
 import pytest
 
 from pharos import Master, Node
-from pharos.program import wait
+from pharos.waiting import wait
 
 TIMEOUT = 30.0  # seconds; a test that passes never waits so long
 _expects_failures = False  # said by the running test
@@ -129,8 +129,12 @@ def create_node(master: Master) -> Iterator[Callable[..., Any]]:
     _expects_failures = False
     yield create
     for node in nodes:
-        node._end_now()
-    told = [f'{failure}\n{failure.traceback}' for node in nodes for failure in node._failures]
+        node._stop_safely()
+    told = [
+        f'{failure}\n{failure.traceback}'
+        for node in nodes
+        for failure in node._current_run.failures
+    ]
     if told and not _expects_failures:
         told.insert(0, 'blocks of its nodes failed (or say expect_failures()):')
         pytest.fail('\n'.join(told), False)

@@ -19,8 +19,9 @@ class _Transcript:
 
     def on_show(self, receiver: Block | None) -> Block | None:
         """Have ``receiver(line)`` take the lines, None: standard output; returns the former one."""
-        former, self._receiver = self._receiver, receiver
-        return former
+        former_receiver = self._receiver
+        self._receiver = receiver
+        return former_receiver
 
 
 Transcript = _Transcript()

@@ -11,7 +11,7 @@ import sys
 import rospy
 
 from pharos import PharosError
-from pharos.program import wait
+from pharos.waiting import wait
 
 TWIST = 'geometry_msgs/Twist'
 #: where turtles take commands, and the types of these; the first is preferred

@@ -18,7 +18,7 @@ import pharos
 
 MODULES = {
     'workspace': 'pharos.live.workspace',
-    'compose': 'pharos.compose.command',
+    'compose': 'pharos.commands.compose',
     'top': 'pharos.live.top',
     'graph': 'pharos.live.graph',
     'create_package': 'pharos.commands.create_package',

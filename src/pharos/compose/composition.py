@@ -1,4 +1,6 @@
 """Compositions: launch files whose Python nodes run in this process."""
+from __future__ import annotations
+
 import contextlib
 import os
 import pickle
@@ -10,19 +12,19 @@ import time
 import roslaunch.core
 import rospkg
 
-from pharos import program
-from pharos.compose import apart_program
-from pharos.compose.launch_file import LaunchFile
-from pharos.compose.script import ScriptNode, load, needs_main_thread, wait_for_end
+from pharos import signals
+from pharos.child_process import RosProcess, find_program
+from pharos.compose import roslaunch_parent
+from pharos.compose.script import ScriptNode, wait_for_end
+from pharos.compose.sources import needs_main_thread
 from pharos.errors import PharosError
-from pharos.master import Master
-from pharos.node import Lifecycle
-from pharos.ros_process import RosProcess, find_program
+from pharos.node import Settings
+from pharos.private_rospy.run import Lifecycle
 from pharos.transcript import Transcript
 
-PATIENCE = 2.0  # seconds that a node may take to start before the next one does
-APART_PATIENCE = 40.0  # seconds: half of it for roslaunch, which gives each node 17
-POLL = 0.02  # seconds between two looks at what has ended
+INIT_LIMIT = 2.0  # seconds that a node may take to start before the next one does
+TERMINATE_LIMIT = 40.0  # seconds: half of it for roslaunch, which gives each node 17
+POLL_PERIOD = 0.02  # seconds between two looks at the nodes that have ended
 
 
 class Composition:
@@ -36,137 +38,154 @@ class Composition:
 
     def __init__(self, master):
         self.master = master
-        self.process = None
+        self.process: RosProcess | None = None
         self.nodes: list[ScriptNode] = []
         self._processes: list[RosProcess] = []  # of scripts that need one each
-        self._ended: dict[ScriptNode, float] = {}  # since when, as time.monotonic()
-        self._ending = threading.Event()
+        self._end_times: dict[ScriptNode, float] = {}  # as time.monotonic()
+        self._stopping = threading.Event()
         self._watcher = threading.Thread(target=self._watch, name='composition', daemon=True)
-        self._is_required = False  # True if a required node runs apart
+        self._is_process_required = False  # True if roslaunch runs a required node
         self._has_started = False  # True if one node was started
-        self._has_lost = False  # True if a required node has ended
+        self._has_lost_required = False
 
-    def launch(self, file):
+    def launch(self, launch_file):
         """Set the parameters of a launch file, and start its nodes.
 
         :raises PharosError: if the master does not answer, or refuses a parameter
         """
         run_id = self.master.parameters.setdefault('/run_id', roslaunch.core.generate_run_id())
-        file.set_parameters(run_id)
-        for text in file.config.config_errors:
+        launch_file.set_parameters(run_id)
+        for text in launch_file.config.config_errors:
             Transcript.show(text)
-        for name, reason in file.reasons.items():
+        for name, reason in launch_file.reasons.items():
             Transcript.show(f'{name} runs in a process of its own: {reason}')
-        if file.apart:
-            with tempfile.NamedTemporaryFile('wb', suffix='.launch', delete=False) as pickled:
-                pickle.dump(file.config_apart(), pickled)
-            command = [sys.executable, apart_program.__file__, pickled.name, str(os.getpid())]
-            self._is_required = any(node.required for node in file.apart)
-            self._has_started = True
-            self.process = RosProcess(command, self.master.url, Transcript.show)
-        logs = os.path.join(rospkg.get_log_dir(), run_id)
-        for number, (name, path, args, launched) in enumerate(file.here, 1):
-            log = f'{name[1:].replace("/", "-")}-{number}.log'  # as roslaunch names it
-            with self.telling(name):
-                self.start(name, path, [*args, f'__log:={logs}/{log}'], launched)
+        if launch_file.nodes_apart:
+            self._start_roslaunch(launch_file)
+        log_folder = os.path.join(rospkg.get_log_dir(), run_id)
+        for number, entry in enumerate(launch_file.entries, 1):
+            log_name = f'{entry.name[1:].replace("/", "-")}-{number}.log'  # as roslaunch has it
+            arguments = [*entry.args, f'__log:={log_folder}/{log_name}']
+            with self._show_failure(entry.name):
+                self.start(entry.name, entry.path, arguments, entry.roslaunch_node)
         self._watcher.start()
 
-    def run_scripts(self, texts, here):
-        """Run programs; why one does not start is shown."""
-        for text in texts:
-            with self.telling(text):
-                self._run_script(text, text in here)
+    def _start_roslaunch(self, launch_file):
+        """Start the nodes apart in a process of roslaunch."""
+        with tempfile.NamedTemporaryFile('wb', suffix='.launch', delete=False) as file:
+            pickle.dump(launch_file.config_apart(), file)
+        command = [sys.executable, roslaunch_parent.__file__, file.name, str(os.getpid())]
+        self._is_process_required = any(node.required for node in launch_file.nodes_apart)
+        self._has_started = True
+        self.process = RosProcess(command, self.master.url, Transcript.show)
+
+    def run_scripts(self, programs, programs_here):
+        """Run programs; the Transcript says why one does not start.
+
+        :param programs: each as PACKAGE/EXECUTABLE, or a path
+        :param programs_here: those of them that run in this process even if they show windows
+        """
+        for text in programs:
+            with self._show_failure(text):
+                self._run_script(text, text in programs_here)
         self._watcher.start()
 
-    def _run_script(self, text, is_here):
-        """Run a program given as PACKAGE/EXECUTABLE or by its path, in a process if it needs one."""
-        package, _, executable = text.partition('/')
+    def _run_script(self, text, may_show_windows):
         path = text
         if not os.path.isfile(text):
+            package, _, executable = text.partition('/')
             path = find_program(package, executable)
-        reason = '' if is_here else needs_main_thread(path)
-        if not reason:
-            Transcript.show(f'{text} starts')
-            self.nodes.append(load(self.master, path, here=True))
+        reason = '' if may_show_windows else needs_main_thread(path)
+        if reason:
+            Transcript.show(f'{text} runs in a process of its own: {reason}')
             self._has_started = True
-            return
-        Transcript.show(f'{text} runs in a process of its own: {reason}')
-        self._has_started = True
-        command = [sys.executable, os.path.abspath(path)]
-        self._processes.append(RosProcess(command, self.master.url, Transcript.show))
+            command = [sys.executable, os.path.abspath(path)]
+            self._processes.append(RosProcess(command, self.master.url, Transcript.show))
+        else:
+            Transcript.show(f'{text} starts')
+            self.nodes.append(self.master.load(path, here=True))
+            self._has_started = True
 
     @contextlib.contextmanager
-    def telling(self, name):
+    def _show_failure(self, name):
         """Show why a program is not started, and go on with the others."""
         try:
             yield
         except PharosError as error:
             Transcript.show(f'{name} is not started: {error}')
 
-    def start(self, name, path, args, launched=None):
+    def start(self, name, path, arguments, roslaunch_node=None):
         """Start a program as the node of that name, and return it.
 
-        :param launched: roslaunch's node, if it is of a launch file
+        :param roslaunch_node: roslaunch's, if a launch file named the program
         """
         node = ScriptNode.__new__(ScriptNode)
-        node._configure(self.master, name, None, None, None, (0, 0), ())
-        node.__init__(path, args, None, launched.env_args if launched else ())
-        node.init_timeout, node.launched = PATIENCE, launched
+        node._configure(Settings(name, self.master, None, (0, 0), ()), None, None)
+        node.__init__(path, arguments, None, roslaunch_node.env_args if roslaunch_node else ())
+        node.init_timeout = INIT_LIMIT
+        node.roslaunch_node = roslaunch_node
         self.nodes.append(node)
         Transcript.show(f'{name} starts')
-        node._begin()
+        node._start_and_release()
         self._has_started = True
         return node
 
     @property
-    def is_over(self):
+    def is_over(self) -> bool:
         """True if all that it started has ended."""
         for node in self.nodes:
-            respawns = node.launched and node.launched.respawn
-            if respawns or node._lifecycle is not Lifecycle.STOPPED:
+            respawns = node.roslaunch_node and node.roslaunch_node.respawn
+            if respawns or node.lifecycle is not Lifecycle.STOPPED:
                 return False
-        return not any(process.poll() is None for process in self._all_processes())
+        return all(process.poll() is not None for process in self._all_processes())
 
     def _all_processes(self):
         return [*self._processes, self.process] if self.process else self._processes
 
     def _watch(self):
-        """Start again what respawns, and end all if a required node has ended."""
-        while not self._ending.wait(POLL) and not self.is_over:
+        """Start again nodes that respawn, and end all if a required node has ended."""
+        while not self.is_over:
+            is_stopping = self._stopping.wait(POLL_PERIOD)
+            if is_stopping:
+                break
             self._look()
         self._look()
 
     def _look(self):
         for node in self.nodes:
-            if self._ending.is_set():
+            if self._stopping.is_set():
                 return
-            if node._lifecycle is Lifecycle.STOPPED:
+            if node.lifecycle is Lifecycle.STOPPED:
                 self._look_at_ended(node)
-        if self._is_required and self.process.poll() is not None:  # all of it has ended
+        if self._is_process_required and self.process.poll() is not None:  # all of it has ended
             self._end('a node in a process of its own')
 
     def _look_at_ended(self, node):
+        name = node._settings.name
         now = time.monotonic()
-        if node not in self._ended:
-            self._ended[node] = now
-            Transcript.show(f'{node._name} has ended, with exit code {node.exit_code}')
-        launched = node.launched
-        if not launched:
+        if node not in self._end_times:
+            self._end_times[node] = now
+            Transcript.show(f'{name} has ended, with exit code {node.exit_code}')
+        roslaunch_node = node.roslaunch_node
+        if not roslaunch_node:
             return
-        if launched.required:
-            self._end(node._name)
-        elif launched.respawn and now - self._ended[node] >= float(launched.respawn_delay):
-            with self.telling(node._name):
-                Transcript.show(f'{node._name} comes back')
-                del self._ended[node]
-                node._begin()
-            if self._ending.is_set():  # since it looked
-                node._end_now()
+        if roslaunch_node.required:
+            self._end(name)
+        elif roslaunch_node.respawn:
+            if now - self._end_times[node] >= float(roslaunch_node.respawn_delay):
+                self._respawn(node, name)
+
+    def _respawn(self, node, name):
+        with self._show_failure(name):
+            Transcript.show(f'{name} comes back')
+            del self._end_times[node]
+            node._start_and_release()
+        if self._stopping.is_set():  # stop() may have looked before the start
+            node._stop_safely()
 
     def _end(self, name):
-        if not self._ending.is_set():
+        if not self._stopping.is_set():
             Transcript.show(f'{name}, which is required, has ended: all others end')
-            self._has_lost = True
+            self._has_lost_required = True
             self.stop()
 
     def wait(self, timeout: float | None = None) -> int:
@@ -175,37 +194,28 @@ class Composition:
         :param timeout: seconds, None: without limit
         :raises TimeoutError: if they have not in that time
         """
-        wait_for_end(self._is_to_end, timeout, 'the composition')
+        wait_for_end(self._must_end, timeout, 'the composition')
         if self.is_over:
-            self._watcher.join()  # it has seen all
+            self._watcher.join()  # it has shown all ends
         self.stop()
-        return 1 if self._has_lost or not self._has_started else 0
+        return 1 if self._has_lost_required or not self._has_started else 0
 
-    def _is_to_end(self):
-        return self.is_over or self._ending.is_set() or program.signalled
+    def _must_end(self):
+        return self.is_over or self._stopping.is_set() or signals.is_ending()
 
     def stop(self) -> None:
-        """End all nodes, those apart, too."""
-        self._ending.set()
-        threads = [threading.Thread(target=node._end_now) for node in self.nodes]
+        """End all nodes, also those in processes of their own."""
+        self._stopping.set()
+        threads = [threading.Thread(target=node._stop_safely) for node in self.nodes]
         for thread in threads:
             thread.start()
         for process in self._all_processes():
-            process.terminate(APART_PATIENCE)
+            process.terminate(TERMINATE_LIMIT)
         for thread in threads:
             thread.join()
 
-    def __enter__(self) -> 'Composition':
+    def __enter__(self) -> Composition:
         return self
 
     def __exit__(self, *error):
         self.stop()
-
-
-def compose(master, package, file, *, only=(), apart=(), here=(), share_connections=False, **args):
-    """Do what :meth:`Master.compose` does."""
-    launch_file = LaunchFile(master.url, package, file, args, only, apart, here)
-    share_connections = share_connections or master.share_connections
-    composition = Composition(Master(master.url, share_connections))
-    composition.launch(launch_file)
-    return composition

@@ -4,22 +4,23 @@ from typing import Any
 
 import rosgraph.names
 
+from pharos.child_process import find_program
 from pharos.compose.composition import Composition
-from pharos.compose.script import ScriptNode, source_of, why_apart
+from pharos.compose.script import ScriptNode
+from pharos.compose.sources import source_of, why_apart
 from pharos.errors import PharosError, UnknownNodeError, UnknownTypeError
 from pharos.node import Node
-from pharos.ros_process import find_program
 
 
 class Container(Node):
     """Loads programs as nodelet's manager loads nodelets: ``nodelet load PACKAGE/EXECUTABLE NAME``.
 
-    :param composition: whose nodes they will be
+    :param composition: the nodes become nodes of this composition
     """
 
     def __init__(self, composition: Composition):
         self.composition = composition
-        self.loaded: dict[str, ScriptNode] = {}
+        self._loaded_nodes: dict[str, ScriptNode] = {}
         self._bonds: dict[str, Any] = {}
 
     def start(self):
@@ -28,10 +29,11 @@ class Container(Node):
         with contextlib.suppress(UnknownTypeError):
             self.serve('~load_nodelet', 'nodelet/NodeletLoad', self._load)
             self.serve('~unload_nodelet', 'nodelet/NodeletUnload', self._unload)
-            self.serve('~list', 'nodelet/NodeletList', lambda request: [*self._running()])
+            self.serve('~list', 'nodelet/NodeletList', lambda request: list(self._running_nodes()))
 
-    def _running(self):
-        return {name: node for name, node in self.loaded.items() if node.is_running}
+    def _running_nodes(self):
+        nodes = self._loaded_nodes.items()
+        return {name: node for name, node in nodes if node.is_running}
 
     def _load(self, request):
         package, _, executable = request.type.partition('/')
@@ -39,35 +41,43 @@ class Container(Node):
         reason = why_apart(path)
         if reason:
             raise PharosError(f'{path} cannot run here, since {reason}: run it as a process')
-        name = full = self._full(request.name)
-        if name in self._running():
+        requested_name = self._full_name(request.name)
+        name = requested_name
+        if name in self._running_nodes():
             raise PharosError(f'{name} is loaded already: unload it first, or name another')
         if request._connection_header.get('callerid') == name:  # nodelet load has that name itself
             name += f'_in_{self.name.rpartition("/")[2]}'
-            self.master.parameters[name] = self.master.parameters.get(full, {})
-        remaps = zip(request.remap_source_args, request.remap_target_args)
-        args = [*request.my_argv, *(f'{source}:={target}' for source, target in remaps)]
-        args.append(f'__name:={name.rpartition("/")[2]}')
-        self.loaded[full] = self.composition.start(name, source_of(path), args)
-        if request.bond_id:  # which ends when whoever loaded it has gone
-            bond = self._bonds[full] = self.ros_import('bondpy.bondpy').Bond(
-                f'{self.name}/bond', request.bond_id, on_broken=lambda: self._drop(full)
-            )
-            bond.start()
+            self.master.parameters[name] = self.master.parameters.get(requested_name, {})
+        remappings = zip(request.remap_source_args, request.remap_target_args)
+        arguments = [*request.my_argv, *(f'{source}:={target}' for source, target in remappings)]
+        arguments.append(f'__name:={name.rpartition("/")[2]}')
+        node = self.composition.start(name, source_of(path), arguments)
+        self._loaded_nodes[requested_name] = node
+        if request.bond_id:
+            self._start_bond(requested_name, request.bond_id)
         return True
 
-    def _full(self, name):
+    def _start_bond(self, name, bond_id):
+        """Unload a program when the process that has loaded it is gone."""
+        bond_class = self.ros_import('bondpy.bondpy').Bond
+        bond = bond_class(f'{self.name}/bond', bond_id, on_broken=lambda: self._drop(name))
+        self._bonds[name] = bond
+        bond.start()
+
+    def _full_name(self, name):
         return rosgraph.names.resolve_name(name, self.name)
 
     def _unload(self, request):
-        if self._full(request.name) not in self._running():
-            raise UnknownNodeError(f'{request.name!r} is not loaded here: ~list names what is')
-        self._drop(self._full(request.name))
+        name = self._full_name(request.name)
+        if name not in self._running_nodes():
+            raise UnknownNodeError(f'{request.name!r} is not loaded here: ~list names all that are')
+        self._drop(name)
         return True
 
     def _drop(self, name):
-        node, bond = self.loaded.pop(name, None), self._bonds.pop(name, None)
+        node = self._loaded_nodes.pop(name, None)
+        bond = self._bonds.pop(name, None)
         if node:
-            node._end_now()
+            node._stop_safely()
         if bond:
             bond.shutdown()

@@ -1,6 +1,7 @@
-"""Launch files, read by roslaunch itself, and which of their nodes can run in this process."""
+"""Launch files, read by roslaunch itself: some of their nodes can run in this process."""
 import copy
 import os
+from typing import Any, NamedTuple
 
 import rosgraph.names
 import roslaunch.config
@@ -10,60 +11,74 @@ import roslaunch.node_args
 import roslaunch.pmon
 import roslaunch.xmlloader
 
-from pharos.compose.script import source_of, why_apart
+from pharos.child_process import find_launch_file
+from pharos.compose.sources import source_of, why_apart
 from pharos.errors import PharosError, UnknownNodeError
-from pharos.ros_process import find_launch_file
 from pharos.transcript import Transcript
+
+
+class Entry(NamedTuple):
+    """A node of a launch file that runs in this process."""
+
+    name: str
+    path: str
+    args: list[str]
+    roslaunch_node: Any
 
 
 class LaunchFile:
     """A launch file and all that it includes.
 
     :param args: its arguments
-    :param only: the names of the nodes that are wanted; none: all
-    :param apart: the names of those that are to run in processes of their own
-    :param in_here: the names of those that are to run in this process though they show windows
+    :param only: the names of the nodes that run; none: all
+    :param apart: the names of nodes that run in processes of their own
+    :param here: the names of nodes that run in this process even if they show windows
     :ivar config: roslaunch's configuration
-    :ivar here: a tuple for each node of this process: name, program, arguments, roslaunch's node
-    :ivar apart: roslaunch's nodes for other processes
-    :ivar reasons: names of these -> why
+    :ivar entries: an :class:`Entry` for each node of this process
+    :ivar nodes_apart: roslaunch's nodes for other processes
+    :ivar reasons: their names -> why
     :raises UnknownNodeError: if there is no such package, file, argument or node
     :raises PharosError: if roslaunch cannot read it
     """
 
-    def __init__(self, url, package, file, args, only=(), apart=(), in_here=()):
+    def __init__(self, url, package, file, args, only=(), apart=(), here=()):
         self.path = find_launch_file(package, file)
-        loader = roslaunch.xmlloader.XmlLoader()
-        given = [f'{name}:={value}' for name, value in args.items()]
-        try:
-            self.config = roslaunch.config.load_config_default(
-                [(self.path, given)], None, loader=loader, verbose=False
-            )
-        except Exception as error:  # roslaunch's, or of what it asks
-            raise PharosError(f'{self.path}: {error}') from error
-        self._check(args, loader.root_context.resolve_dict.get('arg_doc', {}), 'arg')
+        self._read(args)
         self.config.master.uri = url
-        self.here = []
-        self.apart = []
-        self.reasons = {}
+        self.entries: list[Entry] = []
+        self.nodes_apart: list[Any] = []
+        self.reasons: dict[str, str] = {}
         nodes = {
             rosgraph.names.ns_join(node.namespace, node.name): node for node in self.config.nodes
         }
-        names = {name: {name, name[1:], name.rpartition('/')[2]} for name in nodes}
-        self._check([*only, *apart, *in_here], set().union(*names.values()), 'node')
+        # a user may leave out the slash, or the namespace
+        short_names = {name: {name, name[1:], name.rpartition('/')[2]} for name in nodes}
+        self._check([*only, *apart, *here], set().union(*short_names.values()), 'node')
         for name, node in nodes.items():
-            if not only or names[name] & set(only):
-                is_apart = not names[name].isdisjoint(apart)
-                is_here = not names[name].isdisjoint(in_here)
+            if not only or short_names[name] & set(only):
+                is_apart = not short_names[name].isdisjoint(apart)
+                is_here = not short_names[name].isdisjoint(here)
                 self._sort(name, node, is_apart, is_here)
 
-    def _check(self, names, known, kind):
+    def _read(self, args):
+        loader = roslaunch.xmlloader.XmlLoader()
+        arguments = [f'{name}:={value}' for name, value in args.items()]
+        try:
+            self.config = roslaunch.config.load_config_default(
+                [(self.path, arguments)], None, loader=loader, verbose=False
+            )
+        except Exception as error:  # of roslaunch, or of a substitution in the file
+            raise PharosError(f'{self.path}: {error}') from error
+        self._check(args, loader.root_context.resolve_dict.get('arg_doc', {}), 'arg')
+
+    def _check(self, names, known_names, role):
         for name in names:
-            if name not in known:
-                has = ', '.join(sorted(known)) or 'none'
-                raise UnknownNodeError(f'{self.path} has no {kind} {name!r}; it has {has}')
+            if name not in known_names:
+                known_text = ', '.join(sorted(known_names)) or 'none'
+                raise UnknownNodeError(f'{self.path} has no {role} {name!r}; it has {known_text}')
 
     def _sort(self, name, node, is_apart, is_here):
+        """Put a node into the entries of this process, or among the nodes apart."""
         try:
             reason = self._why_apart(node, is_apart)
             if not reason:
@@ -71,14 +86,14 @@ class LaunchFile:
                     node, node.machine, env=os.environ
                 )
                 reason = why_apart(command[0], is_here)
-        except Exception as error:  # roslaunch's, or of what it asks
+        except Exception as error:  # of roslaunch, or of a file that cannot be read
             Transcript.show(f'{name} is not started: {error}')
             return
         if reason:
             self.reasons[name] = reason
-            self.apart.append(node)
+            self.nodes_apart.append(node)
         else:
-            self.here.append((name, source_of(command[0]), command[1:], node))
+            self.entries.append(Entry(name, source_of(command[0]), command[1:], node))
 
     def _why_apart(self, node, is_apart):
         """Return why the launch file or --apart wants a process for a node; '' if nothing does."""
@@ -93,7 +108,7 @@ class LaunchFile:
         return ''
 
     def set_parameters(self, run_id):
-        """Run what is to run before, clear and set the parameters, as roslaunch does.
+        """Run the commands of rosparam, clear and set the parameters, as roslaunch does.
 
         :raises PharosError: if a command fails, or the master refuses
         """
@@ -108,7 +123,12 @@ class LaunchFile:
 
     def config_apart(self):
         """Return the configuration that is left for roslaunch: the nodes apart alone."""
-        rest = copy.copy(self.config)
-        rest.nodes, rest.nodes_core, rest.tests, rest.executables = self.apart, [], [], []
-        rest.params, rest.clear_params, rest.config_errors = {}, [], []
-        return rest
+        config = copy.copy(self.config)
+        config.nodes = self.nodes_apart
+        config.nodes_core = []
+        config.tests = []
+        config.executables = []
+        config.params = {}
+        config.clear_params = []
+        config.config_errors = []
+        return config

@@ -40,21 +40,21 @@ def copier_for(cls):
         return serialize, lambda frozen: cls().deserialize(frozen)
 
 
-def copied(message):
+def copy_of(message):
     """Return a copy of a message."""
     freeze, thaw = copier_for(type(message))
     return thaw(freeze(message))
 
 
 @functools.cache
-def thawer(sent, wanted):
+def thaw_function(sent_class, wanted_class):
     """Return the function that thaws a message of one class as one of another, such as AnyMsg."""
-    thaw = copier_for(sent)[1]
-    if sent is wanted:
+    _, thaw = copier_for(sent_class)
+    if sent_class is wanted_class:
         return thaw
 
     def thaw_as_wanted(frozen):
-        return wanted().deserialize(serialize(thaw(frozen)))
+        return wanted_class().deserialize(serialize(thaw(frozen)))
 
     return thaw_as_wanted
 
@@ -65,11 +65,12 @@ def size_of(frozen):
         frozen = [getattr(frozen, name) for name in frozen.__slots__]
     if isinstance(frozen, (list, tuple)):
         sample = frozen[:20]
-        return 8 + sum(map(size_of, sample)) * len(frozen) // (len(sample) or 1)
+        sample_size = sum(map(size_of, sample))
+        return 8 + sample_size * len(frozen) // max(1, len(sample))
     return sys.getsizeof(frozen)
 
 
-# -- what the generated functions call
+# -- functions that the generated ones call
 
 
 def _sequence(value):
@@ -90,32 +91,38 @@ def _text(value):
 def _octets(value):
     if getattr(value, 'dtype', None) == 'uint8':
         return value.tobytes()
-    return value if type(value) is bytes else bytes(_sequence(value))
+    if type(value) is bytes:
+        return value
+    return bytes(_sequence(value))
 
 
-def _numbers(code):
+def _number_converter(code):
+    """Return a function that passes a sequence of numbers through a code of struct."""
+
     @functools.lru_cache(128)
-    def structs(count):
-        packer = struct.Struct(f'<{count}{code}')
-        return packer.pack, packer.unpack
+    def struct_for(count):
+        return struct.Struct(f'<{count}{code}')
 
     def convert(value):
-        value = _sequence(value)
-        if code == 'd' and set(map(type, value)) == {float}:
-            return value
-        pack, unpack = structs(len(value))
-        return unpack(pack(*value))
+        numbers = _sequence(value)
+        if code == 'd' and set(map(type, numbers)) == {float}:
+            return numbers
+        number_struct = struct_for(len(numbers))
+        return number_struct.unpack(number_struct.pack(*numbers))
 
     return convert
 
 
-def _booleans(value, convert=_numbers('B')):
-    return tuple(map(bool, convert(value)))
+_bytes_of_booleans = _number_converter('B')
 
 
-_SCOPE = {'new': object.__new__, 'text': _text, 'sequence': _sequence, 'Unusual': _UnusualError}
-_SCOPE.update((f'{base}_array', _numbers(code)) for base, code in CODES.items())
-_SCOPE.update(
+def _booleans(value):
+    return tuple(map(bool, _bytes_of_booleans(value)))
+
+
+_GLOBALS = {'new': object.__new__, 'text': _text, 'sequence': _sequence, 'Unusual': _UnusualError}
+_GLOBALS.update((f'{base}_array', _number_converter(code)) for base, code in CODES.items())
+_GLOBALS.update(
     string_array=lambda value: tuple(map(_text, _sequence(value))),
     bool_array=_booleans,
     uint8_array=_octets,
@@ -128,31 +135,41 @@ _SCOPE.update(
 
 
 class _Source:
-    """The lines of the two functions for one class."""
+    """The lines of the two functions for one class. ``m`` is the message in them.
+
+    :ivar namespace: the names that the functions use
+    :ivar freeze_lines: read the fields into variables
+    :ivar thaw_lines: set the fields of a new message
+    :ivar variables: the parts of a frozen message
+    """
 
     def __init__(self, cls, depth):
-        self.scope, self.names = dict(_SCOPE), itertools.count()
-        self.reads = []
-        self.builds = []
-        self.values = []
-        self.numbers = []  # base, field, local
-        self.add_fields(cls, 'm', depth)
+        self.namespace = dict(_GLOBALS)
+        self.freeze_lines = []
+        self.thaw_lines = []
+        self.variables = []
+        self._numbers = []  # (base type, field, variable) of single numbers
+        self._counter = itertools.count()
+        self._add_fields(cls, 'm', depth)
+        if self._numbers:
+            self._pack_numbers()
 
-    def refer(self, thing):
+    def name_for(self, thing):
         """Return a name for a thing in the generated code."""
-        name = f'g{next(self.names)}'
-        self.scope[name] = thing
+        name = f'g{next(self._counter)}'
+        self.namespace[name] = thing
         return name
 
-    def pack_numbers(self):
+    def _pack_numbers(self):
         """Send all single numbers through one pack and unpack, so that they come out as the wire's."""
-        bases, fields, names = zip(*self.numbers)
-        codes = '<' + ''.join(CODES[base] for base in bases)
-        arriving = '<' + ''.join('?' if base == 'bool' else CODES[base] for base in bases)
-        self.scope.update(pack=struct.Struct(codes).pack, unpack=struct.Struct(arriving).unpack)
-        self.reads.append(f'{", ".join(names)}, = unpack(pack({", ".join(fields)}))')
+        bases, fields, variables = zip(*self._numbers)
+        sent_codes = ''.join(CODES[base] for base in bases)
+        received_codes = ''.join('?' if base == 'bool' else CODES[base] for base in bases)
+        self.namespace['pack'] = struct.Struct(f'<{sent_codes}').pack
+        self.namespace['unpack'] = struct.Struct(f'<{received_codes}').unpack
+        self.freeze_lines.append(f'{", ".join(variables)}, = unpack(pack({", ".join(fields)}))')
 
-    def add_fields(self, cls, owner, depth):
+    def _add_fields(self, cls, owner, depth):
         if cls in _TIMES.values():
             base = 'uint32' if cls is genpy.Time else 'int32'
             fields = [('secs', base), ('nsecs', base)]
@@ -160,36 +177,41 @@ class _Source:
             fields = list(zip(cls.__slots__, cls._slot_types))
         else:
             raise _UnusualError
-        for name, type_ in fields:
-            self.add_field(cls, f'{owner}.{name}', type_, depth)
+        for name, type_name in fields:
+            self._add_field(cls, f'{owner}.{name}', type_name, depth)
 
-    def add_field(self, cls, field, type_, depth):
-        base, is_array, length = parse_type(type_)
-        local = f'v{next(self.names)}'
-        nested = None if base in CODES or base == 'string' else nested_class(base, cls)
-        if nested and not is_array:
-            self.reads.append(f'{local} = {field}')
-            self.builds.append(f'{local} = {field} = new({self.refer(nested)})')
-            self.add_fields(nested, local, depth + 1)
-            if depth == 0 and base in _TIMES:  # genpy does so for top-level fields alone
-                self.builds.append(f'{local}.canon()')
+    def _add_field(self, cls, field, type_name, depth):
+        base, is_array, length = parse_type(type_name)
+        variable = f'v{next(self._counter)}'
+        is_nested = base not in CODES and base != 'string'
+        if is_nested and not is_array:
+            self._add_message(nested_class(base, cls), field, variable, depth)
             return
-        self.values.append(local)
-        fresh = local
-        if nested:
-            freeze, thaw = map(self.refer, _generate(nested, 1))
-            self.reads.append(f'{local} = tuple(map({freeze}, sequence({field})))')
-            fresh = f'list(map({thaw}, {local}))'
+        self.variables.append(variable)
+        new_value = variable
+        if is_nested:
+            freeze, thaw = map(self.name_for, _generate(nested_class(base, cls), 1))
+            self.freeze_lines.append(f'{variable} = tuple(map({freeze}, sequence({field})))')
+            new_value = f'list(map({thaw}, {variable}))'
         elif is_array:
-            self.reads.append(f'{local} = {base}_array({field})')
-            fresh = f'list({local})' if base in ('bool', 'string') else local
+            self.freeze_lines.append(f'{variable} = {base}_array({field})')
+            if base in ('bool', 'string'):
+                new_value = f'list({variable})'
         elif base == 'string':
-            self.reads.append(f'{local} = text({field})')
+            self.freeze_lines.append(f'{variable} = text({field})')
         else:
-            self.numbers.append((base, field, local))
+            self._numbers.append((base, field, variable))
         if length is not None:
-            self.reads.append(f'if len({local}) != {length}: raise Unusual')
-        self.builds.append(f'{field} = {fresh}')
+            self.freeze_lines.append(f'if len({variable}) != {length}: raise Unusual')
+        self.thaw_lines.append(f'{field} = {new_value}')
+
+    def _add_message(self, cls, field, variable, depth):
+        """Add the fields of a nested message."""
+        self.freeze_lines.append(f'{variable} = {field}')
+        self.thaw_lines.append(f'{variable} = {field} = new({self.name_for(cls)})')
+        self._add_fields(cls, variable, depth + 1)
+        if depth == 0 and cls in _TIMES.values():  # genpy does so for top-level fields alone
+            self.thaw_lines.append(f'{variable}.canon()')
 
 
 def nested_class(base, cls):
@@ -202,27 +224,27 @@ def nested_class(base, cls):
 
 @functools.cache
 def _generate(cls, depth=0):
+    """Return ``freeze`` and ``thaw`` for a class; depth 1 is an element of an array."""
     source = _Source(cls, depth)
-    if source.numbers:
-        source.pack_numbers()
-    made, values = source.refer(cls), ''.join(f'{value}, ' for value in source.values)
-    reads = source.reads
+    class_name = source.name_for(cls)
+    variables = ''.join(f'{variable}, ' for variable in source.variables)
+    freeze_lines = source.freeze_lines
     if depth == 0:  # an element of an array may be of a similar class
-        reads = [
-            f'if m.__class__ is not {made}: return serialize(m)',
+        freeze_lines = [
+            f'if m.__class__ is not {class_name}: return serialize(m)',
             'try:',
-            *(f'    {line}' for line in reads or ['pass']),
+            *(f'    {line}' for line in freeze_lines or ['pass']),
             'except Exception: return serialize(m)',  # which says what is wrong
         ]
-    freeze = ['def freeze(m):', *reads, f'return ({values})']
+    freeze = ['def freeze(m):', *freeze_lines, f'return ({variables})']
     thaw = [
         'def thaw(frozen):',
-        f'if type(frozen) is bytes: return {made}().deserialize(frozen)',
-        f'{values or "_"} = frozen',
-        f'm = new({made})',
-        *source.builds,
+        f'if type(frozen) is bytes: return {class_name}().deserialize(frozen)',
+        f'{variables or "_"} = frozen',
+        f'm = new({class_name})',
+        *source.thaw_lines,
         'return m',
     ]
-    text = '\n'.join(map('\n    '.join, (freeze, thaw)))
-    exec(compile(text, f'<copier of {cls.__name__}>', 'exec'), source.scope)
-    return source.scope['freeze'], source.scope['thaw']
+    text = '\n'.join(['\n    '.join(freeze), '\n    '.join(thaw)])
+    exec(compile(text, f'<copier of {cls.__name__}>', 'exec'), source.namespace)
+    return source.namespace['freeze'], source.namespace['thaw']

@@ -104,18 +104,18 @@ def _ask(master, node):
             node.problem = str(error)
 
 
-def told(node):
-    """Return what a node of pharos tells of itself: what :meth:`Node.health` knows without the master."""
-    kinds = [info[3] for info in node._run.topics.get_pub_sub_info()]
-    ended = [soul.name for soul in node._souls if not soul.is_alive()]
+def health_facts(run):
+    """Return the facts of :meth:`Node.health` that the master is not asked for."""
+    transports = [info[3] for info in run.topics.get_pub_sub_info()]
+    ended_souls = [soul.name for soul in run.souls if not soul.is_alive()]
     return {
-        'kind': type(node).__name__,
-        'connections': dict(collections.Counter(kinds)),
-        'dropped': sum(getattr(channel, 'dropped', 0) for channel in node.channels),
-        'errors': node._failures.total,
-        'threads': sum(thread.is_alive() for thread in list(node._run.threads)),
-        'souls': len(node._souls) - len(ended),
-        'ended_souls': ended,
+        'kind': type(run.node).__name__,
+        'connections': dict(collections.Counter(transports)),
+        'dropped': sum(getattr(each, 'dropped', 0) for each in run.open_endpoints(object)),
+        'errors': run.failures.total,
+        'threads': sum(thread.is_alive() for thread in list(run.threads)),
+        'souls': len(run.souls) - len(ended_souls),
+        'ended_souls': ended_souls,
     }
 
 

@@ -13,7 +13,7 @@ import rospkg
 from genpy import Message
 
 import pharos
-from pharos import live
+from pharos import live, signals
 from pharos.errors import PharosError
 from pharos.live import pictures
 from pharos.live.words import text_of
@@ -73,7 +73,7 @@ def load_ipython_extension(shell, names=None):
     names = names or namespace()
     shell.push(names)
     end = shell._atexit_once  # which clears the names
-    shell._atexit_once = lambda: (pharos.program.stop_all(), end())
+    shell._atexit_once = lambda: (signals.stop_all(), end())
     shell.set_hook(
         'complete_command',
         lambda _, event: completions(event.text_until_cursor, names['master']),

@@ -1,7 +1,8 @@
 """Load rospy once more, with globals of its own: one process, many nodes.
 
-``sys.modules`` is as before afterwards. Each private module has a ``__builtins__`` whose ``__import__`` finds
-rospy, rosgraph and what is written on rospy in the private set, and all else as usual.
+``sys.modules`` is as before afterwards. Each private module has ``__builtins__`` of its own. Their
+``__import__`` finds rospy, rosgraph and libraries written on rospy in the private set, and all else
+as usual.
 """
 import builtins
 import importlib
@@ -30,31 +31,31 @@ SHARED = sys.stdlib_module_names.union(
 #: logging: rospy takes its handlers away; smach: it keeps what is being built in its classes;
 #: the others use sys.argv, sys.path, os.environ or threads
 PRIVATE = 'logging argparse optparse subprocess concurrent pkgutil smach'.split()
-MOST_FILES = 300  # of a package that could be written on rospy
+MAX_FILES = 300  # of a package that could be written on rospy
 
 
 class Shim:
-    """Looks like a module, with some names of our own."""
+    """Looks like a module, with some names replaced."""
 
-    def __init__(self, real, **own):
-        self.__dict__.update(own, _real=real)
+    def __init__(self, module, **replacements):
+        self.__dict__.update(replacements, _module=module)
 
     def __getattr__(self, name):
-        return getattr(self._real, name)
+        return getattr(self._module, name)
 
 
-def own_path():
+def private_path():
     """Return a copy of sys.path, with the source folders that catkin put in front of it at its end.
 
-    The ``__init__`` of a package in a devel space puts its source folder in front. Whoever then
-    imports the package anew would find it there, without its messages.
+    The ``__init__`` of a package in a devel space puts its source folder in front. A program that
+    then imports the package anew would find it there, without its messages.
     """
     path = list(sys.path)
     for package in list(sys.modules.values()):
-        folders = getattr(package, '__dict__', {}).get('__path__') or ['']
-        home, *others = map(os.path.dirname, folders)
-        for folder in others:
-            if home in path and folder in path[: path.index(home)]:
+        package_folders = getattr(package, '__dict__', {}).get('__path__') or ['']
+        devel_folder, *source_folders = map(os.path.dirname, package_folders)
+        for folder in source_folders:
+            if devel_folder in path and folder in path[: path.index(devel_folder)]:
                 path.remove(folder)
                 path.append(folder)
     return path
@@ -69,7 +70,7 @@ def _spec_of(name, path):
 
 
 @cache
-def _code_of(loader, name, changed):
+def _code_of(loader, name, change_time):
     return loader.get_code(name)
 
 
@@ -78,66 +79,70 @@ def _find(name, path):
     spec = _spec_of(name, path)
     if not spec.has_location:
         return spec, None
-    changed = os.stat(spec.origin).st_mtime_ns if os.path.isfile(spec.origin) else 0
-    return spec, _code_of(spec.loader, name, changed)
+    change_time = 0
+    if os.path.isfile(spec.origin):
+        change_time = os.stat(spec.origin).st_mtime_ns
+    return spec, _code_of(spec.loader, name, change_time)
 
 
-def home_of(top):
+def source_places(top_name):
     """Return the file of a top-level module of Python, and its folders if it is a package."""
-    spec = getattr(sys.modules.get(top), '__spec__', None) or PathFinder.find_spec(top)
-    if top in SHARED or spec is None or not str(spec.origin).endswith('.py'):
+    spec = getattr(sys.modules.get(top_name), '__spec__', None) or PathFinder.find_spec(top_name)
+    if top_name in SHARED or spec is None or not str(spec.origin).endswith('.py'):
         return None, []
     file = pathlib.Path(spec.origin)
     folders = list(spec.submodule_search_locations or ())
-    # catkin's devel space leads to the source
+    # a file of catkin's devel space names the source
     source = re.search(r'__extended_path = [\'"]([^\'"]*)', file.read_text(errors='replace'))
     if source:
-        folders.append(f'{source[1]}/{top}')
+        folders.append(f'{source[1]}/{top_name}')
     return file, folders
 
 
 @cache
-def _imports_of(top):
-    """Return what a module or package of Python imports; nothing of a large one or one in C."""
-    file, folders = home_of(top)
+def _imports_of(top_name):
+    """Return the names that a package of Python imports; none of a large one or one in C."""
+    file, folders = source_places(top_name)
     if file is None:
         return set()
-    init = file.read_bytes()
-    found = (file for folder in folders for file in pathlib.Path(folder).rglob('*.py'))
-    files = [file.read_bytes() for file in itertools.islice(found, MOST_FILES + 1)]
-    text = b'\n'.join([init, *files]) if len(files) <= MOST_FILES else b''
-    names = re.findall(r'^\s*(?:from|import) (\w+)', text.decode(errors='replace'), re.M)
-    return {'rospy', *names} if b'rospy' in text else set(names)
+    files = (path for folder in folders for path in pathlib.Path(folder).rglob('*.py'))
+    contents = [path.read_bytes() for path in itertools.islice(files, MAX_FILES + 1)]
+    if len(contents) > MAX_FILES:
+        return set()
+    text = b'\n'.join([file.read_bytes(), *contents])
+    names = set(re.findall(r'^\s*(?:from|import) (\w+)', text.decode(errors='replace'), re.M))
+    if b'rospy' in text:
+        names.add('rospy')
+    return names
 
 
 @cache
-def _reaches_rospy(top):
+def _reaches_rospy(top_name):
     """True if the code of a package says rospy, or imports a package that does, and so on.
 
     A package that uses pharos does, too.
     """
-    names, new = set(), {top}
-    while new and new.isdisjoint(('rospy', 'rosgraph', 'pharos')):
-        names |= new
-        found = set()
-        for name in new:
-            found |= _imports_of(name)
-        new = found - names
-    return bool(new)
+    seen_names = set()
+    new_names = {top_name}
+    while new_names and new_names.isdisjoint(('rospy', 'rosgraph', 'pharos')):
+        seen_names |= new_names
+        imported_names = set().union(*map(_imports_of, new_names))
+        new_names = imported_names - seen_names
+    return bool(new_names)
 
 
 def _is_generated(name):
-    """True for generated messages, which are shared."""
-    top, *rest = name.split('.')
-    return rest[:1] in (['msg'], ['srv']) and top not in ('rospy', 'rosgraph')
+    """True for generated messages, which all nodes share."""
+    top_name, *rest = name.split('.')
+    return rest[:1] in (['msg'], ['srv']) and top_name not in ('rospy', 'rosgraph')
 
 
 def is_private(name):
     """True if each node has a copy of the module."""
-    top = name.partition('.')[0]
-    if top in PRIVATE:
+    top_name = name.partition('.')[0]
+    if top_name in PRIVATE:
         return True
-    return top not in SHARED and not _is_generated(name) and _reaches_rospy(top)
+    return top_name not in SHARED and not _is_generated(name) and _reaches_rospy(top_name)
 
 
 #: class of a private module -> its PrivateModules, as a weak reference
@@ -146,18 +151,24 @@ _owners = weakref.WeakKeyDictionary()
 
 def _private_module(thing):
     """Return the private module of a class, function, method or frame; None if it has none."""
+    owner = None
     if inspect.isclass(thing):
         name = thing.__module__
-        owner = None
         with suppress(TypeError):  # its metaclass has no hash
             owner = _owners.get(thing, lambda: None)()
     else:
-        names = getattr(thing, 'f_globals', None) or getattr(thing, '__globals__', None) or {}
-        name = names.get('__name__')
-        own_builtins = names.get('__builtins__')
-        has_dict = type(own_builtins) is dict  # that of __main__ is a module
-        owner = getattr(own_builtins.get('__import__'), '__self__', None) if has_dict else None
-    return owner.modules.get(name) if isinstance(owner, PrivateModules) else None
+        variables = getattr(thing, 'f_globals', None) or getattr(thing, '__globals__', None) or {}
+        name = variables.get('__name__')
+        owner = _owner_of_builtins(variables.get('__builtins__'))
+    return owner.modules.get(name) if owner else None
+
+
+def _owner_of_builtins(module_builtins):
+    """Return the PrivateModules that a module's ``__builtins__`` belong to, or None."""
+    if type(module_builtins) is not dict:  # those of __main__ are a module
+        return None
+    owner = getattr(module_builtins.get('__import__'), '__self__', None)
+    return owner if isinstance(owner, PrivateModules) else None
 
 
 def _getmodule(thing, _filename=None, original=inspect.getmodule):
@@ -167,12 +178,12 @@ def _getmodule(thing, _filename=None, original=inspect.getmodule):
 
 def _getfile(thing, original=inspect.getfile):
     """Find the files of private modules' classes, too: inspect looks for them in sys.modules."""
-    module = inspect.isclass(thing) and _private_module(thing)
+    module = _private_module(thing) if inspect.isclass(thing) else None
     return getattr(module, '__file__', None) or original(thing)
 
 
 def _getsourcefile(thing, original=inspect.getsourcefile):
-    """Take the file of a frame as read: each look at the disk lets another thread have the interpreter."""
+    """Return the file of a frame if it is in the cache: a look at the disk lets other threads run."""
     if inspect.isframe(thing) and thing.f_code.co_filename in linecache.cache:
         return thing.f_code.co_filename
     return original(thing)
@@ -186,22 +197,22 @@ inspect.getsourcefile = _getsourcefile
 class PrivateModules:
     """A set of private modules.
 
-    :param substitutes: what private modules import under some names of Python's modules
+    :param substitutes: the stand-ins that private modules import for some modules of Python
     :param patch: ``patch(module)`` is called right after the code of each private module
     """
 
     def __init__(self, substitutes, patch):
         self.modules = {
             **substitutes,
-            # one for all, so that ``except rospy.ROSException`` catches every node's
+            # one for all: ``except rospy.ROSException`` catches every node's
             'rospy.exceptions': rospy.exceptions,
-            # it numbers the connections, INTRAPROCESS and TCPROS ones
+            # one for all: it numbers the connections, INTRAPROCESS and TCPROS ones
             'rospy.impl.transport': rospy.impl.transport,
         }
         self.modules['importlib'] = Shim(importlib, import_module=self._import_module)
         self._patch = patch
         self._lock = threading.RLock()
-        self.folder = None  # of the program, if this is one
+        self.program_folder = None
         self.builtins = {
             **vars(builtins),
             '__import__': self._import,
@@ -214,28 +225,30 @@ class PrivateModules:
         return self.modules['sys'].path
 
     def _is_private(self, name):
-        """True also for what lies beside the program, or in folders that it has put on sys.path."""
+        """True also for modules beside the program, or in folders that it has put on sys.path."""
         if _is_generated(name):
             return False
-        top = name.partition('.')[0]
-        if is_private(name) or self.folder and PathFinder.find_spec(top, [self.folder]):
+        top_name = name.partition('.')[0]
+        if is_private(name):
             return True
-        return top not in SHARED and self._is_added(top)
+        if self.program_folder and PathFinder.find_spec(top_name, [self.program_folder]):
+            return True
+        return top_name not in SHARED and self._is_added(top_name)
 
-    def _is_added(self, top):
+    def _is_added(self, top_name):
         """True if a module lies in a folder that the process does not search."""
-        added = [folder for folder in self.path if folder not in sys.path]
-        spec = PathFinder.find_spec(top, [*self.path, *sys.path]) if added else None
+        added_folders = [folder for folder in self.path if folder not in sys.path]
+        if not added_folders:
+            return False
+        spec = PathFinder.find_spec(top_name, [*self.path, *sys.path])
         if spec is None:
             return False
         places = spec.submodule_search_locations or [spec.origin]
         folder = os.path.dirname(places[0])
-        if folder not in added:
+        if folder not in added_folders:
             return False
-        if (
-            os.path.basename(folder) == 'site-packages'
-        ):  # such as torch, which cannot be loaded twice
-            sys.path.append(folder)
+        if os.path.basename(folder) == 'site-packages':
+            sys.path.append(folder)  # a library such as torch cannot be loaded twice
             return False
         return True
 
@@ -244,12 +257,12 @@ class PrivateModules:
         parent, _, leaf = name.rpartition('.')
         if name not in self.modules and not self._is_private(name):
             module = importlib.import_module(name)
-            if parent and self._is_private(parent):  # of a package with code and messages
+            if parent and self._is_private(parent):  # a package with code and messages
                 setattr(self.load(parent), leaf, module)
             return module
         with self._lock:  # or another thread would see a module that is half loaded
             if name not in self.modules:
-                # what the process has searched since the start of the run comes last
+                # folders that the process has added since the start of the run come last
                 path = self.load(parent).__path__ if parent else [*self.path, *sys.path]
                 if name not in self.modules:  # the parent may have imported it
                     self._execute(name, tuple(path))
@@ -259,7 +272,8 @@ class PrivateModules:
 
     def _execute(self, name, path):
         spec, code = _find(name, path)
-        self.modules[name] = module = module_from_spec(spec)
+        module = module_from_spec(spec)
+        self.modules[name] = module
         vars(module)['__builtins__'] = self.builtins
         is_added = sys.modules.setdefault(name, module) is module  # @dataclass looks there
         try:
@@ -277,9 +291,8 @@ class PrivateModules:
 
     def _build_class(self, function, name, *bases, **options):
         cls = builtins.__build_class__(function, name, *bases, **options)
-        if not str(function.__module__).startswith(
-            'rospy'
-        ):  # of these, sys.modules has the same files
+        is_rospy = str(function.__module__).startswith('rospy')
+        if not is_rospy:  # sys.modules has the same files of rospy
             with suppress(TypeError):  # its metaclass has no hash
                 _owners[cls] = weakref.ref(self)
         return cls
@@ -295,10 +308,15 @@ class PrivateModules:
             return self.load(name.partition('.')[0])
         if hasattr(module, '__path__'):
             importlib._bootstrap._handle_fromlist(module, fromlist, self.load)
-        if '*' in fromlist:  # generated messages bring sys, which is to be the program's
-            starred = Shim(module)
-            for key, value in vars(module).items():
-                name = isinstance(value, ModuleType) and value.__name__
-                vars(starred)[key] = self.modules.get(name, value)
-            return starred
+        if '*' in fromlist:
+            return self._with_private_modules(module)
         return module
+
+    def _with_private_modules(self, module):
+        """Return a module for ``import *``: generated messages bring sys, which must be private."""
+        starred = Shim(module)
+        for key, value in vars(module).items():
+            if isinstance(value, ModuleType):
+                value = self.modules.get(value.__name__, value)
+            vars(starred)[key] = value
+        return starred

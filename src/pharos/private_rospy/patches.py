@@ -2,8 +2,8 @@
 
 Over ``def f(original, run, *args)``, ``@patch(module, target)`` has ``f`` called instead of the
 target; ``run`` is the Run whose copy is patched. Over ``def f(original, run)``, ``@replace(module,
-target)`` puts what it returns in the target's place. Each docstring says what is wrong with
-rospy: read it after the word 'rospy'.
+target)`` puts the returned object in the target's place. Each docstring says first what rospy does,
+then what this does instead.
 """
 import socket
 import threading
@@ -13,27 +13,31 @@ import rospkg
 import rospy
 from rosgraph.network import ROSHandshakeException, decode_ros_handshake_header, is_local_address
 
-from pharos.private_rospy import transport
+from pharos.intraprocess.links import Link
+from pharos.private_rospy import tcpros, topics
 from pharos.private_rospy.loader import Shim
 
-LARGEST = 1 << 20  # bytes of a connection header, and of an XML-RPC request
+MAX_REQUEST = 1 << 20  # bytes of a connection header, and of an XML-RPC request
+POLL_INTERVAL = 60  # seconds; a stop wakes the server sooner
 #: module -> [(target, function that makes the replacement)]
 TABLE = {}
 
 
-class _Client(threading.local):
-    address = ()  # of the client whose request this thread answers
+class _CurrentClient(threading.local):
+    """The client that this thread answers."""
+
+    address = ()
 
 
-_client = _Client()
+_current_client = _CurrentClient()
 
 
 def replace(module, target):
     """Enter a function that makes a replacement into the table."""
 
-    def enter(make):
-        TABLE.setdefault(module, []).append((target, make))
-        return make
+    def enter(make_replacement):
+        TABLE.setdefault(module, []).append((target, make_replacement))
+        return make_replacement
 
     return enter
 
@@ -42,10 +46,10 @@ def patch(module, target):
     """Enter a function that is called instead of another one into the table."""
 
     def enter(function):
-        def make(original, run):
+        def make_replacement(original, run):
             return lambda *args, **kwargs: function(original, run, *args, **kwargs)
 
-        replace(module, target)(make)
+        replace(module, target)(make_replacement)
         return function
 
     return enter
@@ -53,14 +57,14 @@ def patch(module, target):
 
 def apply(module, run):
     """Patch a private module, right after its code has run; a missing target is an AttributeError."""
-    for target, make in TABLE.get(module.__name__, ()):
-        owner, _, name = target.rpartition('.')
-        owner = getattr(module, owner) if owner else module
-        setattr(owner, name, make(getattr(owner, name), run))
+    for target, make_replacement in TABLE.get(module.__name__, ()):
+        class_name, _, name = target.rpartition('.')
+        owner = getattr(module, class_name) if class_name else module
+        setattr(owner, name, make_replacement(getattr(owner, name), run))
 
 
 def overlay(cls, methods, run):
-    """Set the methods of a plain class on a private class; ``rospy_NAME`` is what was there.
+    """Set the methods of a plain class on a private class; ``rospy_NAME`` is the method before.
 
     A subclass would recurse: rospy calls ``super(_PublisherImpl, self)``, and would find it.
     """
@@ -77,24 +81,26 @@ def overlay(cls, methods, run):
 
 @patch('rosgraph.network', 'read_ros_handshake_header')
 def read_handshake(original, run, sock, *buffer):
-    """Wait for ever for a peer that says nothing, too little, or announces 4 GiB."""
-    run.limit(sock)
+    """rospy waits for ever for a peer that says nothing, too little, or announces 4 GiB; this has limits."""
+    run.limit_silence(sock)
     head = sock.recv(4, socket.MSG_WAITALL)
     size = int.from_bytes(head, 'little')
-    data = head + sock.recv(size, socket.MSG_WAITALL) if size <= LARGEST else b''
+    data = head
+    if size <= MAX_REQUEST:
+        data += sock.recv(size, socket.MSG_WAITALL)
     run.deadlines.pop(sock, None)
-    if len(data) < 4 + size:
+    if len(data) < 4 + size:  # too much, too little, or nothing in time
         raise ROSHandshakeException(f'no connection header of {size} bytes came in time')
     return decode_ros_handshake_header(data)
 
 
 @patch('rospy.impl.tcpros_base', 'TCPROSServer._tcp_server_callback')
 def accept(original, run, self, sock, address):
-    """Shakes hands in the thread that accepts: one silent client keeps out all others."""
+    """rospy shakes hands in the thread that accepts, and a silent client keeps out others; this has a thread."""
 
     def shake_hands():
-        _client.address = address
-        transport.keep_alive(sock)
+        _current_client.address = address
+        tcpros.keep_alive(sock)
         original(self, sock, address)
 
     run.sockets.add(sock)
@@ -103,77 +109,78 @@ def accept(original, run, self, sock, address):
 
 @patch('rospy.impl.tcpros_base', 'logwarn')
 def name_client(original, run, text, *args):
-    """Does not say which client it refused."""
-    original(f'{":".join(map(str, _client.address))}: {text}', *args)
+    """rospy does not say which client it refused; this names its address."""
+    original(f'{":".join(map(str, _current_client.address))}: {text}', *args)
 
 
 @patch('rospy.impl.tcpros_base', 'rospyerr')
 @patch('rospy.impl.tcpros_base', 'rospywarn')
 def log_no_traceback(original, run, *args):
-    """Log a traceback for each client that says nonsense; a line says so already."""
+    """rospy logs a traceback for each client that says nonsense; this logs none, since a line says so."""
 
 
 @patch('rospy.impl.tcpros_base', 'TCPServer.shutdown')
 def shutdown_server(original, run, self):
-    """Closes the socket, which does not wake accept(), and the port stays taken."""
+    """rospy closes the socket, which does not wake accept(), and the port stays taken; this wakes it."""
     self.is_shutdown = True
-    transport.shut(self.server_sock)
+    tcpros.shutdown_socket(self.server_sock)
     self.server_sock.close()
 
 
 @patch('rospy.impl.tcpros_pubsub', '_configure_pub_socket')
 def no_delay(original, run, sock, is_tcp_nodelay):
-    """Sends some messages 40 ms late, unless the subscriber asks for tcp_nodelay."""
+    """rospy sends some messages 40 ms late, unless a subscriber asks for tcp_nodelay; this never does."""
     original(sock, True)
 
 
 @patch('rosgraph.xmlrpc', 'XmlRpcNode.start')
 def start_xmlrpc(original, run, self):
-    """Binds its port in another thread, where an error is printed and cannot be raised."""
+    """rospy binds the port in another thread, and prints an error; this binds here, and raises."""
     original.__globals__['print'] = lambda text: None
     self._run_init()
     server = self.server
 
     def serve():
         with server:  # closes it
-            server.serve_forever(poll_interval=60)
+            server.serve_forever(poll_interval=POLL_INTERVAL)
 
     run.start_thread(serve)
 
 
 @patch('rosgraph.xmlrpc', 'XmlRpcNode.shutdown')
 def shutdown_xmlrpc(original, run, self, reason):
-    """Only closes the socket; its thread then spins (ros_comm #2238)."""
+    """rospy only closes the socket, and its thread spins (ros_comm #2238); this ends the thread."""
     self.is_shutdown = True
     if self.server:
         self.handler._shutdown(reason)
         self.server._BaseServer__shutdown_request = True
-        transport.shut(self.server.socket)
+        tcpros.shutdown_socket(self.server.socket)
 
 
 @patch('rosgraph.xmlrpc', 'ThreadingXMLRPCServer.process_request')
 def process_request(original, run, self, request, address):
-    """Has threads and sockets that outlive it, and waits for silent clients."""
+    """rospy's threads and sockets outlive it, and wait for silent clients; these end with the run."""
 
     def answer():
-        _client.address = address
+        _current_client.address = address
         self.process_request_thread(request, address)
         run.deadlines.pop(request, None)
 
-    run.limit(request)
+    run.limit_silence(request)
     run.sockets.add(request)
     if run.stopping.is_set():
-        transport.shut(request)
+        tcpros.shutdown_socket(request)
     run.start_thread(answer)
 
 
 @patch('rosgraph.xmlrpc', 'SilenceableXMLRPCRequestHandler.do_POST')
 def limit_request(original, run, self):
-    """Reads requests of any size."""
-    if int(self.headers.get('content-length', 0)) > LARGEST:
-        return self.send_error(413)
+    """rospy reads requests of any size; this refuses large ones."""
+    if int(self.headers.get('content-length', 0)) > MAX_REQUEST:
+        self.send_error(413)
+        return
     original(self)
-    run.limit(self.connection)
+    run.limit_silence(self.connection)
 
 
 # -- life
@@ -181,52 +188,53 @@ def limit_request(original, run, self):
 
 @replace('rospy.core', 'signal_shutdown')
 def signal_shutdown(original, run):
-    """Ends rospy alone: rosnode kill and the like are to stop the node as its user would."""
-    run.shut_down = original
+    """rospy ends itself alone; this stops the node, for rosnode kill as for its user."""
+    run.rospy_signal_shutdown = original
     return run.signal_shutdown
 
 
 @patch('rospy.core', 'is_shutdown')
 def is_shutdown(original, run):
-    """Is true too late: a stop waits for the loops that ask it."""
+    """rospy says so too late for loops that a stop waits for; this says so when the stop begins."""
     run.checkpoint()
     return run.stopping.is_set() or original()
 
 
 @replace('rosgraph.roslogging', 'rospkg')
 def packages(original, run):
-    """Searches all packages for rosgraph's configuration of the log, again for each node."""
+    """rosgraph searches all packages for its configuration of the log for each node; this does once."""
     return Shim(original, RosPack=rospkg.RosPack.get_instance)
 
 
 @patch('rospy.impl.masterslave', 'ROSHandler._ready')
 def ready(original, run, self, uri):
-    """Starts a thread that then looks twice a second for departed subscribers."""
+    """rospy starts a thread that looks for departed subscribers; this has the watcher of all runs do so."""
     self.uri = uri
-    run.ready(self, uri)
+    run.enter(self, uri)
     self.reg_man.start(uri, self.masterUri)
 
 
 @patch('rospy.impl.registration', 'RegManager.run')
 def run_registration(original, run, self):
-    """Looks for new publishers in a thread for each node; the watcher does so for all."""
+    """rospy looks for new publishers in a thread for each node; this returns, and the watcher looks."""
 
 
 @patch('rospy.impl.masterslave', 'ROSHandler._shutdown')
 def shut_down(original, run, self, reason=''):
-    """Closes what the stop closes later."""
+    """rospy closes all here; this leaves it to the run's stop."""
     self.done = True
 
 
 @patch('rospy.impl.masterslave', 'ROSHandler.shutdown')
 def shut_down_from_outside(original, run, self, caller_id, msg=''):
-    """Obeys everybody, also if an earlier node at its URI is meant (ros_comm #2241)."""
-    host, master = _client.address[0], urlsplit(self.masterUri).hostname
-    is_near = host == socket.gethostbyname(master) or is_local_address(host)
+    """rospy obeys everybody, also if an earlier node at its URI is meant (ros_comm #2241); this checks."""
+    host = _current_client.address[0]
+    master_host = urlsplit(self.masterUri).hostname
+    is_near = host == socket.gethostbyname(master_host) or is_local_address(host)
     is_meant = caller_id != '/master' or f'[{self.name}]' in str(msg)
     obeys = is_meant and (is_near or run.node.allow_remote_shutdown)
     if obeys:
-        run.end_node()
+        run.request_stop()
     else:
         run.ros.logwarn(f'does not stop for {caller_id} at {host}: {msg}')
     return int(obeys), 'only this host and the master may do that', 0
@@ -234,8 +242,13 @@ def shut_down_from_outside(original, run, self, caller_id, msg=''):
 
 @patch('rospy.timer', 'Timer.__init__')
 def start_timer(original, run, self, period, callback, *args, **kwargs):
-    """Calls once more at a stop, which ends its sleep."""
-    original(self, period, lambda event: run.stopping.is_set() or callback(event), *args, **kwargs)
+    """rospy calls once more when a stop ends the timer's sleep; this does not."""
+
+    def call_unless_stopping(event):
+        if not run.stopping.is_set():
+            callback(event)
+
+    original(self, period, call_unless_stopping, *args, **kwargs)
 
 
 # -- topics
@@ -243,72 +256,75 @@ def start_timer(original, run, self, period, callback, *args, **kwargs):
 
 @replace('rospy.topics', '_PublisherImpl')
 def publisher(original, run):
-    """See PublisherOverlay."""
-    return overlay(original, transport.PublisherOverlay, run)
+    """rospy serializes for all receivers; see PublisherOverlay."""
+    return overlay(original, topics.PublisherOverlay, run)
 
 
 @replace('rospy.topics', '_SubscriberImpl')
 def subscription(original, run):
-    """See SubscriptionOverlay."""
-    return overlay(original, transport.SubscriptionOverlay, run)
+    """rospy runs all callbacks in the thread that reads; see SubscriptionOverlay."""
+    return overlay(original, topics.SubscriptionOverlay, run)
 
 
 @patch('rospy.topics', 'Subscriber.__init__')
 def subscribe(original, run, self, *args, **kwargs):
-    """Connects before it has its callback: add_callback() does so after; without one it is here."""
+    """rospy connects before it has the callback; this connects after, as add_callback() does."""
     original(self, *args, **kwargs)
-    if self.callback is None:  # else add_callback() has connected it
+    if self.callback is None:  # otherwise add_callback() has connected it
         run.connect_all(self.resolved_name)
 
 
 @patch('rospy.topics', 'QueuedConnection')
-def queued(original, run, connection, queue_size):
-    """See Sender."""
-    is_link = isinstance(connection, transport.Link)
-    return connection if is_link else transport.Sender(connection, queue_size, run)
+def queue_connection(original, run, connection, queue_size):
+    """rospy's queue is not bounded; see Sender."""
+    if isinstance(connection, Link):
+        return connection
+    return tcpros.Sender(connection, queue_size, run)
 
 
 @patch('rospy.impl.tcpros_pubsub', 'robust_connect_subscriber')
 def receive(original, run, connection, address, port, uri, callback, topic):
-    """Gives up silently, or tries ever more rarely."""
-    subscription, error = callback.__self__, None
+    """rospy gives up silently, or tries ever more rarely; this reports, and tries each second."""
+    subscription = callback.__self__
+    reason = ''
     try:
-        transport.receive(connection, address, port, uri, subscription, run)
-    except Exception as problem:
-        error = str(problem)
+        tcpros.receive(connection, address, port, uri, subscription, run)
+    except Exception as error:
+        reason = str(error)
     connection.close()
-    transport.end_share(run, topic, uri, subscription)
-    if error and ('md5sum' in error or 'do not match' in error):  # rospy compares the names, too
-        run.node._refused(topic, error)
+    tcpros.close_relay(run, topic, uri, subscription)
+    if 'md5sum' in reason or 'do not match' in reason:  # rospy compares the names of types, too
+        run.report_refusal(topic, reason)
     elif not subscription.closed:
-        run.connect_again(topic, uri, error)
+        run.connect_again(topic, uri, reason)
 
 
 @patch('rospy.impl.registration', 'RegManager.reg_added')
-def reg_added(original, run, self, name, data, kind):
-    """Tries for ever with the lock of all topics held: one attempt, then the watcher repairs."""
-    run.register(kind, name, data)
+def register(original, run, self, name, data, registry):
+    """rospy tries for ever with the lock of all topics held; this tries once, and the watcher repairs."""
+    run.register(registry, name, data)
 
 
 @patch('rospy.impl.registration', 'RegManager.publisher_update')
 def publisher_update(original, run, self, name, uris):
-    """Leaves it to its thread; is called once for each publisher."""
+    """rospy leaves the connecting to its thread, once for each publisher; this connects to all."""
     if uris != run.publisher_uris.get(name):
         run.publisher_uris[name] = uris
         run.connect_all(name)
 
 
 @patch('rospy.impl.masterslave', 'ROSHandler.publisherUpdate')
-def publishers_changed(original, run, self, *args):  # it checks their number and types
-    """Does not hear that the last publisher has left."""
-    for topic in args[1:2]:
+def publishers_changed(original, run, self, *args):
+    """rospy does not hear that the last publisher has left; this does."""
+    if len(args) > 1:  # rospy refuses a call with too few
+        topic = args[1]
         run.publisher_uris.pop(topic, None)
     return original(self, *args)
 
 
 @patch('rospy.impl.registration', 'RegManager.cleanup')
 def cleanup(original, run, self, reason):
-    """Trips over a time-out, and then closes nothing."""
+    """rospy trips over a time-out, and then closes nothing; this closes all topics."""
     try:
         original(self, reason)
     finally:
@@ -318,7 +334,7 @@ def cleanup(original, run, self, reason):
 @patch('actionlib.simple_action_client', 'SimpleActionClient.send_goal')
 @patch('actionlib.simple_action_client', 'SimpleActionClient._handle_transition')
 def keep_goal(original, run, self, *args, **kwargs):
-    """Drops what comes before send_goal() returns, as the answer of a node of this process may."""
+    """actionlib drops an answer that comes before send_goal() returns; this has the answer wait."""
     with self.done_condition:
         return original(self, *args, **kwargs)
 
@@ -328,34 +344,34 @@ def keep_goal(original, run, self, *args, **kwargs):
 
 @patch('rospy.impl.masterslave', 'ROSHandler.paramUpdate')
 def parameter_changed(original, run, self, *args):
-    """Tells its own cache alone."""
-    run.node._read_parameters()
+    """rospy tells its own cache alone; this tells the node's parameters, too."""
+    run.read_parameters()
     return original(self, *args)
 
 
 @patch('rospy.msproxy', 'MasterProxy.__setitem__')
 @patch('rospy.msproxy', 'MasterProxy.__delitem__')
 def set_parameter(original, run, self, key, *value):
-    """Tells others of the change, and not the node itself."""
+    """the master tells the other nodes of the change; this tells this node, too."""
     original(self, key, *value)
-    run.node._read_parameters()
+    run.read_parameters()
 
 
 @replace('rospy.impl.rosout', 'rospy')
 def rosout(original, run):
-    """Asks the master for each line, which registers anew a node that stops."""
+    """rospy asks the master for each line, which registers a stopping node anew; this asks nobody."""
     return Shim(original, get_param_cached=lambda name, default=None: default)
 
 
 @replace('rospy.service', 'ServiceException')
 def service_exception(original, run):
-    """Is another one for each node, which others could not catch."""
+    """rospy's exception is another class for each node; this is the one that all can catch."""
     return rospy.ServiceException
 
 
 @patch('rospy.impl.tcpros_service', 'ServiceImpl.handle')
 def handle_call(original, run, self, connection, header):
-    """Lets its thread end with an exception if the client has gone."""
+    """rospy's thread ends with an exception if the client has gone; this closes the connection."""
     try:
         original(self, connection, header)
     except (rospy.exceptions.TransportException, OSError):

@@ -1,7 +1,11 @@
-"""One run of one node: a rospy of its own, started and stopped."""
+"""A node's life from a start to a stop: its own rospy, souls, endpoints and failures."""
+from __future__ import annotations
+
 import atexit
+import enum
 import errno
 import functools
+import io
 import os
 import socket
 import sys
@@ -11,25 +15,53 @@ import xmlrpc
 from contextlib import suppress
 from http.client import HTTPException
 from time import monotonic
+from types import SimpleNamespace
 from urllib.parse import urlsplit
 from weakref import WeakSet
 from xml.parsers.expat import ExpatError
 from xmlrpc import client as xmlrpc_client
 
-from pharos.errors import MasterUnreachableError, NodeNameInUseError, PharosError, PortInUseError
-from pharos.intraprocess.workers import Turns
-from pharos.private_rospy import patches, transport
-from pharos.private_rospy.loader import PrivateModules, Shim, own_path
-from pharos.private_rospy.transport import runs
+from rospy import ServiceException
+
+from pharos.blocks import block_name
+from pharos.errors import MasterUnreachableError, MessageTypeError, NodeNameInUseError
+from pharos.errors import PharosError, PortInUseError
+from pharos.failures import Failure, Failures
+from pharos.intraprocess.callback_queues import CallbackQueue
+from pharos.intraprocess.copier import copy_of
+from pharos.intraprocess.links import link_topic, runs, runs_lock
+from pharos.private_rospy import patches
+from pharos.private_rospy.loader import PrivateModules, Shim, private_path
+from pharos.private_rospy.tcpros import close_relay, follow_relay, shutdown_socket
+from pharos.signals import may_be_signal
+from pharos.transcript import Transcript
 
 MASTER_LIMIT = 5.0  # seconds for each question to a master or node
+PEER_LIMIT = 1.0  # seconds for the question whether a node of our name lives
 STOP_LIMIT = 2.0  # seconds that a stop waits for threads of rospy
 HOLD_LIMIT = 2.0  # seconds that delegates wait for the end of start(), which may wait for them
 RETRY_DELAY = 1.0  # seconds until the next attempt to connect
-WATCH_PERIOD = 0.25  # seconds between two looks; each fourth is at the masters, too
+WATCH_PERIOD = 0.25  # seconds between two looks
+LOOKS_PER_MASTER = 4  # each fourth look is at the masters, too
+BACKLOG = 128  # clients that may wait for a connection; rospy lets five
 UNREACHABLE = OSError, xmlrpc_client.Error, HTTPException, ExpatError
-_METHODS = {'pub': 'registerPublisher', 'sub': 'registerSubscriber', 'srv': 'registerService'}
+#: rospy's names of registries -> methods of the master
+_REGISTER_METHODS = {
+    'pub': 'registerPublisher',
+    'sub': 'registerSubscriber',
+    'srv': 'registerService',
+}
 _end_of_watch = threading.Event()
+
+
+class Lifecycle(enum.Enum):
+    """The states of a node; see :attr:`Node.lifecycle`."""
+
+    NEW = 'new'
+    STARTING = 'starting'
+    RUNNING = 'running'
+    STOPPING = 'stopping'
+    STOPPED = 'stopped'
 
 
 class _Transport(xmlrpc_client.Transport):
@@ -46,7 +78,7 @@ class _Transport(xmlrpc_client.Transport):
 
 
 class ServerProxy(xmlrpc_client.ServerProxy):
-    """One that gives up after ``limit`` seconds."""
+    """A proxy of an XML-RPC server that gives up after ``limit`` seconds."""
 
     def __init__(self, uri, limit=MASTER_LIMIT):
         transport = _Transport()
@@ -55,53 +87,65 @@ class ServerProxy(xmlrpc_client.ServerProxy):
 
 
 class Run:
-    """A rospy with a node.
+    """One run of a node. Its start() makes it; the next start replaces it.
 
-    :param node: a Node, with a name, ports, settings, and methods that are called: ``_end_now()`` if
-        ROS ends it, ``_read_parameters()``, ``_refused(topic, reason)``
+    A stopped run stays with its node, so that its failures can be read.
+
+    :param node: the Node
+    :param settings: the :class:`Settings` of the node
     """
 
     uri = ''
+    lifecycle = Lifecycle.STARTING
 
-    def __init__(self, node):
-        self.node, self.name = node, node._name
-        self.master_url = node._master.url
+    def __init__(self, node, settings):
+        self.node = node
+        self.settings = settings
+        self.name = settings.name
+        self.master = settings.master
+        self.failures = Failures()
+        self.souls = {}  # thread -> its block, None for the node's soul
+        self.endpoints = []  # also those that the stop has closed
         self.stopping = threading.Event()
-        self.over = threading.Event()  # set when threads that are left have nothing more to do
+        self.finished = threading.Event()  # set when threads left behind have nothing more to do
         self.threads = WeakSet()
-        self.sockets, self.calls = WeakSet(), WeakSet()
-        self.deadlines = {}  # socket of a client that is to say something -> until when
+        self.sockets = WeakSet()
+        self.calls = WeakSet()  # sockets of calls of services
+        self.deadlines = {}  # socket of a silent client -> the time when it is closed
         self.publisher_uris = {}  # topic -> URIs, as the master last said
-        self.connecting = set()  # (topic, URI, ...)
-        self.relays = {}  # (topic, URI, class) -> publisher to those that share a connection
-        self.turns = Turns()
-        self.turns.hold()  # until the node's start() has returned
-        self.hold_deadline = monotonic() + (HOLD_LIMIT if node._is_beginning else 0.0)
-        namespace, _, self.base = node._name.rpartition('/')
+        self.connecting = set()  # (topic, URI, id of the subscription)
+        self.relays = {}  # (topic, URI, class) -> publisher to the nodes that share a connection
+        self.callback_queue = CallbackQueue()
+        self.callback_queue.hold()  # until the node's start() has returned
+        self.hold_deadline = monotonic()
+        if node._releases_after_start:
+            self.hold_deadline += HOLD_LIMIT
+        namespace, _, self.base_name = self.name.rpartition('/')
         self.environ = {
             'ROSCONSOLE_FORMAT': '[${severity}] [${time}]: ${node}: ${message}',
             **os.environ,
-            'ROS_MASTER_URI': node._master.url,
+            'ROS_MASTER_URI': self.master.url,
             'ROS_NAMESPACE': namespace or '/',
         }
-        if node._domain:  # it comes before ROS_IP
-            self.environ['ROS_HOSTNAME'] = node._domain
-        self.argv = [self.base, *node._remappings]
-        self.path = own_path()
+        if settings.domain:  # rospy looks for ROS_HOSTNAME before ROS_IP
+            self.environ['ROS_HOSTNAME'] = settings.domain
+        self.argv = [self.base_name, *settings.remappings]
+        self.path = private_path()
         patch = functools.partial(patches.apply, run=self)
         self.modules = PrivateModules(self.substitutes(), patch)
         self.ros = self.modules.load('rospy')
         self.core = self.ros.core
+        self.write_log = self.core._base_logger
         registration = self.modules.load('rospy.impl.registration')
         self.topics = registration.get_topic_manager()
         self.services = registration.get_service_manager()
 
     def substitutes(self):
-        """Return what the node's modules import instead of some modules of Python."""
+        """Return the stand-ins that the node's modules import for some modules of Python."""
         run = self
 
         class Thread(threading.Thread):
-            """A daemon thread of the node's, which its stop waits for."""
+            """A daemon thread of the node's; the node's stop waits for it."""
 
             def start(self):
                 self.daemon = True
@@ -129,17 +173,88 @@ class Run:
 
     def sleep(self, seconds):
         """Stand in for ``time.sleep``: the stop of the node ends it."""
-        if self.over.is_set():
+        if self.finished.is_set():
             raise SystemExit  # in a thread that was left behind
-        if seconds <= 0 or not self.stopping.wait(seconds):
+        if seconds <= 0:
             time.sleep(0)
+            return
+        is_stopping = self.stopping.wait(seconds)
+        if is_stopping:
+            time.sleep(0)  # a loop that sleeps on must let other threads run
 
     def checkpoint(self):
-        """Do what a signal asks for; rospy's loops call it when they publish or look for their end."""
+        """Do nothing: a run of a script handles its signals here.
+
+        rospy's loops call it, since they publish and ask ``is_shutdown()``.
+        """
 
     def signal_shutdown(self, reason):
         """Stop the node; stands in for ``rospy.signal_shutdown``."""
-        self.end_node()
+        self.request_stop()
+
+    # -- state
+
+    @property
+    def is_active(self):
+        """True if the node is registered: it runs, or its stop goes on."""
+        return self.lifecycle in (Lifecycle.RUNNING, Lifecycle.STOPPING)
+
+    def open_endpoints(self, endpoint_class):
+        """Return the endpoints of a class that are open."""
+        return [
+            endpoint
+            for endpoint in self.endpoints
+            if isinstance(endpoint, endpoint_class) and not endpoint.closed
+        ]
+
+    def mark_stopped(self):
+        """Be stopped: nothing is open any more."""
+        for endpoint in self.endpoints:
+            endpoint.closed = True
+        self.lifecycle = Lifecycle.STOPPED
+
+    def health_facts(self):
+        """Return the facts of Node.health() that the master is not asked for; top asks for them."""
+        from pharos.live.snapshot import health_facts
+
+        return health_facts(self)
+
+    # -- failures
+
+    def report_failure(self, error, block, role, message=None, channel=None, retry=None):
+        """Keep an exception of a block, and tell it at the 1st, 10th, 100th time; Ctrl-C goes on.
+
+        :param role: the word for the block in the text, such as 'delegate'
+        :param retry: ``retry(message)`` runs the block again
+        """
+        if isinstance(error, (KeyboardInterrupt, SystemExit)) and may_be_signal():
+            raise error
+        failure = self.keep_failure(error, block, message, channel, retry)
+        is_power_of_ten = str(failure.count).strip('0') == '1'
+        if not is_power_of_ten:
+            return
+        with suppress(Exception):  # neither log nor Transcript can be written
+            text = f'{role} {block_name(block)} of {self.name}'
+            if channel:
+                text += f' on {channel.topic}'
+            text += f' raised {type(error).__name__}: {error}'
+            if failure.count > 1:
+                text += f' ({failure.count} times)'
+            try:
+                self.ros.logerr('%s\n%s', text, failure.traceback)
+            finally:
+                Transcript.show(text)
+
+    def keep_failure(self, error, block, message=None, channel=None, retry=None):
+        """Keep an exception of a block, without telling it, and return the Failure."""
+        failure = Failure(error, block, message, channel, retry)
+        self.failures.keep(failure)
+        return failure
+
+    def report_refusal(self, topic, reason):
+        """Report that a publisher sends another type."""
+        error = MessageTypeError(f'{self.name} does not receive from {topic}: {reason}')
+        self.report_failure(error, topic, 'connection')
 
     # -- start
 
@@ -150,27 +265,19 @@ class Run:
 
         :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: stop() undoes the rest
         """
-        base, node = self.modules.load('rospy.impl.tcpros_base'), self.node
-        taken = node._master.call('lookupNode', self.name)
-        port, xmlrpc_port = node._ports
-        with suppress(*UNREACHABLE):
-            if taken and ServerProxy(taken, 1.0).getPid('/pharos'):
-                raise NodeNameInUseError(
-                    f'{self.name} is running already, at {taken}: choose another name, or end that one'
-                )
+        self._check_name_free()
+        tcpros_base = self.modules.load('rospy.impl.tcpros_base')
+        port, xmlrpc_port = self.settings.ports
         try:
-            server = base.init_tcpros_server(port)
-            tcp = server.tcp_ros_server = base.TCPServer(server._tcp_server_callback, port)
-            tcp.server_sock.listen(128)  # rospy lets five clients wait
-            tcp.start()
+            server = tcpros_base.init_tcpros_server(port)
+            tcp_server = tcpros_base.TCPServer(server._tcp_server_callback, port)
+            server.tcp_ros_server = tcp_server
+            tcp_server.server_sock.listen(BACKLOG)
+            tcp_server.start()
             port = xmlrpc_port
-            options = {
-                'disable_signals': True,
-                **options,
-                'xmlrpc_port': port,
-                'tcpros_port': tcp.port,
-            }
-            self.modules.load('rospy.client').init_node(self.base, self.argv, **options)
+            ports = {'xmlrpc_port': port, 'tcpros_port': tcp_server.port}
+            options = {'disable_signals': True, **options, **ports}
+            self.modules.load('rospy.client').init_node(self.base_name, self.argv, **options)
         except OSError as error:
             if error.errno != errno.EADDRINUSE:
                 raise
@@ -178,146 +285,197 @@ class Run:
                 f'{self.name}: port {port} is in use: choose another one, or 0 for any'
             ) from None
         address = urlsplit(self.uri)
-        node._ports = tcp.port, address.port
-        node._domain = node._domain or address.hostname
+        self.settings.ports = tcp_server.port, address.port
+        self.settings.domain = self.settings.domain or address.hostname
+        node = self.node
         node.uri = self.uri
-        node.tcp_port, node.xmlrpc_port = node._ports
-        node.domain = node._domain
+        node.tcp_port, node.xmlrpc_port = self.settings.ports
+        node.domain = self.settings.domain
 
-    def ready(self, handler, uri):
+    def _check_name_free(self):
+        """Raise NodeNameInUseError if a node of this name answers."""
+        uri = self.master.call('lookupNode', self.name)
+        if not uri:
+            return
+        with suppress(*UNREACHABLE):
+            ServerProxy(uri, PEER_LIMIT).getPid('/pharos')
+            raise NodeNameInUseError(
+                f'{self.name} is running already, at {uri}: choose another name, or end that one'
+            )
+
+    def enter(self, handler, uri):
         """Be found and watched: the servers run, and nothing is registered yet."""
-        self.handler, self.uri = handler, uri
-        handler.pharosHealth = lambda caller_id: (1, '', self.node._told())
-        with transport.guard:
+        self.handler = handler
+        self.uri = uri
+        handler.pharosHealth = lambda caller_id: (1, '', self.health_facts())
+        with runs_lock:
             if not runs:
                 _end_of_watch.clear()
-                threading.Thread(target=_watch, daemon=True).start()
+                threading.Thread(target=_watch_runs, daemon=True).start()
             runs[uri] = self
 
     # -- registration and connections
 
-    def register(self, kind, name, data):
-        """Tell the master of a topic or service; the watcher repairs what it does not hear of."""
+    def register(self, registry, name, data):
+        """Tell the master of a topic or service; the watcher repairs what the master misses."""
+        method = _REGISTER_METHODS[registry]
         with suppress(MasterUnreachableError):
-            value = self.node._master.call(
-                _METHODS[kind], name, data, self.uri, caller_id=self.name
-            )
-            if kind == 'sub' and value:
-                self.publisher_uris[name] = value
-        for other in list(runs.values()) if kind == 'pub' else ():  # sooner than the master
-            if other.master_url == self.master_url:
-                other.connect(name, self.uri)
+            publishers = self.master.call(method, name, data, self.uri, caller_id=self.name)
+            if registry == 'sub' and publishers:
+                self.publisher_uris[name] = publishers
+        if registry == 'pub':  # nodes of this process connect sooner than the master has them do
+            for run in list(runs.values()):
+                if run.master.url == self.master.url:
+                    run.connect(name, self.uri)
 
     def connect_all(self, topic):
         """Connect to the publishers of a topic that the master has named."""
         for uri in self.publisher_uris.get(topic, ()):
-            connect = functools.partial(self.connect, topic, uri)
-            connect() if uri in runs else self.start_thread(connect)
+            if uri in runs:
+                self.connect(topic, uri)
+            else:
+                self.start_thread(functools.partial(self.connect, topic, uri))
 
     def connect(self, topic, uri):
         """Connect a subscription to a publisher, unless it is or is about to be."""
-        subscription, key = self.topics.subs.get(topic), (topic, uri)
+        subscription = self.topics.subs.get(topic)
         if self.stopping.is_set() or not subscription or subscription.has_connection(uri):
             return
-        attempt = *key, id(subscription)
+        attempt = topic, uri, id(subscription)
         if attempt in self.connecting:
             return
         self.connecting.add(attempt)
-        code = 0
         try:
-            if uri in runs:
-                transport.link(runs[uri], self, topic)
-            elif self.node._master.share_connections and transport.follow(self, *key, subscription):
-                pass
-            elif (code := self.handler._connect_topic(*key)[0]) != 1:
-                self.start_thread(lambda: self.connect_again(*key))
-        except (AttributeError, UnboundLocalError):  # rospy's, if it was closed meanwhile
-            pass
+            publisher_run = runs.get(uri)
+            if publisher_run:
+                link_topic(publisher_run, self, topic)
+                return
+            if self.master.share_connections and follow_relay(self, topic, uri, subscription):
+                return
+            self._connect_by_tcpros(topic, uri, subscription)
         finally:
             self.connecting.discard(attempt)
-            if code != 1:
-                transport.end_share(self, *key, subscription)
 
-    def connect_again(self, topic, uri, error=None):
+    def _connect_by_tcpros(self, topic, uri, subscription):
+        code = 0
+        try:
+            code, _, _ = self.handler._connect_topic(topic, uri)
+        except (AttributeError, UnboundLocalError):  # rospy's, if it was closed meanwhile
+            return
+        finally:
+            if code != 1:
+                close_relay(self, topic, uri, subscription)
+        if code != 1:
+            self.start_thread(functools.partial(self.connect_again, topic, uri))
+
+    def connect_again(self, topic, uri, reason=''):
         """Connect once more after a while, if the master still names the publisher."""
-        if not self.stopping.wait(RETRY_DELAY) and uri in self.publisher_uris.get(topic, ()):
-            if error:
-                self.ros.logwarn_throttle_identical(
-                    60, f'{topic}: no connection to {uri}, it is tried again: {error}'
-                )
-            self.connect(topic, uri)
+        is_stopping = self.stopping.wait(RETRY_DELAY)
+        if is_stopping or uri not in self.publisher_uris.get(topic, ()):
+            return
+        if reason:
+            self.ros.logwarn_throttle_identical(
+                60, f'{topic}: no connection to {uri}, it is tried again: {reason}'
+            )
+        self.connect(topic, uri)
 
     def register_missing(self, state):
-        """Register what is not in the master's system state."""
-        topics, services = self.topics, self.services
-        known = {
-            (kind, name)
-            for kind, names in zip(_METHODS, state)
-            for name, nodes in names
-            if self.name in nodes
-        }
-        ours = topics.get_publications, topics.get_subscriptions, services.get_services
-        with topics.lock, services.lock:  # what is closed meanwhile stays closed
-            own = [(kind, *each) for kind, get in zip(_METHODS, ours) for each in get()]
-            for each in own:
-                if each[:2] not in known and not self.stopping.is_set():
-                    self.register(*each)
-                    self.connect_all(each[1])
-        if not known and not self.stopping.is_set():  # the master has begun anew
+        """Register the topics and services that the master's system state lacks."""
+        registered = set()
+        for registry, entries in zip(_REGISTER_METHODS, state):
+            registered.update((registry, name) for name, nodes in entries if self.name in nodes)
+        topics = self.topics
+        services = self.services
+        getters = topics.get_publications, topics.get_subscriptions, services.get_services
+        with topics.lock, services.lock:  # a topic that is closed meanwhile stays closed
+            for registry, get_entries in zip(_REGISTER_METHODS, getters):
+                for name, data in get_entries():
+                    is_known = (registry, name) in registered
+                    if not is_known and not self.stopping.is_set():
+                        self.register(registry, name, data)
+                        self.connect_all(name)
+        if not registered and not self.stopping.is_set():  # the master has begun anew
             self.modules.load('rospy.client')._init_node_params(self.argv, self.name)
             for parameter in self.node._parameters:
                 parameter.subscribe()
 
-    def limit(self, sock):
+    def read_parameters(self):
+        """Have the node's parameters read their values."""
+        for parameter in self.node._parameters:
+            parameter.read()
+
+    def limit_silence(self, sock):
         """Close a client's socket if it says nothing within the node's client_timeout."""
         self.deadlines[sock] = monotonic() + self.node.client_timeout
 
+    def look(self):
+        """Look which peers have left or are silent (ros_comm #927), and end a hold that is too long."""
+        self.topics.check_all()
+        now = monotonic()
+        if now > self.hold_deadline:
+            self.callback_queue.release()
+        for sock, deadline in list(self.deadlines.items()):
+            if now > deadline:
+                self.deadlines.pop(sock, None)
+                shutdown_socket(sock)
+
     # -- stop
 
-    def end_node(self):
+    def request_stop(self):
         """Stop the node, in another thread."""
-        threading.Thread(target=self.node._end_now).start()  # no stop waits for it
+        threading.Thread(target=self.node._stop_safely).start()  # no stop waits for it
 
-    def shut_rospy_down(self, timeout):
-        """Send what is under way, unregister, and close all topics and services.
+    def end_program(self, timeout):
+        """Do nothing: a run of a script ends its program here, before all else stops."""
 
-        :param timeout: seconds for what is under way
+    def close_rospy(self, timeout):
+        """Send messages under way, unregister, and close all topics and services.
+
+        :param timeout: seconds for messages under way
         """
         self.stopping.set()
-        with transport.guard:
+        with runs_lock:
             runs.pop(self.uri, None)
             if not runs:
                 _end_of_watch.set()
-        for sock in list(self.calls):
-            transport.shut(sock)
+        self._interrupt_calls()
         deadline = monotonic() + timeout
         for publisher in list(self.topics.pubs.values()):
             publisher.flush(deadline)
-        self.shut_down('stop')  # rospy's own; its name calls signal_shutdown()
+        self.rospy_signal_shutdown('stop')
+
+    def _interrupt_calls(self):
+        for sock in list(self.calls):
+            shutdown_socket(sock)
 
     def stop(self, timeout):
-        """Send what is under way, unregister, free ports and threads; log what is left behind.
+        """Send messages under way, unregister, free ports and threads; log threads left behind.
 
-        :param timeout: seconds for souls, and as long for what is under way
+        :param timeout: seconds for souls, and as long for messages under way
         """
+        self.lifecycle = Lifecycle.STOPPING
+        self.end_program(timeout)
         self.stopping.set()
-        for sock in list(self.calls):
-            transport.shut(sock)
-        left = [thread.name for thread in join(self.node._souls, timeout)]
-        if not self.turns.close(timeout):
-            left.append('a delegate')
-        if left:
-            self.ros.logwarn(f'left behind, since they did not end in time: {", ".join(left)}')
-        self.shut_rospy_down(timeout)
+        self._interrupt_calls()
+        left_behind = [thread.name for thread in join(self.souls, timeout)]
+        has_ended = self.callback_queue.close(timeout)
+        if not has_ended:
+            left_behind.append('a delegate')
+        if left_behind:
+            self.ros.logwarn(
+                f'left behind, since they did not end in time: {", ".join(left_behind)}'
+            )
+        self.close_rospy(timeout)
         for sock in list(self.sockets):
-            transport.shut(sock)
-        join(set(self.threads) - set(self.node._souls), STOP_LIMIT)
-        self.over.set()
-        log = self.modules.load('logging')
-        log.disable()  # or a thread that is late opens the file again
-        log.shutdown()
+            shutdown_socket(sock)
+        join(set(self.threads) - set(self.souls), STOP_LIMIT)
+        self.finished.set()
+        logging = self.modules.load('logging')
+        logging.disable()  # or a thread that is late opens the file again
+        logging.shutdown()
         for sock in list(self.sockets):
             sock.close()
+        self.mark_stopped()
 
 
 def join(threads, timeout):
@@ -329,23 +487,57 @@ def join(threads, timeout):
     return [thread for thread in others if thread.is_alive()]
 
 
-def _watch():
-    """Look who has left or is silent; ask each master what it knows of our nodes, once a second."""
-    looks = 0
-    while not _end_of_watch.wait(WATCH_PERIOD):
-        looks += 1
-        nodes = list(runs.values())
-        for run in nodes:
-            run.topics.check_all()  # who has left (ros_comm #927)
-            if monotonic() > run.hold_deadline:
-                run.turns.release()
-            for sock, deadline in list(run.deadlines.items()):
-                if monotonic() > deadline:
-                    run.deadlines.pop(sock, None)
-                    transport.shut(sock)
-        for url in () if looks % 4 else {run.master_url for run in nodes}:
-            with suppress(*UNREACHABLE, PharosError):
-                state = ServerProxy(url).getSystemState('/pharos')[2]
-                for run in nodes:
-                    if run.master_url == url and not run.stopping.is_set():
-                        run.register_missing(state)
+def _watch_runs():
+    """Look after all runs; ask each master once a second for the nodes that it knows."""
+    look_count = 0
+    while True:
+        is_over = _end_of_watch.wait(WATCH_PERIOD)
+        if is_over:
+            return
+        look_count += 1
+        for run in list(runs.values()):
+            run.look()
+        if look_count % LOOKS_PER_MASTER == 0:
+            _ask_masters()
+
+
+def _ask_masters():
+    """Register again all that the masters do not know."""
+    all_runs = list(runs.values())
+    for url in {run.master.url for run in all_runs}:
+        with suppress(*UNREACHABLE, PharosError):
+            state = ServerProxy(url).getSystemState('/pharos')[2]
+            for run in all_runs:
+                if run.master.url == url and not run.stopping.is_set():
+                    run.register_missing(state)
+
+
+# -- services of this process
+
+
+def find_local_service(name, uri):
+    """Return the rospy.Service of a node of this process, or None."""
+    for run in list(runs.values()):
+        service = run.services.get_service(name)
+        if service and service.uri == uri:
+            return service
+    return None
+
+
+def call_local_service(service, request, caller_id):
+    """Have a rospy.Service of this process answer in this thread, and return its response.
+
+    :raises ServiceException: if the service fails
+    """
+    answers = []
+    connection = SimpleNamespace(
+        write_buff=io.BytesIO(),
+        send_message=lambda response, seq: answers.append(copy_of(response)),
+        write_data=lambda data: answers.append(ServiceException(data[5:].decode())),
+    )
+    request._connection_header = {'callerid': caller_id, 'service': service.resolved_name}
+    service._handle_request(connection, request)
+    answer = answers[0]
+    if isinstance(answer, Exception):
+        raise answer
+    return answer

@@ -1,6 +1,6 @@
-"""The program of an embedded master: ``python3 -m pharos.master_program PORT``.
+"""The program of an embedded master: ``python3 -m pharos.embedded_master PORT``.
 
-It prints its URL, unless the port is taken, and ends when its standard input does.
+The program prints its URL, unless the port is taken, and ends when its standard input does.
 """
 import logging
 import os
@@ -16,7 +16,8 @@ from pharos import BlockNode, Master
 
 def main(port):
     """Run rosmaster, and a /rosout that passes log lines on to /rosout_agg, as roscore does."""
-    answers, sys.stdout = sys.stdout, sys.stderr
+    answers = sys.stdout
+    sys.stdout = sys.stderr  # rosmaster prints, and the URL must come alone
     logging.disable()  # rosmaster complains of every node that stops
     try:  # rosmaster waits for ever if its port is taken
         socket.create_server((rosgraph.network.get_bind_address(), port)).close()

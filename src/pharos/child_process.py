@@ -17,29 +17,31 @@ from catkin.find_in_workspaces import find_in_workspaces
 
 from pharos.errors import PharosError, UnknownNodeError
 
-_COLOURS = re.compile(r'\x1b\[[0-9;]*[A-Za-z]|\x1b\]0;[^\x07]*\x07')
+_TERMINAL_CODES = re.compile(r'\x1b\[[0-9;]*[A-Za-z]|\x1b\]0;[^\x07]*\x07')
+MAX_LINES = 10_000  # of output that are kept
 
 
 class RosProcess(subprocess.Popen):
     """A running program; made by :meth:`Master.run` and :meth:`Master.launch`.
 
-    It has a terminal of its own, so that what it prints comes at once. ``pid`` and ``poll()`` are those
-    of ``subprocess.Popen``.
+    It has a terminal of its own, so that its lines come at once. ``pid`` and ``poll()`` are those of
+    ``subprocess.Popen``.
 
     :param on_line: ``on_line(text)`` is called for each line that it prints, in another thread
     """
 
     def __init__(self, command, master_url, on_line=None):
-        self._lines, self._on_line = collections.deque(maxlen=10_000), on_line
-        terminal, slave = os.openpty()
-        tty.setraw(slave)
+        self._lines = collections.deque(maxlen=MAX_LINES)
+        self._on_line = on_line
+        terminal, child_terminal = os.openpty()
+        tty.setraw(child_terminal)
         self._terminal = open(terminal, errors='replace')
         environ = {**os.environ, 'ROS_MASTER_URI': master_url, 'TERM': 'dumb'}
-        streams = dict.fromkeys(('stdin', 'stdout', 'stderr'), slave)
+        streams = dict.fromkeys(('stdin', 'stdout', 'stderr'), child_terminal)
         try:
             super().__init__(command, env=environ, start_new_session=True, **streams)
         finally:
-            os.close(slave)
+            os.close(child_terminal)
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
         atexit.register(self.terminate)
@@ -47,7 +49,7 @@ class RosProcess(subprocess.Popen):
     def _read(self):
         with contextlib.suppress(OSError), self._terminal:
             for line in self._terminal:  # until the program has closed it
-                text = _COLOURS.sub('', line.rstrip('\n'))
+                text = _TERMINAL_CODES.sub('', line.rstrip('\n'))
                 self._lines.append(text)
                 if self._on_line:
                     self._on_line(text)
@@ -78,17 +80,19 @@ class RosProcess(subprocess.Popen):
         return code
 
     def terminate(self, timeout: float = 5.0) -> int:  # type: ignore[override]
-        """End it and what it has started, as Ctrl-C does, after ``timeout`` seconds by force.
+        """End it and its children, as Ctrl-C does, after ``timeout`` seconds by force.
 
         :returns: its exit code
         """
         atexit.unregister(self.terminate)
-        started = psutil.Process(self.pid).children(recursive=True) if self.poll() is None else []
+        descendants = []
+        if self.poll() is None:
+            descendants = psutil.Process(self.pid).children(recursive=True)
         for number in signal.SIGINT, signal.SIGTERM, signal.SIGKILL:
             with contextlib.suppress(ProcessLookupError, subprocess.TimeoutExpired):
                 os.killpg(self.pid, number)
                 super().wait(timeout / 2)
-        for process in started:
+        for process in descendants:
             with contextlib.suppress(psutil.Error):
                 process.kill()
         return self.wait()
@@ -106,7 +110,8 @@ def find_program(package, executable):
         paths = roslib.packages.find_node(package, executable)
     except rospkg.ResourceNotFound:  # some of Debian's have no package.xml
         folders = find_in_workspaces(['libexec'], project=package)
-        paths = list(filter(None, (shutil.which(executable, path=folder) for folder in folders)))
+        found_paths = [shutil.which(executable, path=folder) for folder in folders]
+        paths = [path for path in found_paths if path]
     if not paths:
         raise UnknownNodeError(
             f'{package} has no program {executable!r}: is it installed, executable, and the'
@@ -122,7 +127,8 @@ def find_launch_file(package, file):
     """
     from roslaunch import RLException, rlutil
 
+    arguments = [package, str(file)] if package else [str(file)]
     try:
-        return rlutil.resolve_launch_arguments([package, str(file)] if package else [str(file)])[0]
+        return rlutil.resolve_launch_arguments(arguments)[0]
     except RLException as error:
         raise UnknownNodeError(f'there is no launch file {file!r}: {error}') from None

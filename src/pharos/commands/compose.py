@@ -1,6 +1,6 @@
 """Run the Python nodes of a launch file, or several programs, unmodified, in one process.
 
-  compose PKG FILE.launch [arg:=value ...]     as roslaunch; what is not Python runs apart, as there
+  compose PKG FILE.launch [arg:=value ...]     as roslaunch; nodes that are not Python run apart
   compose FILE.launch [arg:=value ...]         the same, by its path
   compose --script PKG/EXECUTABLE ...          programs, as rosrun finds them
   compose                                      none at first
@@ -22,7 +22,6 @@ from pharos.compose.composition import Composition
 from pharos.compose.container import Container
 from pharos.compose.launch_file import LaunchFile
 
-
 #: seconds; beside a node that computes, others wait a tenth of the time that they do by default
 SWITCH_INTERVAL = 0.5e-3
 
@@ -30,6 +29,19 @@ SWITCH_INTERVAL = 0.5e-3
 def main(argv=None):
     """Start, wait, and return the exit status."""
     sys.setswitchinterval(SWITCH_INTERVAL)
+    options, mappings = _parse(sys.argv[1:] if argv is None else argv)
+    with contextlib.ExitStack() as stack:
+        try:
+            return _run(stack, options, mappings)
+        except (PharosError, ValueError) as error:
+            print(f'compose: {error}', file=sys.stderr)
+            return 1
+        except KeyboardInterrupt:
+            return 0
+
+
+def _parse(arguments):
+    """Return the options, and the arguments of the form name:=value."""
     parser = argparse.ArgumentParser(
         'compose', description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -43,49 +55,47 @@ def main(argv=None):
     parser.add_argument(
         '--share-connections', action='store_true', help='one connection to each other publisher'
     )
-    words = sys.argv[1:] if argv is None else argv
-    options = parser.parse_args([word for word in words if ':=' not in word])
-    mappings = [word for word in words if ':=' in word]
-    is_of_file = options.file or options.only or options.apart
-    if is_of_file and (options.script or len(options.file) not in (1, 2)):
+    options = parser.parse_args([each for each in arguments if ':=' not in each])
+    mappings = [each for each in arguments if ':=' in each]
+    needs_file = options.file or options.only or options.apart
+    if needs_file and (options.script or len(options.file) not in (1, 2)):
         parser.error('give one launch file, by package and name or by its path, first; or --script')
-    with contextlib.ExitStack() as stack:
-        try:
-            return _run(stack, options, mappings)
-        except (PharosError, ValueError) as error:
-            print(f'compose: {error}', file=sys.stderr)
-            return 1
-        except KeyboardInterrupt:
-            return 0
+    return options, mappings
 
 
 def _run(stack, options, mappings):
+    """Run as the options say, and return the exit status; the stack ends all."""
     master = Master(share_connections=options.share_connections)
     if not master.is_reachable():
         port = int(master.url.rstrip('/').rpartition(':')[2])
         print(f'no ROS master at {master.url}: it is started here', file=sys.stderr)
         os.environ['ROS_MASTER_URI'] = stack.enter_context(Master.embedded(port)).url
     composition = Composition(master)
-    ros_arguments = [word for word in mappings if word.startswith('_') or not options.file]
+    ros_arguments = [each for each in mappings if each.startswith('_') or not options.file]
     settings = {'argv': ros_arguments, 'composition': composition}
     try:
-        stack.enter_context(master.create(Container, 'compose', **settings))
+        container = master.create(Container, 'compose', **settings)
     except NodeNameInUseError:
-        name = anonymous_name('compose')
-        stack.enter_context(master.create(Container, name, **settings))
+        container = master.create(Container, anonymous_name('compose'), **settings)
+    stack.enter_context(container)
     stack.enter_context(composition)
     if options.file:
-        args = dict(word.split(':=', 1) for word in mappings if not word.startswith('_'))
-        package = options.file[0] if len(options.file) == 2 else None
-        names = options.only, options.apart, options.here
-        file = LaunchFile(master.url, package, options.file[-1], args, *names)
-        home = rospkg.get_ros_home()  # where roslaunch runs its nodes
-        os.makedirs(home, exist_ok=True)
-        os.chdir(home)
-        composition.launch(file)
+        composition.launch(_read_launch_file(master.url, options, mappings))
         return composition.wait()
     if options.script:
         composition.run_scripts(options.script, options.here)
         return composition.wait()
     spin()
     return 0
+
+
+def _read_launch_file(url, options, mappings):
+    """Return the launch file; its nodes run in the folder where roslaunch runs them."""
+    args = dict(each.split(':=', 1) for each in mappings if not each.startswith('_'))
+    package = options.file[0] if len(options.file) == 2 else None
+    names = options.only, options.apart, options.here
+    launch_file = LaunchFile(url, package, options.file[-1], args, *names)
+    home = rospkg.get_ros_home()
+    os.makedirs(home, exist_ok=True)
+    os.chdir(home)
+    return launch_file

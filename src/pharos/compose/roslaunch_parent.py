@@ -1,7 +1,7 @@
-"""Run the nodes of a launch file that need their own processes: ``apart_program.py FILE PARENT``.
+"""Run the nodes of a launch file that need their own processes: ``roslaunch_parent.py FILE PARENT``.
 
-roslaunch runs them, with the configuration that is pickled in FILE. It ends as roslaunch does, and
-when the process PARENT is no more.
+roslaunch runs them, with the configuration that is pickled in FILE. The program ends as roslaunch
+does, and when the process PARENT has ended.
 """
 import os
 import pickle
@@ -15,14 +15,21 @@ import roslaunch.parent
 import roslaunch.rlutil
 
 
+PARENT_PERIOD = 1.0  # seconds between two looks at the parent
+
+
 def _end_with(parent):
     while os.getppid() == parent:
-        time.sleep(1)
+        time.sleep(PARENT_PERIOD)
     os.kill(os.getpid(), signal.SIGINT)
 
 
 def main(path, parent):
-    """Run them; returns the exit status."""
+    """Run the nodes; returns the exit status.
+
+    :param path: the file with the configuration, which is removed
+    :param parent: the number of the parent process
+    """
     with open(path, 'rb') as file:
         config = pickle.load(file)
     os.unlink(path)

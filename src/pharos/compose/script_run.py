@@ -1,0 +1,480 @@
+"""One run of a script: the program in a thread, with stand-ins for what it has of a process."""
+import asyncio
+import collections
+import contextlib
+import ctypes
+import functools
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+import types
+
+from rosgraph.names import anonymous_name, get_ros_namespace, load_mappings, ns_join
+
+import pharos
+from pharos import signals
+from pharos.compose.sources import compile_program
+from pharos.errors import PharosError
+from pharos.master import Master
+from pharos.private_rospy.loader import Shim
+from pharos.private_rospy.patches import patch
+from pharos.private_rospy.run import STOP_LIMIT, Run, join
+from pharos.waiting import current, wait
+
+SIGNAL_LIMIT = 0.2  # seconds that a signal waits for the main thread
+JOIN_PERIOD = 0.02  # seconds between two looks for a signal
+SPIN_PERIOD = 0.01  # seconds
+
+
+@patch('subprocess', 'Popen.__init__')
+def start_child(original, run, self, *args, env=None, **kwargs):
+    """Python gives a child the environment of this process; this gives it the program's."""
+    original(self, *args, env=run.environ if env is None else env, **kwargs)
+
+
+class ScriptRun(Run):
+    """One run of a program.
+
+    At its end these are set, in this order: ``is_end_requested``; ``has_signal`` and
+    ``pending_signal`` (a signal waits for the main thread); ``signal_accepted`` (the program's
+    handlers run); ``has_run_hooks``; ``stopping`` (``is_shutdown()`` is True); ``main_has_ended``;
+    ``finished`` (threads that are left end).
+    """
+
+    error = None  # raised by the program before it was a node
+    exit_request = None  # the SystemExit that a handler or os._exit() raised
+    is_registered = False  # True once rospy.init_node() has registered the node
+    is_starting = True  # False once start() has returned
+    is_end_requested = False
+    has_signal = False
+    has_run_hooks = False
+    main_has_ended = True  # it has not begun
+
+    def __init__(self, node, settings):
+        self.exit_functions = []  # of atexit
+        self.thread_exit_functions = []  # of threading, which run before
+        self.threads_to_join = []  # those that are no daemons
+        self.handlers = {}  # number of a signal -> the program's handler
+        self.created_nodes = []  # by the program, with pharos
+        self.pending_signal = threading.Event()
+        self.signal_accepted = threading.Event()
+        self.handler_lock = threading.RLock()  # held while a signal is handled
+        super().__init__(node, settings)
+        self.main = self.Thread(target=self.run_main, name=self.name)
+        self.environ.update(node.env)
+        self.argv[0] = node.path
+        folder = os.path.dirname(os.path.realpath(node.path))
+        self.path.insert(0, folder)
+        self.modules.program_folder = folder
+        self.modules.modules['sys'].modules = collections.ChainMap(
+            self.modules.modules, sys.modules
+        )
+        self.modules.builtins.update(print=self.print, exit=sys.exit, quit=sys.exit)
+        self.ros.init_node = self.init_node
+
+    def substitutes(self):
+        """Return the stand-ins that the program imports for some modules of Python."""
+        stand_ins = super().substitutes()
+        run = self
+
+        class Thread(self.Thread):
+            """A thread of the program. The program's end waits for it, unless it is a daemon."""
+
+            def __init__(self, *args, **kwargs):
+                super().__init__(*args, **kwargs)
+                if threading.current_thread() is run.main:  # a daemon here, but not as a process
+                    self.daemon = bool(kwargs.get('daemon'))
+
+            def start(self):
+                if not self.daemon:
+                    run.threads_to_join.append(self)
+                self.run = functools.partial(run.run_thread, self.run)
+                super().start()
+
+        stand_ins['threading'] = Shim(
+            threading,
+            Thread=Thread,
+            Timer=type('Timer', (Thread, threading.Timer), {}),
+            main_thread=lambda: self.main,
+            _register_atexit=self.thread_exit_functions.append,
+        )
+        stand_ins['signal'] = Shim(signal, signal=self._set_handler, getsignal=self._handler_of)
+        stand_ins['atexit'].register = self._register_at_exit
+        stand_ins['atexit'].unregister = lambda function: None
+        stand_ins['os'].getenv = self.environ.get
+        stand_ins['os']._exit = self.exit_now
+        stand_ins['asyncio'] = _Asyncio(self)
+        stand_ins['pharos'] = _Pharos(self)
+        self.stdout = NamedLines(sys.__stdout__, self)
+        self.stderr = NamedLines(sys.__stderr__, self)
+        stand_ins['sys'].stdout = self.stdout
+        stand_ins['sys'].stderr = self.stderr
+        # a line has the node's name in front
+        self.environ['ROSCONSOLE_FORMAT'] = os.environ.get(
+            'ROSCONSOLE_FORMAT', '[${severity}] [${time}]: ${message}'
+        )
+        return stand_ins
+
+    def _register_at_exit(self, function, *args, **kwargs):
+        self.exit_functions.append(functools.partial(function, *args, **kwargs))
+        return function
+
+    def _handler_of(self, number):
+        default = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
+        return self.handlers.get(number, default)
+
+    def _set_handler(self, number, handler):
+        former_handler = self._handler_of(number)
+        self.handlers[number] = handler
+        return former_handler
+
+    def print(self, *values, file=None, **options):
+        """Stand in for ``print``: the program may have replaced its sys.stdout."""
+        print(*values, file=file or self.modules.modules['sys'].stdout, **options)
+
+    def print_error(self, error, title=''):
+        """Print a traceback, as Python does at the end of a program or thread."""
+        self.stderr.write(title + ''.join(traceback.format_exception(error)))
+
+    # -- start
+
+    def start(self):
+        """Run the program until its node is registered, or it has ended, or ``init_timeout``.
+
+        :raises PharosError: if the program raised an exception by then, its cause
+        """
+        node = self.node
+        node.exit_code = 1  # stays if the program cannot be read
+        self.code = compile_program(node.path)
+        node.exit_code = None
+        self.souls[self.main] = None
+        self.main_has_ended = False
+        self.main.start()
+        wait(lambda: self.is_known or not self.main.is_alive(), node.init_timeout, node)
+        self.is_starting = False
+        if self.error:
+            is_ours = isinstance(self.error, PharosError)
+            error_class = type(self.error) if is_ours else PharosError
+            text = f'{node.path} ended before it was a node: {self.error!r}'
+            raise error_class(text) from self.error
+
+    @property
+    def is_known(self):
+        """True if the program has a node of its own, or has created one with pharos."""
+        return self.is_registered or bool(self.created_nodes)
+
+    def init_node(self, name, argv=None, anonymous=False, disable_signals=False, **options):
+        """Register the node; stands in for ``rospy.init_node``."""
+        if self.is_registered:
+            return
+        if anonymous:
+            name = anonymous_name(name)
+        settings = self.settings
+        self.base_name = load_mappings(self.argv).get('__name', name)
+        self.name = ns_join(get_ros_namespace(self.environ, self.argv), self.base_name)
+        settings.name = self.name
+        self.node.name = self.name
+        tcp_port, xmlrpc_port = settings.ports
+        settings.ports = (
+            options.pop('tcpros_port', 0) or tcp_port,
+            options.pop('xmlrpc_port', 0) or xmlrpc_port,
+        )
+        for parameter_name, value in self.node.params.items():
+            self.master.parameters[f'{self.name}/{parameter_name}'] = value
+        super().start(disable_signals=disable_signals, **options)
+        self.is_registered = True
+
+    # -- the program
+
+    def run_thread(self, target):
+        """Run the target of a thread of the program."""
+        try:
+            target()
+        except SystemExit:  # ends a thread alone
+            pass
+        except Exception as error:
+            name = target.__self__.name
+            self.print_error(error, f'Exception in thread {name}:\n')
+            self.keep_failure(error, name)
+
+    def run_main(self):
+        """Run the program, and its exit functions, as Python does."""
+        current.node = self.node
+        main_module = types.ModuleType('__main__')
+        main_module.__file__ = self.node.path
+        vars(main_module)['__builtins__'] = self.modules.builtins
+        self.modules.modules['__main__'] = main_module
+        status = self._run_code(vars(main_module))
+        try:
+            self._run_all(self.thread_exit_functions)
+            self._join_threads()
+            # rospy's own function was the first to be registered, and comes last
+            self._run_all(self.exit_functions)
+        finally:
+            self.stdout.flush()
+            self.stderr.flush()
+            if self.node._current_run is self:  # else it is late, and the node runs again
+                if self.exit_request is not None:
+                    status = self._status_of(self.exit_request)
+                self.node.exit_code = status
+            self.main_has_ended = True
+            if not self.is_end_requested:
+                self.request_stop()
+
+    def _run_code(self, variables):
+        """Run the program's code, and return its exit status."""
+        try:
+            exec(self.code, variables)
+            return 0
+        except SystemExit as error:
+            return self._status_of(error)
+        except KeyboardInterrupt as error:
+            self._print_main_error(error)
+            return -signal.SIGINT
+        except BaseException as error:
+            self._print_main_error(error)
+            if self.is_starting and not self.is_known:
+                self.error = error
+            else:
+                self.keep_failure(error, self.node.path)
+            return 1
+
+    def _print_main_error(self, error):
+        # without the frame of _run_code()
+        error.__traceback__ = error.__traceback__.tb_next
+        self.print_error(error)
+
+    def _run_all(self, functions):
+        while functions:
+            function = functions.pop()
+            try:
+                function()
+            except (Exception, SystemExit, KeyboardInterrupt) as error:
+                self.print_error(error)
+                self.keep_failure(error, function)
+
+    def exit_now(self, status):
+        """Stand in for os._exit: end the program, not the process."""
+        self.exit_request = SystemExit(status)
+        self.request_stop()
+        raise self.exit_request
+
+    def _join_threads(self):
+        """Wait for the threads that are no daemons; a signal ends this, as with Python."""
+        with contextlib.suppress(KeyboardInterrupt, SystemExit):
+            while self.threads_to_join and not self.finished.is_set():
+                self.checkpoint()
+                self.threads_to_join[0].join(JOIN_PERIOD)
+                self.threads_to_join = [each for each in self.threads_to_join if each.is_alive()]
+
+    def _status_of(self, exit_request):
+        """Return the exit status that a SystemExit means."""
+        if isinstance(exit_request.code, str):
+            self.print(exit_request.code, file=self.modules.modules['sys'].stderr)
+            return 1
+        return exit_request.code or 0
+
+    # -- signals
+
+    def sleep(self, seconds):
+        """Stand in for ``time.sleep``: a signal ends it; after the end, programs sleep as usual."""
+        if threading.current_thread() is not self.main:
+            if not self.stopping.is_set():
+                super().sleep(seconds)
+                return
+            is_finished = self.finished.wait(seconds)
+            if is_finished:
+                raise SystemExit
+        elif self.stopping.is_set() or seconds <= 0:
+            time.sleep(seconds)
+        else:
+            self.pending_signal.wait(seconds)
+            self.checkpoint()
+
+    def checkpoint(self):
+        """Handle a pending signal, if this is the main thread, or wait until it is handled."""
+        if self.has_signal and threading.current_thread() is self.main:
+            self.handle_signal()
+
+    def handle_signal(self):
+        """Call the program's handlers, once."""
+        with self.handler_lock:
+            if not self.pending_signal.is_set():
+                return
+            self.pending_signal.clear()
+            self.signal_accepted.set()
+            for number in self._signal_numbers():
+                handler = self._handler_of(number)
+                if handler is signal.default_int_handler:
+                    self.stop_created_nodes()
+                if callable(handler):
+                    handler(number, None)
+
+    def _signal_numbers(self):
+        """Return SIGINT; SIGTERM, too, if the program has a handler of its own for this alone."""
+        defaults = signal.default_int_handler, self.core._ros_signal
+        handler = self._handler_of(signal.SIGTERM)
+        is_own = callable(handler) and handler not in defaults
+        if is_own and self._handler_of(signal.SIGINT) in defaults:
+            return [signal.SIGINT, signal.SIGTERM]
+        return [signal.SIGINT]
+
+    def _start_handling(self):
+        """Have another thread handle the signal, and return the threads that do."""
+        try:
+            return [self.start_thread(self.handle_signal_for_main)]
+        except RuntimeError:  # the interpreter ends, and starts none
+            self.handle_signal_for_main()
+            return []
+
+    def handle_signal_for_main(self):
+        """Handle the signal while the main thread stands still, or is busy with something else."""
+        try:
+            self.handle_signal()
+        except (Exception, KeyboardInterrupt, SystemExit) as error:
+            if self.created_nodes:
+                join([self.main], STOP_LIMIT)  # the main thread ends with its nodes
+            self.raise_in_main(error)
+
+    def raise_in_main(self, error):
+        """Raise an exception in the main thread, at the next line that it runs."""
+        if isinstance(error, SystemExit):
+            self.exit_request = error
+        if self.main.is_alive() and not self.main_has_ended:
+            thread_id = ctypes.c_ulong(self.main.ident)
+            error_class = ctypes.py_object(type(error))
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(thread_id, error_class)
+
+    # -- stop
+
+    def signal_shutdown(self, reason):
+        """Run the program's hooks, and close rospy; stands in for rospy's own."""
+        if self.has_run_hooks:
+            return
+        self.has_run_hooks = True
+        hooks = self.core._client_shutdown_hooks[:]
+        self.core._client_shutdown_hooks.clear()
+        for hook in hooks:
+            try:
+                hook()
+            except (Exception, SystemExit) as error:
+                if error is self.exit_request:  # os._exit() runs no more hooks
+                    break
+                self.print_error(error)
+                self.keep_failure(error, hook)
+        self.close_rospy(STOP_LIMIT)
+
+    def stop_created_nodes(self):
+        """Stop the nodes that the program has created with pharos."""
+        for node in self.created_nodes[:]:
+            node._stop_safely()
+
+    def spin(self):
+        """Wait until the nodes that the program has created have stopped; stands in for pharos.spin."""
+        with contextlib.suppress(KeyboardInterrupt):
+            while any(node in signals.own_nodes() for node in self.created_nodes):
+                self.sleep(SPIN_PERIOD)
+        self.stop_created_nodes()
+
+    def end_program(self, timeout):
+        """End the program as Ctrl-C does: its handlers and hooks first, then its main thread."""
+        self.is_end_requested = True
+        if not self.main_has_ended:
+            self.has_signal = True
+            self.pending_signal.set()
+            threads = [self.main]
+            is_accepted = self.signal_accepted.wait(SIGNAL_LIMIT)
+            if not is_accepted:
+                threads += self._start_handling()
+            if join(threads, timeout):
+                self.ros.logwarn(f'left behind, since it did not end in time: {self.node.path}')
+                self.raise_in_main(SystemExit())
+                self.souls.pop(self.main)
+                self.threads.discard(self.main)
+        self.signal_shutdown('stop')
+        self.stop_created_nodes()
+        self.finished.set()  # threads that are left end at their next sleep
+
+
+class NamedLines:
+    """A stream that puts the node's name before each line."""
+
+    def __init__(self, stream, run):
+        self._stream = stream
+        self._run = run
+        self._partial_line = ''  # not written yet
+        self._is_within_line = False  # True if a part of the line is written
+
+    def __getattr__(self, name):
+        return getattr(self._stream, name)
+
+    def write(self, text):
+        """Write the complete lines."""
+        *lines, self._partial_line = (self._partial_line + text).split('\n')
+        if lines:
+            self._write('\n'.join(lines) + '\n')
+        return len(text)
+
+    def flush(self):
+        """Write the rest, which has no end yet."""
+        if self._partial_line:
+            self._write(self._partial_line)
+            self._partial_line = ''
+
+    def _write(self, text):
+        prefix = f'[{self._run.name}] '
+        named_text = ''.join(f'{prefix}{line}' for line in text.splitlines(keepends=True))
+        if self._is_within_line:
+            named_text = named_text.removeprefix(prefix)
+        # the reader of a pipe may have gone: the program goes on, and stops its motors
+        with contextlib.suppress(OSError, ValueError):
+            self._stream.write(named_text)
+            self._stream.flush()
+        self._is_within_line = not text.endswith('\n')
+
+
+class _Asyncio(Shim):
+    """asyncio; a program's main thread has a loop, as asyncio makes one in the main thread alone."""
+
+    def __init__(self, run):
+        super().__init__(asyncio, _run=run, _has_loop=False)
+
+    def __getattr__(self, name):
+        if not self._has_loop and threading.current_thread() is self._run.main:
+            self._has_loop = True
+            asyncio.set_event_loop(asyncio.new_event_loop())
+        return super().__getattr__(name)
+
+
+class _Pharos(Shim):
+    """pharos; the nodes that a program creates belong to its entry, and end with it."""
+
+    def __init__(self, run):
+        class EntryMaster(Master):
+            """A master that gives nodes the name, the namespace and the remappings of the entry."""
+
+            _environ = run.environ
+            _first_nodes: dict = {}
+
+            def __init__(self, url=None, share_connections=None):
+                if share_connections is None:
+                    share_connections = run.master.share_connections
+                super().__init__(url or run.master.url, share_connections)
+
+            def _full_name(self, node, name, mappings):
+                full_name = super()._full_name(node, name, mappings)
+                for parameter_name, value in run.node.params.items():
+                    self.parameters[f'{full_name}/{parameter_name}'] = value
+                return full_name
+
+            def create(self, *args, **kwargs):
+                node = super().create(*args, **kwargs)
+                run.created_nodes.append(node)
+                return node
+
+        transcript = type(pharos.Transcript)()
+        transcript.on_show(run.print)
+        super().__init__(pharos, Master=EntryMaster, spin=run.spin, Transcript=transcript)

@@ -1,0 +1,99 @@
+"""The sources of programs: they tell if a program needs a process of its own."""
+import ast
+import pathlib
+import re
+import tokenize
+
+from pharos.errors import PharosError
+from pharos.private_rospy.loader import source_places
+
+_PYTHON = re.compile(r'#!.*\bpython(3(\.\d+)?)?\b')
+#: catkin puts this into a devel space for a script: it runs the file that it names
+_WRAPPER = re.compile(r'^python_script = (.+?)$.*exec\(compile\(', re.MULTILINE | re.DOTALL)
+_WRAPPER_LENGTH = 4000  # characters
+#: code that shows windows or takes signals, and so needs the main thread of a process
+_NEEDS_MAIN = re.compile(
+    r'^[ \t]*(?:import|from)[ \t]+(?:tkinter|PyQt\d|PySide\d|python_qt_binding'
+    r'|rqt_\w+|qt_gui|gtk|wx|pygame|turtle)\b'
+    r'|\bgi\.require_version\(.Gtk|\bcv2\.(?:imshow|namedWindow)\(|\b(?:plt|pyplot)\.(?:show|pause)\('
+    r'|\.add_signal_handler\(|\bsignal\.(?:alarm|setitimer|pause)\(',
+    re.MULTILINE,
+)
+_IMPORT = re.compile(
+    r'^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t(]+([\w, ]+)|import[ \t]+([\w.]+))', re.MULTILINE
+)
+_SYSTEM_FOLDERS = '/usr/', '/opt/ros/'
+
+
+def source_of(path):
+    """Return the file with the source of a program: catkin's devel space has a wrapper."""
+    with open(path, errors='replace') as file:
+        wrapper = _WRAPPER.search(file.read(_WRAPPER_LENGTH))
+    return str(ast.literal_eval(wrapper[1])) if wrapper else path
+
+
+def compile_program(path):
+    """Return the code of a program.
+
+    :raises PharosError: if it is not a program of Python 3
+    """
+    try:
+        with tokenize.open(path) as file:
+            return compile(file.read(), path, 'exec', dont_inherit=True)
+    except (SyntaxError, ValueError, OSError) as error:
+        raise PharosError(
+            f'{path} cannot be read as Python 3: {error}; master.run() starts others'
+        ) from error
+
+
+def why_apart(path, may_show_windows=False):
+    """Return why a program of a launch file cannot run in this process, as text; '' if it can."""
+    with open(path, errors='replace') as file:
+        first_line = file.readline(256)
+    if not _PYTHON.match(first_line):
+        return 'it is not a program of Python 3'
+    if may_show_windows:
+        return ''
+    return needs_main_thread(path)
+
+
+def needs_main_thread(path):
+    """Return why a Python program needs the main thread of a process, as text; '' if it does not.
+
+    Its modules are read, too, if they lie beside it or in a package of the user's.
+    """
+    files = [pathlib.Path(source_of(path))]
+    for file in files:  # the list grows meanwhile
+        text = re.sub('#.*', '', file.read_text(errors='replace'))
+        match = _NEEDS_MAIN.search(text)
+        if match:
+            return (
+                f'it has {match[0].strip()!r}, which needs the main thread; --here overrides this'
+            )
+        for name in _imported_names(text):
+            imported_file = _user_file(name, file.parent)
+            if imported_file and imported_file not in files:
+                files.append(imported_file)
+    return ''
+
+
+def _imported_names(text):
+    """Yield the names that could be modules in the imports of a text."""
+    for package, names, module in _IMPORT.findall(text):
+        yield module or package
+        for name in names.split(','):
+            yield f'{package}.{name.strip()}'
+
+
+def _user_file(module, folder):
+    """Return the file of a module beside a program, or in a package of the user's, or None."""
+    top_name, *rest = module.lstrip('.').split('.')  # a relative one lies beside it, too
+    if not top_name:
+        return None
+    _, folders = source_places(top_name)
+    for place in folder / top_name, *map(pathlib.Path, folders):
+        base = place.joinpath(*rest)
+        for file in base.with_suffix('.py'), base / '__init__.py':
+            if file.is_file() and not str(file).startswith(_SYSTEM_FOLDERS):
+                return file
+    return None

@@ -1,0 +1,445 @@
+"""Run the callbacks of all nodes in a pool of threads, each node's one at a time.
+
+A publisher puts a message into the Inbox of each receiver, and wakes a worker. A worker takes the
+next callback queue that has a job. The worker wakes another one for the rest, unless the callbacks
+of that queue were fast. There are at most as many workers as nodes, so that a callback that blocks
+holds up its own node alone. Workers end with the last node. A publisher's thread runs inline
+inboxes. A subscription of plain rospy has a thread of its own, as with rospy.
+"""
+import collections
+import threading
+from _thread import allocate_lock, get_ident
+from time import perf_counter, sleep
+
+from pharos.intraprocess.copier import size_of
+
+BURST = 100e-6  # seconds; a publisher that woke a worker less than this ago does not wait for it
+YIELD_LIMIT = 1e-3  # seconds that a publisher waits at most until the receiver's thread runs
+YIELD_PAUSE = 0.02  # seconds without such a wait after one that was in vain
+FAST = 50e-6  # seconds; a callback that takes less may run in the thread that reads the socket
+FAST_RUNS = 10  # such callbacks in a row, until the thread that reads runs the next one
+SENTRY_PERIOD = 4e-3  # seconds that a callback may hold up those of other nodes
+SENTRY_REST = 1.0  # seconds without such callbacks until the sentry rests
+#: seconds until rospy's first callback: a connection between processes takes so long
+FIRST_PAUSE = 0.05
+
+INFINITE = float('inf')
+
+_ready_queues = collections.deque()
+_idle_workers = []
+_workers = set()
+_pooled_queues = set()
+_pool_lock = allocate_lock()  # of _workers and _pooled_queues
+_no_yield_before = 0.0
+_sentry = None
+
+
+class CallbackQueue:
+    """Runs callbacks one at a time: those of a node, or of one subscription of plain rospy.
+
+    ``jobs`` has an Inbox once for each of its messages, or more often if some were dropped.
+    """
+
+    is_pooled = True
+    is_scheduled = False
+    is_fast = False
+    is_held = False
+    closed = False
+    own_thread = None
+    running_thread = None  # the identifier of the thread that runs or holds it
+
+    def __init__(self):
+        self.jobs = collections.deque()
+        self._run_lock = allocate_lock()
+        self._join_pool()
+
+    def _join_pool(self):
+        with _pool_lock:
+            _pooled_queues.add(self)
+
+    def hold(self):
+        """Run nothing until release(), except calls by this thread itself."""
+        self._run_lock.acquire()
+        self.running_thread = get_ident()
+        self.is_held = True
+
+    def release(self):
+        """End a hold, if there is one; any thread may do so."""
+        with _pool_lock:
+            was_held = self.is_held
+            self.is_held = False
+        if was_held:
+            self.running_thread = None
+            self._run_lock.release()
+            self.request_run()
+
+    def release_before_sleep(self):
+        """End a hold by this thread."""
+        if self.running_thread == get_ident():
+            self.release()
+
+    def run(self):
+        """Run the jobs. If another thread runs jobs of this queue, return: that thread runs all."""
+        jobs = self.jobs
+        while jobs and not self.closed and self._run_lock.acquire(False):
+            self.running_thread = get_ident()
+            try:
+                while jobs and not self.closed:
+                    inbox = jobs.popleft()
+                    try:
+                        value, thaw, header = inbox.queue.popleft()
+                    except IndexError:  # several messages were dropped at once
+                        continue
+                    inbox.taken_count += 1
+                    if thaw is not None:
+                        message = thaw(value)
+                        message._connection_header = header
+                        inbox.callback(message)
+                    elif inbox.inline:
+                        inbox.callback(value)
+                    else:
+                        start_time = perf_counter()
+                        inbox.callback(value)
+                        is_fast = perf_counter() - start_time < FAST
+                        inbox.fast_runs = inbox.fast_runs + 1 if is_fast else 0
+            finally:
+                self.running_thread = None
+                self._run_lock.release()
+        if self.closed:  # close() gave up waiting for a callback of this thread
+            self._leave_pool()
+
+    def call(self, block):
+        """Run ``block()`` as if it were a callback, unless the queue is closed."""
+        if self.running_thread == get_ident():
+            block()
+            return
+        with self._run_lock:
+            self.running_thread = get_ident()
+            try:
+                if not self.closed:
+                    block()
+            finally:
+                self.running_thread = None
+        if self.closed:  # as in run()
+            self._leave_pool()
+        else:
+            self.request_run()
+
+    def schedule(self):
+        """Put the queue into the pool's list; True if a worker must be woken for that."""
+        if self.is_scheduled or not self.jobs:
+            return False
+        self.is_scheduled = True
+        _ready_queues.append(self)
+        return True
+
+    def request_run(self):
+        """Have a thread run the jobs."""
+        if self.schedule():
+            _wake_worker()
+
+    def close(self, timeout):
+        """Drop all jobs, and wait for the callback that runs; True if that ended in time."""
+        self.closed = True
+        self.release()
+        has_ended = self.running_thread == get_ident()
+        if not has_ended and self._run_lock.acquire(True, timeout):
+            self._run_lock.release()  # call() may wait for it
+            has_ended = True
+        self.jobs.clear()
+        if has_ended:  # else the pool still counts it, and replaces the blocked worker
+            self._leave_pool()
+        return has_ended
+
+    def _leave_pool(self):
+        with _pool_lock:
+            _pooled_queues.discard(self)
+        if not _pooled_queues:
+            _end_pool()
+
+
+class ThreadedCallbackQueue(CallbackQueue):
+    """Runs the callbacks of one subscription of plain rospy in one thread, which ends with it.
+
+    Objects bound to their thread (a connection of SQLite, a context of CUDA) keep working. The first
+    callback runs some time after the subscription. The constructor that subscribes may not have set
+    yet all that its callback uses.
+    """
+
+    is_pooled = False
+
+    def __init__(self):
+        super().__init__()
+        self._first_run_time = perf_counter() + FIRST_PAUSE
+
+    def _join_pool(self):
+        """Stay out of the pool."""
+
+    def schedule(self):
+        """Wake the queue's own thread; the pool has nothing to do."""
+        if not self.is_scheduled and self.jobs:
+            self.is_scheduled = True
+            if self.own_thread:
+                self.own_thread.wake()
+            else:
+                self._start_thread()
+        return False
+
+    def _start_thread(self):
+        with _pool_lock:  # two publishers may be here
+            if not self.own_thread:
+                self.own_thread = _RestingThread(self._loop, 'pharos callbacks')
+                self.own_thread.start()
+
+    def call(self, block):
+        """Run ``block()`` as if it were a callback, not before the first one may run."""
+        self._wait_for_first_run()
+        super().call(block)
+
+    def _wait_for_first_run(self):
+        sleep(max(0.0, self._first_run_time - perf_counter()))
+
+    def _loop(self):
+        self._wait_for_first_run()
+        while not self.closed:
+            self.is_scheduled = False
+            self.run()
+            self.own_thread.rest()
+
+    def _leave_pool(self):
+        """Let the queue's own thread end."""
+        if self.own_thread:
+            self.own_thread.wake()
+
+
+class _RestingThread:
+    """A thread that rests until another one wakes it."""
+
+    def __init__(self, loop, name):
+        self._rest_lock = allocate_lock()  # released to wake the thread
+        self._start_lock = allocate_lock()  # held from the wake until the thread runs
+        self._rest_lock.acquire()
+        self.start = threading.Thread(target=loop, name=name, daemon=True).start
+
+    def wake(self):
+        """End its rest, or its next one."""
+        self._start_lock.acquire(False)
+        try:
+            self._rest_lock.release()
+        except RuntimeError:  # another thread has woken it already
+            pass
+
+    def rest(self):
+        """Wait until another thread calls wake()."""
+        self._rest_lock.acquire()
+        if self._start_lock.locked():
+            self._start_lock.release()
+
+    def wait_until_running(self, timeout):
+        """Wait until the thread runs after a wake(); True if it runs in time."""
+        return self._start_lock.acquire(True, timeout)
+
+
+class _Worker(_RestingThread):
+    """A thread of the pool."""
+
+    def __init__(self):
+        super().__init__(self._loop, 'pharos worker')
+
+    def _loop(self):
+        while True:
+            try:
+                callback_queue = _ready_queues.popleft()
+            except IndexError:
+                with _pool_lock:
+                    if not _pooled_queues:
+                        _workers.discard(self)
+                        break
+                _idle_workers.append(self)
+                if _ready_queues or not _pooled_queues:
+                    _wake_worker()  # whoever scheduled since then may not have seen this worker
+                self.rest()
+                continue
+            if _ready_queues:
+                if callback_queue.is_fast:
+                    _start_watch()
+                else:
+                    _wake_worker()
+            callback_queue.is_scheduled = False
+            job_count = len(callback_queue.jobs)
+            start_time = perf_counter()
+            callback_queue.run()
+            callback_queue.is_fast = perf_counter() - start_time < FAST * job_count
+        _wake_worker()
+
+
+def _wake_worker():
+    """Wake an idle worker and return it, or start one if there are fewer than nodes."""
+    try:
+        worker = _idle_workers.pop()
+    except IndexError:
+        with _pool_lock:
+            if len(_workers) < len(_pooled_queues):
+                worker = _Worker()
+                _workers.add(worker)
+                worker.start()
+        return None
+    worker.wake()
+    return worker
+
+
+class _Sentry(_RestingThread):
+    """Wakes a worker for the queues behind a callback that was fast so far, and now blocks.
+
+    The sentry looks while such callbacks run, and rests otherwise.
+    """
+
+    is_needed = False
+    is_looking = False
+
+    def __init__(self):
+        super().__init__(self._loop, 'pharos sentry')
+
+    def _loop(self):
+        global _sentry
+        while _pooled_queues and _sentry is self:
+            self.is_looking = True
+            last_need = perf_counter()
+            while _pooled_queues and perf_counter() - last_need < SENTRY_REST:
+                sleep(SENTRY_PERIOD)
+                if self.is_needed:
+                    self.is_needed = False
+                    last_need = perf_counter()
+                if _ready_queues:
+                    _wake_worker()
+            self.is_looking = False
+            if _pooled_queues and not self.is_needed:
+                self.rest()
+        if _sentry is self:
+            _sentry = None
+
+
+def _start_watch():
+    """Have the sentry look after the queues that a worker has left for later."""
+    global _sentry
+    sentry = _sentry
+    if sentry is None:
+        sentry = _Sentry()
+        _sentry = sentry  # before it starts: its loop asks for that
+        sentry.start()
+    sentry.is_needed = True
+    if not sentry.is_looking:
+        sentry.wake()
+
+
+class Inbox:
+    """The messages that wait for one callback; a full one drops the oldest.
+
+    :param callback: called as ``callback(message)``; raises nothing
+    :param queue_size: number of messages; None or 0: as many as ``queue_bytes`` hold
+    """
+
+    queue_bytes = 64 << 20
+    dropped = 0
+    taken_count = 0
+    fast_runs = 0  # in a row
+    _count_at_yield = -1
+
+    def __init__(self, callback_queue, callback, queue_size=None, inline=False, shared=False):
+        self.callback_queue = callback_queue
+        self.callback = callback
+        self.inline = inline
+        self.shared = shared
+        self.queue = collections.deque()
+        self.queue_size = queue_size or INFINITE
+        self.capacity = self.queue_size
+
+    def put(self, item, size=0):
+        """Add ``(value, thaw, header)``; the callback queue must be woken or run then.
+
+        :param item: one tuple for all receivers: many make the collector of garbage run often
+        :param size: the bytes of the value, if they are known
+        """
+        queue = self.queue
+        count = len(queue)
+        if not count:
+            queue.append(item)
+            self.callback_queue.jobs.append(self)
+            return
+        is_power_of_two = not count & (count - 1)
+        if count >= self.capacity or is_power_of_two:  # the size is estimated now and then
+            self.capacity = min(self.queue_size, self.capacity_for(size or size_of(item[0])))
+            if count >= self.capacity and self.taken_count != self._count_at_yield:
+                self._count_at_yield = self.taken_count  # the receiver got on since
+                sleep(1e-6)  # a publisher that never sleeps would starve it
+        queue.append(item)
+        is_full = False
+        while len(queue) > self.capacity:  # after append(), or the receiver finds it empty
+            queue.popleft()
+            self.dropped += 1
+            is_full = True
+        if not is_full:  # the receiver may have taken one meanwhile
+            self.callback_queue.jobs.append(self)
+
+    def capacity_for(self, size):
+        """Return how many messages of a size may wait."""
+        return max(1, self.queue_bytes // size)
+
+    def receive(self, message, size):
+        """Take a message from the thread that reads a socket.
+
+        That thread runs the callback, too, if it was fast ten times running: waking another takes
+        longer. That thread also runs callbacks of plain rospy without a queue_size, as in rospy.
+        Meanwhile messages wait in the sockets and in the publisher, and none is lost.
+        """
+        callback_queue = self.callback_queue
+        if not callback_queue.is_pooled and self.queue_size == INFINITE:
+            callback_queue.call(lambda: self.callback(message))
+            return
+        self.put((message, None, None), size)
+        if self.inline or callback_queue.is_pooled and self.fast_runs >= FAST_RUNS:
+            callback_queue.run()
+        else:
+            callback_queue.request_run()
+
+
+def hand_over(callback_queues, last_wake):
+    """Have threads run the jobs of some callback queues.
+
+    :param last_wake: the last time that the same publisher woke a thread
+    :returns: the time now, if a thread was woken, else ``last_wake``
+    """
+    global _no_yield_before
+    is_worker_needed = False
+    thread = None
+    for callback_queue in callback_queues:
+        if not callback_queue.is_scheduled:
+            is_worker_needed |= callback_queue.schedule()
+            thread = callback_queue.own_thread
+    if is_worker_needed:
+        thread = _wake_worker()  # which wakes another one, if there is more
+    if not thread:
+        return last_wake
+    now = perf_counter()
+    # a busy publisher keeps the interpreter for 5 ms, unless it waits for the thread to run
+    if now - last_wake > BURST and now > _no_yield_before:
+        is_running = thread.wait_until_running(YIELD_LIMIT)
+        if not is_running:
+            _no_yield_before = now + YIELD_PAUSE
+    return now
+
+
+def _end_pool():
+    global _sentry
+    _wake_worker()
+    if _sentry:
+        _sentry.wake()
+        _sentry = None
+
+
+def reset_after_fork():
+    """Have no workers in a forked child."""
+    global _sentry
+    for collection in _ready_queues, _idle_workers, _workers, _pooled_queues:
+        collection.clear()
+    _sentry = None

@@ -1,0 +1,103 @@
+"""INTRAPROCESS links: connections from a publisher to a subscription of the same process.
+
+A link has two ends: one in the list of connections of rospy's publisher, and one in the list of its
+subscription. rospy itself lists links, closes them, and refuses a second one to the same peer.
+"""
+import threading
+
+from rospy.impl.transport import Transport
+from rospy.names import TOPIC_ANYTYPE
+
+from pharos.intraprocess.copier import thaw_function
+
+#: the runs of this process by the URI of their node
+runs = {}
+runs_lock = threading.Lock()  # of runs and their relays
+
+
+def peer_of(connection):
+    """Return the name of the node at the other end; None if that has not said its name yet."""
+    if connection.direction == 'o':
+        return connection.endpoint_id
+    return connection.header and connection.header['callerid']
+
+
+class Link(Transport):
+    """One end of a link.
+
+    :param direction: 'o' for the publisher's end, 'i' for the subscription's
+    :param run: the run of the receiving node
+    :param thaw: makes a message of the subscription's class from a frozen one
+    """
+
+    latch = None
+    header = property(lambda self: self.publisher.header)
+    callerid_pub = property(peer_of)  # actionlib asks for it
+    # not counted for each message: to touch ten links takes as long as to run ten delegates
+    stat_num_msg = property(lambda self: self.publisher.seq, lambda self, zero: None)
+
+    def __init__(self, direction, publisher, run, endpoint_id, transport_type, thaw):
+        super().__init__(direction, publisher.name)
+        self.publisher = publisher
+        self.run = run
+        self.endpoint_id = endpoint_id
+        self.transport_type = transport_type
+        self.thaw = thaw
+
+    def get_transport_info(self):
+        return f'{self.transport_type} connection to [{self.endpoint_id}]'
+
+    def close(self):
+        """Close both ends: nothing else closes a link, a publisherUpdate closes no connection."""
+        if self.done:
+            return
+        self.done = True
+        self.other_end.done = True
+        for end in self, self.other_end:
+            if end.cleanup_cb:
+                end.cleanup_cb(end)
+
+
+def link_topic(sender, receiver, topic):
+    """Link the publisher and the subscription of a topic of two runs of this process."""
+    publisher = sender.topics.pubs.get(topic)
+    subscription = receiver.topics.subs.get(topic)
+    if not publisher or not subscription:
+        return
+    sent_class = publisher.data_class
+    wanted_class = subscription.data_class
+    if wanted_class._md5sum not in (sent_class._md5sum, TOPIC_ANYTYPE):
+        receiver.report_refusal(
+            topic, f'{sender.name} publishes {sent_class._type}, not {wanted_class._type}'
+        )
+        return
+    publisher.make_header()
+    link(publisher, sender.uri, subscription, receiver, 'INTRAPROCESS')
+
+
+def link(publisher, uri, subscription, receiver, transport_type):
+    """Link a publisher and a subscription.
+
+    :param uri: the address of the publisher's node
+    :param receiver: the run that the subscription belongs to
+    """
+    thaw = thaw_function(publisher.data_class, subscription.data_class)
+    with publisher.lock:
+        sender_end = Link('o', publisher, receiver, receiver.name, transport_type, thaw)
+        receiver_end = Link('i', publisher, receiver, uri, transport_type, thaw)
+        sender_end.other_end = receiver_end
+        receiver_end.other_end = sender_end
+        sender_end.inboxes = subscription.inboxes
+        if publisher.closed or not subscription.add_link(receiver_end):
+            return
+        publisher.rospy_add_connection(sender_end)
+        for frozen in publisher.latches.values():
+            for inbox in sender_end.inboxes:
+                inbox.put((frozen, thaw, publisher.header))
+    for inbox in sender_end.inboxes:
+        inbox.callback_queue.request_run()
+
+
+def links_of(connections):
+    """Return the links of some connections."""
+    return [connection for connection in connections if isinstance(connection, Link)]

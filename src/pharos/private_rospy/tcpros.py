@@ -1,0 +1,189 @@
+"""Send to sockets and receive from them, and share a connection among the nodes of a process."""
+import collections
+import contextlib
+import functools
+import math
+import socket
+import struct
+import threading
+import time
+
+from pharos.intraprocess.copier import copy_of
+from pharos.intraprocess.links import link, runs, runs_lock
+
+MAX_MESSAGE = 1_000_000_000  # bytes, as in roscpp
+MAX_DIRECT = 256 << 10  # bytes of a message that a publisher writes itself; more would hold it up
+CONNECT_LIMIT = 10.0  # seconds
+_READ_BUFFER = 1 << 16  # bytes
+_LENGTH = struct.Struct('<I')
+
+
+def shutdown_socket(sock):
+    """Have a thread that reads from a socket find it closed."""
+    with contextlib.suppress(OSError):
+        sock.shutdown(socket.SHUT_RDWR)
+
+
+def keep_alive(sock):
+    """Have a connection break within 30 s if the other host has silently gone."""
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 10)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 5)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 4)
+
+
+# -- receiving
+
+
+def receive(connection, address, port, uri, subscription, run):
+    """Connect to a publisher and receive its messages until the connection ends."""
+    connection.connect(address, port, uri, timeout=CONNECT_LIMIT)
+    sock = connection.socket
+    keep_alive(sock)
+    run.sockets.add(sock)
+    sock.settimeout(None)
+    message_class = subscription.data_class
+    header = connection.header
+    relay = run.relays.get((subscription.resolved_name, uri, message_class))
+    if relay:
+        relay.header = header
+        relay.is_latch = connection.is_latched
+    with sock.makefile('rb', _READ_BUFFER) as stream:
+        while not connection.done:
+            data = _read_message(stream)
+            if data is None:
+                return
+            connection.stat_bytes += len(data) + _LENGTH.size
+            connection.stat_num_msg += 1
+            message = message_class().deserialize(data)
+            logger = subscription.statistics_logger
+            if logger:
+                logger.callback(message, connection.callerid_pub, connection.stat_bytes)
+            if relay:
+                relay.publish(message)
+            inboxes = [*subscription.inboxes]
+            # copied before the first callback may change the message
+            copies = [copy_of(message) for _ in inboxes[1:]]
+            for own_message, inbox in zip([message, *copies], inboxes):
+                own_message._connection_header = header
+                inbox.receive(own_message, len(data))
+            if connection.is_latched:
+                connection.latch = message
+
+
+def _read_message(stream):
+    """Return the bytes of the next message, None at the end of the stream."""
+    head = stream.read(_LENGTH.size)
+    if len(head) < _LENGTH.size:
+        return None
+    (size,) = _LENGTH.unpack(head)
+    if size > MAX_MESSAGE:
+        raise ValueError(f'it announces a message of {size} bytes')
+    data = stream.read(size)
+    if len(data) < size:
+        return None
+    return data
+
+
+# -- sharing
+
+
+def follow_relay(run, topic, uri, subscription):
+    """Link the subscription to the relay of the node that has the connection, and return True.
+
+    If no node of this process has the connection, make a relay for this one, and return False.
+    """
+    key = topic, uri, subscription.data_class
+    with runs_lock:
+        for other in runs.values():
+            if key in other.relays:
+                link(other.relays[key], uri, subscription, run, 'TCPROS')
+                return True
+        relay = run.modules.load('rospy.topics')._PublisherImpl(topic, subscription.data_class)
+        relay.has_header = False  # messages keep the publisher's header.seq
+        run.relays[key] = relay
+    return False
+
+
+def close_relay(run, topic, uri, subscription):
+    """Close the relay of a connection that has ended, or never began: its followers connect anew."""
+    with runs_lock:
+        relay = run.relays.pop((topic, uri, subscription.data_class), None)
+        if not relay:
+            return
+        links = relay.connections
+        relay.close()
+    for end in links:
+        end.run.start_thread(functools.partial(end.run.connect, topic, uri))
+
+
+# -- sending
+
+
+class Sender:
+    """A bounded queue before a connection, and a thread for bytes that the socket does not take at once.
+
+    Stands in for rospy's QueuedConnection. The thread of that one writes everything, and takes all
+    out of its queue at once, so that it neither bounds nor flushes the queue.
+    """
+
+    is_busy = False
+    _rest = b''  # of a message that the socket has taken in part
+
+    def __init__(self, connection, queue_size, run):
+        self._connection = connection
+        self._queue_size = queue_size or math.inf
+        self._run = run
+        self._queue = collections.deque()
+        self._lock = threading.Lock()
+
+    def __getattr__(self, name):
+        return getattr(self._connection, name)
+
+    def write_data(self, data):
+        """Send a message with its length; never waits for the subscriber."""
+        with self._lock:
+            if self.is_busy or len(data) > MAX_DIRECT:
+                self._enqueue(data)
+            elif self._send_directly(data):
+                return
+            if not self.is_busy:
+                self.is_busy = True
+                self._run.start_thread(self._send_queue)
+        time.sleep(0)  # or a busy publisher keeps the interpreter for 5 ms
+
+    def _enqueue(self, data):
+        self._queue.append(data)
+        queue_bytes = self._run.node.queue_bytes
+        capacity = min(self._queue_size, max(1, queue_bytes // len(data)))
+        while len(self._queue) > capacity:
+            self._queue.popleft()
+
+    def _send_directly(self, data):
+        """Send the bytes that the socket takes at once; True if it takes all."""
+        connection = self._connection
+        try:
+            sent_bytes = connection.socket.send(data, socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            sent_bytes = 0
+        connection.stat_bytes += sent_bytes
+        if sent_bytes == len(data):
+            connection.stat_num_msg += 1
+            return True
+        self._rest = data[sent_bytes:]
+        return False
+
+    def _send_queue(self):
+        connection = self._connection
+        while True:
+            with self._lock:
+                has_data = self._rest or self._queue
+                if connection.done or not has_data:
+                    self.is_busy = False
+                    return
+                data = self._rest or self._queue.popleft()
+                self._rest = b''
+            try:
+                connection.write_data(data)
+            except Exception:  # its peer has gone
+                connection.close()

@@ -1,0 +1,273 @@
+"""Methods for rospy's publishers and subscriptions: they send to links and sockets, and receive.
+
+:mod:`pharos.private_rospy.patches` sets them on each node's own copy of rospy's classes.
+"""
+import contextlib
+import io
+import time
+
+import rospy
+from rospy.msg import serialize_message
+
+from pharos.intraprocess.callback_queues import (
+    INFINITE,
+    Inbox,
+    ThreadedCallbackQueue,
+    hand_over,
+)
+from pharos.intraprocess.copier import copier_for
+from pharos.intraprocess.links import links_of
+
+SOCKET_BYTES = 6 << 20  # that the sockets between a publisher and a subscriber hold about
+FLUSH_PERIOD = 0.001  # seconds between two looks
+ROSOUT = '/rosout'
+
+
+class PublisherOverlay:
+    """Methods for a node's own rospy.topics._PublisherImpl; ``rospy_NAME`` is rospy's method.
+
+    rospy serializes for all, and latches the user's object, one for all Publishers of a topic. It
+    keeps bytes that did not serialize in its buffer, and they corrupt the next message. These are no
+    methods of a subclass: rospy calls ``super(_PublisherImpl, self)``, would find it, and recurse.
+    """
+
+    def __init__(self, name, data_class):
+        self.rospy___init__(name, data_class)
+        self.lock = self.publock
+        self.latches = {}  # channel, or None for all Publishers of plain rospy -> frozen message
+        self.last_wake = 0.0
+        self.freeze, self.thaw = copier_for(data_class)
+        self.has_header = getattr(data_class, '_has_header', False)
+        self.header = None
+        self.receivers_are_for = None  # the list of connections that the receivers were found for
+
+    def acquire(self):
+        """Let a signal be handled first: rospy locks here for the whole of a publish().
+
+        publish() has a lock of its own, which it does not hold while it runs inline delegates.
+        """
+        if self.resolved_name != ROSOUT:  # the log's lock is held
+            self.run.checkpoint()
+
+    def release(self):
+        """Do nothing: rospy unlocks here after a publish()."""
+
+    def enable_latch(self):  # rospy calls it after registering, when links may exist
+        self.is_latch = True
+        if self.header:
+            self.header['latching'] = '1'
+
+    def make_header(self):
+        """Make the connection header for links, as TCPROS sends it."""
+        with self.lock:
+            if self.header is None:
+                protocol_class = self.run.modules.load('rospy.impl.tcpros_pubsub').TCPROSPub
+                protocol = protocol_class(
+                    self.resolved_name, self.data_class, self.is_latch, self.headers
+                )
+                self.header = protocol.get_header_fields()
+
+    def add_connection(self, connection):
+        with self.lock:
+            self.rospy_add_connection(connection)
+            for frozen in list(self.latches.values()):
+                self.write(self.thaw(frozen), self.connections[-1:])
+        return True
+
+    def remove_connection(self, connection):
+        if not self.closed:  # rospy trips over attributes that its close() has set to None
+            self.rospy_remove_connection(connection)
+
+    def publish(self, message, connection_override=None, channel=None):
+        """Publish to the links, then to the sockets.
+
+        :param connection_override: to that connection alone
+        :param channel: the OutputChannel that publishes; None: a Publisher of plain rospy
+        """
+        with self.lock:
+            if self.closed:
+                if channel is None and self.run.stopping.is_set():  # rospy's ends quietly, too
+                    return False
+                raise rospy.ROSException('publish() to a closed topic')
+            self.seq += 1
+            if connection_override is None:
+                if self.receivers_are_for is not self.connections:
+                    self.receivers_are_for = self.connections
+                    self.receivers = receivers_of(self.connections)
+                inboxes, inline_queues, other_queues, remotes = self.receivers
+                is_latched = self.is_latch and (channel is None or channel.latch)
+            else:
+                inboxes, inline_queues, other_queues, remotes = receivers_of([connection_override])
+                is_latched = False
+            if self.has_header:  # as serialize_message does
+                message.header.seq = self.seq
+            if inboxes or is_latched or not remotes:  # if nobody receives, freeze() checks it
+                frozen = self.freeze(message)
+                if is_latched:
+                    self.latches[channel] = frozen
+                for thaw, receivers in inboxes.items():
+                    item = frozen, thaw, self.header
+                    for inbox in receivers:
+                        inbox.put((message, None, None) if inbox.shared else item)
+            if remotes:
+                self.write(message, remotes)
+        for callback_queue in inline_queues:
+            callback_queue.run()
+        if other_queues:
+            last_wake = self.last_wake
+            if channel is None:
+                # actionlib keeps a goal after publish() only: never wait for a receiver
+                last_wake = INFINITE
+            self.last_wake = hand_over(other_queues, last_wake)
+        return True
+
+    def write(self, message, connections):
+        """Serialize a message, and write it to some connections."""
+        buffer = io.BytesIO()
+        try:
+            serialize_message(buffer, self.seq, message)
+        except Exception:  # copying makes bytes of numpy's arrays, or says what is wrong
+            self.write(self.thaw(self.freeze(message)), connections)
+            return
+        data = buffer.getvalue()
+        self.message_data_sent += len(data)
+        for connection in connections:
+            try:
+                connection.write_data(data)
+            except Exception:  # its peer has gone
+                connection.close()
+
+    def flush(self, deadline):
+        """Wait until the sockets have taken all messages, or time.monotonic() reaches a deadline."""
+        while any(getattr(connection, 'is_busy', False) for connection in self.connections):
+            if time.monotonic() > deadline:
+                break
+            time.sleep(FLUSH_PERIOD)
+
+    def flush_for_last(self, timeout):
+        """Flush if only one Publisher is left, which closes the topic."""
+        if self.ref_count == 1:
+            self.flush(time.monotonic() + timeout)
+
+    def close(self):
+        close_topic(self)
+        self.headers = {}
+        self.subscriber_listeners = []
+
+
+class PlainInbox(Inbox):
+    """The messages that wait for the callbacks of plain rospy of a subscription."""
+
+    def __init__(self, subscription):
+        super().__init__(ThreadedCallbackQueue(), subscription.call_plain, subscription.queue_size)
+        self.subscription = subscription
+        self.queue_bytes = subscription.run.node.queue_bytes
+
+    def capacity_for(self, size):
+        """Let as many wait as with processes: in the queues of publishers, and in sockets."""
+        connections = self.subscription.connections
+        links = links_of(connections)
+        queue_sizes = [link.publisher.queue_size for link in links]
+        is_bounded = all(queue_sizes) and len(links) == len(connections)
+        if self.queue_size != INFINITE or not queue_sizes or not is_bounded:
+            return super().capacity_for(size)  # nothing is lost between processes
+        socket_messages = min(SOCKET_BYTES, self.queue_bytes) // size
+        return sum(queue_sizes) + max(1, socket_messages)
+
+
+class SubscriptionOverlay:
+    """Methods for a node's own rospy.topics._SubscriberImpl; ``rospy_NAME`` is rospy's method.
+
+    A callback that is an Inbox gets messages directly. All others of a topic share one inbox, and
+    run one after another. Those of two topics run side by side: one may wait for the other.
+    """
+
+    def __init__(self, name, data_class):
+        self.rospy___init__(name, data_class)
+        self.tcp_nodelay = True
+        self.inboxes = []
+        self.plain_inbox = None
+
+    def add_link(self, link):
+        """Add a link unless the topic is closed or has a connection to that node; True if added."""
+        with self.c_lock:
+            if self.closed or self.has_connection(link.endpoint_id):
+                return False
+            self.add_connection(link)
+            return True
+
+    def update_inboxes(self):
+        """Find the inboxes of all callbacks anew, have the publishers do so, and return the links."""
+        callbacks = self.callbacks or ()
+        inboxes = [callback for callback, _ in callbacks if isinstance(callback, Inbox)]
+        if len(inboxes) < len(callbacks):
+            if not self.plain_inbox:
+                self.plain_inbox = PlainInbox(self)
+            inboxes.append(self.plain_inbox)
+        self.inboxes[:] = inboxes  # the links have this very list
+        links = links_of(self.connections)
+        for link in links:
+            link.publisher.receivers_are_for = None
+        return links
+
+    def call_plain(self, message):
+        """Run the callbacks that are no Inbox."""
+        for callback, args in self.callbacks or ():
+            if not isinstance(callback, Inbox):
+                with contextlib.suppress(SystemExit):  # it would end a worker
+                    self._invoke_callback(message, callback, args)
+
+    def add_callback(self, callback, args):
+        self.rospy_add_callback(callback, args)
+        for link in self.update_inboxes():
+            for frozen in list(link.publisher.latches.values()):
+                message = link.thaw(frozen)
+                message._connection_header = link.header
+                self._invoke_callback(message, callback, args)
+        self.run.connect_all(self.resolved_name)
+
+    def remove_callback(self, callback, args):
+        self.rospy_remove_callback(callback, args)
+        self.update_inboxes()
+
+    def close(self):
+        close_topic(self)
+        if self.plain_inbox:
+            self.plain_inbox.callback_queue.close(0)
+
+
+def receivers_of(connections):
+    """Find the receivers of messages that are published to some connections.
+
+    :returns: lists of inboxes by the function that thaws for them, the callback queues of those that
+        are inline, the callback queues of the others, and the connections that are not links
+    """
+    links = links_of(connections)
+    inboxes = {}
+    inline_queues = []
+    other_queues = []
+    for link in links:
+        inboxes.setdefault(link.thaw, []).extend(link.inboxes)
+    for inbox in sum(inboxes.values(), []):
+        queues = inline_queues if inbox.inline else other_queues
+        queues.append(inbox.callback_queue)
+    remotes = [connection for connection in connections if connection not in links]
+    return inboxes, inline_queues, other_queues, remotes
+
+
+def close_topic(impl):
+    """Close a publisher or subscription: links without rospy's lock, the rest, then its epoll."""
+    for link in links_of(impl.connections):
+        link.close()
+    impl.rospy_close()
+    impl.connection_poll.poller.close()
+
+
+def connections_of(ros_object):
+    """Return the connections of a rospy.Publisher or rospy.Subscriber."""
+    impl = ros_object.impl
+    if not impl or impl.closed:
+        return []
+    impl.check()  # rospy looks now and then which peers have left (ros_comm #927)
+    with impl.c_lock:  # the watcher may be removing one
+        return impl.connections

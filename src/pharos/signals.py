@@ -1,0 +1,118 @@
+"""The nodes of this process, and their ends: by spin(), signals, the exit, or a fork."""
+import atexit
+import contextlib
+import os
+import signal
+import sys
+import threading
+import time
+
+import rospy
+
+from pharos.intraprocess import callback_queues, links
+
+SAME_SIGNAL = 1.0  # seconds; people press Ctrl-C twice, and `timeout -s INT` sends two signals
+_SPIN_PERIOD = 0.01  # seconds
+
+#: the nodes of this process that have started
+started_nodes = []
+#: the nodes between the stop and the start of a restart()
+restarting_nodes = []
+
+_signal_time = None  # of the first signal that ends the program, as time.monotonic()
+_is_exiting = False
+
+
+def own_nodes():
+    """Return the nodes of this process that have started, or restart."""
+    between = [node for node in restarting_nodes if node not in started_nodes]
+    return [*started_nodes, *between]
+
+
+@contextlib.contextmanager
+def quiet_wait():
+    """End without an exception at the stop of a node, and at a signal of ours, which stops all."""
+    try:
+        with contextlib.suppress(rospy.ROSInterruptException):
+            yield
+    except (KeyboardInterrupt, SystemExit):
+        if not is_ending():
+            raise
+
+
+def stop_all():
+    """Stop every node of this process, whatever the stop() of its class raises."""
+    for node in own_nodes():
+        node._stop_safely()
+
+
+def spin() -> None:
+    """Block until every node of this process has stopped. Ctrl-C, SIGTERM and SIGHUP stop them."""
+    handle_signals()
+    with contextlib.suppress(KeyboardInterrupt), quiet_wait():
+        # a program may have called rospy.init_node(): then a signal is rospy's
+        while own_nodes() and not rospy.is_shutdown():
+            time.sleep(_SPIN_PERIOD)
+    stop_all()
+
+
+def handle_signals():
+    """Have signals stop the nodes and end the program, unless somebody else handles them."""
+    if threading.current_thread() is not threading.main_thread():
+        return
+    defaults = signal.default_int_handler, signal.SIG_DFL, signal.SIG_IGN
+    is_interactive = hasattr(sys, 'ps1')
+    if signal.getsignal(signal.SIGINT) in defaults and not is_interactive:
+        signal.signal(signal.SIGINT, _end_program)
+    for number in signal.SIGTERM, signal.SIGHUP:
+        if signal.getsignal(number) == signal.SIG_DFL:
+            signal.signal(number, _end_program)
+
+
+def is_ending():
+    """True after a signal that ends the program."""
+    return _signal_time is not None
+
+
+def may_be_signal():
+    """True if an exception of this thread may come from a signal."""
+    is_python_default = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    is_main = threading.current_thread() is threading.main_thread()
+    return is_main and (is_ending() or is_python_default)
+
+
+def _end_program(number, frame):
+    """Handle the signal of that number."""
+    global _signal_time
+    if is_ending():
+        if time.monotonic() - _signal_time > SAME_SIGNAL:
+            signal.signal(number, signal.SIG_DFL)
+            signal.raise_signal(number)  # ends the program at once
+        return
+    _signal_time = time.monotonic()
+    if _is_exiting:  # _stop_at_exit() stops the nodes already
+        return
+    threading.Thread(target=stop_all, name='pharos end').start()
+    if number == signal.SIGINT:
+        raise KeyboardInterrupt
+    raise SystemExit(128 + number)
+
+
+def _stop_at_exit():
+    global _is_exiting
+    _is_exiting = True
+    stop_all()
+
+
+def _forget_nodes():
+    """Have no nodes in a forked child: they run in the parent."""
+    for node in own_nodes():
+        node._current_run.mark_stopped()
+    started_nodes.clear()
+    restarting_nodes.clear()
+    links.runs.clear()
+    callback_queues.reset_after_fork()
+
+
+atexit.register(_stop_at_exit)
+os.register_at_fork(after_in_child=_forget_nodes)

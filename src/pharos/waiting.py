@@ -1,0 +1,49 @@
+"""Waiting on behalf of a node, whose stop ends the wait."""
+import contextlib
+import math
+import threading
+import time
+
+from pharos.errors import PharosError
+
+
+class _Current(threading.local):
+    """The node on whose behalf this thread runs."""
+
+    node = None
+
+
+current = _Current()
+
+
+def wait(predicate, timeout=None, node=None):
+    """Wait until ``predicate()`` is true.
+
+    :param timeout: seconds; None: without limit
+    :param node: its stop ends the wait, too; default: the node on whose behalf this thread runs
+    :returns: the last value of ``predicate()``, false if the wait ended otherwise
+    """
+    deadline = math.inf if timeout is None else time.monotonic() + timeout
+    node = node or current.node
+    pause = 0.002  # seconds between the first two looks
+    while True:
+        value = predicate()
+        if value or time.monotonic() >= deadline:
+            return value
+        if node:
+            is_stopping = node._current_run.stopping.wait(pause)
+            if is_stopping:
+                return value
+        else:
+            time.sleep(pause)
+        pause = min(pause * 1.2, 0.02)
+
+
+def wait_for(find, timeout, node=None):
+    """Return ``find()``, tried again while it raises errors of ours."""
+
+    def attempt():
+        with contextlib.suppress(PharosError):
+            return find()
+
+    return wait(attempt, timeout, node) or find()
