@@ -248,12 +248,12 @@ class Master:
     def _full_name(self, node, name, mappings):
         """Return the full name of a new node; of those with equal mappings, one has ``__name``."""
         special_names = load_mappings(mappings)
-        first = self._first_nodes.get(mappings)
-        is_name_taken = first and first.is_running and first.master == self
-        if '__name' in special_names and not is_name_taken:
-            self._first_nodes[mappings] = node
-            namespace = name[: name.rfind('/') + 1]
-            name = namespace + node_name(special_names['__name'])
+        if '__name' in special_names:
+            first = self._first_nodes.get(mappings)
+            if not (first and first.is_running and first.master == self):
+                self._first_nodes[mappings] = node
+                namespace = name[: name.rfind('/') + 1]
+                name = namespace + node_name(special_names['__name'])
         if '__ns' in special_names and name.startswith('/'):
             name = name[name.rfind('/') + 1 :]
         return ns_join(get_ros_namespace(self._environ, mappings), name)

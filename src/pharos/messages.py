@@ -90,7 +90,9 @@ def message_class(type_: str | type, ask: Callable | None = None) -> type[Messag
     if isinstance(type_, type) and issubclass(type_, Message):
         return type_
     installed_class = _installed_class('msg', type_)
-    return installed_class or _make_message(type_, _find_definition('msg', type_, ask))
+    if installed_class:
+        return installed_class
+    return _make_message(type_, _find_definition('msg', type_, ask))
 
 
 def service_class(type_: Any) -> Any:
@@ -98,7 +100,9 @@ def service_class(type_: Any) -> Any:
     if hasattr(type_, '_request_class'):
         return type_
     installed_class = _installed_class('srv', type_)
-    return installed_class or _make_service(type_, _find_definition('srv', type_))
+    if installed_class:
+        return installed_class
+    return _make_service(type_, _find_definition('srv', type_))
 
 
 def define_message(type_: str, text: str) -> type[Message]:
@@ -308,8 +312,8 @@ def response(cls, value):
     if value is None and not names:
         value = {}
     elif len(names) == 1 and type(value) is list and cls._slot_types[0].endswith(']'):
-        is_list_of_fields = bool(value) and type(value[0]) is list
-        if not is_list_of_fields:
+        has_fields = value and type(value[0]) is list  # a list of fields, or the only field
+        if not has_fields:
             value = {names[0]: value}
     if type(value) is dict:
         return check(_fill(cls(), value))

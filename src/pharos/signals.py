@@ -76,9 +76,11 @@ def is_ending():
 
 def may_be_signal():
     """True if an exception of this thread may come from a signal."""
-    is_python_default = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    is_main = threading.current_thread() is threading.main_thread()
-    return is_main and (is_ending() or is_python_default)
+    if threading.current_thread() is not threading.main_thread():
+        return False
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        return True
+    return is_ending()
 
 
 def _end_program(number, frame):

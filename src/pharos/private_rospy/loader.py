@@ -142,7 +142,9 @@ def is_private(name):
     top_name = name.partition('.')[0]
     if top_name in PRIVATE:
         return True
-    return top_name not in SHARED and not _is_generated(name) and _reaches_rospy(top_name)
+    if top_name in SHARED or _is_generated(name):
+        return False
+    return _reaches_rospy(top_name)
 
 
 #: class of a private module -> its PrivateModules, as a weak reference
@@ -233,7 +235,9 @@ class PrivateModules:
             return True
         if self.program_folder and PathFinder.find_spec(top_name, [self.program_folder]):
             return True
-        return top_name not in SHARED and self._is_added(top_name)
+        if top_name in SHARED:
+            return False
+        return self._is_added(top_name)
 
     def _is_added(self, top_name):
         """True if a module lies in a folder that the process does not search."""

@@ -197,7 +197,9 @@ def signal_shutdown(original, run):
 def is_shutdown(original, run):
     """rospy says so too late for loops that a stop waits for; this says so when the stop begins."""
     run.checkpoint()
-    return run.stopping.is_set() or original()
+    if run.stopping.is_set():
+        return True
+    return original()
 
 
 @replace('rosgraph.roslogging', 'rospkg')
@@ -230,9 +232,11 @@ def shut_down_from_outside(original, run, self, caller_id, msg=''):
     """rospy obeys everybody, also if an earlier node at its URI is meant (ros_comm #2241); this checks."""
     host = _current_client.address[0]
     master_host = urlsplit(self.masterUri).hostname
-    is_near = host == socket.gethostbyname(master_host) or is_local_address(host)
-    is_meant = caller_id != '/master' or f'[{self.name}]' in str(msg)
-    obeys = is_meant and (is_near or run.node.allow_remote_shutdown)
+    obeys = run.node.allow_remote_shutdown
+    if host == socket.gethostbyname(master_host) or is_local_address(host):
+        obeys = True
+    if caller_id == '/master' and f'[{self.name}]' not in str(msg):
+        obeys = False  # the master means an earlier node
     if obeys:
         run.request_stop()
     else:

@@ -95,7 +95,9 @@ class PublisherOverlay:
                     self.receivers_are_for = self.connections
                     self.receivers = receivers_of(self.connections)
                 inboxes, inline_queues, other_queues, remotes = self.receivers
-                is_latched = self.is_latch and (channel is None or channel.latch)
+                is_latched = self.is_latch
+                if channel:
+                    is_latched = channel.latch
             else:
                 inboxes, inline_queues, other_queues, remotes = receivers_of([connection_override])
                 is_latched = False
@@ -168,9 +170,10 @@ class PlainInbox(Inbox):
         connections = self.subscription.connections
         links = links_of(connections)
         queue_sizes = [link.publisher.queue_size for link in links]
-        is_bounded = all(queue_sizes) and len(links) == len(connections)
-        if self.queue_size != INFINITE or not queue_sizes or not is_bounded:
-            return super().capacity_for(size)  # nothing is lost between processes
+        if self.queue_size != INFINITE or not links or len(links) < len(connections):
+            return super().capacity_for(size)
+        if not all(queue_sizes):  # nothing is lost between processes
+            return super().capacity_for(size)
         socket_messages = min(SOCKET_BYTES, self.queue_bytes) // size
         return sum(queue_sizes) + max(1, socket_messages)
 
