@@ -84,7 +84,7 @@ class ExternalNode:
 
     def describe(self, seconds: float = 1.0) -> str:
         """Return as text what it publishes, receives and offers, its peers, and how often."""
-        from pharos.live.words import describe
+        from pharos.live.text_format import describe
 
         return describe(self.master, self.name, seconds)
 

@@ -310,13 +310,13 @@ class Node(Receiver):
 
     def _told(self):
         """Return what :meth:`health` knows without the master; top asks for it by XML-RPC."""
-        from pharos.live.snapshot import told
+        from pharos.live.snapshot import health_facts
 
-        return told(self)
+        return health_facts(self)
 
     def describe(self, seconds: float = 1.0) -> str:
         """Return as text what it publishes, receives and offers, its peers, and how often."""
-        from pharos.live.words import describe
+        from pharos.live.text_format import describe
 
         return describe(self._master, self._name, seconds)
 

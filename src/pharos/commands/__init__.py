@@ -11,25 +11,56 @@ usage: pharos COMMAND [ARGUMENT ...]
 
 'pharos COMMAND --help' tells the arguments of one.
 """
+import argparse
 import importlib
+import inspect
+import os
+import re
 import sys
+from typing import Callable
+
+import rosgraph
+import rospkg
 
 import pharos
 
-MODULES = {
-    'workspace': 'pharos.live.workspace',
-    'compose': 'pharos.compose.command',
-    'top': 'pharos.live.top',
-    'graph': 'pharos.live.graph',
-    'create_package': 'pharos.commands.create_package',
-}
+#: each is a function of its name in the module of its name, except compose
+COMMANDS = 'workspace', 'compose', 'top', 'graph', 'create_package'
 
 
-def main():
-    """Run the command that the first argument names; returns its exit status."""
-    command = sys.argv[1] if sys.argv[1:] else '--help'
-    if command in MODULES:
-        sys.argv[:2] = [f'pharos {command}']
-        return importlib.import_module(MODULES[command]).main()
-    print(f'pharos {pharos.__version__}' if command == '--version' else __doc__)
-    return not command.startswith('-')
+def main() -> int:
+    """Run the command that the first argument names, and return the exit status."""
+    name = sys.argv[1] if sys.argv[1:] else '--help'
+    if name in COMMANDS:
+        sys.argv[:2] = [f'pharos {name}']
+        if name == 'compose':
+            return importlib.import_module('pharos.compose.command').main()
+        module = importlib.import_module(f'pharos.commands.{name}')
+        return run_command(getattr(module, name))
+    print(f'pharos {pharos.__version__}' if name == '--version' else __doc__)
+    return 0 if name.startswith('-') else 1
+
+
+def argument_parser(command: Callable[[list[str]], None]) -> argparse.ArgumentParser:
+    """Return a parser of arguments; the docstring of the command is its help."""
+    return argparse.ArgumentParser(
+        description=inspect.getdoc(command), formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+
+
+def run_command(command: Callable[[list[str]], None]) -> int:
+    """Run a function with the program's arguments, and return the exit status.
+
+    ROS's remappings are left out of the arguments. An error of the user's is one line.
+    """
+    try:
+        command(rosgraph.myargv()[1:])
+        sys.stdout.flush()
+    except BrokenPipeError:  # by `| head`; Python would flush, and fail, once more at its exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (pharos.PharosError, ValueError, OSError, re.error, rospkg.ResourceNotFound) as error:
+        print(f'{command.__name__}: {error}', file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:  # ends the command, as the key q does
+        pass
+    return 0
