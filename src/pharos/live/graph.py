@@ -262,7 +262,7 @@ def _dot_box(prefix, name, caption, style):
 def graph_of(master: Master, seconds: float = 0, **options: Any) -> Graph:
     """Return the graph of :meth:`Master.graph`; the options are keywords of :class:`Graph`.
 
-    :param seconds: the time for which messages are counted; 0: no rates
+    :param seconds: how long messages are counted, for rates; 0: no rates
     :raises MasterUnreachableError: if the master does not answer
     """
     start = take_snapshot(master)

@@ -172,7 +172,7 @@ def publisher_rates(link_rates: dict[Link, Traffic], unit: str) -> dict[tuple, f
     rates: dict[tuple, float] = {}
     for link, traffic in link_rates.items():
         key = link.topic, link.publisher
-        rates[key] = max(rates.get(key, 0), getattr(traffic, unit))
+        rates[key] = max(rates.get(key, 0.0), getattr(traffic, unit))
     return rates
 
 
@@ -180,12 +180,12 @@ def topic_rates(link_rates: dict[Link, Traffic], unit: str) -> dict[str, float]:
     """Return ``{topic: rate}``, the sum of the topic's publishers; see :func:`publisher_rates`."""
     rates: dict[str, float] = {}
     for (topic, _), rate in publisher_rates(link_rates, unit).items():
-        rates[topic] = rates.get(topic, 0) + rate
+        rates[topic] = rates.get(topic, 0.0) + rate
     return rates
 
 
 def health_facts(node: Node) -> dict[str, Any]:
-    """Return the facts of :meth:`Node.health` for which no master is needed."""
+    """Return the facts of :meth:`Node.health` that need no master."""
     connections = node._run.topics.get_pub_sub_info()
     ended_souls = [soul.name for soul in node._souls if not soul.is_alive()]
     return {
