@@ -20,13 +20,17 @@ def create_package(arguments: list[str]) -> None:
       rosrun pharos create_package my_robot                            with a node my_robot_node
       rosrun pharos create_package my_robot --node camera controller   with these
 
-    Each node is a class in a module, with a program in scripts/ and a test. A node counts the messages
-    that it hears: replace that by what it shall do. The launch file starts all nodes. Write who
-    maintains the package, and its license, into package.xml.
+    Each node is a class in a module, with a program in scripts/ and a test. At first a node counts the
+    messages that it receives: put your own code there. The launch file starts all nodes. Write the
+    maintainer and the license into package.xml.
     """
     parser = argument_parser(create_package)
-    parser.add_argument('package', metavar='NAME', type=package_name, help='the package')
-    parser.add_argument('--node', metavar='NAME', type=package_name, nargs='+', help='its nodes')
+    parser.add_argument(
+        'package', metavar='NAME', type=package_name, help='the name of the package'
+    )
+    parser.add_argument(
+        '--node', metavar='NAME', type=package_name, nargs='+', help='the names of its nodes'
+    )
     options = parser.parse_args(arguments)
     package = options.package
     write_package(package, options.node or [f'{package}_node'])
@@ -39,8 +43,8 @@ def package_name(text: str) -> str:
 
     :raises argparse.ArgumentTypeError: if not
     """
-    is_reserved = keyword.iskeyword(text) or text in sys.stdlib_module_names
-    if is_reserved or not NAME_PATTERN.fullmatch(text):
+    is_module = text in sys.stdlib_module_names
+    if is_module or keyword.iskeyword(text) or not NAME_PATTERN.fullmatch(text):
         raise argparse.ArgumentTypeError(
             f'{text!r} cannot be a name: give small letters, digits and single underscores, and no'
             ' word or module of Python'

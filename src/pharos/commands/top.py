@@ -13,22 +13,23 @@ FILE_WIDTH = 10000  # columns of a table that is not for a terminal, so that not
 
 
 def top(arguments: list[str]) -> None:
-    """Show what nodes, processes and topics are doing.
+    """Show the nodes, processes and topics of the ROS master in a live table.
 
-    Messages and bytes a second, transports, what was dropped, failures, CPU and memory. Nothing is
-    subscribed to for it.
+    The columns are messages and bytes a second, transports, dropped messages, failures, CPU and
+    memory. The command subscribes to nothing.
 
-      top NAME ...        of nodes and topics those with that in their names
+      top NAME ...        only nodes and topics that have a NAME in their names
     """
     parser = argument_parser(top)
     parser.add_argument('names', nargs='*', metavar='NAME', help='a part of a name')
     parser.add_argument('--once', action='store_true', help='print the tables once')
-    parser.add_argument('--json', action='store_true', help='print them once, as JSON')
-    parser.add_argument('--interval', type=float, default=1, metavar='S', help='between two looks')
+    parser.add_argument('--json', action='store_true', help='print JSON once')
+    parser.add_argument(
+        '--interval', type=float, default=1, metavar='S', help='seconds between measurements'
+    )
     options = parser.parse_args(arguments)
     meter = Meter(Master(), options.names)
-    prints_once = options.once or options.json
-    if sys.stdin.isatty() and sys.stdout.isatty() and not prints_once:
+    if sys.stdin.isatty() and sys.stdout.isatty() and not (options.once or options.json):
         show(meter, options.interval)
         return
     meter.measure()

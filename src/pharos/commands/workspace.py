@@ -10,7 +10,7 @@ from pharos.live.workspace import load_ipython_extension, namespace
 def workspace(arguments: list[str]) -> None:
     """Open a session of IPython with the live ROS graph: `master`, a node `me`, and all of pharos."""
     parser = argument_parser(workspace)
-    parser.add_argument('script', nargs='?', metavar='SCRIPT', help='a program to be run first')
+    parser.add_argument('script', nargs='?', metavar='SCRIPT', help='a program to run first')
     parser.add_argument('args', nargs=argparse.REMAINDER, metavar='ARGUMENT', help='its arguments')
     options = parser.parse_args(arguments)
     try:
@@ -18,7 +18,10 @@ def workspace(arguments: list[str]) -> None:
     except ModuleNotFoundError:
         raise PharosError('a workspace needs IPython: apt install python3-ipython') from None
     app = TerminalIPythonApp.instance(display_banner=False)
-    app.initialize(['--', options.script, *options.args] if options.script else [])
+    app_arguments = []
+    if options.script:
+        app_arguments = ['--', options.script, *options.args]
+    app.initialize(app_arguments)
     app.force_interact = True
     load_ipython_extension(app.shell, namespace(sys.argv))
     app.start()

@@ -110,8 +110,11 @@ class Graph:
         return processes
 
     def _process_of(self, name):
+        """Return ``(host, process id)``; a node that does not tell it counts as a process."""
         node = self.nodes[name]
-        return node.host, node.pid or f'of {name}'
+        if node.pid is None:
+            return node.host, f'of {name}'
+        return node.host, node.pid
 
     def _topic_label(self, topic):
         """Return the type of a topic, and the rate if one was measured."""

@@ -1,6 +1,6 @@
 """Measure the nodes, processes and topics of a master, and show them as tables in a terminal.
 
-Nodes count their messages anyway, so that two snapshots give rates. Nothing is subscribed to.
+Nodes count their messages anyway. Two snapshots give rates, so top subscribes to nothing.
 """
 import collections
 import os
@@ -67,14 +67,14 @@ class Meter:
             process_id = row['PID'] or row['NODE']
             rows_by_process[row['HOST'], process_id].append(row)
         for (host, process_id), rows in rows_by_process.items():
-            row = {'PID': process_id, 'HOST': host, 'CPU%': None, 'MEM': None, 'THR': None}
+            process_row = {'PID': process_id, 'HOST': host, 'CPU%': None, 'MEM': None, 'THR': None}
             if host == LOCAL_HOST and isinstance(process_id, int):
-                row.update(self._process_load(process_id))
+                process_row.update(self._process_load(process_id))
             for column in SUM_COLUMNS:
-                values = [node_row[column] for node_row in rows]
-                row[column] = sum(value for value in values if value is not None)
-            row['NODES'] = ' '.join(node_row['NODE'] for node_row in rows)
-            yield row
+                values = [row[column] for row in rows]
+                process_row[column] = sum(value for value in values if value is not None)
+            process_row['NODES'] = ' '.join(row['NODE'] for row in rows)
+            yield process_row
 
     def _process_load(self, process_id):
         try:
@@ -89,20 +89,20 @@ class Meter:
 
 
 def _node_rows(snapshot, link_rates):
-    output_rates = publisher_rates(link_rates, 'messages')
+    message_rates = publisher_rates(link_rates, 'messages')
     for name, node in snapshot.nodes.items():
         input_traffic = [rate for link, rate in link_rates.items() if link.subscriber == name]
         output_traffic = [rate for link, rate in link_rates.items() if link.publisher == name]
-        transports = [link.transport for link in snapshot.links if name in link[1:3]]
+        output_rates = [rate for (_, sender), rate in message_rates.items() if sender == name]
+        own_links = [link for link in snapshot.links if name in (link.publisher, link.subscriber)]
+        transports = [link.transport for link in own_links]
         yield {
             'NODE': name,
             'CLASS': node.health.get('kind'),
             'HOST': node.host,
             'PID': node.pid,
             'IN/S': sum(rate.messages for rate in input_traffic),
-            'OUT/S': sum(
-                rate for (_, node_name), rate in output_rates.items() if node_name == name
-            ),
+            'OUT/S': sum(output_rates),  # a message counts once, however many nodes receive it
             'IN B/S': sum(rate.bytes for rate in input_traffic),
             'OUT B/S': sum(rate.bytes for rate in output_traffic),
             'LOCAL': transports.count('INTRAPROCESS'),
@@ -132,7 +132,7 @@ def _topic_rows(snapshot, link_rates):
 
 
 def table(rows: list[dict[str, Any]], sort_column: int = 0) -> Table:
-    """Return a table of rows, sorted by a column: texts by the alphabet, the largest number first.
+    """Return a table of rows, sorted by a column: texts by the alphabet, numbers from the largest.
 
     :param sort_column: the index of the column; after the last one comes the first again
     """
@@ -159,8 +159,10 @@ def table(rows: list[dict[str, Any]], sort_column: int = 0) -> Table:
 def _cell_text(column, value):
     if value is None or value == '':
         return '-'
-    is_count = isinstance(value, (int, float)) and column != 'PID'
-    text = short_number(value) if is_count else str(value)
+    if isinstance(value, str) or column == 'PID':
+        text = str(value)
+    else:
+        text = short_number(value)
     if column in ALARM_COLUMNS and value:
         return f'[bold red]{text}[/]'
     return text

@@ -84,7 +84,7 @@ def measure(topic: Topic, seconds: float) -> Rate:
     """Measure the rate of a topic for :meth:`Topic.hz`."""
     with arrival_queue(topic, rospy.AnyMsg) as arrivals:
         arrival_list = _collect_arrivals(arrivals, seconds)
-    gaps = [later.time - first.time for first, later in zip(arrival_list, arrival_list[1:])]
+    gaps = [later.time - earlier.time for earlier, later in zip(arrival_list, arrival_list[1:])]
     byte_count = sum(len(arrival.message._buff) for arrival in arrival_list)
     rate = len(gaps) / sum(gaps) if gaps else 0.0
     if not gaps:
@@ -111,7 +111,10 @@ def last(topic: Topic) -> Message:
 
 
 def watch(topic: Topic, count: int | None, block: Block | None) -> None:
-    """Run the block of :meth:`Topic.watch` on messages, or show them; None: until Ctrl-C."""
+    """Run the block of :meth:`Topic.watch` on messages, or show them.
+
+    :param count: the number of messages; None: until Ctrl-C, which ends the call in any case
+    """
     show_message = block or _show_message
     numbers = itertools.count() if count is None else range(count)
     with arrival_queue(topic) as arrivals, contextlib.suppress(KeyboardInterrupt):
