@@ -37,6 +37,9 @@ class Endpoint:
     def _run(self):
         return self.node._current_run
 
+    def _open(self):
+        raise NotImplementedError
+
     def open(self):
         """Register, by _open() of the subclass; the node's next start calls this again."""
         self._run.master.call('getPid')  # raises if the master does not answer

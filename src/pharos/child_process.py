@@ -37,9 +37,15 @@ class RosProcess(subprocess.Popen):
         tty.setraw(child_terminal)
         self._terminal = open(terminal, errors='replace')
         environ = {**os.environ, 'ROS_MASTER_URI': master_url, 'TERM': 'dumb'}
-        streams = dict.fromkeys(('stdin', 'stdout', 'stderr'), child_terminal)
         try:
-            super().__init__(command, env=environ, start_new_session=True, **streams)
+            super().__init__(
+                command,
+                env=environ,
+                start_new_session=True,
+                stdin=child_terminal,
+                stdout=child_terminal,
+                stderr=child_terminal,
+            )
         finally:
             os.close(child_terminal)
         self._reader = threading.Thread(target=self._read, daemon=True)

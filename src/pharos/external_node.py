@@ -86,7 +86,7 @@ class ExternalNode:
 
     def describe(self, seconds: float = 1.0) -> str:
         """Return as text the node's topics, services, peers and rates, counted for some seconds."""
-        from pharos.live.words import describe
+        from pharos.live.text_format import describe
 
         return describe(self.master, self.name, seconds)
 

@@ -302,7 +302,7 @@ class Node(Receiver):
 
     def describe(self, seconds: float = 1.0) -> str:
         """Return as text the node's topics, services, peers and rates, counted for some seconds."""
-        from pharos.live.words import describe
+        from pharos.live.text_format import describe
 
         return describe(self._settings.master, self._settings.name, seconds)
 
@@ -535,7 +535,7 @@ class Node(Receiver):
         if known_class and typed_as is None:
             return known_class
         type_name = typed_as or self._settings.master.topic_type(topic)
-        if type_name in (None, '*'):
+        if type_name is None or type_name == '*':
             raise UnknownTopicError(
                 f'the master knows no type of {topic}: give typed_as=, such as "std_msgs/String"'
             )

@@ -1,4 +1,6 @@
 """The nodes of this process, and their ends: by spin(), signals, the exit, or a fork."""
+from __future__ import annotations
+
 import atexit
 import contextlib
 import os
@@ -19,7 +21,7 @@ started_nodes = []
 #: the nodes between the stop and the start of a restart()
 restarting_nodes = []
 
-_signal_time = None  # of the first signal that ends the program, as time.monotonic()
+_signal_time: float | None = None  # of the first signal that ends the program, as time.monotonic()
 _is_exiting = False
 
 
@@ -86,7 +88,7 @@ def may_be_signal():
 def _end_program(number, frame):
     """Handle the signal of that number."""
     global _signal_time
-    if is_ending():
+    if _signal_time is not None:
         if time.monotonic() - _signal_time > SAME_SIGNAL:
             signal.signal(number, signal.SIG_DFL)
             signal.raise_signal(number)  # ends the program at once

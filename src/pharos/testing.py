@@ -1,4 +1,4 @@
-"""Fixtures of pytest, a mailbox, and waiting for events, for tests of your own nodes.
+"""Fixtures of pytest, a mailbox, and a way to wait for events, for tests of your own nodes.
 
 In a ``conftest.py``: ``pytest_plugins = ['pharos.testing']``; and a test is::
 
@@ -19,17 +19,18 @@ from pharos import Master, Node
 from pharos.waiting import wait
 
 TIMEOUT = 30.0  # seconds; a test that passes never waits so long
-_expects_failures = False  # said by the running test
+_expects_failures = False  # True: the running test has called expect_failures()
 
 
 def until(predicate: Callable[[], Any], timeout: float | None = None, what: str = '') -> Any:
     """Wait until ``predicate()`` is true, and return its value.
 
     :param timeout: seconds, None: :data:`TIMEOUT`
-    :param what: what is waited for, for the error
-    :raises TimeoutError: if it is not in time
+    :param what: a description of the event, for the error
+    :raises TimeoutError: if the value is not true in time
     """
-    timeout = TIMEOUT if timeout is None else timeout
+    if timeout is None:
+        timeout = TIMEOUT
     value = wait(predicate, timeout)
     if not value:
         raise TimeoutError(f'{what or predicate} did not come to be within {timeout:g} s')
@@ -37,107 +38,132 @@ def until(predicate: Callable[[], Any], timeout: float | None = None, what: str 
 
 
 class Mailbox:
-    """Keeps the messages of a topic, and lets a test wait for them. It is a delegate, too.
+    """Keeps the messages of a topic, and lets a test wait for them. A mailbox is a delegate, too.
 
-    :param node: the node that receives them; None: the mailbox is given as a delegate
+    Each method can be called from any thread.
+
+    :param node: the node that receives them; None: the test gives the mailbox as a delegate
+    :param typed_as: the type of the topic; None: the type that the master knows
+    :ivar channel: the InputChannel of the node, None without a node
     """
 
     def __init__(self, node: Node | None = None, topic: str = '', typed_as: Any = None):
-        self._came: list[Any] = []
-        self._waiting: queue.SimpleQueue = queue.SimpleQueue()
-        self.channel = node.interested_in(topic, typed_as, delegate=self) if node else None
+        self._messages: list[Any] = []
+        self._new_messages: queue.SimpleQueue = queue.SimpleQueue()
+        self.channel = None
+        if node:
+            self.channel = node.interested_in(topic, typed_as, delegate=self)
 
     def __call__(self, message: Any, channel: Any = None) -> None:
-        self._came.append(message)
-        self._waiting.put(message)
+        self._messages.append(message)
+        self._new_messages.put(message)
 
     def next(self, timeout: float | None = None) -> Any:
-        """Take the next message, and wait for it if need be; raises TimeoutError."""
+        """Take the next message, and wait until one is there.
+
+        :param timeout: seconds, None: :data:`TIMEOUT`
+        :raises TimeoutError: if no message comes in time
+        """
+        if timeout is None:
+            timeout = TIMEOUT
         try:
-            return self._waiting.get(timeout=TIMEOUT if timeout is None else max(0, timeout))
+            return self._new_messages.get(timeout=max(0, timeout))
         except queue.Empty:
-            others = f'{len(self._came)} others: {str(self._came[-1:])[:300]}'
+            others = f'{len(self._messages)} others: {str(self._messages[-1:])[:300]}'
             raise TimeoutError(f'no message came in time, after {others}') from None
 
     def wait_for(self, predicate: Callable[[Any], Any], timeout: float | None = None) -> Any:
-        """Take messages until ``predicate(message)`` is true, and return that one."""
-        deadline = time.monotonic() + (TIMEOUT if timeout is None else timeout)
-        while not predicate(message := self.next(deadline - time.monotonic())):
-            pass
-        return message
+        """Take messages until ``predicate(message)`` is true, and return that message.
+
+        :param timeout: seconds for all of them, None: :data:`TIMEOUT`
+        :raises TimeoutError: if the message does not come in time
+        """
+        if timeout is None:
+            timeout = TIMEOUT
+        deadline = time.monotonic() + timeout
+        while True:
+            message = self.next(deadline - time.monotonic())
+            if predicate(message):
+                return message
 
     def all(self) -> list[Any]:
-        """Return all messages that came so far."""
-        return list(self._came)
+        """Return all messages so far, also those that were taken."""
+        return list(self._messages)
 
     def empty(self) -> bool:
-        """True if there is no message that was not taken."""
-        return self._waiting.empty()
+        """True if all messages were taken."""
+        return self._new_messages.empty()
 
 
 @pytest.fixture
-def master(monkeypatch) -> Iterator[Master]:
-    """An embedded master of the test, which leaves no node, registration or thread behind."""
+def master(monkeypatch: pytest.MonkeyPatch) -> Iterator[Master]:
+    """An embedded master for one test. The test must leave no node, registration or thread."""
     threads = set(threading.enumerate())
     with Master.embedded() as embedded:
         monkeypatch.setenv('ROS_MASTER_URI', embedded.url)
-        known = _registrations(embedded)
+        registrations = _registrations(embedded)
         yield embedded
         nodes = embedded.own_nodes()
         for node in nodes:
             node.stop()
         assert not nodes, f'left running: {nodes}; stop() them, or make them by create_node()'
-        _check_gone(lambda: _registrations(embedded) - known)
+        _check_gone(lambda: _registrations(embedded) - registrations)
         _check_gone(lambda: set(threading.enumerate()) - threads)
 
 
 def _registrations(master):
-    kinds = master.system_state()
-    return {(name, node) for kind in kinds for name, nodes in kind.items() for node in nodes}
+    """Return the names of topics and services, each with the name of a node that has it."""
+    pairs = set()
+    for registry in master.system_state():
+        for name, nodes in registry.items():
+            pairs.update((name, node) for node in nodes)
+    return pairs
 
 
-def _check_gone(left):
+def _check_gone(find_remains):
     try:
-        until(lambda: not left())
+        until(lambda: not find_remains())
     except TimeoutError:
-        pytest.fail(f'left behind: {left()}', False)
+        pytest.fail(f'left behind: {find_remains()}', False)
 
 
 def expect_failures() -> None:
-    """Say in a test that blocks of its nodes may fail; a fixture of this name does so, too."""
+    """Let blocks fail in this test. A test can also name this as a fixture."""
     global _expects_failures
     _expects_failures = True
 
 
 @pytest.fixture
 def create_node(master: Master) -> Iterator[Callable[..., Any]]:
-    """Make and start nodes, ``create_node(node_class, name=None, **kwargs)``; the test's end stops
-    them. A failure in a block of them fails the test, unless it says :func:`expect_failures`."""
+    """Create and start nodes by ``create_node(node_class, name=None, **kwargs)``.
+
+    The end of the test stops them. If a block of theirs fails, the test fails, unless the test calls
+    :func:`expect_failures`.
+    """
     nodes: list[Node] = []
 
     def create(node_class: type[Node], name: str | None = None, **kwargs: Any) -> Any:
         """Create a node; its name is by default that of the class, made unique."""
         if name is None:
             name = re.sub('(?<=[a-z0-9])(?=[A-Z])', '_', node_class.__name__).lower()
-            same = sum(type(node) is node_class for node in nodes)
-            name += f'_{same}' if same else ''
-        kwargs = {'domain': '127.0.0.1', **kwargs}
-        nodes.append(master.create(node_class, name, **kwargs))
-        return nodes[-1]
+            same_class = sum(type(node) is node_class for node in nodes)
+            if same_class:
+                name += f'_{same_class}'
+        kwargs.setdefault('domain', '127.0.0.1')
+        node = master.create(node_class, name, **kwargs)
+        nodes.append(node)
+        return node
 
     global _expects_failures
     _expects_failures = False
     yield create
     for node in nodes:
         node._stop_safely()
-    told = [
-        f'{failure}\n{failure.traceback}'
-        for node in nodes
-        for failure in node._current_run.failures
-    ]
-    if told and not _expects_failures:
-        told.insert(0, 'blocks of its nodes failed (or say expect_failures()):')
-        pytest.fail('\n'.join(told), False)
+    failures = [failure for node in nodes for failure in node._current_run.failures]
+    if failures and not _expects_failures:
+        lines = ['blocks of its nodes failed (or say expect_failures()):']
+        lines += [f'{failure}\n{failure.traceback}' for failure in failures]
+        pytest.fail('\n'.join(lines), False)
 
 
 @pytest.fixture(name='expect_failures')

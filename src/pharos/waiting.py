@@ -3,6 +3,7 @@ import contextlib
 import math
 import threading
 import time
+from typing import Any
 
 from pharos.errors import PharosError
 
@@ -10,7 +11,7 @@ from pharos.errors import PharosError
 class _Current(threading.local):
     """The node on whose behalf this thread runs."""
 
-    node = None
+    node: Any = None
 
 
 current = _Current()

@@ -1,8 +1,8 @@
-"""Shared by the programs of the report's listings: options, a turtle, an end.
+"""Options, a turtle, and an end, which the programs of the report's listings share.
 
-The turtle's commands differ between the releases of turtlesim: up to ROS groovy, and so in the
-report, they are turtlesim/Velocity on /turtle1/command_velocity, since ROS hydro
-geometry_msgs/Twist on /turtle1/cmd_vel. The graph tells which of them is there.
+The turtle's commands differ between the releases of turtlesim. Up to ROS groovy, and in the report,
+they are turtlesim/Velocity on /turtle1/command_velocity. Since ROS hydro they are
+geometry_msgs/Twist on /turtle1/cmd_vel. The graph tells which of the two a turtle takes.
 """
 import argparse
 import os
@@ -14,38 +14,42 @@ from pharos import PharosError
 from pharos.waiting import wait
 
 TWIST = 'geometry_msgs/Twist'
-#: where turtles take commands, and the types of these; the first is preferred
+#: the topics on which turtles take commands, with their types; the first is preferred
 COMMANDS = (('/turtle1/cmd_vel', TWIST), ('/turtle1/command_velocity', 'turtlesim/Velocity'))
-PATIENCE = 10.0  # seconds until a program gives up waiting for a turtle that is just starting
+TURTLE_TIMEOUT = 10.0  # seconds that a program waits for a turtle to start
 
 
 def find_commands(node):
-    """Return the topic to which a turtle listens, and its type; waits for one for a while.
+    """Return the topic and the type of a turtle's commands; waits a while until a turtle is there.
 
-    A turtle is any other node that listens to one of :data:`COMMANDS`.
+    A turtle is any other node that receives from one of :data:`COMMANDS`.
     """
 
-    def others(topic):
-        return {*node.master.topic(node.ros.resolve_name(topic)).subscribers} - {node.name}
+    def has_turtle(topic):
+        subscribers = node.master.topic(node.ros.resolve_name(topic)).subscribers
+        return bool(set(subscribers) - {node.name})
 
-    def heard():
-        return [each for each in COMMANDS if others(each[0])]
+    def find_turtles():
+        return [command for command in COMMANDS if has_turtle(command[0])]
 
-    topic, type_name = (wait(heard, PATIENCE, node) or COMMANDS)[0]
+    turtles = wait(find_turtles, TURTLE_TIMEOUT, node) or COMMANDS
+    topic, type_name = turtles[0]
     node.log(f'drives {node.ros.resolve_name(topic)} ({type_name})')
     return topic, type_name
 
 
 def fill(message, linear, angular):
-    """Make the message a command to drive at so many metres and radians a second."""
+    """Fill in the speeds of a command: metres and radians in one second."""
     if message._type == TWIST:
-        message.linear.x, message.angular.z = linear, angular
+        message.linear.x = linear
+        message.angular.z = angular
     else:
-        message.linear, message.angular = linear, angular
+        message.linear = linear
+        message.angular = angular
 
 
 def parser_of(description):
-    """Return the parser of a program whose options are keywords of ``Master.create``."""
+    """Return a parser of options that are keywords of ``Master.create``."""
     parser = argparse.ArgumentParser(
         description=description,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -58,12 +62,12 @@ def parser_of(description):
 
 
 def options_of(parser):
-    """Return what the command line says, as keywords of ``Master.create``."""
+    """Return the options of the command line, as keywords of ``Master.create``."""
     return {'argv': sys.argv, **vars(parser.parse_args(rospy.myargv()[1:]))}
 
 
 def run(main):
-    """Run the ``main`` of a program; what is wrong is told in one line, with the status 1."""
+    """Run the ``main`` of a program; an error of ours ends it with one line and the status 1."""
     try:
         main()
     except KeyboardInterrupt:

@@ -1,4 +1,4 @@
-"""The command ``pharos``, which runs the commands of this package if rosrun does not find it.
+"""The command ``pharos``, which runs the commands of this package without rosrun.
 
 usage: pharos COMMAND [ARGUMENT ...]
        pharos --version
@@ -6,30 +6,64 @@ usage: pharos COMMAND [ARGUMENT ...]
   workspace       a session in IPython, with the live graph at hand
   compose         run the Python nodes of a launch file in one process
   top             a live table of nodes, processes and topics
-  graph           who talks to whom, as text or as a picture
+  graph           the nodes, topics and links, as text or as a picture
   create_package  make a catkin package with nodes and tests
 
-'pharos COMMAND --help' tells the arguments of one.
+'pharos COMMAND --help' tells the arguments of a command.
 """
+import argparse
 import importlib
+import inspect
+import os
+import re
 import sys
+from typing import Callable
+
+import rosgraph
+import rospkg
 
 import pharos
 
-MODULES = {
-    'workspace': 'pharos.live.workspace',
-    'compose': 'pharos.commands.compose',
-    'top': 'pharos.live.top',
-    'graph': 'pharos.live.graph',
-    'create_package': 'pharos.commands.create_package',
-}
+#: each is a function of its name in the module of its name; compose has a main(), for its status
+COMMANDS = 'workspace', 'compose', 'top', 'graph', 'create_package'
 
 
-def main():
-    """Run the command that the first argument names; returns its exit status."""
-    command = sys.argv[1] if sys.argv[1:] else '--help'
-    if command in MODULES:
-        sys.argv[:2] = [f'pharos {command}']
-        return importlib.import_module(MODULES[command]).main()
-    print(f'pharos {pharos.__version__}' if command == '--version' else __doc__)
-    return not command.startswith('-')
+def main() -> int:
+    """Run the command that the first argument names, and return the exit status."""
+    name = sys.argv[1] if sys.argv[1:] else '--help'
+    if name == '--version':
+        print(f'pharos {pharos.__version__}')
+        return 0
+    if name not in COMMANDS:
+        print(__doc__)
+        return 0 if name.startswith('-') else 1
+    sys.argv[:2] = [f'pharos {name}']
+    module = importlib.import_module(f'pharos.commands.{name}')
+    if name == 'compose':
+        return module.main()
+    return run_command(getattr(module, name))
+
+
+def argument_parser(command: Callable[[list[str]], None]) -> argparse.ArgumentParser:
+    """Return a parser of arguments; the docstring of the command is its help."""
+    return argparse.ArgumentParser(
+        description=inspect.getdoc(command), formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+
+
+def run_command(command: Callable[[list[str]], None]) -> int:
+    """Run a command with the program's arguments, and return the exit status.
+
+    Remappings of ROS are not passed on. An error that the user can mend is printed in one line.
+    """
+    try:
+        command(rosgraph.myargv()[1:])
+        sys.stdout.flush()
+    except BrokenPipeError:  # by `| head`; the exit of Python flushes once more
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (pharos.PharosError, ValueError, OSError, re.error, rospkg.ResourceNotFound) as error:
+        print(f'{command.__name__}: {error}', file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:  # the usual end of a command that runs on
+        pass
+    return 0

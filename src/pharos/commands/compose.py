@@ -11,6 +11,7 @@ compose __name:=talker` loads one more. It ends when all nodes have ended, or by
 """
 import argparse
 import contextlib
+import functools
 import os
 import sys
 
@@ -72,11 +73,13 @@ def _run(stack, options, mappings):
         os.environ['ROS_MASTER_URI'] = stack.enter_context(Master.embedded(port)).url
     composition = Composition(master)
     ros_arguments = [each for each in mappings if each.startswith('_') or not options.file]
-    settings = {'argv': ros_arguments, 'composition': composition}
+    create = functools.partial(
+        master.create, Container, argv=ros_arguments, composition=composition
+    )
     try:
-        container = master.create(Container, 'compose', **settings)
+        container = create(named='compose')
     except NodeNameInUseError:
-        container = master.create(Container, anonymous_name('compose'), **settings)
+        container = create(named=anonymous_name('compose'))
     stack.enter_context(container)
     stack.enter_context(composition)
     if options.file:

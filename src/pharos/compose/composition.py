@@ -120,7 +120,9 @@ class Composition:
         """
         node = ScriptNode.__new__(ScriptNode)
         node._configure(Settings(name, self.master, None, (0, 0), ()), None, None)
-        node.__init__(path, arguments, None, roslaunch_node.env_args if roslaunch_node else ())
+        ScriptNode.__init__(
+            node, path, arguments, None, roslaunch_node.env_args if roslaunch_node else ()
+        )
         node.init_timeout = INIT_LIMIT
         node.roslaunch_node = roslaunch_node
         self.nodes.append(node)
@@ -156,7 +158,7 @@ class Composition:
                 return
             if node.lifecycle is Lifecycle.STOPPED:
                 self._look_at_ended(node)
-        if self._is_process_required and self.process.poll() is not None:  # all of it has ended
+        if self._is_process_required and self.process and self.process.poll() is not None:
             self._end('a node in a process of its own')
 
     def _look_at_ended(self, node):

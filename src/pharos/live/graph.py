@@ -1,7 +1,9 @@
-"""Show the graph of a master: who sends what to whom, their processes, and how."""
+"""Draw the graph of a master: nodes in their processes, topics, and the links between them."""
+from __future__ import annotations
+
 import collections
 import dataclasses
-import json
+import os
 import pathlib
 import re
 import subprocess
@@ -9,30 +11,32 @@ import time
 from typing import Any, NamedTuple
 from xml.sax.saxutils import escape
 
-from pharos import live
 from pharos.errors import PharosError
-from pharos.live import snapshot
-from pharos.live.words import number
+from pharos.live.snapshot import Snapshot, take_snapshot, topic_rates
+from pharos.live.text_format import short_number
 from pharos.master import Master
 
-FORMATS = '.svg', '.png', '.pdf', '.dot'
-#: what every node has
-COMMON = re.compile(
+SUFFIXES = '.svg', '.png', '.pdf', '.dot'
+DRAW_TIMEOUT = 60  # seconds that graphviz has for a picture
+#: the topics and services that every node has
+COMMON_NAMES = re.compile(
     r'/(rosout|rosout_agg|statistics|clock)|.*/(parameter_updates|parameter_descriptions|get_loggers'
     r'|set_logger_level|set_parameters|pharos_looks_.*)'
 )
-#: transport -> how its arrows look
-ARROWS = {
+#: transport -> the style of its arrows
+ARROW_STYLES = {
     'INTRAPROCESS': 'color="#0072B2", penwidth=2.6',
     'TCPROS': 'color="#D55E00", penwidth=1.2, style=dashed',
     'UDPROS': 'color="#009E73", penwidth=1.2, style=dotted',
-    '': 'color="#8A8A8A", style=dotted, arrowhead=empty',
 }
+LOOSE_STYLE = 'color="#8A8A8A", style=dotted, arrowhead=empty'  # of arrows without a connection
 LEGEND = 'blue: INTRAPROCESS, no socket; red: TCPROS; grey: not connected; frames: processes'
-NODE = 'shape=box, style="rounded,filled", fillcolor="{}"'
-TOPIC = 'shape=box, style=filled, fillcolor="#FFF6D5"'
-SERVICE = 'shape=cds, style=filled, fillcolor="#DDF3E8"'
-GRAY = 'style="rounded,filled"; color="#9AA5B1"; fillcolor="#F5F7F9"'
+NODE_STYLE = 'shape=box, style="rounded,filled", fillcolor="#D9EAF7"'
+DEAD_NODE_STYLE = 'shape=box, style="rounded,filled", fillcolor="#EEEEEE"'
+TOPIC_STYLE = 'shape=box, style=filled, fillcolor="#FFF6D5"'
+SERVICE_STYLE = 'shape=cds, style=filled, fillcolor="#DDF3E8"'
+FRAME_STYLE = 'style="rounded,filled"; color="#9AA5B1"; fillcolor="#F5F7F9"'
+NO_NAME = '(?!)'  # a regular expression that matches nothing
 
 
 class Edge(NamedTuple):
@@ -40,145 +44,202 @@ class Edge(NamedTuple):
 
     start: str
     end: str
-    is_incoming: bool  # True if it ends at a node
-    transports: tuple[str, ...]  # none if nothing is connected
+    is_incoming: bool  # True if the arrow ends at the node
+    transports: tuple[str, ...]  # empty if nothing is connected
 
-    node = property(lambda self: self[self.is_incoming])
-    topic = property(lambda self: self[not self.is_incoming])
+    @property
+    def node(self) -> str:
+        """The name of the node."""
+        return self.end if self.is_incoming else self.start
+
+    @property
+    def topic(self) -> str:
+        """The name of the topic."""
+        return self.start if self.is_incoming else self.end
 
 
 class Graph:
-    """A graph; made by :meth:`Master.graph`.
+    """The graph of a master; :meth:`Master.graph` makes one.
 
-    :ivar nodes: ``{name: what was seen of it}``
+    :ivar nodes: ``{name: NodeReport}``
     :ivar topics: ``{name: type}``
     :ivar edges: the arrows, each an :class:`Edge`
-    :ivar rates: ``{topic: messages a second}``, if that was measured
+    :ivar rates: ``{topic: messages a second}``, empty if they were not measured
     """
 
-    def __init__(self, seen, rates, show_all=False, services=False, only='', hide='(?!)'):
-        def is_shown(name):
-            is_wanted = re.search(only, name) and not re.search(hide, name)
-            return bool(is_wanted and (show_all or not COMMON.fullmatch(name)))
+    def __init__(
+        self,
+        snapshot: Snapshot,
+        rates: dict[str, float],
+        show_all: bool = False,
+        show_services: bool = False,
+        only: str = '',
+        hide: str = NO_NAME,
+    ):
+        def is_visible(name):
+            if re.search(hide, name):
+                return False
+            if COMMON_NAMES.fullmatch(name) and not show_all:
+                return False
+            return bool(re.search(only, name))
 
-        self.snapshot, self.rates = seen, rates
-        self.nodes = {name: node for name, node in seen.nodes.items() if is_shown(name)}
+        self.snapshot = snapshot
+        self.rates = rates
+        self.nodes = {name: node for name, node in snapshot.nodes.items() if is_visible(name)}
         self.edges: list[Edge] = []
-        carried = collections.defaultdict(set)
-        for link in seen.links:
-            carried[link.topic, link.publisher, False].add(link.transport)
-            carried[link.topic, link.subscriber, True].add(link.transport)
+        self.services: dict[str, str] = {}  # name -> node
         for name, node in self.nodes.items():
-            for topics, is_incoming in (node.publishes, False), (node.subscribes, True):
-                for topic in filter(is_shown, topics):
-                    ends = (topic, name) if is_incoming else (name, topic)
-                    by = tuple(sorted(carried[topic, name, is_incoming]))
-                    self.edges.append(Edge(*ends, is_incoming, by))
-        used = {edge.topic for edge in self.edges}
-        self.topics = {name: kind for name, kind in seen.topics.items() if name in used}
-        shown = self.nodes.items() if services else ()
-        self.services = {
-            each: name for name, node in shown for each in filter(is_shown, node.offers)
-        }
+            for topic in filter(is_visible, node.publishes):
+                self.edges.append(Edge(name, topic, False, self._transports(name, topic, False)))
+            for topic in filter(is_visible, node.subscribes):
+                self.edges.append(Edge(topic, name, True, self._transports(name, topic, True)))
+            if show_services:
+                self.services.update((service, name) for service in filter(is_visible, node.offers))
+        edge_topics = {edge.topic for edge in self.edges}
+        self.topics = {name: snapshot.topics[name] for name in sorted(edge_topics)}
 
-    def processes(self):
-        """Return ``{(host, process id): the names of its nodes}``."""
-        found = collections.defaultdict(list)
-        for name, node in self.nodes.items():
-            found[node.host, node.pid or f'of {name}'].append(name)
-        return found
+    def _transports(self, node_name, topic, is_incoming):
+        links = self.snapshot.links_of(node_name, topic, is_incoming)
+        return tuple(sorted({link.transport for link in links}))
 
-    def _about(self, topic):
+    def processes(self) -> dict[tuple[str, Any], list[str]]:
+        """Return ``{(host, process id): names of nodes}``."""
+        processes = collections.defaultdict(list)
+        for name in self.nodes:
+            processes[self._process_of(name)].append(name)
+        return processes
+
+    def _process_of(self, name):
+        """Return ``(host, process id)``; a node that does not tell it counts as a process."""
+        node = self.nodes[name]
+        if node.pid is None:
+            return node.host, f'of {name}'
+        return node.host, node.pid
+
+    def _topic_label(self, topic):
+        """Return the type of a topic, and the rate if one was measured."""
+        label = self.topics[topic] or 'type unknown'
         rate = self.rates.get(topic)
-        return (self.topics[topic] or 'type unknown') + (f', {number(rate)} Hz' if rate else '')
+        if rate:
+            label += f', {short_number(rate)} Hz'
+        return label
+
+    # -- as text
 
     def text(self) -> str:
-        """Return the graph for a terminal: each node with what it sends, receives and offers."""
-        return '\n'.join(self._lines())
+        """Return the graph for a terminal: each node with its topics, peers and services."""
+        return '\n'.join(self._text_lines())
 
-    def _lines(self):
+    def _text_lines(self):
         yield f'{self.snapshot.master}: {len(self.nodes)} nodes, {len(self.topics)} topics'
-        for (host, pid), names in self.processes().items():
-            yield f'process {pid}, {host}'
+        for (host, process_id), names in self.processes().items():
+            yield f'process {process_id}, {host}'
             for name in names:
                 yield f'  {name}  {self.nodes[name].problem}'
                 for edge in self.edges:
-                    if name == edge.node:
-                        yield self._line(edge, name)
-                for service, node in self.services.items():
-                    if node == name:
+                    if edge.node == name:
+                        yield self._edge_text(edge)
+                for service, node_name in self.services.items():
+                    if node_name == name:
                         yield f'    offers {service}'
 
-    def _line(self, edge, name):
-        topic, own, peer = (edge.start, 2, 1) if edge.is_incoming else (edge.end, 1, 2)
-        links = [each for each in self.snapshot.links if each.topic == topic and each[own] == name]
-        peers = ', '.join(f'{link[peer]} ({link.transport})' for link in links) or 'not connected'
-        return f'    {"<-" if edge.is_incoming else "->"} {topic}  {self._about(topic)}  {peers}'
+    def _edge_text(self, edge):
+        links = self.snapshot.links_of(edge.node, edge.topic, edge.is_incoming)
+        peers = [f'{link.peer_of(edge.node)} ({link.transport})' for link in links]
+        peer_text = ', '.join(peers) or 'not connected'
+        arrow = '<-' if edge.is_incoming else '->'
+        return f'    {arrow} {edge.topic}  {self._topic_label(edge.topic)}  {peer_text}'
+
+    # -- as a picture
 
     def dot(self) -> str:
-        """Return the graph in graphviz's language."""
-        return '\n'.join(self._dot())
+        """Return the graph in the language of graphviz."""
+        return '\n'.join(self._dot_lines())
 
-    def _dot(self):
-        at = time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(self.snapshot.time))
+    def _dot_lines(self):
+        clock_time = time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(self.snapshot.time))
         yield 'digraph pharos { rankdir=LR; newrank=true; ranksep=0.4; nodesep=0.14; nslimit=2'
         yield 'node [fontname="Helvetica", fontsize=11, height=0.3]; edge [arrowsize=0.7]'
-        yield f'label="{self.snapshot.master}, {at}\\n{LEGEND}"; labeljust=l; fontsize=10'
-        homes = {name: home for home, names in self.processes().items() for name in names}
-        inside = collections.defaultdict(list)
-        for name, node in self.nodes.items():
-            look = NODE.format('#EEEEEE' if node.problem else '#D9EAF7')
-            about = 'does not answer' if node.problem else ''
-            inside[homes[name]].append(_box('n', name, about, look))
-        for topic in self.topics:  # beside its publishers, or else its subscribers
-            edges = [edge for edge in self.edges if topic == edge.topic]
-            senders = {homes[edge.start] for edge in edges if not edge.is_incoming}
-            own = senders or {homes[edge.end] for edge in edges}
-            home = own.pop() if len(own) == 1 else None
-            inside[home].append(_box('t', topic, self._about(topic), TOPIC))
-        for service, name in self.services.items():
-            inside[homes[name]].append(_box('s', service, '', SERVICE))
-            inside[None].append(f'{_id("n", name)} -> {_id("s", service)} [arrowhead=none]')
-        yield from inside.pop(None, ())
-        for home, lines in inside.items():
-            yield f'subgraph {_id("cluster", str(home))} {{ label="process {home[1]}, {home[0]}"'
-            yield from (f'labeljust=l; fontsize=10; {GRAY}', *lines, '}')
+        yield f'label="{self.snapshot.master}, {clock_time}\\n{LEGEND}"; labeljust=l; fontsize=10'
+        for process, boxes in self._boxes_by_process().items():
+            if process is None:
+                yield from boxes
+            else:
+                host, process_id = process
+                frame_id = _dot_id('cluster', str(process))
+                yield f'subgraph {frame_id} {{ label="process {process_id}, {host}"'
+                yield f'labeljust=l; fontsize=10; {FRAME_STYLE}'
+                yield from boxes
+                yield '}'
         for edge in self.edges:
-            kinds = ('t', 'n') if edge.is_incoming else ('n', 't')
-            for transport in edge.transports or ('',):
-                arrow = ARROWS[transport]
-                yield f'{_id(kinds[0], edge.start)} -> {_id(kinds[1], edge.end)} [{arrow}]'
+            node_id = _dot_id('n', edge.node)
+            topic_id = _dot_id('t', edge.topic)
+            arrow = f'{topic_id} -> {node_id}' if edge.is_incoming else f'{node_id} -> {topic_id}'
+            for transport in edge.transports:
+                yield f'{arrow} [{ARROW_STYLES[transport]}]'
+            if not edge.transports:
+                yield f'{arrow} [{LOOSE_STYLE}]'
         yield '}'
 
-    def save(self, path: Any) -> None:
-        """Write the picture to a file, whose suffix says how: .svg, .png, .pdf or .dot.
+    def _boxes_by_process(self):
+        """Return ``{(host, process id): lines}``; the lines of None are outside all frames."""
+        boxes: dict[Any, list[str]] = {None: []}
+        for process in self.processes():
+            boxes[process] = []
+        for name, node in self.nodes.items():
+            if node.problem:
+                box = _dot_box('n', name, 'does not answer', DEAD_NODE_STYLE)
+            else:
+                box = _dot_box('n', name, '', NODE_STYLE)
+            boxes[self._process_of(name)].append(box)
+        for topic in self.topics:
+            box = _dot_box('t', topic, self._topic_label(topic), TOPIC_STYLE)
+            boxes[self._topic_process(topic)].append(box)
+        for service, name in self.services.items():
+            boxes[self._process_of(name)].append(_dot_box('s', service, '', SERVICE_STYLE))
+            boxes[None].append(f'{_dot_id("n", name)} -> {_dot_id("s", service)} [arrowhead=none]')
+        return boxes
 
-        :raises ValueError: if it has another suffix
-        :raises PharosError: if graphviz is not installed, or does not draw it
+    def _topic_process(self, topic):
+        """Return the process of the publishers, or else of the subscribers; None if of several."""
+        edges = [edge for edge in self.edges if edge.topic == topic]
+        output_edges = [edge for edge in edges if not edge.is_incoming]
+        processes = {self._process_of(edge.node) for edge in output_edges or edges}
+        return processes.pop() if len(processes) == 1 else None
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a picture to a file; the suffix tells the format: .svg, .png, .pdf or .dot.
+
+        :raises ValueError: if the suffix is another one
+        :raises PharosError: if graphviz is not installed, or fails
         """
-        path = pathlib.Path(path)
-        if path.suffix not in FORMATS:
+        file = pathlib.Path(path)
+        if file.suffix not in SUFFIXES:
             raise ValueError(
-                f'{path} is not a picture: its name ends in one of {", ".join(FORMATS)}'
+                f'{file} is not a picture: its name ends in one of {", ".join(SUFFIXES)}'
             )
-        is_dot = path.suffix == '.dot'
-        path.write_bytes(self.dot().encode() if is_dot else self._draw(path.suffix[1:]))
+        if file.suffix == '.dot':
+            file.write_bytes(self.dot().encode())
+        else:
+            file.write_bytes(self._draw(file.suffix[1:]))
 
-    def _draw(self, kind):
-        options = {'input': self.dot().encode(), 'stdout': subprocess.PIPE, 'timeout': 60}
+    def _draw(self, picture_format):
+        """Return the bytes of a picture that graphviz draws."""
+        command = ['dot', f'-T{picture_format}']
+        source = self.dot().encode()
         try:
-            return subprocess.run(['dot', f'-T{kind}'], check=True, **options).stdout
+            return subprocess.check_output(command, input=source, timeout=DRAW_TIMEOUT)
         except (OSError, subprocess.SubprocessError) as error:
             raise PharosError(f'{error}: apt install graphviz, or leave out nodes') from error
 
     def _repr_svg_(self):
         return self._draw('svg').decode()
 
-    def as_dict(self):
-        """Return it as plain values, for JSON."""
+    def as_dict(self) -> dict[str, Any]:
+        """Return the graph as plain values, for JSON."""
         nodes = {name: dataclasses.asdict(node) for name, node in self.nodes.items()}
         for node in nodes.values():
-            del node['ends']
+            del node['links']  # JSON has no keys for them; the edges tell the same
         edges = [edge._asdict() for edge in self.edges]
         return {'nodes': nodes, 'topics': self.topics, 'edges': edges, 'rates': self.rates}
 
@@ -186,51 +247,31 @@ class Graph:
         return f'<Graph of {len(self.nodes)} nodes: see text() and save()>'
 
 
-def _id(kind, name):
-    return f'"{kind} {name}"'
+def _dot_id(prefix, name):
+    """Return an id for graphviz; the prefix tells nodes, topics and services of one name apart."""
+    return f'"{prefix} {name}"'
 
 
-def _box(kind, name, about, look):
-    """Return a node, topic or service: its name, and something about it in small letters."""
-    small = f'<br/><font point-size="9" color="#505050">{escape(about)}</font>' if about else ''
-    bold = f'<b>{escape(name)}</b>' if kind == 'n' else escape(name)
-    return f'{_id(kind, name)} [{look}, label=<{bold}{small}>]'
+def _dot_box(prefix, name, caption, style):
+    """Return the box of a node, topic or service, with a caption in small letters."""
+    label = escape(name)
+    if prefix == 'n':
+        label = f'<b>{label}</b>'
+    if caption:
+        label += f'<br/><font point-size="9" color="#505050">{escape(caption)}</font>'
+    return f'{_dot_id(prefix, name)} [{style}, label=<{label}>]'
 
 
-def graph_of(master, seconds=0, **options):
-    """Do what :meth:`Master.graph` does."""
-    before = seen = snapshot.take(master)
-    if seconds:
-        time.sleep(seconds)
-        seen = snapshot.take(master)
-    return Graph(seen, snapshot.topic_rates(before, seen), **options)
+def graph_of(master: Master, seconds: float = 0, **options: Any) -> Graph:
+    """Return the graph of :meth:`Master.graph`; the options are keywords of :class:`Graph`.
 
-
-def graph(words):
-    """Show the graph of the ROS master: processes, nodes, topics, and how messages go.
-
-    graph                            as text
-    graph --output graph.svg         as a picture: .svg, .png, .pdf (by graphviz) or .dot
-    graph --rates 2 --hide '/tf'     with how often messages come, and without some names
-    watch -n1 rosrun pharos graph    again and again
+    :param seconds: how long messages are counted, for rates; 0: no rates
+    :raises MasterUnreachableError: if the master does not answer
     """
-    read = live.parser(graph.__doc__)
-    read.add_argument('-o', '--output', metavar='FILE', help='a picture, instead of text')
-    read.add_argument('--json', action='store_true', help='JSON, instead of text')
-    read.add_argument('--all', action='store_true', help='also what all have, such as /rosout')
-    read.add_argument('--services', action='store_true', help='services, too')
-    read.add_argument('--only', default='', metavar='REGEX', help='of the names, those alone')
-    read.add_argument('--hide', default='(?!)', metavar='REGEX', help='of the names, not those')
-    read.add_argument('--rates', type=float, default=0, metavar='S', help='count messages so long')
-    chosen = read.parse_args(words)
-    which = {'show_all': chosen.all, 'only': chosen.only, 'hide': chosen.hide}
-    found = graph_of(Master(), chosen.rates, services=chosen.services, **which)
-    if chosen.output:
-        found.save(chosen.output)
-    else:
-        print(json.dumps(found.as_dict()) if chosen.json else found.text())
-
-
-def main():
-    """Run the command."""
-    return live.run(graph)
+    start = take_snapshot(master)
+    if not seconds:
+        return Graph(start, {}, **options)
+    time.sleep(seconds)
+    snapshot = take_snapshot(master)
+    rates = topic_rates(snapshot.rates_since(start), 'messages')
+    return Graph(snapshot, rates, **options)

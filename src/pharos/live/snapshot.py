@@ -1,146 +1,198 @@
-"""Take one look at the graph of a master: nodes, topics, services, connections and their counts."""
+"""Take a snapshot of a master and its nodes: topics, services, links and their traffic."""
+from __future__ import annotations
+
 import collections
 import concurrent.futures
-import dataclasses
 import time
 import urllib.parse
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import rosgraph.network
 
-from pharos.private_rospy.run import ServerProxy
+from pharos.master import CALLER_ID, Master
+from pharos.private_rospy.run import Run, ServerProxy
 
-TIMEOUT = 1.0  # seconds that a node has for each answer
-THREADS = 50  # nodes that are asked at once
+NODE_TIMEOUT = 1.0  # seconds that a node has for each answer
+MAX_THREADS = 50  # nodes that are asked at once
+LOCAL_HOST = 'here'  # stands for every address of this host
+#: the lists of a NodeReport, in the order of the master's getSystemState
+REGISTRIES = 'publishes', 'subscribes', 'offers'
 
 
 class Link(NamedTuple):
     """A connection from one node to another."""
 
     topic: str
-    publisher: str  # the name of a node; its URI if the master knows none there
+    publisher: str  # a node's name, or its URI if the master knows no node there
     subscriber: str
     transport: str  # 'INTRAPROCESS', 'TCPROS' or 'UDPROS'
 
+    def peer_of(self, node_name: str) -> str:
+        """Return the name of the node at the other end."""
+        return self.publisher if node_name == self.subscriber else self.subscriber
 
-@dataclasses.dataclass
-class SeenNode:
-    """A node, and what it says of itself."""
+
+class Traffic(NamedTuple):
+    """The messages and bytes of a link: in all, or as rates in one second."""
+
+    messages: float = 0
+    bytes: float = 0
+
+
+@dataclass
+class NodeReport:
+    """A node, as the master and the node itself report it."""
 
     name: str
     uri: str = ''
     host: str = ''
-    pid: int | None = None  # None: it does not say
-    problem: str = ''  # why it does not answer
-    #: messages and bytes of its connections: (is incoming, topic, other end, transport) -> both
-    ends: dict[tuple, tuple[int, int]] = dataclasses.field(default_factory=dict)
-    health: dict[str, Any] = dataclasses.field(default_factory=dict)  # nodes of pharos tell it
-    publishes: list[str] = dataclasses.field(default_factory=list)
-    subscribes: list[str] = dataclasses.field(default_factory=list)
-    offers: list[str] = dataclasses.field(default_factory=list)
+    pid: int | None = None  # None: unknown
+    problem: str = ''  # the reason why the node does not answer
+    links: dict[Link, Traffic] = field(default_factory=dict)  # publishers are URIs
+    health: dict[str, Any] = field(default_factory=dict)  # empty: no node of pharos
+    publishes: list[str] = field(default_factory=list)
+    subscribes: list[str] = field(default_factory=list)
+    offers: list[str] = field(default_factory=list)
 
 
-@dataclasses.dataclass
+@dataclass
 class Snapshot:
-    """The graph of a master at a time."""
+    """The nodes, topics and links of a master at one time."""
 
     master: str  # its URL
     time: float  # seconds, as of time.time()
-    nodes: dict[str, SeenNode]
-    topics: dict[str, str]  # and their types; '' if nobody has named it
-    links: dict[Link, tuple[int, int]]  # messages and bytes so far
+    nodes: dict[str, NodeReport]
+    topics: dict[str, str]  # name -> type, '' if the master knows none
+    links: dict[Link, Traffic]  # traffic since the links began
 
-    def rates_since(self, before):
-        """Return messages and bytes a second of the connections that both have."""
-        seconds, rates = self.time - before.time, {}
-        for link, now in self.links.items():
-            then = before.links.get(link)
-            if then and now[0] >= then[0]:
-                rates[link] = (now[0] - then[0]) / seconds, (now[1] - then[1]) % 2**32 / seconds
+    def rates_since(self, start: Snapshot) -> dict[Link, Traffic]:
+        """Return the messages and bytes in one second of the links that both snapshots have."""
+        seconds = self.time - start.time
+        rates = {}
+        for link, traffic in self.links.items():
+            old_traffic = start.links.get(link)
+            # A link that counts fewer messages than before is a new one.
+            if old_traffic and traffic.messages >= old_traffic.messages:
+                message_count = traffic.messages - old_traffic.messages
+                byte_count = (traffic.bytes - old_traffic.bytes) % 2**32  # XML-RPC has 32 bits
+                rates[link] = Traffic(message_count / seconds, byte_count / seconds)
         return rates
 
+    def links_of(self, node_name: str, topic: str, is_incoming: bool) -> list[Link]:
+        """Return the links of a topic that end at a node, or else those that begin there."""
+        links = [link for link in self.links if link.topic == topic]
+        if is_incoming:
+            return [link for link in links if link.subscriber == node_name]
+        return [link for link in links if link.publisher == node_name]
 
-def take(master):
-    """Ask the master, and all nodes at once.
+
+def take_snapshot(master: Master) -> Snapshot:
+    """Ask the master, then all nodes at once.
 
     :raises MasterUnreachableError: if the master does not answer
     """
-    nodes: dict[str, SeenNode] = {}
-    types = dict(master.call('getTopicTypes'))
-    for kind, uses in zip(('publishes', 'subscribes', 'offers'), master.system_state()):
-        for what, users in sorted(uses.items()):
-            for name in sorted(set(users)):
-                getattr(nodes.setdefault(name, SeenNode(name)), kind).append(what)
-    topics = {topic for node in nodes.values() for topic in (*node.publishes, *node.subscribes)}
-    with concurrent.futures.ThreadPoolExecutor(THREADS) as pool:
-        list(pool.map(lambda node: _ask(master, node), nodes.values()))
-    seen = {topic: types.get(topic, '').replace('*', '') for topic in sorted(topics)}
-    return Snapshot(master.url, time.time(), dict(sorted(nodes.items())), seen, _links(nodes))
+    topic_types = dict(master.call('getTopicTypes'))
+    nodes: dict[str, NodeReport] = {}
+    topics: set[str] = set()
+    for registry, registrations in zip(REGISTRIES, master.system_state()):
+        for name, users in sorted(registrations.items()):
+            for user in sorted(set(users)):
+                node = nodes.setdefault(user, NodeReport(user))
+                getattr(node, registry).append(name)
+    for node in nodes.values():
+        topics.update(node.publishes, node.subscribes)
+    with concurrent.futures.ThreadPoolExecutor(MAX_THREADS) as pool:
+        list(pool.map(lambda node: _ask_node(master, node), nodes.values()))
+    # The master tells '*' if the topic has only subscribers, of any type.
+    types = {topic: topic_types.get(topic, '').replace('*', '') for topic in sorted(topics)}
+    links = _merge_links(nodes.values())
+    return Snapshot(master.url, time.time(), dict(sorted(nodes.items())), types, links)
 
 
-def _ask(master, node):
-    """Fill in what a node says of itself."""
+def _ask_node(master, node):
+    """Fill in the address, process, links and health of a node."""
     try:
         node.uri = master.call('lookupNode', node.name) or ''
         node.host = urllib.parse.urlsplit(node.uri).hostname or ''
         if rosgraph.network.is_local_address(node.host):
-            node.host = 'here'
-        api = ServerProxy(node.uri, TIMEOUT)
-        node.pid = int(api.getPid('/pharos')[2])
-        answer = api.getBusStats('/pharos')
-        published, subscribed, *_ = answer[2] if answer[0] == 1 else answer  # roscpp has no code
-        counts = {}  # as rospy's and roscpp's rows have them
-        for topic, *_, rows in published:  # rospy has a count of bytes between them
-            counts.update({(False, topic, row[0]): (row[-2], row[1]) for row in rows})
-        for topic, rows in subscribed:
-            counts.update({(True, topic, row[0]): (row[2], row[1]) for row in rows})
-        for number, other, direction, transport, topic, *_ in api.getBusInfo('/pharos')[2]:
+            node.host = LOCAL_HOST
+        proxy: Any = ServerProxy(node.uri, NODE_TIMEOUT)
+        node.pid = int(proxy.getPid(CALLER_ID)[2])
+        traffic = _traffic_counts(proxy.getBusStats(CALLER_ID))
+        for number, peer, direction, transport, topic, *_ in proxy.getBusInfo(CALLER_ID)[2]:
             is_incoming = direction == 'i'
-            found = counts.get((is_incoming, topic, number), (0, 0))
-            node.ends[is_incoming, topic, other, transport] = found
-        node.health = api.pharosHealth('/pharos')[2]
-    except Exception as error:  # whatever it answers, it is one of many
-        if 'pharosHealth' not in str(error):  # else it is not a node of pharos
+            if is_incoming:
+                link = Link(topic, peer, node.name, transport)
+            else:
+                link = Link(topic, node.name, peer, transport)
+            node.links[link] = traffic.get((is_incoming, topic, number), Traffic())
+        node.health = proxy.pharosHealth(CALLER_ID)[2]
+    except Exception as error:  # a node with a problem must not hide the others
+        if 'pharosHealth' not in str(error):  # only nodes of pharos have this method
             node.problem = str(error)
 
 
-def health_facts(run):
+def _traffic_counts(answer):
+    """Return ``{(is incoming, topic, number of the connection): Traffic}`` from getBusStats."""
+    has_code = answer[0] == 1  # roscpp leaves out code and message
+    publications, subscriptions, *_ = answer[2] if has_code else answer
+    counts = {}
+    for topic, *_, rows in publications:  # rospy has the sum of bytes before the rows
+        for row in rows:  # the count of messages is third in rospy's rows, fourth in roscpp's
+            counts[False, topic, row[0]] = Traffic(row[-2], row[1])
+    for topic, rows in subscriptions:
+        for number, byte_count, message_count, *_ in rows:
+            counts[True, topic, number] = Traffic(message_count, byte_count)
+    return counts
+
+
+def _merge_links(nodes):
+    """Return the links that one end at least reports, with the greater traffic of both.
+
+    A publisher reports the name of the other end, a subscriber the URI.
+    """
+    names = {node.uri: node.name for node in nodes}
+    links: dict[Link, Traffic] = {}
+    for node in nodes:
+        for link, traffic in node.links.items():
+            publisher = names.get(link.publisher, link.publisher)
+            subscriber = names.get(link.subscriber, link.subscriber)
+            merged_link = Link(link.topic, publisher, subscriber, link.transport)
+            links[merged_link] = max(links.get(merged_link, Traffic()), traffic)
+    return links
+
+
+def publisher_rates(link_rates: dict[Link, Traffic], unit: str) -> dict[tuple, float]:
+    """Return ``{(topic, publisher): rate}``, the rate of the publisher's fastest link.
+
+    :param unit: 'messages' or 'bytes'
+    """
+    rates: dict[tuple, float] = {}
+    for link, traffic in link_rates.items():
+        key = link.topic, link.publisher
+        rates[key] = max(rates.get(key, 0.0), getattr(traffic, unit))
+    return rates
+
+
+def topic_rates(link_rates: dict[Link, Traffic], unit: str) -> dict[str, float]:
+    """Return ``{topic: rate}``, the sum of the topic's publishers; see :func:`publisher_rates`."""
+    rates: dict[str, float] = {}
+    for (topic, _), rate in publisher_rates(link_rates, unit).items():
+        rates[topic] = rates.get(topic, 0.0) + rate
+    return rates
+
+
+def health_facts(run: Run) -> dict[str, Any]:
     """Return the facts of :meth:`Node.health` that the master is not asked for."""
-    transports = [info[3] for info in run.topics.get_pub_sub_info()]
+    connections = run.topics.get_pub_sub_info()
     ended_souls = [soul.name for soul in run.souls if not soul.is_alive()]
     return {
         'kind': type(run.node).__name__,
-        'connections': dict(collections.Counter(transports)),
+        'connections': dict(collections.Counter(row[3] for row in connections)),
         'dropped': sum(getattr(each, 'dropped', 0) for each in run.open_endpoints(object)),
         'errors': run.failures.total,
         'threads': sum(thread.is_alive() for thread in list(run.threads)),
         'souls': len(run.souls) - len(ended_souls),
         'ended_souls': ended_souls,
     }
-
-
-def _links(nodes):
-    """Return the connections that one end at least tells, with the greater count of both.
-
-    A publisher names the other end by its node, a subscriber by its URI.
-    """
-    names = {node.uri: node.name for node in nodes.values()}
-    links = collections.defaultdict(lambda: (0, 0))
-    for node in nodes.values():
-        for (is_incoming, topic, other, transport), counts in node.ends.items():
-            peer = names.get(other, other)
-            ends = (peer, node.name) if is_incoming else (node.name, peer)
-            link = Link(topic, *ends, transport)
-            links[link] = max(links[link], counts)
-    return dict(links)
-
-
-def topic_rates(before, now, what=0):
-    """Return ``{topic: messages (1: bytes) a second}``: the best connection of each publisher."""
-    best: dict[tuple[str, str], float] = collections.defaultdict(float)
-    for link, rate in now.rates_since(before).items() if now is not before else ():
-        best[link[:2]] = max(best[link[:2]], rate[what])
-    rates: dict[str, float] = collections.defaultdict(float)
-    for (topic, _), most in best.items():
-        rates[topic] += most
-    return dict(rates)

@@ -1,200 +1,210 @@
-"""Show what the nodes, processes and topics of a graph are doing just now: ``rosrun pharos top``.
+"""Measure the nodes, processes and topics of a master, and show them as tables in a terminal.
 
-Nodes count what comes and goes in any case, so that two looks make rates. Nothing is subscribed to.
+Nodes count their messages anyway. Two snapshots give rates, so top subscribes to nothing.
 """
 import collections
-import json
 import os
 import select
 import sys
 import termios
 import time
 import tty
+from typing import Any, Sequence
 
 import psutil
-from rich.console import Console, Group
+from rich.console import Group
 from rich.live import Live
 from rich.table import Table
 
-from pharos import live
 from pharos.errors import MasterUnreachableError
-from pharos.live import snapshot
-from pharos.live.words import number
+from pharos.live.snapshot import LOCAL_HOST, publisher_rates, take_snapshot, topic_rates
+from pharos.live.text_format import short_number
 from pharos.master import Master
 
-VIEWS = 'nodes', 'processes', 'topics'
-KEYS = 'n nodes  p processes  t topics  s sort by the next column  q quit'
-WHOLE = 'NODE', 'TOPIC', 'PID'  # columns that are shown whole, however narrow the terminal is
-BAD = 'DROP', 'FAIL', 'PROBLEM'  # columns in which all but 0 is red
-SUMS = 'IN/S', 'OUT/S', 'IN B/S', 'OUT B/S', 'DROP', 'FAIL'
+VIEWS = {'n': 'nodes', 'p': 'processes', 't': 'topics'}  # key -> view
+KEY_HELP = 'n nodes  p processes  t topics  s sort by the next column  q quit'
+WIDE_COLUMNS = 'NODE', 'TOPIC', 'PID'  # are never cut, however narrow the terminal is
+ALARM_COLUMNS = 'DROP', 'FAIL', 'PROBLEM'  # are red unless the value is 0 or empty
+SUM_COLUMNS = 'IN/S', 'OUT/S', 'IN B/S', 'OUT B/S', 'DROP', 'FAIL'
 
 
 class Meter:
-    """Looks again and again, and tells what has happened since the last time."""
+    """Measures a master: each measurement tells the rates since the one before.
 
-    def __init__(self, master, names=()):
-        self._master, self._names = master, names
-        self._before = snapshot.take(master)
-        self._processes: dict[int, psutil.Process] = {}
+    :param names: parts of names; only nodes and topics that have one of them are measured
+    :raises MasterUnreachableError: if the master does not answer
+    """
 
-    def measure(self):
-        """Return ``{view: rows}``; a row is ``{column: value}``, None if it is not known.
+    def __init__(self, master: Master, names: Sequence[str] = ()):
+        self._master = master
+        self._names = names
+        self._snapshot = take_snapshot(master)
+        self._processes: dict[int, psutil.Process] = {}  # each keeps its last CPU time
+
+    def measure(self) -> dict[str, list[dict[str, Any]]]:
+        """Return ``{view: rows}``; a row is ``{column: value}``, None if the value is unknown.
 
         :raises MasterUnreachableError: if the master does not answer
         """
-        before, self._before = self._before, snapshot.take(self._master)
-        nodes, topics = (
-            [row for row in rows(before, self._before) if self._is_wanted(next(iter(row.values())))]
-            for rows in (_nodes, _topics)
-        )
-        return {'nodes': nodes, 'processes': list(self._by_process(nodes)), 'topics': topics}
+        start = self._snapshot
+        self._snapshot = take_snapshot(self._master)
+        link_rates = self._snapshot.rates_since(start)
+        node_rows = self._select(_node_rows(self._snapshot, link_rates), 'NODE')
+        topic_rows = self._select(_topic_rows(self._snapshot, link_rates), 'TOPIC')
+        process_rows = list(self._process_rows(node_rows))
+        return {'nodes': node_rows, 'processes': process_rows, 'topics': topic_rows}
 
-    def _is_wanted(self, name):
-        return not self._names or any(part in name for part in self._names)
+    def _select(self, rows, column):
+        """Return the rows that have one of the names in a column."""
+        if not self._names:
+            return list(rows)
+        return [row for row in rows if any(name in row[column] for name in self._names)]
 
-    def _by_process(self, nodes):
-        """Yield the sums of each process's nodes, and what the system tells if it is here."""
-        processes = collections.defaultdict(list)
-        for row in nodes:
-            processes[row['HOST'], row['PID'] or row['NODE']].append(row)
-        for (host, pid), rows in processes.items():
-            found = {'PID': pid, 'HOST': host, 'CPU%': None, 'MEM': None, 'THR': None}
-            if host == 'here' and isinstance(pid, int):
-                try:
-                    process = self._processes.setdefault(pid, psutil.Process(pid))
-                    found['CPU%'] = process.cpu_percent()
-                    found['MEM'], found['THR'] = process.memory_info().rss, process.num_threads()
-                except psutil.Error:  # it has ended
-                    pass
-            sums = {column: sum(row[column] or 0 for row in rows) for column in SUMS}
-            yield {**found, **sums, 'NODES': ' '.join(row['NODE'] for row in rows)}
+    def _process_rows(self, node_rows):
+        """Yield the sums of each process's nodes, with the load of processes of this host."""
+        rows_by_process = collections.defaultdict(list)
+        for row in node_rows:
+            process_id = row['PID'] or row['NODE']
+            rows_by_process[row['HOST'], process_id].append(row)
+        for (host, process_id), rows in rows_by_process.items():
+            process_row = {'PID': process_id, 'HOST': host, 'CPU%': None, 'MEM': None, 'THR': None}
+            if host == LOCAL_HOST and isinstance(process_id, int):
+                process_row.update(self._process_load(process_id))
+            for column in SUM_COLUMNS:
+                values = [row[column] for row in rows]
+                process_row[column] = sum(value for value in values if value is not None)
+            process_row['NODES'] = ' '.join(row['NODE'] for row in rows)
+            yield process_row
+
+    def _process_load(self, process_id):
+        try:
+            process = self._processes.setdefault(process_id, psutil.Process(process_id))
+            return {
+                'CPU%': process.cpu_percent(),
+                'MEM': process.memory_info().rss,
+                'THR': process.num_threads(),
+            }
+        except psutil.Error:  # the process has ended
+            return {}
 
 
-def _nodes(before, now):
-    came = collections.defaultdict(lambda: [0, 0])
-    went = collections.defaultdict(dict)
-    sizes = collections.defaultdict(float)
-    for link, (rate, size) in now.rates_since(before).items():
-        came[link.subscriber][0] += rate
-        came[link.subscriber][1] += size
-        sizes[link.publisher] += size
-        sent = went[link.publisher]
-        sent[link.topic] = max(sent.get(link.topic, 0), rate)  # however many receive it
-    for name, node in now.nodes.items():
-        own = [link.transport for link in now.links if name in link[1:3]]
+def _node_rows(snapshot, link_rates):
+    message_rates = publisher_rates(link_rates, 'messages')
+    for name, node in snapshot.nodes.items():
+        input_traffic = [rate for link, rate in link_rates.items() if link.subscriber == name]
+        output_traffic = [rate for link, rate in link_rates.items() if link.publisher == name]
+        output_rates = [rate for (_, sender), rate in message_rates.items() if sender == name]
+        own_links = [link for link in snapshot.links if name in (link.publisher, link.subscriber)]
+        transports = [link.transport for link in own_links]
         yield {
             'NODE': name,
             'CLASS': node.health.get('kind'),
             'HOST': node.host,
             'PID': node.pid,
-            'IN/S': came[name][0],
-            'OUT/S': sum(went[name].values()),
-            'IN B/S': came[name][1],
-            'OUT B/S': sizes[name],
-            'LOCAL': own.count('INTRAPROCESS'),
-            'TCP': own.count('TCPROS'),
+            'IN/S': sum(rate.messages for rate in input_traffic),
+            'OUT/S': sum(output_rates),  # a message counts once, however many nodes receive it
+            'IN B/S': sum(rate.bytes for rate in input_traffic),
+            'OUT B/S': sum(rate.bytes for rate in output_traffic),
+            'LOCAL': transports.count('INTRAPROCESS'),
+            'TCP': transports.count('TCPROS'),
             'DROP': node.health.get('dropped'),
             'FAIL': node.health.get('errors'),
             'PROBLEM': node.problem,
         }
 
 
-def _topics(before, now):
-    rates, sizes = (snapshot.topic_rates(before, now, what) for what in (0, 1))
-    nodes = now.nodes.values()
-    for name, kind in now.topics.items():
-        links = [link.transport for link in now.links if link.topic == name]
+def _topic_rows(snapshot, link_rates):
+    message_rates = topic_rates(link_rates, 'messages')
+    byte_rates = topic_rates(link_rates, 'bytes')
+    nodes = snapshot.nodes.values()
+    for name, topic_type in snapshot.topics.items():
+        transports = [link.transport for link in snapshot.links if link.topic == name]
         yield {
             'TOPIC': name,
-            'TYPE': kind,
-            'HZ': rates.get(name),
-            'B/S': sizes.get(name),
+            'TYPE': topic_type,
+            'HZ': message_rates.get(name),
+            'B/S': byte_rates.get(name),
             'PUB': sum(name in node.publishes for node in nodes),
             'SUB': sum(name in node.subscribes for node in nodes),
-            'LOCAL': links.count('INTRAPROCESS'),
-            'TCP': links.count('TCPROS'),
+            'LOCAL': transports.count('INTRAPROCESS'),
+            'TCP': transports.count('TCPROS'),
         }
 
 
-def table(rows, sort=0):
-    """Return the rows by a column: words by the alphabet, numbers the largest first."""
-    columns = list(rows[0]) if rows else ['nothing there']
-    by = columns[sort % len(columns)]
+def table(rows: list[dict[str, Any]], sort_column: int = 0) -> Table:
+    """Return a table of rows, sorted by a column: texts by the alphabet, numbers from the largest.
 
-    def order(row):
-        value = row[by]
-        return (value, 0) if isinstance(value, str) else ('', -(value or 0))
-
-    made = Table(box=None, padding=(0, 1, 0, 0))
-    for column in columns:
-        is_text = any(isinstance(row[column], str) for row in rows)
-        title = f'[reverse]{column}[/]' if column == by else column
-        no_wrap = column in WHOLE
-        made.add_column(title, justify='left' if is_text else 'right', no_wrap=no_wrap)
-    for row in sorted(rows, key=order):
-        made.add_row(*(_cell(column, value) for column, value in row.items()))
-    return made
-
-
-def _cell(column, value):
-    is_number = column != 'PID' and not isinstance(value, str)
-    text = number(value) if is_number else str(value or '-')
-    return f'[bold red]{text}[/]' if column in BAD and value else text
-
-
-def show(meter, interval):
-    """Show the tables until q or Ctrl-C."""
-    view, sort, said = VIEWS[0], 0, ''
-    keys = sys.stdin.fileno()
-    terminal = termios.tcgetattr(keys)
-    tty.setcbreak(keys)
-    try:
-        with Live(screen=True, auto_refresh=False) as shown:
-            found, due = meter.measure(), time.monotonic() + interval
-            while True:
-                shown.update(Group(KEYS, said, table(found[view], sort)), refresh=True)
-                ready = select.select([keys], [], [], max(0, due - time.monotonic()))[0]
-                key = os.read(keys, 1).decode('latin-1') if ready else ''
-                if key == 'q':
-                    return
-                sort = sort + 1 if key == 's' else 0 if key in {*'npt'} else sort
-                view = next((each for each in VIEWS if each[0] == key), view)
-                if not key:
-                    due = time.monotonic() + interval
-                    try:
-                        found, said = meter.measure(), ''
-                    except MasterUnreachableError as error:
-                        said = str(error)
-    finally:
-        termios.tcsetattr(keys, termios.TCSADRAIN, terminal)
-
-
-def top(words):
-    """Show what nodes, processes and topics are doing.
-
-    Messages and bytes a second, transports, what was dropped, failures, CPU and memory. Nothing is
-    subscribed to for it.
-
-    top NAME ...        of nodes and topics those with that in their names
+    :param sort_column: the index of the column; after the last one comes the first again
     """
-    read = live.parser(top.__doc__)
-    read.add_argument('names', nargs='*', metavar='NAME', help='a part of a name')
-    read.add_argument('--once', action='store_true', help='print the tables once')
-    read.add_argument('--json', action='store_true', help='print them once, as JSON')
-    read.add_argument('--interval', type=float, default=1, metavar='S', help='between two looks')
-    chosen = read.parse_args(words)
-    meter = Meter(Master(), chosen.names)
-    if sys.stdin.isatty() and sys.stdout.isatty() and not (chosen.once or chosen.json):
-        return show(meter, chosen.interval)
-    meter.measure()
-    time.sleep(chosen.interval)
-    found = meter.measure()
-    if chosen.json:
-        return print(json.dumps(found))
-    for view in VIEWS:
-        Console(width=None if sys.stdout.isatty() else 10000).print(table(found[view]))
+    columns = list(rows[0]) if rows else ['nothing there']
+    sort_title = columns[sort_column % len(columns)]
+
+    def sort_key(row):
+        value = row[sort_title]
+        if isinstance(value, str):
+            return value, 0
+        return '', 0 if value is None else -value
+
+    rich_table = Table(box=None, padding=(0, 1, 0, 0))
+    for column in columns:
+        has_text = any(isinstance(row[column], str) for row in rows)
+        title = f'[reverse]{column}[/]' if column == sort_title else column
+        justify: Any = 'left' if has_text else 'right'
+        rich_table.add_column(title, justify=justify, no_wrap=column in WIDE_COLUMNS)
+    for row in sorted(rows, key=sort_key):
+        rich_table.add_row(*[_cell_text(column, value) for column, value in row.items()])
+    return rich_table
 
 
-def main():
-    """Run the command."""
-    return live.run(top)
+def _cell_text(column, value):
+    if value is None or value == '':
+        return '-'
+    if isinstance(value, str) or column == 'PID':
+        text = str(value)
+    else:
+        text = short_number(value)
+    if column in ALARM_COLUMNS and value:
+        return f'[bold red]{text}[/]'
+    return text
+
+
+def show(meter: Meter, interval: float) -> None:
+    """Show the tables in the terminal until the key q or Ctrl-C.
+
+    :param interval: seconds between two measurements
+    """
+    keyboard = sys.stdin.fileno()
+    terminal_settings = termios.tcgetattr(keyboard)
+    tty.setcbreak(keyboard)
+    try:
+        with Live(screen=True, auto_refresh=False) as screen:
+            _show_views(screen, meter, interval, keyboard)
+    finally:
+        termios.tcsetattr(keyboard, termios.TCSADRAIN, terminal_settings)
+
+
+def _show_views(screen, meter, interval, keyboard):
+    view = 'nodes'
+    sort_column = 0
+    problem = ''
+    tables = meter.measure()
+    deadline = time.monotonic() + interval
+    while True:
+        screen.update(Group(KEY_HELP, problem, table(tables[view], sort_column)), refresh=True)
+        timeout = max(0, deadline - time.monotonic())
+        if select.select([keyboard], [], [], timeout)[0]:
+            key = os.read(keyboard, 1).decode('latin-1')
+            if key == 'q':
+                return
+            if key == 's':
+                sort_column += 1
+            elif key in VIEWS:
+                view = VIEWS[key]
+                sort_column = 0
+        else:
+            deadline = time.monotonic() + interval
+            try:
+                tables = meter.measure()
+                problem = ''
+            except MasterUnreachableError as error:
+                problem = str(error)

@@ -1,112 +1,143 @@
-"""Look at a topic for a while; each look has a node of its own, which stops at its end."""
+"""Receive from a topic for a while. Each function starts a node of its own, and stops the node."""
 import contextlib
+import itertools
 import operator
 import queue
 import statistics
 import time
-from typing import NamedTuple
+from typing import Any, Iterator, NamedTuple, Sequence
 
 import rosgraph.names
 import rospy
+from genpy import Message
 
+from pharos.blocks import Block
+from pharos.channels import Topic
 from pharos.errors import UnknownTopicError
-from pharos.live.words import number, text_of
+from pharos.live.text_format import message_text, short_number
 from pharos.node import BlockNode
 from pharos.transcript import Transcript
 
 LAST_TIMEOUT = 3.0  # seconds that Topic.last waits
 FIRST_TIMEOUT = 1.0  # seconds that a measurement waits for the first message
+MAX_ARRIVALS = 1000  # messages that wait; further ones are dropped
 
 
 class Rate(NamedTuple):
-    """How often messages came, and how many bytes they had."""
+    """The rate and the size of the messages of a topic, as measured for a while."""
 
     topic: str
-    rate: float  # messages a second
-    bandwidth: float  # bytes a second
-    window: int  # messages that came
-    min: float  # seconds from one to the next
+    rate: float  # messages in one second
+    bandwidth: float  # bytes in one second
+    window: int  # messages that were counted
+    min: float  # seconds from one message to the next
     max: float
     std_dev: float
 
     def __repr__(self):
-        apart = f'{self.min:.3g} to {self.max:.3g} s apart, std dev {self.std_dev:.3g} s'
-        return f'{self.rate:.4g} Hz ({apart}), {number(self.bandwidth)}B/s, {self.window} messages'
+        gaps = f'{self.min:.3g} to {self.max:.3g} s apart, std dev {self.std_dev:.3g} s'
+        bandwidth = f'{short_number(self.bandwidth)}B/s'
+        return f'{self.rate:.4g} Hz ({gaps}), {bandwidth}, {self.window} messages'
+
+
+class Arrival(NamedTuple):
+    """A message, and the time at which the message arrived."""
+
+    time: float  # seconds, as of time.monotonic()
+    message: Any
 
 
 @contextlib.contextmanager
-def looking(topic, typed_as=None):
-    """Return a queue of what comes on a topic: ``(when, message)``.
+def arrival_queue(topic: Topic, typed_as: Any = None) -> Iterator[queue.Queue[Arrival]]:
+    """Receive from a topic into a queue.
 
-    :raises UnknownTopicError: if nobody publishes on it
+    :raises UnknownTopicError: if nobody publishes on the topic
     """
     if not topic.publishers:
         raise UnknownTopicError(f'nobody publishes on {topic.name}: see master.topics()')
-    came: queue.Queue = queue.Queue(1000)
+    arrivals: queue.Queue[Arrival] = queue.Queue(MAX_ARRIVALS)
 
-    def keep(message):
+    def keep_message(message):
         with contextlib.suppress(queue.Full):
-            came.put_nowait((time.monotonic(), message))
+            arrivals.put_nowait(Arrival(time.monotonic(), message))
 
     name = rosgraph.names.anonymous_name('pharos_looks')
     with topic.master.create(BlockNode, named=name) as node:
-        node.interested_in(topic.name, typed_as, delegate=keep)
-        yield came
+        node.interested_in(topic.name, typed_as, delegate=keep_message)
+        yield arrivals
 
 
-def _come(came, seconds, wait=0.0):
-    """Yield what comes within some seconds, as of the first that comes if it may be waited for."""
-    end = time.monotonic() + seconds + wait
+def _collect_arrivals(arrivals, seconds):
+    """Return the arrivals of some seconds, which begin with the first one."""
+    arrival_list: list[Arrival] = []
+    deadline = time.monotonic() + seconds + FIRST_TIMEOUT
     with contextlib.suppress(queue.Empty):
-        while time.monotonic() < end:
-            found = came.get(timeout=max(0.0, end - time.monotonic()))
-            end, wait = (found[0] + seconds, 0) if wait else (end, 0)
-            yield found
+        while time.monotonic() < deadline:
+            arrival = arrivals.get(timeout=max(0.0, deadline - time.monotonic()))
+            if not arrival_list:
+                deadline = arrival.time + seconds
+            arrival_list.append(arrival)
+    return arrival_list
 
 
-def measure(topic, seconds):
-    """Do what :meth:`Topic.hz` does."""
-    with looking(topic, rospy.AnyMsg) as came:
-        found = list(_come(came, seconds, FIRST_TIMEOUT))
-    gaps = [after[0] - before[0] for before, after in zip(found, found[1:])]
+def measure(topic: Topic, seconds: float) -> Rate:
+    """Measure the rate of a topic for :meth:`Topic.hz`."""
+    with arrival_queue(topic, rospy.AnyMsg) as arrivals:
+        arrival_list = _collect_arrivals(arrivals, seconds)
+    gaps = [later.time - earlier.time for earlier, later in zip(arrival_list, arrival_list[1:])]
+    byte_count = sum(len(arrival.message._buff) for arrival in arrival_list)
+    rate = len(gaps) / sum(gaps) if gaps else 0.0
+    if not gaps:
+        gaps = [0.0]
     return Rate(
         topic.name,
-        len(gaps) / sum(gaps) if gaps else 0.0,
-        sum(len(message._buff) for _, message in found) / seconds,
-        len(found),
-        min(gaps, default=0.0),
-        max(gaps, default=0.0),
-        statistics.pstdev(gaps) if gaps else 0.0,
+        rate=rate,
+        bandwidth=byte_count / seconds,
+        window=len(arrival_list),
+        min=min(gaps),
+        max=max(gaps),
+        std_dev=statistics.pstdev(gaps),
     )
 
 
-def last(topic):
-    """Do what :attr:`Topic.last` does."""
-    with looking(topic) as came:
-        for _, message in _come(came, LAST_TIMEOUT):
-            return message
+def last(topic: Topic) -> Message:
+    """Return the message of :attr:`Topic.last`.
+
+    :raises TimeoutError: if no message arrives within 3 s
+    """
+    with arrival_queue(topic) as arrivals, contextlib.suppress(queue.Empty):
+        return arrivals.get(timeout=LAST_TIMEOUT).message
     raise TimeoutError(f'no message came on {topic.name} within {LAST_TIMEOUT:g} s')
 
 
-def watch(topic, count, block):
-    """Do what :meth:`Topic.watch` does."""
-    show = block or (lambda message: Transcript.show(f'{text_of(message)}\n---'))
-    with looking(topic) as came, contextlib.suppress(KeyboardInterrupt):
-        while count is None or count > 0:
-            show(came.get()[1])
-            count = None if count is None else count - 1
+def watch(topic: Topic, count: int | None, block: Block | None) -> None:
+    """Run the block of :meth:`Topic.watch` on messages, or show them.
+
+    :param count: the number of messages; None: until Ctrl-C, which ends the call in any case
+    """
+    show_message = block or _show_message
+    numbers = itertools.count() if count is None else range(count)
+    with arrival_queue(topic) as arrivals, contextlib.suppress(KeyboardInterrupt):
+        for _ in numbers:
+            show_message(arrivals.get().message)
 
 
-def plot(topic, fields, seconds):
-    """Do what :meth:`Topic.plot` does."""
-    from matplotlib.figure import Figure
+def _show_message(message):
+    Transcript.show(f'{message_text(message)}\n---')
 
-    with looking(topic) as came:
-        rows = list(_come(came, seconds, FIRST_TIMEOUT))
+
+def plot(topic: Topic, fields: Sequence[str], seconds: float) -> Any:
+    """Return the matplotlib Figure of :meth:`Topic.plot`."""
+    from matplotlib.figure import Figure  # loaded only for plots
+
+    with arrival_queue(topic) as arrivals:
+        arrival_list = _collect_arrivals(arrivals, seconds)
     figure = Figure(figsize=(8, 4), layout='constrained')
     axes = figure.add_subplot(title=topic.name, xlabel='seconds')
-    times = [when - rows[0][0] for when, _ in rows]
+    times = [arrival.time - arrival_list[0].time for arrival in arrival_list]
     for field in fields:
-        axes.plot(times, [operator.attrgetter(field)(each) for _, each in rows], label=field)
+        read_field = operator.attrgetter(field)
+        values = [read_field(arrival.message) for arrival in arrival_list]
+        axes.plot(times, values, label=field)
     axes.legend()
     return figure

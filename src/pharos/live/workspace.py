@@ -1,22 +1,21 @@
-"""The workspace: IPython with a master, a node of its own, and the names of the graph at hand.
+"""The workspace: a session of IPython with a master, a node, and the names of the ROS graph.
 
-``rosrun pharos workspace`` is one; a notebook has one by ``%load_ext pharos.live.workspace``.
+``rosrun pharos workspace`` opens one; ``%load_ext pharos.live.workspace`` makes a notebook one.
 """
-import argparse
 import os
 import pathlib
 import re
-import sys
+from typing import Any, Sequence
 
 import rosgraph.names
 import rospkg
 from genpy import Message
 
 import pharos
-from pharos import live, signals
+from pharos import signals
 from pharos.errors import PharosError
-from pharos.live import pictures
-from pharos.live.words import text_of
+from pharos.live.pictures import figure_png, message_png
+from pharos.live.text_format import message_text
 from pharos.master import Master
 from pharos.node import BlockNode
 
@@ -24,87 +23,101 @@ BANNER = """PhaROS {pharos.__version__}: {count} nodes are at the ROS master {ma
 master is that master, me the node {me.name} of this session; all of pharos is imported.
 Tab completes, x? explains x, Ctrl-C ends a line, Ctrl-D the session and its nodes.
 """
-#: a string that a line ends in, and the field of a call of send_to that it ends in
-STRING = re.compile(r'.*[\'"]([\w/~]*)$', re.DOTALL)
-FIELD = re.compile(r'.*send_to\(\s*[\'"]([\w/]+)[\'"].*,\s*(\w*)$', re.DOTALL)
+#: matches a line that ends inside a string
+STRING_PATTERN = re.compile(r'.*[\'"]([\w/~]*)$', re.DOTALL)
+#: matches a line that ends inside send_to('TOPIC', ... FIELD
+FIELD_PATTERN = re.compile(r'.*send_to\(\s*[\'"]([\w/]+)[\'"].*,\s*(\w*)$', re.DOTALL)
 
 
-def namespace(argv=None):
-    """Return the names of a session: all of pharos, ``master`` and ``me``, a node.
+def namespace(argv: Sequence[str] | None = None) -> dict[str, Any]:
+    """Return the names of a session: all of pharos, ``master``, and the node ``me``.
 
-    The master is one of its own if none answers.
+    Starts a master if none answers.
+
+    :param argv: ROS's remappings and private parameters, for the node
     """
     master = Master()
     if not master.is_reachable():
         print(f'no ROS master answers at {master.url}: this session has one of its own')
         master = Master.embedded()
         os.environ['ROS_MASTER_URI'] = master.url
-    is_taken = bool(master.call('lookupNode', '/workspace'))
-    name = rosgraph.names.anonymous_name('workspace') if is_taken else 'workspace'
-    me = master.create(BlockNode, named=name, argv=argv)
-    return {**{each: getattr(pharos, each) for each in pharos.__all__}, 'master': master, 'me': me}
+    name = 'workspace'
+    if master.call('lookupNode', '/workspace'):
+        name = rosgraph.names.anonymous_name('workspace')
+    names = {each: getattr(pharos, each) for each in pharos.__all__}
+    names['master'] = master
+    names['me'] = master.create(BlockNode, named=name, argv=argv)
+    return names
 
 
-def completions(line, master):
-    """Return what a line can end in: names of the graph, types of messages, fields of send_to."""
-    string, field = STRING.fullmatch(line), FIELD.fullmatch(line)
-    words: list[str] = []
+def completions(line: str, master: Master) -> list[str]:
+    """Return the words that the last word of a line can become.
+
+    In a string: names of the graph and types of messages. In a call of send_to: fields.
+    """
+    string = STRING_PATTERN.fullmatch(line)
+    field = FIELD_PATTERN.fullmatch(line)
     try:
-        if string and string[1].startswith('/'):
-            for names in master.system_state():
-                words += [*names, *(name for nodes in names.values() for name in nodes)]
-            words += master.parameters
-        elif string:
-            package, slash, _ = string[1].partition('/')
-            packages = rospkg.RosPack()
-            files = pathlib.Path(packages.get_path(package)).glob('[ms][sr][gv]/*') if slash else ()
-            words = [f'{package}/{file.stem}' for file in files] or packages.list()
+        if string:
+            prefix = string[1]
+            words = _graph_names(master) if prefix.startswith('/') else _type_names(prefix)
         elif field:
-            cls = pharos.message_class(master.topic(field[1]).type)
-            words = [f'{name}=' for name in cls.__slots__]
-    except (PharosError, LookupError, rospkg.ResourceNotFound):  # the master is away, or no such
-        pass
-    typed = string or field
-    return sorted({word for word in words if word.startswith(typed.groups()[-1])})
+            prefix = field[2]
+            message_class = pharos.message_class(master.topic(field[1]).type or '')
+            words = [f'{name}=' for name in message_class.__slots__]
+        else:
+            return []
+    except (PharosError, LookupError, rospkg.ResourceNotFound):
+        return []  # Tab must not raise if the master, topic or package is missing
+    return sorted({word for word in words if word.startswith(prefix)})
 
 
-def load_ipython_extension(shell, names=None):
-    """Make a session of IPython a workspace."""
-    names = names or namespace()
+def _graph_names(master):
+    """Return the names of topics, services, nodes and parameters."""
+    names = list(master.parameters)
+    for registrations in master.system_state():
+        names += registrations
+        for node_names in registrations.values():
+            names += node_names
+    return names
+
+
+def _type_names(prefix):
+    """Return the types of the package that the prefix names, or else the names of packages."""
+    packages = rospkg.RosPack()
+    package, slash, _ = prefix.partition('/')
+    if not slash:
+        return packages.list()
+    files = pathlib.Path(packages.get_path(package)).glob('[ms][sr][gv]/*')
+    return [f'{package}/{file.stem}' for file in files]
+
+
+def load_ipython_extension(shell: Any, names: dict[str, Any] | None = None) -> None:
+    """Make a session of IPython a workspace; ``%load_ext`` calls this.
+
+    :param shell: the InteractiveShell
+    :param names: default: those of :func:`namespace`
+    """
+    if names is None:
+        names = namespace()
+    master = names['master']
     shell.push(names)
-    end = shell._atexit_once  # which clears the names
-    shell._atexit_once = lambda: (signals.stop_all(), end())
-    shell.set_hook(
-        'complete_command',
-        lambda _, event: completions(event.text_until_cursor, names['master']),
-        re_key='.*',
-    )
+    end_session = shell._atexit_once
+
+    def stop_nodes():
+        signals.stop_all()
+        end_session()  # clears the names, so that the nodes stop before
+
+    def complete(shell, event):
+        return completions(event.text_until_cursor, master)
+
+    def print_message(message, printer, is_cycle):
+        printer.text(message_text(message))
+
+    shell._atexit_once = stop_nodes
+    shell.set_hook('complete_command', complete, re_key='.*')
     formatters = shell.display_formatter.formatters
-    formatters['image/png'].for_type(Message, pictures.png_of)
-    formatters['image/png'].for_type_by_name('matplotlib.figure', 'Figure', pictures.png)
-    formatters['text/plain'].for_type(
-        Message, lambda message, printer, _: printer.text(text_of(message))
-    )
-    print(BANNER.format(pharos=pharos, count=len(names['master'].nodes()), **names))
-
-
-def workspace(words):
-    """Open a session of IPython with the live ROS graph: `master`, a node `me`, and all of pharos."""
-    read = live.parser(workspace.__doc__)
-    read.add_argument('script', nargs='?', metavar='SCRIPT', help='a program to be run first')
-    read.add_argument('args', nargs=argparse.REMAINDER, metavar='ARGUMENT', help='its arguments')
-    chosen = read.parse_args(words)
-    try:
-        from IPython.terminal.ipapp import TerminalIPythonApp
-    except ModuleNotFoundError:
-        raise PharosError('a workspace needs IPython: apt install python3-ipython') from None
-    app = TerminalIPythonApp.instance(display_banner=False)
-    app.initialize(['--', chosen.script, *chosen.args] if chosen.script else [])
-    app.force_interact = True
-    load_ipython_extension(app.shell, namespace(sys.argv))
-    app.start()
-
-
-def main():
-    """Run the command."""
-    return live.run(workspace)
+    formatters['image/png'].for_type(Message, message_png)
+    formatters['image/png'].for_type_by_name('matplotlib.figure', 'Figure', figure_png)
+    formatters['text/plain'].for_type(Message, print_message)
+    print(BANNER.format(pharos=pharos, count=len(master.nodes()), **names))

@@ -1,0 +1,41 @@
+"""The command graph."""
+import json
+
+from pharos.commands import argument_parser
+from pharos.live.graph import NO_NAME, graph_of
+from pharos.master import Master
+
+
+def graph(arguments: list[str]) -> None:
+    """Show the graph of the ROS master: processes, nodes, topics, and their links.
+
+    graph                            as text
+    graph --output graph.svg         as a picture: .svg, .png, .pdf (by graphviz) or .dot
+    graph --rates 2 --hide '/tf'     with messages a second, counted for 2 s, without /tf
+    watch -n1 rosrun pharos graph    again and again
+    """
+    parser = argument_parser(graph)
+    parser.add_argument('-o', '--output', metavar='FILE', help='save a picture')
+    parser.add_argument('--json', action='store_true', help='print JSON')
+    parser.add_argument('--all', action='store_true', help='show names of every node, too: /rosout')
+    parser.add_argument('--services', action='store_true', help='show services, too')
+    parser.add_argument('--only', default='', metavar='REGEX', help='show only names that match')
+    parser.add_argument('--hide', default=NO_NAME, metavar='REGEX', help='hide names that match')
+    parser.add_argument(
+        '--rates', type=float, default=0, metavar='S', help='count messages for S s'
+    )
+    options = parser.parse_args(arguments)
+    ros_graph = graph_of(
+        Master(),
+        options.rates,
+        show_all=options.all,
+        show_services=options.services,
+        only=options.only,
+        hide=options.hide,
+    )
+    if options.output:
+        ros_graph.save(options.output)
+    elif options.json:
+        print(json.dumps(ros_graph.as_dict()))
+    else:
+        print(ros_graph.text())

@@ -1,0 +1,43 @@
+"""The command top."""
+import json
+import sys
+import time
+
+from rich.console import Console
+
+from pharos.commands import argument_parser
+from pharos.live.top import Meter, show, table
+from pharos.master import Master
+
+FILE_WIDTH = 10000  # columns of a table that is not for a terminal, so that nothing is cut
+
+
+def top(arguments: list[str]) -> None:
+    """Show the nodes, processes and topics of the ROS master in a live table.
+
+    The columns are messages and bytes a second, transports, dropped messages, failures, CPU and
+    memory. The command subscribes to nothing.
+
+      top NAME ...        only nodes and topics that have a NAME in their names
+    """
+    parser = argument_parser(top)
+    parser.add_argument('names', nargs='*', metavar='NAME', help='a part of a name')
+    parser.add_argument('--once', action='store_true', help='print the tables once')
+    parser.add_argument('--json', action='store_true', help='print JSON once')
+    parser.add_argument(
+        '--interval', type=float, default=1, metavar='S', help='seconds between measurements'
+    )
+    options = parser.parse_args(arguments)
+    meter = Meter(Master(), options.names)
+    if sys.stdin.isatty() and sys.stdout.isatty() and not (options.once or options.json):
+        show(meter, options.interval)
+        return
+    meter.measure()
+    time.sleep(options.interval)
+    tables = meter.measure()
+    if options.json:
+        print(json.dumps(tables))
+        return
+    console = Console(width=None if sys.stdout.isatty() else FILE_WIDTH)
+    for rows in tables.values():
+        console.print(table(rows))
