@@ -56,8 +56,8 @@ def _count_needed(signature, least, most):
     return min(max(count, least), most)
 
 
-class Receiver:
-    """Runs a delegate for each message."""
+class DelegateHolder:
+    """Has a delegate, for nodes and channels."""
 
     _delegate: Block | None = None
     _delegate_block: Block | None = None  # the delegate, as a block that takes two arguments

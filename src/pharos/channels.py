@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from genpy import Message
 
 from pharos import messages
-from pharos.blocks import Block, Receiver
+from pharos.blocks import Block, DelegateHolder
 from pharos.errors import MessageTypeError, NodeStoppedError, UnknownNodeError
 from pharos.intraprocess.callback_queues import Inbox
 from pharos.intraprocess.links import peer_of
@@ -66,7 +66,8 @@ class Channel(Endpoint):
     :ivar type: the name of its message type
     """
 
-    def _configure(self, node, topic, message_class):
+    def _open_on(self, node, topic, message_class):
+        """Set the attributes, and open the channel."""
         self.node = node
         self.topic = topic
         self.message_class = message_class
@@ -84,7 +85,8 @@ class Channel(Endpoint):
         return f'<{state}{type(self).__name__} {self.topic} ({self.type}) of {self._run.name}>'
 
 
-class InputChannel(Receiver, Channel, Inbox):
+# DelegateHolder comes first: its ``delegate`` replaces that of Endpoint
+class InputChannel(DelegateHolder, Channel, Inbox):
     """The end of a topic at which a node receives; see :meth:`Node.interested_in`.
 
     :ivar received: the number of messages that the delegate was run on
@@ -98,16 +100,17 @@ class InputChannel(Receiver, Channel, Inbox):
         self.queue_bytes = node.queue_bytes
         self.from_ = from_
         self.delegate = delegate
-        self._configure(node, topic, message_class)
+        self._open_on(node, topic, message_class)
 
     def _open(self):
-        self.queue.clear()  # messages that came while the node stopped were never scheduled
+        self.queue.clear()  # the stop has dropped the jobs of these messages
         self.callback_queue = self._run.callback_queue
         self.closed = False  # the first message may come before the Subscriber is made
+        # the callback is an Inbox, which SubscriptionOverlay fills
         self.ros_object = self.node.ros.Subscriber(self.topic, self.message_class, self)
 
     def __call__(self, message):
-        """Take a latched message; rospy calls this for a connection that was there before."""
+        """Take a latched message: rospy calls this, if a connection was there before the channel."""
         self.receive(message, 0)
 
     def _deliver(self, message):
@@ -126,7 +129,7 @@ class InputChannel(Receiver, Channel, Inbox):
 
     def _retry(self, message):
         """Run the delegate on a message once more, in the node's turn."""
-        self.node._check_running()
+        self.node._check_active()
         self.callback_queue.call(lambda: self._deliver(message))
 
 
@@ -141,10 +144,11 @@ class OutputChannel(Channel):
     def __init__(self, node, topic, message_class, latch=False, queue_size=QUEUE_SIZE):
         self.latch = latch
         self.queue_size = queue_size
-        self._configure(node, topic, message_class)
+        self._open_on(node, topic, message_class)
 
     def open(self):
         """Advertise, and wait for the subscribers that the master knows."""
+        # asked before: a node that subscribes from now on hears of this publisher in time
         subscribers = set(Topic(self._run.master, self.topic).subscribers)
         latched = None
         if self.ros_object:  # the node has stopped since, and starts again
@@ -152,7 +156,7 @@ class OutputChannel(Channel):
         super().open()
         if latched is not None:
             self._publisher.publish(self._publisher.thaw(latched), channel=self)
-        self._wait_for(subscribers)
+        self._wait_until_connected(subscribers)
 
     def _open(self):
         self.ros_object = self.node.ros.Publisher(
@@ -160,7 +164,7 @@ class OutputChannel(Channel):
         )
         self._publisher = self.ros_object.impl
 
-    def _wait_for(self, subscribers):
+    def _wait_until_connected(self, subscribers):
         """Wait until these nodes are connected: rospy loses messages sent before (#176).
 
         A node that refuses connections is dead. A node that does not connect in time is logged.
@@ -189,13 +193,11 @@ class OutputChannel(Channel):
         :raises MessageTypeError: if it is of another type, or cannot be serialized
         :raises NodeStoppedError: if the channel is closed
         """
-        wanted_class = self.message_class
+        # AnyMsg has the md5sum '*'
         sent_class = type(message)
-        if sent_class is not wanted_class:
-            # AnyMsg, for relays, has the md5sum '*'
-            if getattr(sent_class, '_md5sum', None) not in (wanted_class._md5sum, '*'):
-                sent_type = getattr(sent_class, '_type', repr(message)[:80])
-                raise MessageTypeError(f'{self.topic} carries {self.type}, not {sent_type}')
+        if getattr(sent_class, '_md5sum', None) not in (self.message_class._md5sum, '*'):
+            sent_type = getattr(sent_class, '_type', repr(message)[:80])
+            raise MessageTypeError(f'{self.topic} carries {self.type}, not {sent_type}')
         if self.closed:
             raise NodeStoppedError(f'{self!r} cannot send: open another one, or start the node')
         try:

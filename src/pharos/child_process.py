@@ -94,6 +94,7 @@ class RosProcess(subprocess.Popen):
         descendants = []
         if self.poll() is None:
             descendants = psutil.Process(self.pid).children(recursive=True)
+        # to the group: its children may live on when the program has ended
         for number in signal.SIGINT, signal.SIGTERM, signal.SIGKILL:
             with contextlib.suppress(ProcessLookupError, subprocess.TimeoutExpired):
                 os.killpg(self.pid, number)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from pharos.live.graph import Graph
 
 CALLER_ID = '/pharos'
-PEER_LIMIT = 0.5  # seconds that a node has to answer whether it lives
+LIFE_LIMIT = 0.5  # seconds that a node has to answer whether it lives
 _URL = re.compile(r'http://(\[[\w:]+\]|[\w.-]+):([1-6]?\d{1,4})/?')
 
 N = TypeVar('N', bound=Node)
@@ -57,8 +57,8 @@ class Parameters(collections.abc.MutableMapping):
         self._call('setParam', full_name(name), value)
 
     def __delitem__(self, name):
-        self[name]
-        self._call('deleteParam', name)
+        self[name]  # raises KeyError
+        self._call('deleteParam', full_name(name))
 
     def __iter__(self):
         return iter(sorted(self._call('getParamNames')))
@@ -80,7 +80,7 @@ class Master:
     :raises ValueError: if the URL is malformed
     """
 
-    _environ = os.environ
+    _environ = os.environ  # a script's Master has another one
     _first_nodes: dict = {}  # argv -> the first node that was created with it
 
     def __init__(self, url: str | None = None, share_connections: bool = False):
@@ -226,7 +226,8 @@ class Master:
                 raise ValueError(f'{port!r} cannot be a port: give 0 to 65535')
         mappings = [argument for argument in argv or () if is_legal_remap(argument)]
         node = node_class.__new__(node_class)
-        name = self._full_name(node, node_name(named), tuple(mappings))
+        name = self._remapped_name(node, node_name(named), tuple(mappings))
+        # the full name holds: rospy would apply these once more
         remappings = [each for each in mappings if not each.startswith(('__name:=', '__ns:='))]
         settings = Settings(name, self, domain, (tcp_port, xmlrpc_port), remappings)
         node._configure(settings, soul, delegate)
@@ -239,18 +240,18 @@ class Master:
             ) from None
         node.__init__(**kwargs)  # type: ignore[misc]
         try:
-            node._start_and_release()
+            node._start_held()
         except BaseException:
             node._stop_safely()
             raise
         return node
 
-    def _full_name(self, node, name, mappings):
+    def _remapped_name(self, node, name, mappings):
         """Return the full name of a new node; of those with equal mappings, one has ``__name``."""
         special_names = load_mappings(mappings)
         if '__name' in special_names:
             first = self._first_nodes.get(mappings)
-            if not (first and first.is_running and first.master == self):
+            if not (first and first.is_running and first._settings.master == self):
                 self._first_nodes[mappings] = node
                 namespace = name[: name.rfind('/') + 1]
                 name = namespace + node_name(special_names['__name'])
@@ -284,7 +285,7 @@ class Master:
         if not nodes:
             return ExternalNode(self, name)
         for node in nodes:
-            if node._current_run.uri:  # not a script that creates its nodes with pharos
+            if node._current_run.uri:  # a script that creates nodes with pharos has none itself
                 return node
         return nodes[0]
 
@@ -294,7 +295,7 @@ class Master:
         if not uri:
             return False
         try:
-            ServerProxy(uri, PEER_LIMIT).getPid(CALLER_ID)
+            ServerProxy(uri, LIFE_LIMIT).getPid(CALLER_ID)
         except UNREACHABLE as error:
             return not isinstance(error, ConnectionRefusedError)
         return True

@@ -14,10 +14,15 @@ import rosgraph.names
 import rospy
 
 from pharos import messages, signals
-from pharos.blocks import Block, Receiver, block_name, rebind, with_arguments
+from pharos.blocks import Block, DelegateHolder, block_name, rebind, with_arguments
 from pharos.channels import QUEUE_SIZE, Channel, InputChannel, OutputChannel
-from pharos.errors import MasterUnreachableError, MessageTypeError, NodeStoppedError
-from pharos.errors import PharosError, UnknownTopicError
+from pharos.errors import (
+    MasterUnreachableError,
+    MessageTypeError,
+    NodeStoppedError,
+    PharosError,
+    UnknownTopicError,
+)
 from pharos.external_node import ExternalNode
 from pharos.failures import Failures
 from pharos.names import legal_name, node_name
@@ -47,7 +52,7 @@ class Settings:
     remappings: Sequence[str]
 
 
-class Node(Receiver):
+class Node(DelegateHolder):
     """A ROS node of this process, made by :meth:`Master.create`.
 
     The report: a subclass of PhaROSNode. A class of your own overrides :meth:`start` and
@@ -92,7 +97,7 @@ class Node(Receiver):
     _run_class = Run
     _current_run: Run = None  # type: ignore[assignment]
     _settings: Settings = None  # type: ignore[assignment]
-    _releases_after_start = False  # True while start() runs, and lets no delegate run
+    _holds_delegates = False  # True while _start_held() runs
 
     def __init__(self, *args, **kwargs):
         """Do nothing: :meth:`Master.create` has given the node its name and all else.
@@ -112,7 +117,7 @@ class Node(Receiver):
         )
 
     def _configure(self, settings, soul, delegate):
-        with_arguments(soul, 'soul', 0, 1)  # raises if it cannot be one
+        with_arguments(soul, 'soul', 0, 1)  # raises if it is not a soul
         self._settings = settings
         self._life_lock = threading.RLock()  # held by a start, stop or restart
         self._send_lock = threading.Lock()  # held while send_to() opens a channel
@@ -142,6 +147,7 @@ class Node(Receiver):
         with self._life_lock:
             if self.lifecycle not in (Lifecycle.NEW, Lifecycle.STOPPED):
                 raise PharosError(f'{self._settings.name} is {self.lifecycle.value} already')
+            # of the run before
             endpoints = self._current_run.endpoints if self._current_run else []
             run = self._run_class(self, self._settings)
             self._current_run = run
@@ -150,7 +156,7 @@ class Node(Receiver):
             try:
                 run.start()
                 run.lifecycle = Lifecycle.RUNNING
-                if not self._opens_own_endpoints:
+                if not self._has_own_start:
                     for endpoint in endpoints:
                         endpoint.open()
                     run.callback_queue.release()
@@ -160,17 +166,17 @@ class Node(Receiver):
                 raise
 
     @property
-    def _opens_own_endpoints(self):
-        """True if the start() of the node's class opens its channels itself."""
+    def _has_own_start(self):
+        """True if the node's class has a start(), which opens its endpoints and forks its souls."""
         return type(self).start is not Node.start
 
-    def _start_and_release(self):
+    def _start_held(self):
         """Start, and let delegates run when the start() of the node's class has returned."""
-        self._releases_after_start = True
+        self._holds_delegates = True
         try:
             self.start()
         finally:
-            self._releases_after_start = False
+            self._holds_delegates = False
         if self.lifecycle is Lifecycle.NEW:
             raise PharosError(f'{type(self).__name__}.start() must call super().start() first')
         self._current_run.callback_queue.release()
@@ -198,28 +204,29 @@ class Node(Receiver):
             except Exception as error:
                 self._current_run.report_failure(error, self.stop, 'method')
             finally:
-                Node.stop(self)
+                Node.stop(self)  # does nothing if the class's stop() has called it
 
     def restart(self) -> None:
         """Stop the node and start it again, under its name and ports, with its channels and souls.
 
-        Souls that had not ended run again from their first lines.
+        Souls that had not ended run again from their first lines. If the node's class has a start()
+        of its own, that opens the channels and forks the souls.
 
         :raises MasterUnreachableError: if the master does not answer, and the node runs on
         """
         with self._life_lock:
             self._settings.master.call('getPid')  # raises if the master does not answer
-            souls = self._current_run.souls
-            blocks = {thread.name: souls[thread] for thread in souls if thread.is_alive()}
+            souls = self._current_run.souls.items()
+            live_souls = [(thread.name, block) for thread, block in souls if thread.is_alive()]
             signals.restarting_nodes.append(self)  # spin() goes on
             try:
                 self.stop()
-                self._start_and_release()
+                self._start_held()
             finally:
                 signals.restarting_nodes.remove(self)
-            if not self._opens_own_endpoints:
-                for name, block in blocks.items():
-                    Node.fork(self, block, name)
+            if not self._has_own_start:
+                for name, block in live_souls:
+                    Node.fork(self, block, name)  # the class may have a fork() of its own
 
     def become(self, node_class: type[Node]) -> None:
         """Be a node of another class from now on; name, ports, connections and attributes stay.
@@ -231,7 +238,7 @@ class Node(Receiver):
         :raises AttributeError: if it lacks a method that is a block of the node
         """
         check_node_class(node_class)
-        self._check_running()
+        self._check_active()
         run = self._current_run
 
         def change():
@@ -252,7 +259,7 @@ class Node(Receiver):
     def __exit__(self, *error):
         self.stop()
 
-    def _check_running(self):
+    def _check_active(self):
         """Raise NodeStoppedError if the node has not started, or has stopped."""
         if not (self._current_run and self._current_run.is_active):
             raise NodeStoppedError(
@@ -278,12 +285,12 @@ class Node(Receiver):
     @property
     def ros(self) -> Any:
         """The node's own rospy in this run, whole: ``node.ros.Timer``, ``node.ros.Time.now()``."""
-        self._check_running()
+        self._check_active()
         return self._current_run.ros
 
     def ros_import(self, name: str) -> Any:
         """Return a library written on rospy, such as 'actionlib', bound to this run of the node."""
-        self._check_running()
+        self._check_active()
         return self._current_run.modules.load(name)
 
     def health(self) -> types.SimpleNamespace:
@@ -329,7 +336,8 @@ class Node(Receiver):
         return thread
 
     def _check_soul(self, block):
-        self._check_running()
+        """Return the block if it is a soul, else raise an error."""
+        self._check_active()
         if with_arguments(block, 'soul', 0, 1) is None:
             raise PharosError(f'{self._settings.name} has no soul: give it one, node.soul = block')
         return block
@@ -355,7 +363,7 @@ class Node(Receiver):
     def sleep(self, seconds: float) -> None:
         """Sleep for some seconds of ROS time; the stop of the node ends it, and its soul."""
         with signals.quiet_wait():
-            self._check_running()
+            self._check_active()
             self._current_run.callback_queue.release_before_sleep()
             self._current_run.ros.sleep(seconds)
         if self._current_run.stopping.is_set() and current.node is self:
@@ -370,7 +378,7 @@ class Node(Receiver):
         """
         if not seconds > 0:
             raise ValueError(f'a period is a number of seconds above 0, not {seconds!r}')
-        self._check_running()
+        self._check_active()
         run = self._current_run
         rate = run.ros.Rate(1 / seconds, reset=True)
 
@@ -414,7 +422,7 @@ class Node(Receiver):
 
         :raises ValueError: if it cannot be a name
         """
-        self._check_running()
+        self._check_active()
         return self._current_run.ros.resolve_name(legal_name(name).replace('~/', '~'))
 
     def _peer_name(self, peer):
@@ -450,7 +458,7 @@ class Node(Receiver):
         """
         topic = self._resolve(topic)
         peer_name = self._peer_name(from_) if from_ else None
-        message_class = self._receiver_class(topic, typed_as)
+        message_class = self._class_to_receive(topic, typed_as)
         return InputChannel(
             self, topic, message_class, delegate, queue_size, inline, shared, peer_name
         )
@@ -468,7 +476,7 @@ class Node(Receiver):
         :param queue_size: messages that wait for each subscriber at most
         """
         topic = self._resolve(topic)
-        return OutputChannel(self, topic, self._message_class(topic, typed_as), latch, queue_size)
+        return OutputChannel(self, topic, self._class_of(topic, typed_as), latch, queue_size)
 
     def send_to(
         self,
@@ -515,34 +523,30 @@ class Node(Receiver):
         name = self._resolve(topic)
         if isinstance(block, Message):
             typed_as = typed_as or type(block)
-        message_class = self._message_class(name, typed_as)
+        message_class = self._class_of(name, typed_as)
         for channel in self._current_run.open_endpoints(OutputChannel):
             if channel.topic == name:
                 return channel, False
         return OutputChannel(self, name, message_class), True
 
-    def _receiver_class(self, topic, typed_as):
+    def _class_to_receive(self, topic, typed_as):
         """Return the message class for a channel that receives: a publisher may define the type."""
         ask_publisher = functools.partial(self._ask_definition, topic)
-        return self._message_class(topic, typed_as, ask_publisher)
+        return self._class_of(topic, typed_as, ask_publisher)
 
-    def _message_class(self, topic, typed_as, ask_publisher=None):
-        known_class = None
-        for channel in self.channels:
-            if channel.topic == topic:
-                known_class = channel.message_class
-                break
-        if known_class and typed_as is None:
-            return known_class
+    def _class_of(self, topic, typed_as, ask_publisher=None):
+        known = [channel.message_class for channel in self.channels if channel.topic == topic]
+        if known and typed_as is None:
+            return known[0]
         type_name = typed_as or self._settings.master.topic_type(topic)
         if type_name is None or type_name == '*':
             raise UnknownTopicError(
                 f'the master knows no type of {topic}: give typed_as=, such as "std_msgs/String"'
             )
         message_class = messages.message_class(type_name, ask_publisher)
-        if known_class and known_class._md5sum != message_class._md5sum:
+        if known and known[0]._md5sum != message_class._md5sum:
             raise MessageTypeError(
-                f'{self._settings.name} has {topic} open as {known_class._type},'
+                f'{self._settings.name} has {topic} open as {known[0]._type},'
                 f' not as {message_class._type}'
             )
         return message_class
@@ -591,7 +595,8 @@ class Node(Receiver):
         topic = self._resolve(topic)
         received = []
 
-        def wanted(subscriber):
+        def find_wanted(subscriber):
+            """Drop messages up to the first one that is wanted; true if there is one."""
             while received and where and not where(received[0]):
                 del received[0]
             return received
@@ -600,8 +605,8 @@ class Node(Receiver):
         master.call('getPid')  # raises if the master does not answer
         if timeout and not typed_as:
             typed_as = wait(lambda: master.topic_type(topic), timeout, self)
-        message_class = self._receiver_class(topic, typed_as)
-        if self._wait_subscribed(wanted, timeout, topic, message_class, received.append):
+        message_class = self._class_to_receive(topic, typed_as)
+        if self._wait_subscribed(find_wanted, timeout, topic, message_class, received.append):
             return received[0]
         if not self._current_run.stopping.is_set():
             raise TimeoutError(f'no message on {topic} came within {timeout:g} s: is it published?')
@@ -644,7 +649,7 @@ class Node(Receiver):
 
 
 def check_node_class(node_class):
-    """Raise TypeError if it is not a class of nodes, or has attributes that Node needs itself."""
+    """Raise TypeError if it is not a class of nodes, or replaces private methods of Node."""
     if not (isinstance(node_class, type) and issubclass(node_class, Node)):
         raise TypeError(f'a node is made of a subclass of Node, not {node_class!r}')
     own_names = {name for name in vars(Node) if re.match('_[a-z]', name)}

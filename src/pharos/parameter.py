@@ -39,7 +39,7 @@ class Parameter(Endpoint):
     @property
     def value(self):
         """The value: a bool, int, float, str, list or dict; None if it has none."""
-        self.node._check_running()
+        self.node._check_active()
         return deepcopy(self._value)
 
     def set(self, value) -> None:
@@ -48,7 +48,7 @@ class Parameter(Endpoint):
         :raises ValueError: if the server cannot hold such a value
         :raises MasterUnreachableError: if the master does not answer
         """
-        self.node._check_running()
+        self.node._check_active()
         self._run.master.parameters[self.name] = value
         self._run.read_parameters()
 
@@ -59,7 +59,7 @@ class Parameter(Endpoint):
             value = self._run.master.parameters.get(self.name)
             self._value = value
         is_same = value == former and type(value) is type(former)
-        if is_same or self.closed:
+        if is_same or self.closed:  # open() reads while the parameter is still closed
             return
         for block in self.delegate:
             self._run_block(block, deepcopy(value))

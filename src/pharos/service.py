@@ -139,7 +139,9 @@ class Service:
             service_class = messages.service_class(self.type)
             request = self._build_request(service_class, block, fields)
             self._check_md5sum(service_class)
-            local = find_local_service(self.name, self.uri) if timeout is None else None
+            local = None
+            if timeout is None:  # nothing ends a local call
+                local = find_local_service(self.name, self.uri)
             if local:
                 self.response = call_local_service(local, request, self.caller_id)
             else:
@@ -157,14 +159,14 @@ class Service:
         request = messages.build(request_class, block, fields)
         if request._md5sum != request_class._md5sum:
             raise MessageTypeError(f'{self.name} takes {request_class._type}, not {request._type}')
-        return messages.check(request)
+        return messages.checked_copy(request)
 
     def _check_md5sum(self, service_class):
         if self.md5sum not in ('*', service_class._md5sum):
             raise ServiceTypeError(
                 f'{self.name} is of type {self.type}, whose md5sum is {service_class._md5sum} here'
-                f' (request {messages.describe(service_class._request_class)}; response'
-                f' {messages.describe(service_class._response_class)}), and not {self.md5sum}: use'
+                f' (request {messages.fields_text(service_class._request_class)}; response'
+                f' {messages.fields_text(service_class._response_class)}), and not {self.md5sum}: use'
                 ' the same definition at both ends, or leave md5sum as it is'
             )
 

@@ -65,10 +65,10 @@ def handle_signals():
     defaults = signal.default_int_handler, signal.SIG_DFL, signal.SIG_IGN
     is_interactive = hasattr(sys, 'ps1')
     if signal.getsignal(signal.SIGINT) in defaults and not is_interactive:
-        signal.signal(signal.SIGINT, _end_program)
+        signal.signal(signal.SIGINT, _handle_signal)
     for number in signal.SIGTERM, signal.SIGHUP:
         if signal.getsignal(number) == signal.SIG_DFL:
-            signal.signal(number, _end_program)
+            signal.signal(number, _handle_signal)
 
 
 def is_ending():
@@ -85,7 +85,7 @@ def may_be_signal():
     return is_ending()
 
 
-def _end_program(number, frame):
+def _handle_signal(number, frame):
     """Handle the signal of that number."""
     global _signal_time
     if _signal_time is not None:

@@ -1,4 +1,4 @@
-"""Waiting on behalf of a node, whose stop ends the wait."""
+"""Waiting, which the stop of a node ends."""
 import contextlib
 import math
 import threading
@@ -9,7 +9,7 @@ from pharos.errors import PharosError
 
 
 class _Current(threading.local):
-    """The node on whose behalf this thread runs."""
+    """The node that has its soul or its program in this thread."""
 
     node: Any = None
 
@@ -21,7 +21,7 @@ def wait(predicate, timeout=None, node=None):
     """Wait until ``predicate()`` is true.
 
     :param timeout: seconds; None: without limit
-    :param node: its stop ends the wait, too; default: the node on whose behalf this thread runs
+    :param node: its stop ends the wait, too; default: the one with its soul in this thread
     :returns: the last value of ``predicate()``, false if the wait ended otherwise
     """
     deadline = math.inf if timeout is None else time.monotonic() + timeout
@@ -47,4 +47,4 @@ def wait_for(find, timeout, node=None):
         with contextlib.suppress(PharosError):
             return find()
 
-    return wait(attempt, timeout, node) or find()
+    return wait(attempt, timeout, node) or find()  # which raises the error

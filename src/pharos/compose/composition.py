@@ -127,7 +127,7 @@ class Composition:
         node.roslaunch_node = roslaunch_node
         self.nodes.append(node)
         Transcript.show(f'{name} starts')
-        node._start_and_release()
+        node._start_held()
         self._has_started = True
         return node
 
@@ -180,7 +180,7 @@ class Composition:
         with self._show_failure(name):
             Transcript.show(f'{name} comes back')
             del self._end_times[node]
-            node._start_and_release()
+            node._start_held()
         if self._stopping.is_set():  # stop() may have looked before the start
             node._stop_safely()
 

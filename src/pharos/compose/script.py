@@ -35,7 +35,7 @@ class ScriptNode(Node):
     exit_code: int | None = None
     roslaunch_node: Any = None  # roslaunch's, if a launch file named it
     _run_class = ScriptRun
-    _opens_own_endpoints = True  # its program does
+    _has_own_start = True  # its program does
 
     def __init__(self, path: str, args: list[str], params: dict | None = None, env: Any = ()):
         self.path = path

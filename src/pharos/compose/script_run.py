@@ -464,8 +464,8 @@ class _Pharos(Shim):
                     share_connections = run.master.share_connections
                 super().__init__(url or run.master.url, share_connections)
 
-            def _full_name(self, node, name, mappings):
-                full_name = super()._full_name(node, name, mappings)
+            def _remapped_name(self, node, name, mappings):
+                full_name = super()._remapped_name(node, name, mappings)
                 for parameter_name, value in run.node.params.items():
                     self.parameters[f'{full_name}/{parameter_name}'] = value
                 return full_name

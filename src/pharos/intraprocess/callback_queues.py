@@ -29,7 +29,7 @@ _ready_queues = collections.deque()
 _idle_workers = []
 _workers = set()
 _pooled_queues = set()
-_pool_lock = allocate_lock()  # of _workers and _pooled_queues
+_pool_lock = allocate_lock()  # of _workers, _pooled_queues, and attributes of queues
 _no_yield_before = 0.0
 _sentry = None
 
@@ -37,7 +37,9 @@ _sentry = None
 class CallbackQueue:
     """Runs callbacks one at a time: those of a node, or of one subscription of plain rospy.
 
-    ``jobs`` has an Inbox once for each of its messages, or more often if some were dropped.
+    ``jobs`` has an Inbox once for each of its messages, or more often if some were dropped. Each message
+    waits in its Inbox as ``(value, thaw, header)``: a frozen one, or, if ``thaw`` is None, the message
+    itself, which came from a socket or is shared.
     """
 
     is_pooled = True
@@ -50,7 +52,7 @@ class CallbackQueue:
 
     def __init__(self):
         self.jobs = collections.deque()
-        self._run_lock = allocate_lock()
+        self._jobs_lock = allocate_lock()
         self._join_pool()
 
     def _join_pool(self):
@@ -59,7 +61,7 @@ class CallbackQueue:
 
     def hold(self):
         """Run nothing until release(), except calls by this thread itself."""
-        self._run_lock.acquire()
+        self._jobs_lock.acquire()
         self.running_thread = get_ident()
         self.is_held = True
 
@@ -70,18 +72,18 @@ class CallbackQueue:
             self.is_held = False
         if was_held:
             self.running_thread = None
-            self._run_lock.release()
-            self.request_run()
+            self._jobs_lock.release()
+            self.request_thread()
 
     def release_before_sleep(self):
         """End a hold by this thread."""
         if self.running_thread == get_ident():
             self.release()
 
-    def run(self):
+    def run_jobs(self):
         """Run the jobs. If another thread runs jobs of this queue, return: that thread runs all."""
         jobs = self.jobs
-        while jobs and not self.closed and self._run_lock.acquire(False):
+        while jobs and not self.closed and self._jobs_lock.acquire(False):
             self.running_thread = get_ident()
             try:
                 while jobs and not self.closed:
@@ -97,14 +99,14 @@ class CallbackQueue:
                         inbox.callback(message)
                     elif inbox.inline:
                         inbox.callback(value)
-                    else:
+                    else:  # receive() asks if the callbacks are fast
                         start_time = perf_counter()
                         inbox.callback(value)
                         is_fast = perf_counter() - start_time < FAST
                         inbox.fast_runs = inbox.fast_runs + 1 if is_fast else 0
             finally:
                 self.running_thread = None
-                self._run_lock.release()
+                self._jobs_lock.release()
         if self.closed:  # close() gave up waiting for a callback of this thread
             self._leave_pool()
 
@@ -113,17 +115,17 @@ class CallbackQueue:
         if self.running_thread == get_ident():
             block()
             return
-        with self._run_lock:
+        with self._jobs_lock:
             self.running_thread = get_ident()
             try:
                 if not self.closed:
                     block()
             finally:
                 self.running_thread = None
-        if self.closed:  # as in run()
+        if self.closed:  # as in run_jobs()
             self._leave_pool()
         else:
-            self.request_run()
+            self.request_thread()
 
     def schedule(self):
         """Put the queue into the pool's list; True if a worker must be woken for that."""
@@ -133,7 +135,7 @@ class CallbackQueue:
         _ready_queues.append(self)
         return True
 
-    def request_run(self):
+    def request_thread(self):
         """Have a thread run the jobs."""
         if self.schedule():
             _wake_worker()
@@ -143,8 +145,8 @@ class CallbackQueue:
         self.closed = True
         self.release()
         has_ended = self.running_thread == get_ident()
-        if not has_ended and self._run_lock.acquire(True, timeout):
-            self._run_lock.release()  # call() may wait for it
+        if not has_ended and self._jobs_lock.acquire(True, timeout):
+            self._jobs_lock.release()  # call() may wait for it
             has_ended = True
         self.jobs.clear()
         if has_ended:  # else the pool still counts it, and replaces the blocked worker
@@ -203,7 +205,7 @@ class ThreadedCallbackQueue(CallbackQueue):
         self._wait_for_first_run()
         while not self.closed:
             self.is_scheduled = False
-            self.run()
+            self.run_jobs()
             self.own_thread.rest()
 
     def _leave_pool(self):
@@ -262,19 +264,22 @@ class _Worker(_RestingThread):
                 continue
             if _ready_queues:
                 if callback_queue.is_fast:
-                    _start_watch()
+                    _alert_sentry()
                 else:
                     _wake_worker()
             callback_queue.is_scheduled = False
             job_count = len(callback_queue.jobs)
             start_time = perf_counter()
-            callback_queue.run()
+            callback_queue.run_jobs()
             callback_queue.is_fast = perf_counter() - start_time < FAST * job_count
-        _wake_worker()
+        _wake_worker()  # each worker that ends has the next one end
 
 
 def _wake_worker():
-    """Wake an idle worker and return it, or start one if there are fewer than nodes."""
+    """Wake an idle worker and return it. If all are busy and fewer than nodes, start one.
+
+    Nobody waits for a worker that starts: it is not returned.
+    """
     try:
         worker = _idle_workers.pop()
     except IndexError:
@@ -319,7 +324,7 @@ class _Sentry(_RestingThread):
             _sentry = None
 
 
-def _start_watch():
+def _alert_sentry():
     """Have the sentry look after the queues that a worker has left for later."""
     global _sentry
     sentry = _sentry
@@ -370,15 +375,18 @@ class Inbox:
         if count >= self.capacity or is_power_of_two:  # the size is estimated now and then
             self.capacity = min(self.queue_size, self.capacity_for(size or size_of(item[0])))
             if count >= self.capacity and self.taken_count != self._count_at_yield:
-                self._count_at_yield = self.taken_count  # the receiver got on since
-                sleep(1e-6)  # a publisher that never sleeps would starve it
+                # the receiver has taken messages since the last such sleep: without another one, a
+                # publisher that never sleeps would starve it
+                self._count_at_yield = self.taken_count
+                sleep(1e-6)
+        # append, then drop: a receiver that runs meanwhile must not find the queue empty
         queue.append(item)
         is_full = False
-        while len(queue) > self.capacity:  # after append(), or the receiver finds it empty
+        while len(queue) > self.capacity:
             queue.popleft()
             self.dropped += 1
             is_full = True
-        if not is_full:  # the receiver may have taken one meanwhile
+        if not is_full:  # else the job of the dropped message is left for this one
             self.callback_queue.jobs.append(self)
 
     def capacity_for(self, size):
@@ -398,15 +406,16 @@ class Inbox:
             return
         self.put((message, None, None), size)
         if self.inline or callback_queue.is_pooled and self.fast_runs >= FAST_RUNS:
-            callback_queue.run()
+            callback_queue.run_jobs()
         else:
-            callback_queue.request_run()
+            callback_queue.request_thread()
 
 
-def hand_over(callback_queues, last_wake):
+def hand_over(callback_queues, last_wake, may_wait):
     """Have threads run the jobs of some callback queues.
 
     :param last_wake: the last time that the same publisher woke a thread
+    :param may_wait: True: wait a moment until the thread runs
     :returns: the time now, if a thread was woken, else ``last_wake``
     """
     global _no_yield_before
@@ -422,7 +431,7 @@ def hand_over(callback_queues, last_wake):
         return last_wake
     now = perf_counter()
     # a busy publisher keeps the interpreter for 5 ms, unless it waits for the thread to run
-    if now - last_wake > BURST and now > _no_yield_before:
+    if may_wait and now - last_wake > BURST and now > _no_yield_before:
         is_running = thread.wait_until_running(YIELD_LIMIT)
         if not is_running:
             _no_yield_before = now + YIELD_PAUSE

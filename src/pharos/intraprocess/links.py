@@ -30,7 +30,7 @@ class Link(Transport):
     :param thaw: makes a message of the subscription's class from a frozen one
     """
 
-    latch = None
+    latch = None  # for rospy, which would resend it; the overlay has latches of its own
     header = property(lambda self: self.publisher.header)
     callerid_pub = property(peer_of)  # actionlib asks for it
     # not counted for each message: to touch ten links takes as long as to run ten delegates
@@ -60,8 +60,8 @@ class Link(Transport):
 
 def link_topic(sender, receiver, topic):
     """Link the publisher and the subscription of a topic of two runs of this process."""
-    publisher = sender.topics.pubs.get(topic)
-    subscription = receiver.topics.subs.get(topic)
+    publisher = sender.topic_manager.pubs.get(topic)
+    subscription = receiver.topic_manager.subs.get(topic)
     if not publisher or not subscription:
         return
     sent_class = publisher.data_class
@@ -95,7 +95,7 @@ def link(publisher, uri, subscription, receiver, transport_type):
             for inbox in sender_end.inboxes:
                 inbox.put((frozen, thaw, publisher.header))
     for inbox in sender_end.inboxes:
-        inbox.callback_queue.request_run()
+        inbox.callback_queue.request_thread()
 
 
 def links_of(connections):

@@ -185,7 +185,7 @@ def topic_rates(link_rates: dict[Link, Traffic], unit: str) -> dict[str, float]:
 
 def health_facts(run: Run) -> dict[str, Any]:
     """Return the facts of :meth:`Node.health` that the master is not asked for."""
-    connections = run.topics.get_pub_sub_info()
+    connections = run.topic_manager.get_pub_sub_info()
     ended_souls = [soul.name for soul in run.souls if not soul.is_alive()]
     return {
         'kind': type(run.node).__name__,

@@ -24,7 +24,7 @@ from types import ModuleType
 import rospy.exceptions
 import rospy.impl.transport
 
-SHARED = sys.stdlib_module_names.union(
+COMMON = sys.stdlib_module_names.union(
     'genpy genmsg roslib rospkg rosmaster catkin catkin_pkg pharos'.split(),
     'numpy yaml matplotlib cv2 PIL'.split(),
 )
@@ -88,7 +88,7 @@ def _find(name, path):
 def source_places(top_name):
     """Return the file of a top-level module of Python, and its folders if it is a package."""
     spec = getattr(sys.modules.get(top_name), '__spec__', None) or PathFinder.find_spec(top_name)
-    if top_name in SHARED or spec is None or not str(spec.origin).endswith('.py'):
+    if top_name in COMMON or spec is None or not str(spec.origin).endswith('.py'):
         return None, []
     file = pathlib.Path(spec.origin)
     folders = list(spec.submodule_search_locations or ())
@@ -135,16 +135,6 @@ def _is_generated(name):
     """True for generated messages, which all nodes share."""
     top_name, *rest = name.split('.')
     return rest[:1] in (['msg'], ['srv']) and top_name not in ('rospy', 'rosgraph')
-
-
-def is_private(name):
-    """True if each node has a copy of the module."""
-    top_name = name.partition('.')[0]
-    if top_name in PRIVATE:
-        return True
-    if top_name in SHARED or _is_generated(name):
-        return False
-    return _reaches_rospy(top_name)
 
 
 #: class of a private module -> its PrivateModules, as a weak reference
@@ -227,17 +217,20 @@ class PrivateModules:
         return self.modules['sys'].path
 
     def _is_private(self, name):
-        """True also for modules beside the program, or in folders that it has put on sys.path."""
+        """True if each node has a copy of the module.
+
+        Also modules beside the program, or in folders that it has put on sys.path, are private.
+        """
+        top_name = name.partition('.')[0]
         if _is_generated(name):
             return False
-        top_name = name.partition('.')[0]
-        if is_private(name):
+        if top_name in PRIVATE:
             return True
         if self.program_folder and PathFinder.find_spec(top_name, [self.program_folder]):
             return True
-        if top_name in SHARED:
+        if top_name in COMMON:
             return False
-        return self._is_added(top_name)
+        return _reaches_rospy(top_name) or self._is_added(top_name)
 
     def _is_added(self, top_name):
         """True if a module lies in a folder that the process does not search."""
@@ -281,7 +274,7 @@ class PrivateModules:
         vars(module)['__builtins__'] = self.builtins
         is_added = sys.modules.setdefault(name, module) is module  # @dataclass looks there
         try:
-            if code is None and spec.loader and spec.has_location:
+            if code is None and spec.loader and spec.has_location:  # an extension in C
                 spec.loader.exec_module(module)
             else:
                 exec(code or '', vars(module))

@@ -35,24 +35,24 @@ _current_client = _CurrentClient()
 def replace(module, target):
     """Enter a function that makes a replacement into the table."""
 
-    def enter(make_replacement):
+    def add_to_table(make_replacement):
         TABLE.setdefault(module, []).append((target, make_replacement))
         return make_replacement
 
-    return enter
+    return add_to_table
 
 
 def patch(module, target):
     """Enter a function that is called instead of another one into the table."""
 
-    def enter(function):
+    def add_to_table(function):
         def make_replacement(original, run):
             return lambda *args, **kwargs: function(original, run, *args, **kwargs)
 
         replace(module, target)(make_replacement)
         return function
 
-    return enter
+    return add_to_table
 
 
 def apply(module, run):
@@ -188,7 +188,7 @@ def limit_request(original, run, self):
 
 @replace('rospy.core', 'signal_shutdown')
 def signal_shutdown(original, run):
-    """rospy ends itself alone; this stops the node, for rosnode kill as for its user."""
+    """rospy ends itself alone; this stops the node."""
     run.rospy_signal_shutdown = original
     return run.signal_shutdown
 
@@ -203,7 +203,7 @@ def is_shutdown(original, run):
 
 
 @replace('rosgraph.roslogging', 'rospkg')
-def packages(original, run):
+def cached_packages(original, run):
     """rosgraph searches all packages for its configuration of the log for each node; this does once."""
     return Shim(original, RosPack=rospkg.RosPack.get_instance)
 
@@ -212,7 +212,7 @@ def packages(original, run):
 def ready(original, run, self, uri):
     """rospy starts a thread that looks for departed subscribers; this has the watcher of all runs do so."""
     self.uri = uri
-    run.enter(self, uri)
+    run.make_findable(self, uri)
     self.reg_man.start(uri, self.masterUri)
 
 
@@ -259,13 +259,13 @@ def start_timer(original, run, self, period, callback, *args, **kwargs):
 
 
 @replace('rospy.topics', '_PublisherImpl')
-def publisher(original, run):
+def overlay_publisher(original, run):
     """rospy serializes for all receivers; see PublisherOverlay."""
     return overlay(original, topics.PublisherOverlay, run)
 
 
 @replace('rospy.topics', '_SubscriberImpl')
-def subscription(original, run):
+def overlay_subscription(original, run):
     """rospy runs all callbacks in the thread that reads; see SubscriptionOverlay."""
     return overlay(original, topics.SubscriptionOverlay, run)
 
@@ -287,7 +287,7 @@ def queue_connection(original, run, connection, queue_size):
 
 
 @patch('rospy.impl.tcpros_pubsub', 'robust_connect_subscriber')
-def receive(original, run, connection, address, port, uri, callback, topic):
+def receive_and_retry(original, run, connection, address, port, uri, callback, topic):
     """rospy gives up silently, or tries ever more rarely; this reports, and tries each second."""
     subscription = callback.__self__
     reason = ''
@@ -304,13 +304,13 @@ def receive(original, run, connection, address, port, uri, callback, topic):
 
 
 @patch('rospy.impl.registration', 'RegManager.reg_added')
-def register(original, run, self, name, data, registry):
+def register_once(original, run, self, name, data, registry):
     """rospy tries for ever with the lock of all topics held; this tries once, and the watcher repairs."""
     run.register(registry, name, data)
 
 
 @patch('rospy.impl.registration', 'RegManager.publisher_update')
-def publisher_update(original, run, self, name, uris):
+def publisher_update(original, run, self, name, uris):  # with the same list each time
     """rospy leaves the connecting to its thread, once for each publisher; this connects to all."""
     if uris != run.publisher_uris.get(name):
         run.publisher_uris[name] = uris
@@ -319,7 +319,10 @@ def publisher_update(original, run, self, name, uris):
 
 @patch('rospy.impl.masterslave', 'ROSHandler.publisherUpdate')
 def publishers_changed(original, run, self, *args):
-    """rospy does not hear that the last publisher has left; this does."""
+    """rospy does not hear that the last publisher has left; this does.
+
+    rospy then calls publisher_update() above, unless the list is empty.
+    """
     if len(args) > 1:  # rospy refuses a call with too few
         topic = args[1]
         run.publisher_uris.pop(topic, None)
@@ -332,7 +335,7 @@ def cleanup(original, run, self, reason):
     try:
         original(self, reason)
     finally:
-        run.topics.close_all()
+        run.topic_manager.close_all()
 
 
 @patch('actionlib.simple_action_client', 'SimpleActionClient.send_goal')
@@ -362,7 +365,7 @@ def set_parameter(original, run, self, key, *value):
 
 
 @replace('rospy.impl.rosout', 'rospy')
-def rosout(original, run):
+def rosout_without_master(original, run):
     """rospy asks the master for each line, which registers a stopping node anew; this asks nobody."""
     return Shim(original, get_param_cached=lambda name, default=None: default)
 

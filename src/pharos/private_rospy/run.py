@@ -11,7 +11,7 @@ import socket
 import sys
 import threading
 import time
-import xmlrpc
+import xmlrpc.client
 from contextlib import suppress
 from http.client import HTTPException
 from time import monotonic
@@ -19,33 +19,37 @@ from types import SimpleNamespace
 from urllib.parse import urlsplit
 from weakref import WeakSet
 from xml.parsers.expat import ExpatError
-from xmlrpc import client as xmlrpc_client
 
 from rospy import ServiceException
 
 from pharos.blocks import block_name
-from pharos.errors import MasterUnreachableError, MessageTypeError, NodeNameInUseError
-from pharos.errors import PharosError, PortInUseError
+from pharos.errors import (
+    MasterUnreachableError,
+    MessageTypeError,
+    NodeNameInUseError,
+    PharosError,
+    PortInUseError,
+)
 from pharos.failures import Failure, Failures
 from pharos.intraprocess.callback_queues import CallbackQueue
 from pharos.intraprocess.copier import copy_of
 from pharos.intraprocess.links import link_topic, runs, runs_lock
 from pharos.private_rospy import patches
 from pharos.private_rospy.loader import PrivateModules, Shim, private_path
-from pharos.private_rospy.tcpros import close_relay, follow_relay, shutdown_socket
+from pharos.private_rospy.tcpros import close_relay, join_relay, shutdown_socket
 from pharos.signals import may_be_signal
 from pharos.transcript import Transcript
 
 MASTER_LIMIT = 5.0  # seconds for each question to a master or node
-PEER_LIMIT = 1.0  # seconds for the question whether a node of our name lives
+NAME_LIMIT = 1.0  # seconds for the question whether another node has the name
 STOP_LIMIT = 2.0  # seconds that a stop waits for threads of rospy
 HOLD_LIMIT = 2.0  # seconds that delegates wait for the end of start(), which may wait for them
 RETRY_DELAY = 1.0  # seconds until the next attempt to connect
 WATCH_PERIOD = 0.25  # seconds between two looks
 LOOKS_PER_MASTER = 4  # each fourth look is at the masters, too
 BACKLOG = 128  # clients that may wait for a connection; rospy lets five
-UNREACHABLE = OSError, xmlrpc_client.Error, HTTPException, ExpatError
-#: rospy's names of registries -> methods of the master
+UNREACHABLE = OSError, xmlrpc.client.Error, HTTPException, ExpatError
+#: rospy's names of registries, in the order of the master's system state -> methods of the master
 _REGISTER_METHODS = {
     'pub': 'registerPublisher',
     'sub': 'registerSubscriber',
@@ -64,7 +68,7 @@ class Lifecycle(enum.Enum):
     STOPPED = 'stopped'
 
 
-class _Transport(xmlrpc_client.Transport):
+class _Transport(xmlrpc.client.Transport):
     def make_connection(self, host):
         connection = super().make_connection(host)
         connection.timeout = self.limit
@@ -77,7 +81,7 @@ class _Transport(xmlrpc_client.Transport):
             self.close()
 
 
-class ServerProxy(xmlrpc_client.ServerProxy):
+class ServerProxy(xmlrpc.client.ServerProxy):
     """A proxy of an XML-RPC server that gives up after ``limit`` seconds."""
 
     def __init__(self, uri, limit=MASTER_LIMIT):
@@ -117,8 +121,8 @@ class Run:
         self.relays = {}  # (topic, URI, class) -> publisher to the nodes that share a connection
         self.callback_queue = CallbackQueue()
         self.callback_queue.hold()  # until the node's start() has returned
-        self.hold_deadline = monotonic()
-        if node._releases_after_start:
+        self.hold_deadline = monotonic()  # the watcher releases then
+        if node._holds_delegates:  # otherwise nobody knows when start() has returned
             self.hold_deadline += HOLD_LIMIT
         namespace, _, self.base_name = self.name.rpartition('/')
         self.environ = {
@@ -137,8 +141,8 @@ class Run:
         self.core = self.ros.core
         self.write_log = self.core._base_logger
         registration = self.modules.load('rospy.impl.registration')
-        self.topics = registration.get_topic_manager()
-        self.services = registration.get_service_manager()
+        self.topic_manager = registration.get_topic_manager()
+        self.service_manager = registration.get_service_manager()
 
     def substitutes(self):
         """Return the stand-ins that the node's modules import for some modules of Python."""
@@ -153,7 +157,7 @@ class Run:
                 run.threads.add(self)
 
         self.Thread = Thread
-        client = Shim(xmlrpc_client, ServerProxy=ServerProxy)
+        client = Shim(xmlrpc.client, ServerProxy=ServerProxy)
         return {
             'os': Shim(os, environ=self.environ, register_at_fork=lambda **hooks: None),
             'sys': Shim(sys, argv=self.argv, path=self.path),
@@ -269,12 +273,13 @@ class Run:
         tcpros_base = self.modules.load('rospy.impl.tcpros_base')
         port, xmlrpc_port = self.settings.ports
         try:
+            # rospy's own start finds this server, and makes none; it could not raise a busy port
             server = tcpros_base.init_tcpros_server(port)
             tcp_server = tcpros_base.TCPServer(server._tcp_server_callback, port)
             server.tcp_ros_server = tcp_server
             tcp_server.server_sock.listen(BACKLOG)
             tcp_server.start()
-            port = xmlrpc_port
+            port = xmlrpc_port  # init_node() binds it
             ports = {'xmlrpc_port': port, 'tcpros_port': tcp_server.port}
             options = {'disable_signals': True, **options, **ports}
             self.modules.load('rospy.client').init_node(self.base_name, self.argv, **options)
@@ -298,14 +303,14 @@ class Run:
         if not uri:
             return
         with suppress(*UNREACHABLE):
-            ServerProxy(uri, PEER_LIMIT).getPid('/pharos')
+            ServerProxy(uri, NAME_LIMIT).getPid('/pharos')
             raise NodeNameInUseError(
                 f'{self.name} is running already, at {uri}: choose another name, or end that one'
             )
 
-    def enter(self, handler, uri):
+    def make_findable(self, handler, uri):
         """Be found and watched: the servers run, and nothing is registered yet."""
-        self.handler = handler
+        self.ros_handler = handler
         self.uri = uri
         handler.pharosHealth = lambda caller_id: (1, '', self.health_facts())
         with runs_lock:
@@ -338,7 +343,7 @@ class Run:
 
     def connect(self, topic, uri):
         """Connect a subscription to a publisher, unless it is or is about to be."""
-        subscription = self.topics.subs.get(topic)
+        subscription = self.topic_manager.subs.get(topic)
         if self.stopping.is_set() or not subscription or subscription.has_connection(uri):
             return
         attempt = topic, uri, id(subscription)
@@ -350,22 +355,20 @@ class Run:
             if publisher_run:
                 link_topic(publisher_run, self, topic)
                 return
-            if self.master.share_connections and follow_relay(self, topic, uri, subscription):
+            if self.master.share_connections and join_relay(self, topic, uri, subscription):
                 return
             self._connect_by_tcpros(topic, uri, subscription)
         finally:
             self.connecting.discard(attempt)
 
     def _connect_by_tcpros(self, topic, uri, subscription):
-        code = 0
-        try:
-            code, _, _ = self.handler._connect_topic(topic, uri)
-        except (AttributeError, UnboundLocalError):  # rospy's, if it was closed meanwhile
+        code = None
+        with suppress(AttributeError, UnboundLocalError):  # rospy's, if it was closed meanwhile
+            code, _, _ = self.ros_handler._connect_topic(topic, uri)
+        if code == 1:
             return
-        finally:
-            if code != 1:
-                close_relay(self, topic, uri, subscription)
-        if code != 1:
+        close_relay(self, topic, uri, subscription)
+        if code is not None:
             self.start_thread(functools.partial(self.connect_again, topic, uri))
 
     def connect_again(self, topic, uri, reason=''):
@@ -384,8 +387,8 @@ class Run:
         registered = set()
         for registry, entries in zip(_REGISTER_METHODS, state):
             registered.update((registry, name) for name, nodes in entries if self.name in nodes)
-        topics = self.topics
-        services = self.services
+        topics = self.topic_manager
+        services = self.service_manager
         getters = topics.get_publications, topics.get_subscriptions, services.get_services
         with topics.lock, services.lock:  # a topic that is closed meanwhile stays closed
             for registry, get_entries in zip(_REGISTER_METHODS, getters):
@@ -408,9 +411,9 @@ class Run:
         """Close a client's socket if it says nothing within the node's client_timeout."""
         self.deadlines[sock] = monotonic() + self.node.client_timeout
 
-    def look(self):
-        """Look which peers have left or are silent (ros_comm #927), and end a hold that is too long."""
-        self.topics.check_all()
+    def check_peers(self):
+        """Find peers that have left (ros_comm #927) or are silent, and end a hold that is too long."""
+        self.topic_manager.check_all()
         now = monotonic()
         if now > self.hold_deadline:
             self.callback_queue.release()
@@ -433,18 +436,19 @@ class Run:
 
         :param timeout: seconds for messages under way
         """
-        self.stopping.set()
+        self._begin_stop()
         with runs_lock:
             runs.pop(self.uri, None)
             if not runs:
                 _end_of_watch.set()
-        self._interrupt_calls()
         deadline = monotonic() + timeout
-        for publisher in list(self.topics.pubs.values()):
+        for publisher in list(self.topic_manager.pubs.values()):
             publisher.flush(deadline)
         self.rospy_signal_shutdown('stop')
 
-    def _interrupt_calls(self):
+    def _begin_stop(self):
+        """End sleeps and calls of services."""
+        self.stopping.set()
         for sock in list(self.calls):
             shutdown_socket(sock)
 
@@ -455,8 +459,7 @@ class Run:
         """
         self.lifecycle = Lifecycle.STOPPING
         self.end_program(timeout)
-        self.stopping.set()
-        self._interrupt_calls()
+        self._begin_stop()
         left_behind = [thread.name for thread in join(self.souls, timeout)]
         has_ended = self.callback_queue.close(timeout)
         if not has_ended:
@@ -496,7 +499,7 @@ def _watch_runs():
             return
         look_count += 1
         for run in list(runs.values()):
-            run.look()
+            run.check_peers()
         if look_count % LOOKS_PER_MASTER == 0:
             _ask_masters()
 
@@ -518,7 +521,7 @@ def _ask_masters():
 def find_local_service(name, uri):
     """Return the rospy.Service of a node of this process, or None."""
     for run in list(runs.values()):
-        service = run.services.get_service(name)
+        service = run.service_manager.get_service(name)
         if service and service.uri == uri:
             return service
     return None
@@ -533,6 +536,7 @@ def call_local_service(service, request, caller_id):
     connection = SimpleNamespace(
         write_buff=io.BytesIO(),
         send_message=lambda response, seq: answers.append(copy_of(response)),
+        # an error is a 0, four bytes of length, and the text
         write_data=lambda data: answers.append(ServiceException(data[5:].decode())),
     )
     request._connection_header = {'callerid': caller_id, 'service': service.resolved_name}

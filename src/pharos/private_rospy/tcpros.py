@@ -88,15 +88,16 @@ def _read_message(stream):
 # -- sharing
 
 
-def follow_relay(run, topic, uri, subscription):
-    """Link the subscription to the relay of the node that has the connection, and return True.
+def join_relay(run, topic, uri, subscription):
+    """Link the subscription to the relay of the node that has the connection; True if there is one.
 
-    If no node of this process has the connection, make a relay for this one, and return False.
+    If no node of this process has the connection, this one must make it: make its relay.
     """
     key = topic, uri, subscription.data_class
     with runs_lock:
         for other in runs.values():
             if key in other.relays:
+                # the connection of the relay is one of TCPROS
                 link(other.relays[key], uri, subscription, run, 'TCPROS')
                 return True
         relay = run.modules.load('rospy.topics')._PublisherImpl(topic, subscription.data_class)
@@ -111,7 +112,7 @@ def close_relay(run, topic, uri, subscription):
         relay = run.relays.pop((topic, uri, subscription.data_class), None)
         if not relay:
             return
-        links = relay.connections
+        links = [*relay.connections]
         relay.close()
     for end in links:
         end.run.start_thread(functools.partial(end.run.connect, topic, uri))
@@ -145,8 +146,10 @@ class Sender:
         with self._lock:
             if self.is_busy or len(data) > MAX_DIRECT:
                 self._enqueue(data)
-            elif self._send_directly(data):
-                return
+            else:
+                is_sent = self._send_directly(data)
+                if is_sent:
+                    return
             if not self.is_busy:
                 self.is_busy = True
                 self._run.start_thread(self._send_queue)

@@ -33,13 +33,14 @@ class PublisherOverlay:
 
     def __init__(self, name, data_class):
         self.rospy___init__(name, data_class)
-        self.lock = self.publock
+        self.lock = self.publock  # rospy's close() sets publock to None
         self.latches = {}  # channel, or None for all Publishers of plain rospy -> frozen message
         self.last_wake = 0.0
         self.freeze, self.thaw = copier_for(data_class)
         self.has_header = getattr(data_class, '_has_header', False)
         self.header = None
-        self.receivers_are_for = None  # the list of connections that the receivers were found for
+        # the connections that the receivers were found for: rospy makes a new list at each change
+        self.receivers_are_for = None
 
     def acquire(self):
         """Let a signal be handled first: rospy locks here for the whole of a publish().
@@ -70,8 +71,9 @@ class PublisherOverlay:
     def add_connection(self, connection):
         with self.lock:
             self.rospy_add_connection(connection)
+            new_connections = self.connections[-1:]  # rospy has wrapped it in a Sender
             for frozen in list(self.latches.values()):
-                self.write(self.thaw(frozen), self.connections[-1:])
+                self.write(self.thaw(frozen), new_connections)
         return True
 
     def remove_connection(self, connection):
@@ -87,23 +89,23 @@ class PublisherOverlay:
         with self.lock:
             if self.closed:
                 if channel is None and self.run.stopping.is_set():  # rospy's ends quietly, too
-                    return False
+                    return
                 raise rospy.ROSException('publish() to a closed topic')
             self.seq += 1
             if connection_override is None:
                 if self.receivers_are_for is not self.connections:
                     self.receivers_are_for = self.connections
                     self.receivers = receivers_of(self.connections)
-                inboxes, inline_queues, other_queues, remotes = self.receivers
+                inboxes, inline_queues, other_queues, others = self.receivers
                 is_latched = self.is_latch
                 if channel:
                     is_latched = channel.latch
             else:
-                inboxes, inline_queues, other_queues, remotes = receivers_of([connection_override])
+                inboxes, inline_queues, other_queues, others = receivers_of([connection_override])
                 is_latched = False
             if self.has_header:  # as serialize_message does
                 message.header.seq = self.seq
-            if inboxes or is_latched or not remotes:  # if nobody receives, freeze() checks it
+            if inboxes or is_latched or not others:  # if nobody receives, freeze() checks it
                 frozen = self.freeze(message)
                 if is_latched:
                     self.latches[channel] = frozen
@@ -111,17 +113,14 @@ class PublisherOverlay:
                     item = frozen, thaw, self.header
                     for inbox in receivers:
                         inbox.put((message, None, None) if inbox.shared else item)
-            if remotes:
-                self.write(message, remotes)
+            if others:
+                self.write(message, others)
         for callback_queue in inline_queues:
-            callback_queue.run()
+            callback_queue.run_jobs()
         if other_queues:
-            last_wake = self.last_wake
-            if channel is None:
-                # actionlib keeps a goal after publish() only: never wait for a receiver
-                last_wake = INFINITE
-            self.last_wake = hand_over(other_queues, last_wake)
-        return True
+            # actionlib keeps a goal after publish() only: plain rospy never waits for a receiver
+            may_wait = channel is not None
+            self.last_wake = hand_over(other_queues, self.last_wake, may_wait)
 
     def write(self, message, connections):
         """Serialize a message, and write it to some connections."""
@@ -254,8 +253,8 @@ def receivers_of(connections):
     for inbox in sum(inboxes.values(), []):
         queues = inline_queues if inbox.inline else other_queues
         queues.append(inbox.callback_queue)
-    remotes = [connection for connection in connections if connection not in links]
-    return inboxes, inline_queues, other_queues, remotes
+    others = [connection for connection in connections if connection not in links]
+    return inboxes, inline_queues, other_queues, others
 
 
 def close_topic(impl):
