@@ -7,6 +7,8 @@ import sys
 import tempfile
 import threading
 
+import rospkg
+
 # before pharos is imported: the tests have their own logs and addresses
 os.environ['ROS_HOSTNAME'] = '127.0.0.1'
 os.environ['ROS_LOG_DIR'] = tempfile.mkdtemp(prefix='pharos-test-log-')
@@ -18,9 +20,8 @@ SRC = str(ROOT / 'src')
 sys.path.insert(0, SRC)
 os.environ['PYTHONPATH'] = f'{SRC}:{os.environ.get("PYTHONPATH", "")}'.rstrip(':')
 # in a clone with nothing built, rosrun finds this package, too
-PATHS = os.environ.get('ROS_PACKAGE_PATH', '/usr/share')
-if not any('pharos' in path for path in PATHS.split(':')):
-    os.environ['ROS_PACKAGE_PATH'] = f'{ROOT}:{PATHS}'
+if 'pharos' not in rospkg.RosPack().list():
+    os.environ['ROS_PACKAGE_PATH'] = f'{ROOT}:{os.environ.get("ROS_PACKAGE_PATH", "/usr/share")}'
 
 import pytest  # noqa: E402
 

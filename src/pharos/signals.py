@@ -89,7 +89,7 @@ def _handle_signal(number, frame):
     """Handle the signal of that number."""
     global _signal_time
     if _signal_time is not None:
-        if time.monotonic() - _signal_time > SAME_SIGNAL:
+        if time.monotonic() - _signal_time > SAME_SIGNAL:  # pragma: no cover: it ends the process
             signal.signal(number, signal.SIG_DFL)
             signal.raise_signal(number)  # ends the program at once
         return
