@@ -193,11 +193,8 @@ class OutputChannel(Channel):
         :raises MessageTypeError: if it is of another type, or cannot be serialized
         :raises NodeStoppedError: if the channel is closed
         """
-        # AnyMsg has the md5sum '*'
-        sent_class = type(message)
-        if getattr(sent_class, '_md5sum', None) not in (self.message_class._md5sum, '*'):
-            sent_type = getattr(sent_class, '_type', repr(message)[:80])
-            raise MessageTypeError(f'{self.topic} carries {self.type}, not {sent_type}')
+        if type(message) is not self.message_class:
+            self._check_type(message)
         if self.closed:
             raise NodeStoppedError(f'{self!r} cannot send: open another one, or start the node')
         try:
@@ -207,6 +204,13 @@ class OutputChannel(Channel):
                 raise NodeStoppedError(f'{self!r} was closed while it sent') from error
             raise messages.explain(message, error) from error
         self.sent += 1
+
+    def _check_type(self, message):
+        sent_class = type(message)
+        # AnyMsg has the md5sum '*'
+        if getattr(sent_class, '_md5sum', None) not in (self.message_class._md5sum, '*'):
+            sent_type = getattr(sent_class, '_type', repr(message)[:80])
+            raise MessageTypeError(f'{self.topic} carries {self.type}, not {sent_type}')
 
     def send(self, block=None, *, to=None, **fields) -> Message:
         """Fill a new message by ``block(message)`` and keywords, or take a ready one; send it.
