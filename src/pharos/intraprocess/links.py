@@ -30,6 +30,7 @@ class Link(Transport):
     :param thaw: makes a message of the subscription's class from a frozen one
     """
 
+    has_own_queue = True  # the inboxes
     latch = None  # for rospy, which would resend it; the overlay has latches of its own
     header = property(lambda self: self.publisher.header)
     callerid_pub = property(peer_of)  # actionlib asks for it

@@ -5,6 +5,7 @@ target; ``run`` is the Run whose copy is patched. Over ``def f(original, run)``,
 target)`` puts the returned object in the target's place. Each docstring says first what rospy does,
 then what this does instead.
 """
+import functools
 import socket
 import threading
 from urllib.parse import urlsplit
@@ -13,7 +14,6 @@ import rospkg
 import rospy
 from rosgraph.network import ROSHandshakeException, decode_ros_handshake_header, is_local_address
 
-from pharos.intraprocess.links import Link
 from pharos.private_rospy import tcpros, topics
 from pharos.private_rospy.loader import Shim
 
@@ -281,7 +281,7 @@ def subscribe(original, run, self, *args, **kwargs):
 @patch('rospy.topics', 'QueuedConnection')
 def queue_connection(original, run, connection, queue_size):
     """rospy's queue is not bounded; see Sender."""
-    if isinstance(connection, Link):
+    if getattr(connection, 'has_own_queue', False):
         return connection
     return tcpros.Sender(connection, queue_size, run)
 
@@ -290,17 +290,8 @@ def queue_connection(original, run, connection, queue_size):
 def receive_and_retry(original, run, connection, address, port, uri, callback, topic):
     """rospy gives up silently, or tries ever more rarely; this reports, and tries each second."""
     subscription = callback.__self__
-    reason = ''
-    try:
-        tcpros.receive(connection, address, port, uri, subscription, run)
-    except Exception as error:
-        reason = str(error)
-    connection.close()
-    tcpros.close_relay(run, topic, uri, subscription)
-    if 'md5sum' in reason or 'do not match' in reason:  # rospy compares the names of types, too
-        run.report_refusal(topic, reason)
-    elif not subscription.closed:
-        run.connect_again(topic, uri, reason)
+    receive = functools.partial(tcpros.receive, connection, address, port, uri, subscription, run)
+    tcpros.receive_until_end(run, subscription, connection, uri, receive)
 
 
 @patch('rospy.impl.registration', 'RegManager.reg_added')

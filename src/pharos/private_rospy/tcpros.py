@@ -8,7 +8,6 @@ import struct
 import threading
 import time
 
-from pharos.intraprocess.copier import copy_of
 from pharos.intraprocess.links import link, runs, runs_lock
 
 MAX_MESSAGE = 1_000_000_000  # bytes, as in roscpp
@@ -35,6 +34,22 @@ def keep_alive(sock):
 # -- receiving
 
 
+def receive_until_end(run, subscription, connection, uri, receive_messages):
+    """Receive messages until the connection ends, then connect again, or report a refusal."""
+    topic = subscription.resolved_name
+    reason = ''
+    try:
+        receive_messages()
+    except Exception as error:
+        reason = str(error)
+    connection.close()
+    close_relay(run, topic, uri, subscription)
+    if 'md5sum' in reason or 'do not match' in reason:  # rospy compares the names of types, too
+        run.report_refusal(topic, reason)
+    elif not subscription.closed:
+        run.connect_again(topic, uri, reason)
+
+
 def receive(connection, address, port, uri, subscription, run):
     """Connect to a publisher and receive its messages until the connection ends."""
     connection.connect(address, port, uri, timeout=CONNECT_LIMIT)
@@ -43,32 +58,13 @@ def receive(connection, address, port, uri, subscription, run):
     run.sockets.add(sock)
     sock.settimeout(None)
     message_class = subscription.data_class
-    header = connection.header
-    relay = run.relays.get((subscription.resolved_name, uri, message_class))
-    if relay:
-        relay.header = header
-        relay.is_latch = connection.is_latched
     with sock.makefile('rb', _READ_BUFFER) as stream:
         while not connection.done:
             data = _read_message(stream)
             if data is None:
                 return
-            connection.stat_bytes += len(data) + _LENGTH.size
-            connection.stat_num_msg += 1
             message = message_class().deserialize(data)
-            logger = subscription.statistics_logger
-            if logger:
-                logger.callback(message, connection.callerid_pub, connection.stat_bytes)
-            if relay:
-                relay.publish(message)
-            inboxes = [*subscription.inboxes]
-            # copied before the first callback may change the message
-            copies = [copy_of(message) for _ in inboxes[1:]]
-            for own_message, inbox in zip([message, *copies], inboxes):
-                own_message._connection_header = header
-                inbox.receive(own_message, len(data))
-            if connection.is_latched:
-                connection.latch = message
+            subscription.deliver(message, connection, len(data) + _LENGTH.size)
 
 
 def _read_message(stream):

@@ -15,7 +15,7 @@ from pharos.intraprocess.callback_queues import (
     ThreadedCallbackQueue,
     hand_over,
 )
-from pharos.intraprocess.copier import copier_for
+from pharos.intraprocess.copier import copier_for, copy_of
 from pharos.intraprocess.links import links_of
 
 SOCKET_BYTES = 6 << 20  # that the sockets between a publisher and a subscriber hold about
@@ -211,6 +211,30 @@ class SubscriptionOverlay:
         for link in links:
             link.publisher.receivers_are_for = None
         return links
+
+    def deliver(self, message, connection, size):
+        """Count a message that came by a connection, and give each inbox a message of its own.
+
+        :param size: bytes of the message and its length
+        """
+        connection.stat_bytes += size
+        connection.stat_num_msg += 1
+        if self.statistics_logger:
+            self.statistics_logger.callback(message, connection.callerid_pub, connection.stat_bytes)
+        key = self.resolved_name, connection.endpoint_id, self.data_class
+        relay = self.run.relays.get(key)
+        if relay:
+            relay.header = connection.header
+            relay.is_latch = connection.is_latched
+            relay.publish(message)
+        inboxes = [*self.inboxes]
+        # copied before the first callback may change the message
+        copies = [copy_of(message) for _ in inboxes[1:]]
+        for own_message, inbox in zip([message, *copies], inboxes):
+            own_message._connection_header = connection.header
+            inbox.receive(own_message, size)
+        if connection.is_latched:
+            connection.latch = message
 
     def call_plain(self, message):
         """Run the callbacks that are no Inbox."""
