@@ -77,13 +77,20 @@ class Master:
     :param url: default: ROS_MASTER_URI, else ROS's default
     :param share_connections: nodes of this process that receive from one external publisher on one
         topic share a connection
+    :param shared_memory: False: nodes use TCPROS between processes of this package on one host, too;
+        default: what PHAROS_SHARED_MEMORY says, 0 or 1, else True
     :raises ValueError: if the URL is malformed
     """
 
     _environ = os.environ  # a script's Master has another one
     _first_nodes: dict = {}  # argv -> the first node that was created with it
 
-    def __init__(self, url: str | None = None, share_connections: bool = False):
+    def __init__(
+        self,
+        url: str | None = None,
+        share_connections: bool = False,
+        shared_memory: bool | None = None,
+    ):
         url = url or os.environ.get('ROS_MASTER_URI') or 'http://localhost:11311/'
         parts = _URL.fullmatch(str(url).lower())
         if not parts:
@@ -93,6 +100,9 @@ class Master:
         host = parts[1].replace('localhost', '127.0.0.1')
         self.url = f'http://{host}:{parts[2]}/'
         self.share_connections = share_connections
+        if shared_memory is None:
+            shared_memory = os.environ.get('PHAROS_SHARED_MEMORY') != '0'
+        self.shared_memory = shared_memory and hasattr(os, 'memfd_create')
         self.parameters = Parameters(self.call)
         self._process = None
         signals.handle_signals()
@@ -406,7 +416,7 @@ class Master:
         from pharos.compose.launch_file import LaunchFile
 
         launch_file = LaunchFile(self.url, package, file, args, only, apart, here)
-        master = Master(self.url, share_connections or self.share_connections)
+        master = Master(self.url, share_connections or self.share_connections, self.shared_memory)
         composition = Composition(master)
         composition.launch(launch_file)
         return composition

@@ -459,10 +459,12 @@ class _Pharos(Shim):
             _environ = run.environ
             _first_nodes: dict = {}
 
-            def __init__(self, url=None, share_connections=None):
+            def __init__(self, url=None, share_connections=None, shared_memory=None):
                 if share_connections is None:
                     share_connections = run.master.share_connections
-                super().__init__(url or run.master.url, share_connections)
+                if shared_memory is None:
+                    shared_memory = run.master.shared_memory
+                super().__init__(url or run.master.url, share_connections, shared_memory)
 
             def _remapped_name(self, node, name, mappings):
                 full_name = super()._remapped_name(node, name, mappings)

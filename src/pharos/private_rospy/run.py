@@ -312,6 +312,10 @@ class Run:
         """Be found and watched: the servers run, and nothing is registered yet."""
         self.ros_handler = handler
         self.uri = uri
+        if self.master.shared_memory:
+            from pharos.shared_memory.receiving import SharedMemoryHandler
+
+            handler.protocol_handlers.insert(0, SharedMemoryHandler(self))
         handler.pharosHealth = lambda caller_id: (1, '', self.health_facts())
         with runs_lock:
             if not runs:

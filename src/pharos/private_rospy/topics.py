@@ -39,6 +39,7 @@ class PublisherOverlay:
         self.freeze, self.thaw = copier_for(data_class)
         self.has_header = getattr(data_class, '_has_header', False)
         self.header = None
+        self.memory = None  # the shared_memory.MessageMemory, if a reader shares memory
         # the connections that the receivers were found for: rospy makes a new list at each change
         self.receivers_are_for = None
 
@@ -126,6 +127,10 @@ class PublisherOverlay:
         """Serialize a message, and write it to some connections."""
         buffer = io.BytesIO()
         try:
+            if self.memory:
+                connections = self.memory.write(message, self.seq, connections)
+            if not connections:
+                return
             serialize_message(buffer, self.seq, message)
         except Exception:  # copying makes bytes of numpy's arrays, or says what is wrong
             self.write(self.thaw(self.freeze(message)), connections)
@@ -152,6 +157,8 @@ class PublisherOverlay:
 
     def close(self):
         close_topic(self)
+        if self.memory:
+            self.memory.close()
         self.headers = {}
         self.subscriber_listeners = []
 

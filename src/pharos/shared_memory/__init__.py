@@ -1,0 +1,1 @@
+"""SHARED_MEMORY: messages between processes of this package on one host, by files in memory."""

@@ -1,0 +1,308 @@
+"""Send messages to the readers of a publisher that are processes of this package on this host.
+
+A small message is one packet of a socket. A large one lies in a file in memory; a packet announces
+it. The first such packet has the file's descriptor, and the reader maps the file. The reader copies
+the message at once, and says so by a receipt of one byte: then the file is free for another message.
+"""
+from __future__ import annotations
+
+import array
+import collections
+import copy
+import fcntl
+import functools
+import io
+import itertools
+import math
+import mmap
+import os
+import select
+import socket
+import struct
+import threading
+import time
+from typing import NamedTuple
+
+import genpy
+from rospy.impl.transport import Transport
+from rospy.msg import serialize_message
+
+from pharos.private_rospy.tcpros import shutdown_socket
+
+TRANSPORT_TYPE = 'SHARED_MEMORY'
+MAX_PACKET = 1 << 16  # bytes of a message, or a part of one, that the socket takes itself
+MAX_FILES = 4  # of a publisher
+POLL_LIMIT = 1000  # milliseconds between two looks if the connection is closed
+#: position of the file, or NO_FILE; slot of the field in it, or WHOLE; its bytes; dropped messages
+PACKET = struct.Struct('<bBQI')
+NO_FILE = -1
+WHOLE = 255
+_SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
+
+
+class MemoryFile:
+    """A file in memory for one message; the kernel frees it with the last process that has it."""
+
+    def __init__(self, position, size):
+        self.position = position
+        self.capacity = size + size // 4  # messages grow
+        self.number = 0  # of the message
+        self.readers = set()  # senders that announce it later, or have no receipt yet
+        self.descriptor = os.memfd_create('pharos', os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        os.ftruncate(self.descriptor, self.capacity)
+        fcntl.fcntl(self.descriptor, fcntl.F_ADD_SEALS, _SEALS)
+        self.map = mmap.mmap(self.descriptor, self.capacity)
+
+    def close(self):
+        self.map.close()
+        os.close(self.descriptor)
+
+
+class MessageMemory:
+    """The files of a publisher, at most four."""
+
+    def __init__(self, run):
+        self.run = run
+        self.lock = threading.Lock()  # of the files, and of the queues of all senders
+        self._files = []
+        self._numbers = itertools.count(1)
+
+    def write(self, message, seq, connections):
+        """Send a message by the connections that share memory, and return the other connections."""
+        senders = [each for each in connections if isinstance(each, MemorySender)]
+        if not senders:
+            return connections
+        slot, value, rest = _split(message, seq)
+        size = len(value)
+        with self.lock:
+            for sender in senders:
+                sender.take_receipts()
+            if size > MAX_PACKET:
+                file = self._free_file(size)
+                file.map[:size] = value
+                file.number = next(self._numbers)
+                entry = Entry(file, slot, size, rest)
+            else:
+                entry = Entry(None, WHOLE, 0, value)
+            for sender in senders:
+                sender.put(entry)
+        for sender in senders:
+            sender.close_if_broken()
+        if any(sender.is_busy for sender in senders):
+            time.sleep(0)  # or a busy publisher keeps the interpreter for 5 ms
+        return [each for each in connections if each not in senders]
+
+    def _free_file(self, size):
+        """Return a file that no reader needs, with room for so many bytes."""
+        free_files = [file for file in self._files if not file.readers]
+        for file in free_files:
+            if file.capacity >= size:
+                return file
+        if free_files:  # the message has grown
+            position = free_files[0].position
+            free_files[0].close()
+            self._files[position] = MemoryFile(position, size)
+            return self._files[position]
+        if len(self._files) < MAX_FILES:
+            self._files.append(MemoryFile(len(self._files), size))
+            return self._files[-1]
+        self._drop_oldest()
+        return self._free_file(size)
+
+    def _drop_oldest(self):
+        """Drop the oldest message that no reader may be reading; else give up its readers."""
+        files = sorted(self._files, key=lambda file: file.number)
+        queued_files = [
+            file for file in files if not any(r.announced is file for r in file.readers)
+        ]
+        oldest = (queued_files or files)[0]
+        for sender in list(oldest.readers):
+            sender.drop(oldest)
+
+    def close(self):
+        """Free the files."""
+        with self.lock:
+            for file in self._files:
+                file.close()
+            self._files.clear()
+
+
+class Entry(NamedTuple):
+    """A message in the queue of a sender."""
+
+    file: MemoryFile | None
+    slot: int  # of the field in the file, or WHOLE
+    size: int  # bytes in the file
+    data: bytes  # the rest of the message
+
+
+class MemorySender(Transport):
+    """The publisher's end of a connection."""
+
+    transport_type = TRANSPORT_TYPE
+    has_own_queue = True
+    is_busy = False  # True while a thread sends the queue
+    is_broken = False
+    announced = None  # the file that the reader has no receipt for yet
+
+    def __init__(self, topic, reader_name, sock, memory, queue_size):
+        super().__init__('o', topic)
+        self.endpoint_id = reader_name
+        self._socket = sock
+        self._memory = memory
+        self._queue_size = queue_size or math.inf
+        self._queue = collections.deque()
+        self._known_files = {}  # position -> the file that the reader has mapped
+        self._dropped = 0  # messages since the last packet
+
+    def fileno(self):
+        return self._socket.fileno()
+
+    def put(self, entry):
+        """Add a message to the queue, and send all that the socket takes; never waits."""
+        if self.done or self.is_broken:
+            return
+        self._queue.append(entry)
+        if entry.file:
+            entry.file.readers.add(self)
+        queue_bytes = self._memory.run.node.queue_bytes
+        capacity = min(self._queue_size, max(1, queue_bytes // max(1, len(entry.data))))
+        while len(self._queue) > capacity:
+            self._drop_entry(self._queue[0])
+        self._send_ready()
+        if self._queue and not self.is_busy:
+            self.is_busy = True
+            self._memory.run.start_thread(self._send_queue)
+
+    def _drop_entry(self, entry):
+        self._queue.remove(entry)
+        self._dropped += 1
+        if entry.file:
+            entry.file.readers.discard(self)
+
+    def drop(self, file):
+        """Drop the message in a file. If the reader may be reading it, give up the reader."""
+        if self.announced is file:
+            self._break()
+        for entry in [each for each in self._queue if each.file is file]:
+            self._drop_entry(entry)
+
+    def _break(self):
+        """Have the reader find its socket closed: its receipt fails, and it drops the message."""
+        self.is_broken = True
+        shutdown_socket(self._socket)
+        if self.announced:
+            self.announced.readers.discard(self)
+        for entry in list(self._queue):
+            self._drop_entry(entry)
+
+    def _send_ready(self):
+        """Send the messages that the socket takes, one in a file at a time."""
+        while self._queue:
+            entry = self._queue[0]
+            if entry.file and self.announced:
+                return
+            try:
+                self._send(entry)
+            except BlockingIOError:
+                return
+            except OSError:  # the reader has gone
+                self._break()
+                return
+            self._queue.popleft()
+            self.announced = entry.file or self.announced
+            self._dropped = 0
+            self.stat_num_msg += 1
+            self.stat_bytes += entry.size + len(entry.data)
+
+    def _send(self, entry):
+        file = entry.file
+        position = file.position if file else NO_FILE
+        head = PACKET.pack(position, entry.slot, entry.size, self._dropped)
+        rights = []
+        if file and self._known_files.get(position) is not file:
+            descriptors = array.array('i', [file.descriptor])
+            rights = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, descriptors)]
+        self._socket.sendmsg([head, entry.data], rights, socket.MSG_DONTWAIT)
+        self._known_files[position] = file
+
+    def take_receipts(self):
+        """Free the file that the reader has read."""
+        try:
+            receipt = self._socket.recv(1, socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            return
+        except OSError:
+            receipt = b''
+        if not receipt:
+            self._break()
+        elif self.announced:
+            self.announced.readers.discard(self)
+            self.announced = None
+
+    def _send_queue(self):
+        poller = select.poll()
+        while True:
+            with self._memory.lock:
+                self.take_receipts()
+                self._send_ready()
+                if not self._queue:
+                    self.is_busy = False
+                    break
+                waits_for_receipt = self._queue[0].file and self.announced
+            poller.register(self._socket, select.POLLIN if waits_for_receipt else select.POLLOUT)
+            poller.poll(POLL_LIMIT)
+        self.close_if_broken()
+
+    def close_if_broken(self):
+        if self.is_broken:
+            self.close()
+
+    def close(self):
+        if not self.done:
+            super().close()
+            with self._memory.lock:
+                self._break()
+                self._socket.close()
+
+
+def is_plain(message_class):
+    """True for classes as genpy makes them: not AnyMsg, and not a class of numpy_msg."""
+    return message_class.__bases__ == (genpy.Message,) and message_class._md5sum != '*'
+
+
+@functools.cache
+def _byte_fields(message_class):
+    """Return the slots of the fields that may lie in a file by themselves."""
+    if not is_plain(message_class):
+        return []
+    return [slot for slot, name in enumerate(message_class._slot_types) if name == 'uint8[]']
+
+
+def _split(message, seq):
+    """Return the slot of a large field and its bytes, or WHOLE and the message, and the rest."""
+    for slot in _byte_fields(type(message)):
+        name = message.__slots__[slot]
+        value = _view(getattr(message, name))
+        if len(value) > MAX_PACKET:
+            others = copy.copy(message)
+            setattr(others, name, b'')
+            rest = _serialize(others, seq)
+            if len(rest) <= MAX_PACKET:
+                return slot, value, rest
+    return WHOLE, _serialize(message, seq), b''
+
+
+def _view(value):
+    """Return the bytes of a field without copying them, b'' if that cannot be."""
+    if isinstance(value, bytes):
+        return value
+    if getattr(value, 'dtype', None) == 'uint8' and value.flags.c_contiguous:
+        return memoryview(value).cast('B')
+    return b''
+
+
+def _serialize(message, seq):
+    buffer = io.BytesIO()
+    serialize_message(buffer, seq, message)
+    return buffer.getvalue()[4:]  # without the length
