@@ -9,13 +9,16 @@ Block = Callable[..., Any]
 
 
 def with_arguments(block, role, least, most):
-    """Return a block that takes ``most`` arguments, and passes on as many as the block needs.
+    """Return a block that takes ``most`` arguments, and passes on as many as the given one needs.
 
-    Parameters with a default keep it: ``lambda message, side=side: ...`` gets the message alone.
+    Parameters keep their defaults: ``lambda message, side=side: ...`` gets the message alone.
+    None stays None.
 
     :param role: the word for the block in an error, such as 'delegate'
-    :param least: the block gets at least so many arguments
-    :raises TypeError: if it is not callable, takes another number of arguments, or is an ``async def``
+    :param least: the given block gets at least so many arguments
+    :param most: the given block gets at most so many arguments
+    :raises TypeError: if the block is not callable, is an ``async def``, or takes another number of
+        arguments
     """
     if block is None:
         return None
@@ -41,7 +44,7 @@ def with_arguments(block, role, least, most):
 
 
 def _count_needed(signature, least, most):
-    """Return how many arguments to pass: all if there is ``*args``, else those without a default."""
+    """Return how many arguments to pass: ``most`` for ``*args``, else those without a default."""
     parameters = signature.parameters.values()
     if any(parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters):
         return most
@@ -57,7 +60,7 @@ def _count_needed(signature, least, most):
 
 
 class DelegateHolder:
-    """Has a delegate, for nodes and channels."""
+    """The base of nodes and input channels: an object with a delegate."""
 
     _delegate: Block | None = None
     _delegate_block: Block | None = None  # the delegate, as a block that takes two arguments
@@ -66,8 +69,10 @@ class DelegateHolder:
     def delegate(self):
         """The block run for each message, as ``block(message, channel)`` or ``block(message)``.
 
-        A channel's delegate goes before its node's. A new one takes effect with the next message.
-        The report: ``self receiverDelegate: [:message :channel | ...]``.
+        None: no block. A channel's delegate goes before its node's. A new delegate takes effect
+        with the next message. The report: ``self receiverDelegate: [:message :channel | ...]``.
+
+        :raises TypeError: if the new delegate is not a block of one or two arguments
         """
         return self._delegate
 
@@ -78,7 +83,11 @@ class DelegateHolder:
 
 
 def rebind(block, node, node_class):
-    """Return the block; if it is a method of the node, the method of that name of another class."""
+    """Return a block; a method of the node is replaced by the method of that name in a class.
+
+    :param block: a block, None, or a list of blocks, which gives a list
+    :raises AttributeError: if the class lacks the method
+    """
     if isinstance(block, list):
         return [rebind(item, node, node_class) for item in block]
     if getattr(block, '__self__', None) is not node:
@@ -87,7 +96,7 @@ def rebind(block, node, node_class):
 
 
 def block_name(block):
-    """Return the name of a block, for texts."""
+    """Return the name of a block for logs and tables; a string is its own name."""
     if isinstance(block, str):
         return block
     return getattr(block, '__qualname__', type(block).__name__)

@@ -22,15 +22,17 @@ QUEUE_SIZE = 1000
 
 
 class Endpoint:
-    """A channel, service or parameter of a node: its stop closes it, its next start opens it again.
+    """A channel, service or parameter of a node.
+
+    The node's stop closes the endpoint. The node's next start opens the endpoint again.
 
     :ivar node: the node
-    :ivar closed: True if it was closed, or the node is stopped
+    :ivar closed: True if the endpoint was closed, or the node is stopped
     """
 
     node: Node
     closed = True
-    delegate: Any = None  # its block or blocks
+    delegate: Any = None  # the endpoint's block or blocks
     ros_object: Any = None  # rospy's Publisher, Subscriber or Service
 
     @property
@@ -41,14 +43,22 @@ class Endpoint:
         raise NotImplementedError
 
     def open(self):
-        """Register, by _open() of the subclass; the node's next start calls this again."""
+        """Register with the master, by _open() of the subclass.
+
+        The constructor calls this, and each further start of the node.
+
+        :raises MasterUnreachableError: if the master does not answer
+        """
         self._run.master.call('getPid')  # raises if the master does not answer
         self._open()
         self._run.endpoints = [*self._run.endpoints, self]
         self.closed = False
 
     def close(self) -> None:
-        """Receive, send or offer no more, and unregister."""
+        """Unregister, and receive, send or offer no more.
+
+        The node's next start leaves the endpoint closed. A second call does nothing.
+        """
         run = self._run
         run.endpoints = [endpoint for endpoint in run.endpoints if endpoint is not self]
         if not self.closed:
@@ -60,10 +70,10 @@ class Endpoint:
 
 
 class Channel(Endpoint):
-    """Either kind of channel.
+    """The base of input and output channels.
 
     :ivar topic: the full name of the topic
-    :ivar type: the name of its message type
+    :ivar type: the name of the topic's message type
     """
 
     def _open_on(self, node, topic, message_class):
@@ -76,7 +86,7 @@ class Channel(Endpoint):
 
     @property
     def connections(self) -> list[tuple[str, str]]:
-        """The peers: ``(name of the node, 'INTRAPROCESS' or 'TCPROS')``."""
+        """The connected peers: ``(name of the node, 'INTRAPROCESS' or 'TCPROS')``."""
         connections = [each for each in connections_of(self.ros_object) if peer_of(each)]
         return [(peer_of(connection), connection.transport_type) for connection in connections]
 
@@ -89,8 +99,10 @@ class Channel(Endpoint):
 class InputChannel(DelegateHolder, Channel, Inbox):
     """The end of a topic at which a node receives; see :meth:`Node.interested_in`.
 
+    The channel is an Inbox: messages wait in the channel itself for its delegate.
+
     :ivar received: the number of messages that the delegate was run on
-    :ivar dropped: the number of messages that were dropped since the queue was full
+    :ivar dropped: the number of messages that were dropped because the queue was full
     """
 
     received = 0
@@ -110,7 +122,7 @@ class InputChannel(DelegateHolder, Channel, Inbox):
         self.ros_object = self.node.ros.Subscriber(self.topic, self.message_class, self)
 
     def __call__(self, message):
-        """Take a latched message: rospy calls this, if a connection was there before the channel."""
+        """Take a latched message: rospy calls this if the connection is older than the channel."""
         self.receive(message, 0)
 
     def _deliver(self, message):
@@ -128,7 +140,7 @@ class InputChannel(DelegateHolder, Channel, Inbox):
             self._run.report_failure(error, delegate, 'delegate', message, self, self._retry)
 
     def _retry(self, message):
-        """Run the delegate on a message once more, in the node's turn."""
+        """Run the delegate on a message once more, while no other delegate of the node runs."""
         self.node._check_active()
         self.callback_queue.call(lambda: self._deliver(message))
 
@@ -148,10 +160,10 @@ class OutputChannel(Channel):
 
     def open(self):
         """Advertise, and wait for the subscribers that the master knows."""
-        # asked before: a node that subscribes from now on hears of this publisher in time
+        # asked before: later subscribers learn of this publisher from the master
         subscribers = set(Topic(self._run.master, self.topic).subscribers)
         latched = None
-        if self.ros_object:  # the node has stopped since, and starts again
+        if self.ros_object:  # the node was stopped, and starts again: its latched message stays
             latched = self._publisher.latches.get(self)
         super().open()
         if latched is not None:
@@ -167,7 +179,8 @@ class OutputChannel(Channel):
     def _wait_until_connected(self, subscribers):
         """Wait until these nodes are connected: rospy loses messages sent before (#176).
 
-        A node that refuses connections is dead. A node that does not connect in time is logged.
+        Dead nodes, which refuse connections, are left out. A node that does not connect within the
+        node's connect_timeout is logged.
         """
         node = self.node
 
@@ -189,8 +202,11 @@ class OutputChannel(Channel):
     def publish(self, message: Message, connection=None) -> None:
         """Send a message.
 
-        :param connection: to that one alone
-        :raises MessageTypeError: if it is of another type, or cannot be serialized
+        Inline delegates of nodes of this process run before this returns. This never waits for the
+        subscribers.
+
+        :param connection: send to that connection alone; None: to all
+        :raises MessageTypeError: if the message is of another type, or cannot be serialized
         :raises NodeStoppedError: if the channel is closed
         """
         if type(message) is not self.message_class:
@@ -213,10 +229,15 @@ class OutputChannel(Channel):
             raise MessageTypeError(f'{self.topic} carries {self.type}, not {sent_type}')
 
     def send(self, block=None, *, to=None, **fields) -> Message:
-        """Fill a new message by ``block(message)`` and keywords, or take a ready one; send it.
+        """Fill a new message, or take a ready one, and send the message.
 
-        :param to: the node that alone gets it: a name, Node or ExternalNode
+        :param block: ``block(message)`` fills a new message; or a dict, or a ready message
+        :param to: the node that alone gets the message: a name, Node or ExternalNode
+        :param fields: fill the message by name
         :returns: the message
+        :raises MessageTypeError: if the message does not fit the topic, or has no such field
+        :raises UnknownNodeError: if the node ``to`` is not connected
+        :raises NodeStoppedError: if the channel is closed
         """
         message = messages.build(self.message_class, block, fields)
         connection = self._connection_to(to) if to else None
@@ -233,16 +254,23 @@ class OutputChannel(Channel):
         )
 
     def close(self) -> None:
-        """Send no more, once the sockets have taken all messages; unregister."""
+        """Unregister, and send no more.
+
+        Before that, wait until the sockets have taken all messages, up to the node's stop_timeout.
+        If the node has another Publisher of the topic, do not wait.
+        """
         if not self.closed:
             self._publisher.latches.pop(self, None)
             self._publisher.flush_for_last(self.node.stop_timeout)
         super().close()
 
     def wait_for_subscribers(self, count: int = 1, timeout: float | None = None) -> bool:
-        """Wait until so many subscribers are connected; True if they are.
+        """Wait until so many subscribers are connected.
+
+        The node's stop ends the wait.
 
         :param timeout: seconds, None: without limit
+        :returns: True if they are connected
         """
         return wait(lambda: len(self.connections) >= count, timeout, self.node)
 
@@ -251,7 +279,7 @@ class OutputChannel(Channel):
 class Topic:
     """A topic of a master: the named bus, which hands nodes their channels.
 
-    :ivar name: its full name
+    :ivar name: the topic's full name
     """
 
     master: Master
@@ -259,27 +287,30 @@ class Topic:
 
     @property
     def type(self) -> str | None:
-        """The name of its message type, None if the master knows none."""
+        """The name of the topic's message type, None if the master knows none."""
         return self.master.topic_type(self.name)
 
     @property
     def publishers(self) -> list[str]:
-        """The names of the nodes that publish on it."""
+        """The names of the nodes that publish on the topic."""
         return self.master.system_state()[0].get(self.name, [])
 
     @property
     def subscribers(self) -> list[str]:
-        """The names of the nodes that receive from it."""
+        """The names of the nodes that receive from the topic."""
         return self.master.system_state()[1].get(self.name, [])
 
     @property
     def channels(self) -> list[Channel]:
-        """The channels of nodes of this process."""
+        """The open channels of this topic in nodes of this process."""
         channels = [channel for node in self.master.own_nodes() for channel in node.channels]
         return [channel for channel in channels if channel.topic == self.name]
 
     def hz(self, seconds: float = 1.0):
-        """Measure for some seconds how often messages come, and how large they are."""
+        """Measure the rate and the size of messages for some seconds; ``bw`` is the same method.
+
+        :raises UnknownTopicError: if nobody publishes on the topic
+        """
         from pharos.live import watching
 
         return watching.measure(self, seconds)
@@ -288,13 +319,20 @@ class Topic:
 
     @property
     def last(self) -> Message:
-        """The latched or else the next message; TimeoutError if none comes within 3 s."""
+        """The latched message, or else the next one.
+
+        :raises UnknownTopicError: if nobody publishes on the topic
+        :raises TimeoutError: if no message comes within 3 s
+        """
         from pharos.live import watching
 
         return watching.last(self)
 
     def watch(self, count: int | None = None, block: Block | None = None) -> None:
-        """Show the next messages, or run ``block(message)`` on them; None: until Ctrl-C."""
+        """Show the next messages, or run ``block(message)`` on them.
+
+        :param count: the number of messages, None: until Ctrl-C
+        """
         from pharos.live import watching
 
         watching.watch(self, count, block)

@@ -24,10 +24,11 @@ MAX_LINES = 10_000  # of output that are kept
 class RosProcess(subprocess.Popen):
     """A running program; made by :meth:`Master.run` and :meth:`Master.launch`.
 
-    It has a terminal of its own, so that its lines come at once. ``pid`` and ``poll()`` are those of
-    ``subprocess.Popen``.
+    The program has a terminal of its own, so that its lines come at once. ``pid`` and ``poll()``
+    are those of ``subprocess.Popen``. The end of a ``with`` block or of this process ends the
+    program.
 
-    :param on_line: ``on_line(text)`` is called for each line that it prints, in another thread
+    :param on_line: ``on_line(text)`` is called for each printed line, in another thread
     """
 
     def __init__(self, command, master_url, on_line=None):
@@ -62,13 +63,13 @@ class RosProcess(subprocess.Popen):
 
     @property
     def output(self) -> str:
-        """The last 10,000 lines that it has printed."""
+        """The last 10,000 lines that the program has printed."""
         return '\n'.join(self._lines)
 
     def send(self, text: str) -> None:
-        """Type a text at its terminal: a line ends with ``'\\n'``.
+        """Type a text at the program's terminal: a line ends with ``'\\n'``.
 
-        :raises PharosError: if it has ended
+        :raises PharosError: if the program has ended
         """
         try:
             os.write(self._terminal.fileno(), text.encode())
@@ -76,7 +77,7 @@ class RosProcess(subprocess.Popen):
             raise PharosError(f'{self!r} has ended, and reads nothing') from None
 
     def wait(self, timeout: float | None = None) -> int:
-        """Wait for its end, and return its exit code.
+        """Wait for the program's end, and return its exit code.
 
         :raises subprocess.TimeoutExpired: after ``timeout`` seconds
         """
@@ -86,15 +87,19 @@ class RosProcess(subprocess.Popen):
         return code
 
     def terminate(self, timeout: float = 5.0) -> int:  # type: ignore[override]
-        """End it and its children, as Ctrl-C does, after ``timeout`` seconds by force.
+        """End the program and its children.
 
-        :returns: its exit code
+        Send SIGINT, as Ctrl-C does, then SIGTERM after half of the timeout. Kill them after all of
+        the timeout.
+
+        :param timeout: seconds
+        :returns: the program's exit code
         """
         atexit.unregister(self.terminate)
         descendants = []
         if self.poll() is None:
             descendants = psutil.Process(self.pid).children(recursive=True)
-        # to the group: its children may live on when the program has ended
+        # to the group: the program's children may live on without the program
         for number in signal.SIGINT, signal.SIGTERM, signal.SIGKILL:
             with contextlib.suppress(ProcessLookupError, subprocess.TimeoutExpired):
                 os.killpg(self.pid, number)
@@ -109,13 +114,13 @@ class RosProcess(subprocess.Popen):
 
 
 def find_program(package, executable):
-    """Return the path of a program, as rosrun finds it.
+    """Return the path of a program, found as rosrun does.
 
-    :raises UnknownNodeError: if there is none
+    :raises UnknownNodeError: if the package has no such program
     """
     try:
         paths = roslib.packages.find_node(package, executable)
-    except rospkg.ResourceNotFound:  # some of Debian's have no package.xml
+    except rospkg.ResourceNotFound:  # some of Debian's packages have no package.xml
         folders = find_in_workspaces(['libexec'], project=package)
         found_paths = [shutil.which(executable, path=folder) for folder in folders]
         paths = [path for path in found_paths if path]
@@ -128,9 +133,10 @@ def find_program(package, executable):
 
 
 def find_launch_file(package, file):
-    """Return the path of a launch file, as roslaunch finds it; without a package, it is the path.
+    """Return the path of a launch file, found as roslaunch does.
 
-    :raises UnknownNodeError: if there is none
+    :param package: None: ``file`` is a path
+    :raises UnknownNodeError: if there is no such file
     """
     from roslaunch import RLException, rlutil
 

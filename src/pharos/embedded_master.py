@@ -1,6 +1,7 @@
 """The program of an embedded master: ``python3 -m pharos.embedded_master PORT``.
 
-The program prints its URL, unless the port is taken, and ends when its standard input does.
+The program prints the URL of its master, unless the port is taken. The end of its standard input
+ends the program.
 """
 import logging
 import os
@@ -15,7 +16,10 @@ from pharos import BlockNode, Master
 
 
 def main(port):  # pragma: no cover: os._exit() drops the data of this process
-    """Run rosmaster, and a /rosout that passes log lines on to /rosout_agg, as roscore does."""
+    """Run rosmaster, and a node /rosout that passes log lines on to /rosout_agg, as roscore does.
+
+    :param port: the port of the master; 0: any free one
+    """
     answers = sys.stdout
     sys.stdout = sys.stderr  # rosmaster prints, and the URL must come alone
     logging.disable()  # rosmaster complains of every node that stops
@@ -31,7 +35,7 @@ def main(port):  # pragma: no cover: os._exit() drops the data of this process
     rosout.interested_in('/rosout', Log, delegate=aggregate.send)
     print(master.url, file=answers, flush=True)
     sys.stdin.read()
-    os._exit(0)  # nothing of it has to be unregistered
+    os._exit(0)  # /rosout needs no unregistering: its master ends, too
 
 
 if __name__ == '__main__':

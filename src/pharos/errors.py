@@ -1,4 +1,4 @@
-"""The errors of this package. Each says what failed, on what name, and what to do next."""
+"""The errors of this package. Each names the failure, the thing that failed, and a next step."""
 import rospy
 
 
@@ -19,7 +19,7 @@ class PortInUseError(PharosError):
 
 
 class UnknownNodeError(PharosError):
-    """The master knows no node of that name, or it is not interested in the topic."""
+    """A node, program or launch file of that name was not found, or the node is not connected."""
 
 
 class UnknownTopicError(PharosError):
@@ -27,11 +27,11 @@ class UnknownTopicError(PharosError):
 
 
 class UnknownTypeError(PharosError):
-    """No definition of a message or service type was found, or it cannot be read."""
+    """No readable definition of a message or service type was found."""
 
 
 class MessageTypeError(PharosError):
-    """A message, a field or a type does not fit where it was given."""
+    """A message, field or type does not fit its topic, service or type."""
 
 
 class UnknownServiceError(PharosError):
@@ -39,7 +39,7 @@ class UnknownServiceError(PharosError):
 
 
 class ServiceTypeError(PharosError):
-    """The md5sum of a service is not the provider's."""
+    """The provider's md5sum of a service differs from the caller's."""
 
 
 class ServiceCallError(PharosError):
@@ -47,4 +47,4 @@ class ServiceCallError(PharosError):
 
 
 class NodeStoppedError(PharosError):
-    """The node is not running, or stopped meanwhile."""
+    """The node or channel is not open, or was stopped meanwhile."""

@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 class ExternalNode:
     """Any node outside this process; made by :meth:`Master.node`.
 
-    To receive from it alone: ``node.interested_in(topic, from_=external)``; to send to it alone:
-    ``node.send_to(topic, block, to=external)``.
+    ``node.interested_in(topic, from_=external)`` receives from this node alone.
+    ``node.send_to(topic, block, to=external)`` sends to this node alone. The node need not live.
 
-    :ivar name: its full name
+    :ivar name: the full name
     """
 
     master: Master
@@ -27,7 +27,7 @@ class ExternalNode:
 
     @property
     def uri(self) -> str:
-        """The URI of its XML-RPC server, as the master knows it.
+        """The URI of the node's XML-RPC server, as registered at the master.
 
         :raises UnknownNodeError: if the master knows no such node any more
         """
@@ -40,7 +40,7 @@ class ExternalNode:
 
     @property
     def host(self) -> str | None:
-        """The host in its URI."""
+        """The host in the node's URI."""
         return urlsplit(self.uri).hostname
 
     def _call(self, method, *args):
@@ -53,7 +53,10 @@ class ExternalNode:
 
     @property
     def pid(self) -> int:
-        """The number of its process, on its host."""
+        """The number of the node's process, on its host.
+
+        :raises UnknownNodeError: if the node does not answer
+        """
         return self._call('getPid')
 
     def is_alive(self) -> bool:
@@ -74,7 +77,11 @@ class ExternalNode:
         return self._names_in_state(1)
 
     def _names_in_state(self, position):
-        """Return the topics or services of the node at a position of the master's system state."""
+        """Return the node's topics or services in one part of the master's system state.
+
+        :param position: 0 for publications, 1 for subscriptions, 2 for services
+        :returns: ``{name: type}``; the type is None for a service, or if the master knows none
+        """
         types = dict(self.master.call('getTopicTypes'))
         users = self.master.system_state()[position]
         return {name: types.get(name) for name in sorted(users) if self.name in users[name]}
@@ -85,13 +92,16 @@ class ExternalNode:
         return list(self._names_in_state(2))
 
     def describe(self, seconds: float = 1.0) -> str:
-        """Return as text the node's topics, services, peers and rates, counted for some seconds."""
+        """Return the node's topics, services, peers and rates as text; count for some seconds."""
         from pharos.live.text_format import describe
 
         return describe(self.master, self.name, seconds)
 
     def shutdown(self) -> None:
-        """Ask the node to end, as rosnode kill does."""
+        """Ask the node to end, as rosnode kill does.
+
+        :raises UnknownNodeError: if the node does not answer
+        """
         self._call('shutdown', 'asked by pharos')
 
     def __repr__(self):

@@ -15,13 +15,13 @@ MAX_WITH_FRAMES = 5  # the newest ones keep their messages and frames
 class Failure:
     """An exception that a block raised at one place: one of :attr:`Node.failures`.
 
-    :ivar error: the exception, as raised last
-    :ivar block: the block that raised it
+    :ivar error: the newest exception
+    :ivar block: the block that raised the exception
     :ivar message: the message, request or value that the block was run on; None for a soul, and for
         all but the newest 5 failures
     :ivar channel: the channel of the message, or None
-    :ivar count: how often the exception was raised
-    :ivar time: the last time, in seconds as of ``time.time()``
+    :ivar count: how often this block raised such an exception at this place
+    :ivar time: the time of the newest exception, in seconds as of ``time.time()``
     :ivar traceback: the traceback as text
     """
 
@@ -36,11 +36,11 @@ class Failure:
         self.traceback = ''.join(traceback.format_exception(error))
         self._retry = retry
         self._frames = error.__traceback__
-        #: is equal for failures of one kind
+        #: equal for failures of one kind, which share one entry
         self.place = block, type(error), traceback.extract_tb(self._frames, -1), channel
 
     def drop_frames(self):
-        """Keep neither message nor frames, which may be large."""
+        """Drop the message and the frames, which may be large."""
         self.message = None
         self._retry = None
         self._frames = None
@@ -55,15 +55,19 @@ class Failure:
             )
 
     def retry(self) -> None:
-        """Run the block again, as it is now, on the same message, in the node's turn.
+        """Run the block again, on the same message.
 
-        :raises PharosError: if the message is not kept any more
+        If the channel or node has another delegate or soul now, that one runs. The block runs in
+        this thread. A delegate waits for the node's other delegates first: they run one at a time.
+
+        :raises PharosError: if the message is not kept any more, or came from no block
+        :raises NodeStoppedError: if a delegate's node is stopped
         """
         self._check_kept(self._retry)
         self._retry(self.message)
 
     def debug(self) -> None:
-        """Look at the frame that raised it: in IPython's debugger if IPython is used, else in pdb.
+        """Open the frame that raised the exception: in IPython's debugger, or else in pdb.
 
         :raises PharosError: if the frames are not kept any more
         """
@@ -80,15 +84,15 @@ class Failure:
 
 
 class Failures(list):
-    """The failures of one run of a node, the newest last; shown as a table. For any thread."""
+    """The failures of one run of a node, the newest last; printed as a table. For any thread."""
 
-    total = 0  #: how often blocks failed
+    total = 0  #: the number of all failures, also of those dropped since
 
     def __init__(self):
         self._lock = threading.RLock()
 
     def keep(self, failure):
-        """Add a failure, and count it if there was one of its kind."""
+        """Add a failure; replace an older one of its kind, and add the counts."""
         with self._lock:
             self.total += 1
             for former in [each for each in self if each.place == failure.place]:

@@ -1,4 +1,4 @@
-"""The Master: the proxy of a ROS master, which creates nodes and finds those of others."""
+"""The Master: a proxy of a ROS master. It creates nodes, and finds those of other processes."""
 from __future__ import annotations
 
 import collections.abc
@@ -31,14 +31,17 @@ if TYPE_CHECKING:
     from pharos.live.graph import Graph
 
 CALLER_ID = '/pharos'
-LIFE_LIMIT = 0.5  # seconds that a node has to answer whether it lives
+LIFE_LIMIT = 0.5  # seconds that a node has to show that the node lives
 _URL = re.compile(r'http://(\[[\w:]+\]|[\w.-]+):([1-6]?\d{1,4})/?')
 
 N = TypeVar('N', bound=Node)
 
 
 class Parameters(collections.abc.MutableMapping):
-    """The parameter server as a mapping: names to values."""
+    """The parameter server as a mapping of names to values; a name without a slash gets one.
+
+    Values are bools, ints, floats, strings, lists and dicts. All methods ask the master.
+    """
 
     def __init__(self, call):
         self._call = call
@@ -68,13 +71,17 @@ class Parameters(collections.abc.MutableMapping):
 
 
 class Master:
-    """A ROS master, by its URL. Makes no connection yet.
+    """A proxy of the ROS master at a URL. The constructor makes no connection yet.
 
     The report: ``PhaROSMaster url: 'http://127.0.0.1:11311/'``::
 
         master = Master('http://127.0.0.1:11311/')
 
-    :param url: default: ROS_MASTER_URI, else ROS's default
+    A Master made in the main thread has SIGINT, SIGTERM and SIGHUP stop all nodes of this process.
+    Signals that the program handles stay the program's. Masters with equal URLs are equal. Methods
+    that ask the master raise MasterUnreachableError if the master does not answer.
+
+    :param url: default: ROS_MASTER_URI, or else http://localhost:11311/
     :param share_connections: nodes of this process that receive from one external publisher on one
         topic share a connection
     :param shared_memory: False: nodes use TCPROS between processes of this package on one host, too;
@@ -82,7 +89,7 @@ class Master:
     :raises ValueError: if the URL is malformed
     """
 
-    _environ = os.environ  # a script's Master has another one
+    _environ = os.environ  # a script's Master has another environment
     _first_nodes: dict = {}  # argv -> the first node that was created with it
 
     def __init__(
@@ -113,9 +120,10 @@ class Master:
     def embedded(cls, port: int = 0) -> Master:
         """Start a ROS master as a child of this process.
 
-        :meth:`stop`, the end of its ``with`` block, or that of this process ends it.
+        The master ends with its ``with`` block, at :meth:`stop`, or with this process. A /rosout
+        node passes log lines on to /rosout_agg, as with roscore.
 
-        :param port: 0: any free one
+        :param port: 0: any free port
         :raises PortInUseError: if the port is taken
         """
         environ = dict(os.environ)
@@ -135,7 +143,10 @@ class Master:
         return master
 
     def stop(self) -> None:
-        """End an embedded master, and do nothing to another."""
+        """Stop the nodes of an embedded master in this process, and end the master.
+
+        Do nothing to any other master.
+        """
         process = self._process
         self._process = None
         if process:
@@ -153,8 +164,10 @@ class Master:
     # -- questions
 
     def call(self, method: str, *args, caller_id: str = CALLER_ID) -> Any:
-        """Call a method of the master's API; returns its value, None if the master refuses.
+        """Call a method of the master's API, and return its value; None if the master refuses.
 
+        :param method: such as 'lookupNode'
+        :param caller_id: the name of the node that calls
         :raises MasterUnreachableError: if the master does not answer within 5 s
         """
         try:
@@ -174,6 +187,8 @@ class Master:
     def wait(self, timeout: float | None = None) -> bool:
         """Wait until the master answers, and return True.
 
+        In a soul, the stop of the soul's node ends the wait, too.
+
         :param timeout: seconds, None: without limit
         :raises MasterUnreachableError: if the master does not answer in time
         """
@@ -181,7 +196,7 @@ class Master:
 
     @property
     def pid(self) -> int:
-        """The number of its process, on its host."""
+        """The number of the master's process, on its host."""
         return self.call('getPid')
 
     def system_state(self) -> tuple[dict[str, list[str]], ...]:
@@ -193,12 +208,15 @@ class Master:
         return dict(self.call('getTopicTypes')).get(name)
 
     def topics(self) -> list[Topic]:
-        """Return all topics."""
+        """Return the topics that have a publisher or a subscriber."""
         publishers, subscribers, _ = self.system_state()
         return [Topic(self, name) for name in sorted({**publishers, **subscribers})]
 
     def topic(self, name: str) -> Topic:
-        """Return the topic of that name, which need not exist yet."""
+        """Return the topic of that name, which need not exist yet.
+
+        :raises ValueError: if a topic cannot have the name
+        """
         return Topic(self, full_name(name))
 
     # -- nodes
@@ -215,18 +233,24 @@ class Master:
         argv: Sequence[str] | None = None,
         **kwargs,
     ) -> N:
-        """Create a node, register and start it, and return it.
+        """Create a node, start and register the node, and return the node.
 
         The report: ``master create: Driver named: '/driver' domain: '127.0.0.1' tcpPort: 8080
         xmlRpcPort: 8081``.
 
-        :param named: its name, perhaps with a namespace: '/robot1/driver'
-        :param domain: the address that it advertises; if it is loopback, the only one that it
-            listens on; default: the one of ROS_HOSTNAME, ROS_IP or the host
-        :param tcp_port: 0: any free one, as ``xmlrpc_port``
+        :param node_class: :class:`Node`, or a subclass
+        :param named: the node's name, perhaps with a namespace: '/robot1/driver'
+        :param domain: the address that the node advertises; a loopback address is also the only one
+            that the node listens on; default: ROS_HOSTNAME, ROS_IP or the host's address
+        :param tcp_port: the port for messages and services, 0: any free port
+        :param xmlrpc_port: the port for ROS's calls, 0: any free port
+        :param soul: the node's soul, ``soul(node)``; :meth:`Node.fork` runs the soul
+        :param delegate: the block for messages of channels without a delegate
         :param argv: ROS's remappings and private parameters; a script passes ``sys.argv``
         :param kwargs: the arguments of the ``__init__`` of the class
         :raises NodeNameInUseError, PortInUseError, MasterUnreachableError: and nothing is left
+        :raises TypeError: if the class is not a Node, or its ``__init__`` takes other arguments
+        :raises ValueError: if the name, the address or a port cannot be one
         """
         check_node_class(node_class)
         if not (domain is None or isinstance(domain, str) and re.fullmatch(r'[\w.:-]+', domain)):
@@ -237,7 +261,7 @@ class Master:
         mappings = [argument for argument in argv or () if is_legal_remap(argument)]
         node = node_class.__new__(node_class)
         name = self._remapped_name(node, node_name(named), tuple(mappings))
-        # the full name holds: rospy would apply these once more
+        # the full name contains these already, and rospy would apply them once more
         remappings = [each for each in mappings if not each.startswith(('__name:=', '__ns:='))]
         settings = Settings(name, self, domain, (tcp_port, xmlrpc_port), remappings)
         node._configure(settings, soul, delegate)
@@ -257,7 +281,7 @@ class Master:
         return node
 
     def _remapped_name(self, node, name, mappings):
-        """Return the full name of a new node; of those with equal mappings, one has ``__name``."""
+        """Return the full name of a new node; ``__name`` goes to one node of those remappings."""
         special_names = load_mappings(mappings)
         if '__name' in special_names:
             first = self._first_nodes.get(mappings)
@@ -270,24 +294,24 @@ class Master:
         return ns_join(get_ros_namespace(self._environ, mappings), name)
 
     def own_nodes(self) -> list[Node]:
-        """Return the nodes of this process that run at this master, or start or stop."""
+        """Return the nodes of this process at this master that run, start, stop or restart."""
         return [node for node in signals.own_nodes() if node._settings.master == self]
 
     def nodes(self) -> list[Node | ExternalNode]:
-        """Return all nodes, of this process and others."""
+        """Return all nodes that the master knows: Nodes of this process, and ExternalNodes."""
         names: set[str] = set()
         for registry in self.system_state():
             names.update(*registry.values())
         return [self._find_node(name) for name in sorted(names)]
 
     def node(self, name: str) -> Node | ExternalNode:
-        """Return the node of that name.
+        """Return the node of that name: a Node if of this process, else an ExternalNode.
 
-        :raises UnknownNodeError: if there is none
+        :raises UnknownNodeError: if the master knows no such node
         """
         node = self._find_node(full_name(node_name(name)))
         if isinstance(node, ExternalNode):
-            node.uri  # raises if the master does not know it
+            node.uri  # raises if the master does not know the node
         return node
 
     def _find_node(self, name):
@@ -295,12 +319,12 @@ class Master:
         if not nodes:
             return ExternalNode(self, name)
         for node in nodes:
-            if node._current_run.uri:  # a script that creates nodes with pharos has none itself
+            if node._current_run.uri:  # '' for a script that creates its node with pharos
                 return node
         return nodes[0]
 
     def may_live(self, name: str) -> bool:
-        """False if the node of that name refuses connections, or is not registered."""
+        """True unless the node of that name refuses connections, or is not registered."""
         uri = self.call('lookupNode', name)
         if not uri:
             return False
@@ -311,9 +335,10 @@ class Master:
         return True
 
     def wait_for_node(self, name: str, timeout: float | None = None) -> Node | ExternalNode:
-        """Wait until a node of that name is registered, and return it.
+        """Wait until a node of that name is registered, and return the node.
 
-        :raises UnknownNodeError: if it is not in time
+        :param timeout: seconds, None: without limit
+        :raises UnknownNodeError: if no such node is registered in time
         """
         return wait_for(lambda: self.node(name), timeout)
 
@@ -328,16 +353,18 @@ class Master:
 
         The report: ``master lookupService: '/clear' with: '/myID'``.
 
-        :raises UnknownServiceError: if nobody offers it
+        :param caller_id: the name of the calling node, which the provider gets
+        :raises UnknownServiceError: if nobody offers the service
         """
         return Service(self, full_name(name), caller_id)
 
     def wait_for_service(
         self, name: str, timeout: float | None = None, caller_id: str = CALLER_ID
     ) -> Service:
-        """Wait until a service is offered, and return it.
+        """Wait until a service is offered, and return the service.
 
-        :raises UnknownServiceError: if it is not in time
+        :param timeout: seconds, None: without limit
+        :raises UnknownServiceError: if nobody offers the service in time
         """
         return wait_for(lambda: self.lookup_service(name, caller_id), timeout)
 
@@ -350,15 +377,22 @@ class Master:
         *args,
         on_line: Callable[[str], Any] | None = None,
     ) -> RosProcess:
-        """Run a program of ROS at this master, as rosrun does.
+        """Run a program of ROS as a process at this master, as rosrun does.
 
-        :param on_line: ``on_line(text)`` is called for each line that the program prints
+        :param args: the program's arguments
+        :param on_line: ``on_line(text)`` is called for each printed line, in another thread
+        :raises UnknownNodeError: if there is no such program
         """
         path = find_program(package, executable)
         return RosProcess([path, *map(str, args)], self.url, on_line)
 
     def launch(self, package: str | None, file: str, **args) -> RosProcess:
-        """Run a launch file at this master, as roslaunch does; ``package`` None: it is a path."""
+        """Run a launch file in a process of roslaunch, at this master.
+
+        :param package: None: ``file`` is a path
+        :param args: the arguments of the launch file
+        :raises UnknownNodeError: if there is no such file
+        """
         path = find_launch_file(package, file)
         arguments = [f'{name}:={value}' for name, value in args.items()]
         return RosProcess(['roslaunch', '--skip-log-check', path, *arguments], self.url)
@@ -376,12 +410,17 @@ class Master:
     ) -> ScriptNode:
         """Run a program of rospy, unmodified, as a node of this process.
 
+        Return when the program has called ``rospy.init_node`` or has ended, after 10 s at most.
+
         :param package: without ``executable``, the path of the program
-        :param args: its arguments
-        :param name: default: the one that it gives to ``init_node``
-        :param here: True: it runs in this process even if it shows windows
+        :param args: the program's arguments
+        :param name: the node's name; default: the name that the program gives to ``init_node``
+        :param namespace: the node's namespace
+        :param remap: names of the program -> other names
+        :param params: names of the node's private parameters -> values
+        :param here: True: run the program in this process even if the program shows windows
         :raises UnknownNodeError: if there is no such program
-        :raises PharosError: if it cannot run in this process, or failed before it was a node
+        :raises PharosError: if the program cannot run in this process, or fails before init_node
         """
         from pharos.compose.script import load
 
@@ -402,15 +441,17 @@ class Master:
     ) -> Composition:
         """Run the Python nodes of a launch file in this process.
 
-        The rest (C++, other machines, with a launch-prefix, cwd or windows) runs as roslaunch starts it.
+        roslaunch starts the other nodes in processes of their own: C++, other machines, and nodes
+        with a launch-prefix, a cwd or windows.
 
         :param package: None: ``file`` is a path
         :param only: the names of the nodes that run; none: all
         :param apart: the names of nodes that run in processes of their own
         :param here: the names of nodes that run in this process even if they show windows
+        :param share_connections: as for :class:`Master`; True here or there is enough
         :param args: the arguments of the launch file
         :raises UnknownNodeError: if there is no such file, argument or node
-        :raises PharosError: if roslaunch cannot read it
+        :raises PharosError: if roslaunch cannot read the file
         """
         from pharos.compose.composition import Composition
         from pharos.compose.launch_file import LaunchFile
@@ -422,7 +463,10 @@ class Master:
         return composition
 
     def graph(self, seconds: float = 0) -> Graph:
-        """Return the :class:`Graph` of all nodes and topics, with rates if it looks for a while."""
+        """Return the :class:`Graph` of all nodes and topics.
+
+        :param seconds: how long messages are counted, for rates; 0: no rates
+        """
         from pharos.live.graph import graph_of
 
         return graph_of(self, seconds)

@@ -1,4 +1,4 @@
-"""Message and service types: classes by name, made from definitions, filled by name."""
+"""Message and service types: find or make their classes, and fill messages by name."""
 import functools
 import pathlib
 import re
@@ -81,11 +81,12 @@ _lock = threading.RLock()  # genpy's generator is not thread-safe
 def message_class(type_: str | type, ask: Callable | None = None) -> type[Message]:
     """Return the class of a message type, such as ``'geometry_msgs/Twist'``.
 
-    Types are sought in installed Python packages, in ``.msg`` files on ROS_PACKAGE_PATH, among those
-    given to :func:`define_message`, and among turtlesim's. A message class is returned as it is.
+    A type is sought in installed Python packages, then in ``.msg`` files on ROS_PACKAGE_PATH, then
+    by ``ask``. The last places are the types given to :func:`define_message`, and turtlesim's.
 
+    :param type_: the name of the type; or a message class, which is returned
     :param ask: ``ask(type_)`` returns the definition that a publisher sends, or None
-    :raises UnknownTypeError: if the type is nowhere, or its definition cannot be read
+    :raises UnknownTypeError: if the type is not found, or its definition cannot be read
     """
     if isinstance(type_, type) and issubclass(type_, Message):
         return type_
@@ -96,7 +97,10 @@ def message_class(type_: str | type, ask: Callable | None = None) -> type[Messag
 
 
 def service_class(type_: Any) -> Any:
-    """Return the class of a service type, sought as :func:`message_class` does."""
+    """Return the class of a service type such as ``'std_srvs/Empty'``; see :func:`message_class`.
+
+    :raises UnknownTypeError: if the type is not found, or its definition cannot be read
+    """
     if hasattr(type_, '_request_class'):
         return type_
     installed_class = _installed_class('srv', type_)
@@ -108,9 +112,10 @@ def service_class(type_: Any) -> Any:
 def define_message(type_: str, text: str) -> type[Message]:
     """Define a message type by the text of a ``.msg`` file, and return its class.
 
-    Nested types follow after a line of ``=`` and ``MSG: package/Type``, if they are not known.
+    Texts of unknown nested types follow, each after a line of ``=`` and ``MSG: package/Type``.
 
     :raises MessageTypeError: if the type is known already, with other fields
+    :raises UnknownTypeError: if the text cannot be read, or a nested type is not found
     """
     return _define('msg', type_, text, message_class, _make_message)
 
@@ -125,7 +130,7 @@ def _define(suffix, type_name, text, find_class, make_class):
     key = suffix, type_name
     with suppress(UnknownTypeError):
         known_class = find_class(type_name)
-        is_shipped = key in _shipped_definitions  # those of a real turtlesim may differ
+        is_shipped = key in _shipped_definitions  # a real turtlesim may have other fields
         if _checksums(known_class) != _checksums(new_class) and not is_shipped:
             raise MessageTypeError(f'{type_name} is known with other fields: define another type')
     _given_definitions.setdefault(key, text)
@@ -133,12 +138,12 @@ def _define(suffix, type_name, text, find_class, make_class):
 
 
 def _checksums(cls):
-    """Return md5sums that are equal for equal fields; services are compared by their requests, too."""
+    """Return the md5sums of a class, and of a service's request: equal for equal fields."""
     return cls._md5sum, getattr(cls, '_request_class', cls)._md5sum
 
 
 def _installed_class(suffix, type_name):
-    """Return the class of an installed Python package, or None."""
+    """Return the class of a type that an installed Python package has, or None."""
     if not (isinstance(type_name, str) and _TYPE.fullmatch(type_name)):
         raise UnknownTypeError(
             f"malformed type {type_name!r}: give 'package/Type', such as 'std_msgs/String', or a class"
@@ -146,14 +151,15 @@ def _installed_class(suffix, type_name):
     get_class = get_message_class if suffix == 'msg' else get_service_class
     try:
         return get_class(type_name)
-    except InvalidPackage:  # genpy reads package.xml; there may be a file of the type all the same
+    except InvalidPackage:  # genpy cannot read package.xml; the package may still have a .msg file
         return None
 
 
 def _find_definition(suffix, type_name, ask=None):
-    """Return the definition of a type that has no generated class."""
+    """Return the definition of a type that has no generated class, or raise UnknownTypeError."""
     package, name = type_name.split('/')
-    with suppress(Exception):  # there is no file; or another package.xml cannot be parsed
+    # there may be no file, or the package.xml of another package cannot be parsed
+    with suppress(Exception):
         folder = pathlib.Path(rospkg.RosPack().get_path(package), suffix)
         return (folder / f'{name}.{suffix}').read_text('utf-8', 'replace')
     key = suffix, type_name
@@ -176,8 +182,8 @@ def _find_definition(suffix, type_name, ask=None):
 class _Definition:
     """A definition as genmsg reads it, with the definitions of all nested types.
 
-    :ivar context: genmsg's, with all types
-    :ivar text: of the type alone
+    :ivar context: genmsg's context, with all types
+    :ivar text: the text of the type alone
     :ivar nested_texts: names of nested types -> their texts
     """
 
@@ -190,11 +196,11 @@ class _Definition:
         for part in parts:
             name, _, nested_text = part.partition('\n')
             self._given_texts[name.strip()] = nested_text
-        for part in re.split(r'^---.*$', own_text, flags=re.M):  # a service has two
+        for part in re.split(r'^---.*$', own_text, flags=re.M):  # a service has two parts
             self._add_nested(type_name, part)
 
     def _add_nested(self, type_name, text):
-        """Read the text of a type, and add the types of its fields."""
+        """Read the text of a type, and add the types of its fields, and those nested in them."""
         spec = load_msg_from_string(self.context, text, type_name)
         for field_type in map(bare_msg_type, spec.types):
             name = 'std_msgs/Header' if field_type == 'Header' else field_type
@@ -215,7 +221,7 @@ class _Definition:
 
 
 def _nested_definition(type_name):
-    """Return the definition of a nested type, without the types that are nested in it."""
+    """Return the definition of a nested type, without the texts of further nested types."""
     installed_class = _installed_class('msg', type_name)
     if installed_class:
         text = installed_class._full_text
@@ -225,7 +231,10 @@ def _nested_definition(type_name):
 
 
 def _once(make_class):
-    """Have a function run once for the same arguments, in one thread at a time."""
+    """Return a function that runs once for the same arguments, in one thread at a time.
+
+    Each exception becomes an UnknownTypeError.
+    """
     cached_function = functools.cache(make_class)
 
     def make_once(type_name, text):
@@ -279,12 +288,16 @@ def fields_text(cls):
 
 
 def build(cls, block, fields):
-    """Return a message that ``block(message)``, a dict or keywords fill, or a ready message.
+    """Return a message that is filled by a block and by keywords, or a ready message.
 
-    Dicts fill nested messages, and a list of dicts an array of them. numpy arrays are taken for arrays
-    of numbers. ``block(message)`` may return another message instead.
+    Dicts fill nested messages, and a list of dicts fills an array of them. numpy arrays may stand
+    for arrays of numbers.
 
-    :raises MessageTypeError: for a field that does not exist
+    :param cls: the message class
+    :param block: ``block(message)`` fills the message or returns another one; or a dict of fields;
+        or a ready message; or None
+    :param fields: a dict of fields, which are set last
+    :raises MessageTypeError: for a field that does not exist, or another kind of block
     """
     message = cls()
     if isinstance(block, Message):
@@ -305,9 +318,11 @@ def build(cls, block, fields):
 def response(cls, value):
     """Return the response for the value that the block of a service returned.
 
-    That is a response, a dict, tuple or list of its fields, or its only field; None if it has none.
+    The value is a response, a dict, tuple or list of its fields, or its only field. None stands for
+    an empty response.
 
-    :raises MessageTypeError: if it does not fit
+    :param cls: the class of the response
+    :raises MessageTypeError: if the response cannot be sent
     """
     names = cls.__slots__
     if value is None and not names:
@@ -351,7 +366,7 @@ def _class_of_field(base_type, cls):
 
 
 def explain(message, error):
-    """Return our error for what serializing a message raised; genpy names the field."""
+    """Return a MessageTypeError for an exception of serializing; genpy's check names the field."""
     try:
         message._check_types()
     except Exception as type_error:

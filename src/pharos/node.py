@@ -41,8 +41,9 @@ class Settings:
     """The settings of a node that hold for all its runs.
 
     :ivar name: the full name
-    :ivar domain: the address that it advertises; None until the first run has found one
+    :ivar domain: the address that the node advertises; None until the first run has found one
     :ivar ports: for messages, and for ROS's calls; 0 until the first run has found one
+    :ivar remappings: ROS's remappings and private parameters, such as '/a:=/b' and '_rate:=5'
     """
 
     name: str
@@ -55,8 +56,8 @@ class Settings:
 class Node(DelegateHolder):
     """A ROS node of this process, made by :meth:`Master.create`.
 
-    The report: a subclass of PhaROSNode. A class of your own overrides :meth:`start` and
-    :meth:`stop`, and calls ``super()``::
+    The report: a subclass of PhaROSNode. A subclass overrides :meth:`start` and :meth:`stop`, and
+    calls ``super()``::
 
         class Driver(Node):
             def start(self):
@@ -66,29 +67,30 @@ class Node(DelegateHolder):
             def on_pose(self, pose):
                 self.send_to('/cmd_vel', typed_as='turtlesim/Velocity', linear=1.0)
 
-    All methods may be called from any thread. A node's delegates run one at a time, and the first
-    one when :meth:`start` has returned. All that this class has inside begins with an underscore: a
-    class of your own may have a ``run``, ``report`` or ``state``.
+    All methods may be called from any thread. A node's delegates run one at a time, in a pool of
+    threads. The first one runs when :meth:`start` has returned. All private names of this class
+    begin with an underscore: a subclass may have a ``run``, ``report`` or ``state``. Methods that
+    need a started node raise NodeStoppedError if the node has not started, or has stopped.
 
-    :ivar name: the full name, as the master knows it: '/robot1/driver'
-    :ivar master: its :class:`Master`
-    :ivar soul: the block that says what the node does, called as ``soul(node)``, or None
-    :ivar uri: the URI of its XML-RPC server, None before the first start, as ``domain``, the
-        address that it advertises, unless it was given
-    :ivar tcp_port: its port for messages; before the first start the one asked for
-    :ivar xmlrpc_port: its port for ROS's calls, likewise
-    :ivar failures: for each of :attr:`errors` a :class:`Failure`: what failed, on what, how often
+    :ivar name: the full name, as registered at the master: '/robot1/driver'
+    :ivar master: the node's :class:`Master`
+    :ivar soul: the block with the node's own work, called as ``soul(node)``, or None
+    :ivar uri: the URI of the node's XML-RPC server; None before the first start
+    :ivar domain: the address that the node advertises; None before the first start, unless given
+    :ivar tcp_port: the port for messages and services; before the first start the one asked for
+    :ivar xmlrpc_port: the port for ROS's calls; before the first start the one asked for
+    :ivar failures: a :class:`Failure` for each of :attr:`errors`: the block, its message, the count
     """
 
-    #: seconds that a topic's first message waits for subscribers
+    #: seconds that the opening of an output channel waits for subscribers
     connect_timeout = 2.0
-    #: seconds that a stop waits for souls, and as long for messages under way
+    #: seconds that a stop waits for souls, for the delegate that runs, and for messages under way
     stop_timeout = 2.0
-    #: seconds that a client may be silent before it is closed
+    #: seconds that a client may be silent before the node closes its connection
     client_timeout = 5.0
-    #: bytes of messages that wait for a slow receiver, or one message
+    #: bytes of messages that may wait for a slow receiver; a larger message waits alone
     queue_bytes = 64 << 20
-    #: True if any host may end the node by ROS's shutdown call, not only this one and the master's
+    #: True if any host may end the node by ROS's shutdown call; False: this host and the master's
     allow_remote_shutdown = False
 
     master: Master
@@ -100,9 +102,9 @@ class Node(DelegateHolder):
     _holds_delegates = False  # True while _start_held() runs
 
     def __init__(self, *args, **kwargs):
-        """Do nothing: :meth:`Master.create` has given the node its name and all else.
+        """Do nothing: :meth:`Master.create` has given the node its name and settings.
 
-        :raises PharosError: if the class is called, or this method with arguments
+        :raises PharosError: if a program calls the class, or gives this method arguments
         """
         if self._settings and not args and not kwargs:
             return
@@ -117,12 +119,12 @@ class Node(DelegateHolder):
         )
 
     def _configure(self, settings, soul, delegate):
-        with_arguments(soul, 'soul', 0, 1)  # raises if it is not a soul
+        with_arguments(soul, 'soul', 0, 1)  # raises if the block is not a soul
         self._settings = settings
         self._life_lock = threading.RLock()  # held by a start, stop or restart
         self._send_lock = threading.Lock()  # held while send_to() opens a channel
         self._send_channels = {}  # (topic, type) as given to send_to -> OutputChannel
-        # for users; their class may set these names to something else
+        # for users: their class may give these names another meaning, so this class reads _settings
         self.name = settings.name
         self.master = settings.master
         self.domain = settings.domain
@@ -137,7 +139,7 @@ class Node(DelegateHolder):
         """Register with the master.
 
         A stopped node starts again, under the same name and ports. Its channels, services and
-        parameters come back, unless its class has a start() of its own, which opens them.
+        parameters come back. If its class has a start() of its own, that one opens them instead.
 
         :raises PharosError: if the node runs already
         :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: and nothing is left
@@ -147,7 +149,7 @@ class Node(DelegateHolder):
         with self._life_lock:
             if self.lifecycle not in (Lifecycle.NEW, Lifecycle.STOPPED):
                 raise PharosError(f'{self._settings.name} is {self.lifecycle.value} already')
-            # of the run before
+            # the endpoints of the run before
             endpoints = self._current_run.endpoints if self._current_run else []
             run = self._run_class(self, self._settings)
             self._current_run = run
@@ -184,8 +186,8 @@ class Node(DelegateHolder):
     def stop(self) -> None:
         """End the souls, send messages under way, unregister, free ports and threads.
 
-        Does nothing if the node is stopped. Waits up to :attr:`stop_timeout` for souls, and as long
-        for messages under way. The log names threads that go on after that.
+        Do nothing if the node is stopped. Wait up to :attr:`stop_timeout` for souls, then for the
+        delegate that runs, then for messages. The log names threads that go on after that.
         """
         with self._life_lock:
             if self.is_running:
@@ -196,7 +198,7 @@ class Node(DelegateHolder):
         signals.started_nodes.remove(self)
 
     def _stop_safely(self):
-        """Stop the node, even if the stop() of its class raises; two threads may ask for it."""
+        """Stop the node, even if the stop() of its class raises; for any number of threads."""
         with self._life_lock:
             try:
                 if self.is_running:
@@ -207,18 +209,18 @@ class Node(DelegateHolder):
                 Node.stop(self)  # does nothing if the class's stop() has called it
 
     def restart(self) -> None:
-        """Stop the node and start it again, under its name and ports, with its channels and souls.
+        """Stop and start the node, with the same name, ports, channels and souls.
 
-        Souls that had not ended run again from their first lines. If the node's class has a start()
-        of its own, that opens the channels and forks the souls.
+        Each soul that had not ended begins anew, at its first line. If the node's class has a
+        start() of its own, that one opens the channels and forks the souls instead.
 
-        :raises MasterUnreachableError: if the master does not answer, and the node runs on
+        :raises MasterUnreachableError: if the master does not answer; the node runs on
         """
         with self._life_lock:
             self._settings.master.call('getPid')  # raises if the master does not answer
             souls = self._current_run.souls.items()
             live_souls = [(thread.name, block) for thread, block in souls if thread.is_alive()]
-            signals.restarting_nodes.append(self)  # spin() goes on
+            signals.restarting_nodes.append(self)  # or spin() would return
             try:
                 self.stop()
                 self._start_held()
@@ -229,13 +231,13 @@ class Node(DelegateHolder):
                     Node.fork(self, block, name)  # the class may have a fork() of its own
 
     def become(self, node_class: type[Node]) -> None:
-        """Be a node of another class from now on; name, ports, connections and attributes stay.
+        """Change the node's class; its name, ports, connections and attributes stay.
 
-        It happens between two delegates. Blocks that are methods of the node are looked up anew.
-        Neither ``__init__`` nor ``start`` of the new class runs.
+        The change happens between two delegates, or at once if a delegate calls this. Methods that
+        are blocks of the node become those of the new class; its start() does not run.
 
-        :raises TypeError: if it is not a subclass of Node
-        :raises AttributeError: if it lacks a method that is a block of the node
+        :raises TypeError: if the class is not one of nodes
+        :raises AttributeError: if the class lacks a method that is a block of the node
         """
         check_node_class(node_class)
         self._check_active()
@@ -243,7 +245,7 @@ class Node(DelegateHolder):
 
         def change():
             receivers = [self, *run.endpoints]
-            # all blocks are found before the first change: one may be missing
+            # find all blocks before the first change: the new class may lack one
             soul = rebind(self.soul, self, node_class)
             delegates = [rebind(receiver.delegate, self, node_class) for receiver in receivers]
             self.__class__ = node_class
@@ -269,12 +271,12 @@ class Node(DelegateHolder):
 
     @property
     def is_running(self) -> bool:
-        """True if the node is started and no stop has begun."""
+        """True if the node has started, and no stop has begun."""
         return self.lifecycle is Lifecycle.RUNNING
 
     @property
     def lifecycle(self) -> Lifecycle:
-        """The node's state."""
+        """The node's state: NEW, STARTING, RUNNING, STOPPING or STOPPED."""
         return self._current_run.lifecycle if self._current_run else Lifecycle.NEW
 
     @property
@@ -284,22 +286,22 @@ class Node(DelegateHolder):
 
     @property
     def ros(self) -> Any:
-        """The node's own rospy in this run, whole: ``node.ros.Timer``, ``node.ros.Time.now()``."""
+        """The node's own rospy, such as ``node.ros.Timer``; each run has another one."""
         self._check_active()
         return self._current_run.ros
 
     def ros_import(self, name: str) -> Any:
-        """Return a library written on rospy, such as 'actionlib', bound to this run of the node."""
+        """Return a private copy, for this run, of a library on rospy such as 'actionlib'."""
         self._check_active()
         return self._current_run.modules.load(name)
 
     def health(self) -> types.SimpleNamespace:
-        """Return how the node is doing; asks the master.
+        """Ask the master for the node, and return how the node is doing.
 
-        :returns: an object with ``registered`` (True if the master has the node, None if it does not
-            answer), ``kind`` (its class), ``connections`` ({transport: number}), ``dropped`` (number
-            of messages), ``errors`` (how often blocks failed), ``threads``, ``souls`` (number of
-            those that run in threads), ``ended_souls`` (their names)
+        :returns: an object with ``registered`` (True if the master has the node, None if the master
+            is silent), ``kind`` (the class's name), ``connections`` ({transport: number}),
+            ``dropped`` (number of messages), ``errors`` (how often blocks failed), ``threads``
+            (number), ``souls`` (number of those that run in threads), ``ended_souls`` (names)
         """
         registered = None
         with suppress(MasterUnreachableError):
@@ -308,7 +310,7 @@ class Node(DelegateHolder):
         return types.SimpleNamespace(registered=registered, **self._current_run.health_facts())
 
     def describe(self, seconds: float = 1.0) -> str:
-        """Return as text the node's topics, services, peers and rates, counted for some seconds."""
+        """Return the node's topics, services, peers and rates as text; count for some seconds."""
         from pharos.live.text_format import describe
 
         return describe(self._settings.master, self._settings.name, seconds)
@@ -319,14 +321,19 @@ class Node(DelegateHolder):
     # -- souls
 
     def execute(self) -> Any:
-        """Run the soul once, in this thread, and return its value (``node execute`` in the report)."""
+        """Run the soul once, in this thread, and return its value; None if the soul fails.
+
+        The report: ``node execute``. An exception of the soul goes to :attr:`failures`.
+        """
         return self._run_soul(self._check_soul(self.soul))
 
     def fork(self, block: Block | None = None, name: str | None = None) -> threading.Thread:
         """Run the soul, or ``block(node)``, in a thread of its own, and return the thread.
 
-        The report (listing 3.8): ``[node execute] fork``. :meth:`stop` ends it at its next
-        :meth:`sleep` or turn of :meth:`every`.
+        The report (listing 3.8): ``[node execute] fork``. :meth:`stop` ends the soul at its next
+        :meth:`sleep` or turn of :meth:`every`. An exception of the soul goes to :attr:`failures`.
+
+        :param name: the thread's name; default: the block's
         """
         soul = self._check_soul(block or self.soul)
         run = self._current_run
@@ -336,7 +343,7 @@ class Node(DelegateHolder):
         return thread
 
     def _check_soul(self, block):
-        """Return the block if it is a soul, else raise an error."""
+        """Return the block; raise an error if the node is not active or the block is not a soul."""
         self._check_active()
         if with_arguments(block, 'soul', 0, 1) is None:
             raise PharosError(f'{self._settings.name} has no soul: give it one, node.soul = block')
@@ -361,7 +368,10 @@ class Node(DelegateHolder):
         return None
 
     def sleep(self, seconds: float) -> None:
-        """Sleep for some seconds of ROS time; the stop of the node ends it, and its soul."""
+        """Sleep for some seconds of ROS time; the node's stop ends the sleep, and the soul.
+
+        A stopped soul gets a NodeStoppedError. A sleep in start() lets delegates run from now on.
+        """
         with signals.quiet_wait():
             self._check_active()
             self._current_run.callback_queue.release_before_sleep()
@@ -372,7 +382,7 @@ class Node(DelegateHolder):
     def every(self, seconds: float) -> Iterator[int]:
         """Return an iterator that turns every so many seconds of ROS time, until the node stops.
 
-        It counts its turns. A turn that takes longer delays the next.
+        The values are the numbers of the turns, from 0 on. A longer turn delays the next one.
 
         :raises ValueError: if ``seconds`` is not above 0
         """
@@ -402,15 +412,16 @@ class Node(DelegateHolder):
         return [failure.error for failure in failures]
 
     def log(self, text: Any, level: str = 'info') -> None:
-        """Log a line to the screen, the log file and /rosout.
+        """Log a line to the screen, the log file and /rosout; of a stopped node, to the Transcript.
 
         :param level: 'debug', 'info', 'warning' (or 'warn'), 'error' or 'fatal'
+        :raises ValueError: for another level
         """
         if level not in ('debug', 'info', 'warn', 'warning', 'error', 'fatal'):
             raise ValueError(f'unknown level {level!r}: give info or error, and one text')
         run = self._current_run
         if run and run.is_active:
-            # no function between: rospy looks for the caller of this one
+            # called from here, not from a helper: rospy logs the caller of this method
             run.write_log('%s', (text,), {}, level=level)
         else:
             Transcript.show(f'[{level.upper()}] {self._settings.name}: {text}')
@@ -418,9 +429,9 @@ class Node(DelegateHolder):
     # -- topics
 
     def _resolve(self, name: str) -> str:
-        """Return the full name of a topic, service or parameter, remapped as the node's are.
+        """Return the full name of a topic, service or parameter; apply the node's remappings.
 
-        :raises ValueError: if it cannot be a name
+        :raises ValueError: if the name is not legal
         """
         self._check_active()
         return self._current_run.ros.resolve_name(legal_name(name).replace('~/', '~'))
@@ -447,13 +458,14 @@ class Node(DelegateHolder):
 
         The report: ``self interestedIn: '/pose' typedAs: 'turtlesim/Pose'``.
 
-        :param typed_as: type name or message class; default: what the node or the master knows
+        :param typed_as: type name or message class; default: the type known to node or master
         :param delegate: for this channel only; default: :attr:`delegate`
         :param queue_size: messages that wait at most; the oldest are dropped, and counted
-        :param inline: the delegate runs in the thread of a publisher of this process
-        :param shared: hand out the published object, which nobody may change
+        :param inline: True: the delegate runs in the thread of a publisher of this process
+        :param shared: True: the delegate gets the published object itself, which nobody may change
         :param from_: receive from that node alone: its name, Node or ExternalNode
         :raises UnknownTopicError, UnknownTypeError: if the type is not known
+        :raises MessageTypeError: if the node has the topic open with another type
         :raises MasterUnreachableError: if the master does not answer; nothing is left behind
         """
         topic = self._resolve(topic)
@@ -470,10 +482,13 @@ class Node(DelegateHolder):
         latch: bool = False,
         queue_size: int = QUEUE_SIZE,
     ) -> OutputChannel:
-        """Open a channel to send to a topic; returns when the known subscribers are connected.
+        """Open a channel to send to a topic, and wait until the known subscribers are connected.
 
-        :param latch: the last message goes to subscribers that come later, too
-        :param queue_size: messages that wait for each subscriber at most
+        The wait lasts up to :attr:`connect_timeout`. The log names subscribers that are late.
+
+        :param typed_as: as for :meth:`interested_in`, with the same errors
+        :param latch: True: later subscribers get the last message, too
+        :param queue_size: messages that wait for each subscriber in another process at most
         """
         topic = self._resolve(topic)
         return OutputChannel(self, topic, self._class_of(topic, typed_as), latch, queue_size)
@@ -488,8 +503,9 @@ class Node(DelegateHolder):
         to=None,
         **fields,
     ) -> Message:
-        """Send a message, and return it.
+        """Send a message to a topic, and return the message.
 
+        The first message opens a channel, or takes an open one; see :meth:`output_channel`.
         The report: ``self sendTo: '/cmd_vel' a: [:msg | msg linear: 2.0]``::
 
             node.send_to('/cmd_vel', typed_as='turtlesim/Velocity', linear=2.0)
@@ -498,9 +514,12 @@ class Node(DelegateHolder):
 
         :param block: ``block(message)`` fills a new message; or a ready message, a dict of fields,
             or a message class, which is the type
-        :param typed_as: the type; default: what the node or the master knows of the topic
-        :param to: the node that alone gets it: a name, Node or ExternalNode
+        :param fill: if ``block`` is a message class, a block, ready message or dict of fields
+        :param typed_as: as for :meth:`interested_in`, with the same errors
+        :param to: the node that alone gets the message: a name, Node or ExternalNode
         :param fields: fill the message by name
+        :raises MessageTypeError: if the message does not fit the topic, or has no such field
+        :raises UnknownNodeError: if the node ``to`` is not connected
         """
         if isinstance(block, type) and issubclass(block, Message):
             typed_as = block
@@ -519,7 +538,7 @@ class Node(DelegateHolder):
             raise
 
     def _find_send_channel(self, topic, typed_as, block):
-        """Return an OutputChannel for send_to(), and True if it was opened for that."""
+        """Return an OutputChannel for send_to(), and True if the channel is a new one."""
         name = self._resolve(topic)
         if isinstance(block, Message):
             typed_as = typed_as or type(block)
@@ -530,7 +549,7 @@ class Node(DelegateHolder):
         return OutputChannel(self, name, message_class), True
 
     def _class_to_receive(self, topic, typed_as):
-        """Return the message class for a channel that receives: a publisher may define the type."""
+        """Return the message class for a receiving channel; a publisher may send the definition."""
         ask_publisher = functools.partial(self._ask_definition, topic)
         return self._class_of(topic, typed_as, ask_publisher)
 
@@ -552,7 +571,7 @@ class Node(DelegateHolder):
         return message_class
 
     def _ask_definition(self, topic, type_name):
-        """Return the definition that a publisher sends when it is connected, None if none does."""
+        """Return the type's definition from the header of a publisher's connection, or None."""
         if not self._settings.master.topic(topic).publishers:
             return None
 
@@ -569,8 +588,8 @@ class Node(DelegateHolder):
         return found[0] if found else None
 
     def _wait_subscribed(self, predicate, timeout, *arguments):
-        """Wait until ``predicate(subscriber)`` is true of a rospy.Subscriber, and return its value."""
-        # not through a channel: the delegate that calls this may hold the node's callback queue
+        """Return the first true ``predicate(subscriber)`` of a new rospy.Subscriber."""
+        # a channel would not do: the delegate that calls this holds up the node's callback queue
         subscriber = self._current_run.ros.Subscriber(*arguments)
         try:
             return wait(lambda: predicate(subscriber), timeout, self)
@@ -584,19 +603,20 @@ class Node(DelegateHolder):
         timeout: float | None = None,
         where: Block | None = None,
     ) -> Message:
-        """Return the next message of a topic.
+        """Return the next message of a topic; a latched one comes at once.
 
-        :param timeout: seconds until its type is known, and as long for the message; None: without
-            limit, for a topic of a known type
+        :param timeout: seconds until the type is known, and as long for the message; None: without
+            limit, but the type must be known
         :param where: skip messages unless ``where(message)`` is true
-        :raises UnknownTopicError, TimeoutError: if none comes in time
+        :raises UnknownTopicError: if the topic's type is not known in time
+        :raises TimeoutError: if no such message comes in time
         :raises NodeStoppedError: if the node stops meanwhile
         """
         topic = self._resolve(topic)
         received = []
 
         def find_wanted(subscriber):
-            """Drop messages up to the first one that is wanted; true if there is one."""
+            """Drop messages up to the first wanted one, and return the rest."""
             while received and where and not where(received[0]):
                 del received[0]
             return received
@@ -615,25 +635,35 @@ class Node(DelegateHolder):
     # -- services and parameters
 
     def serve(self, name: str, typed_as: str | type, block: Block) -> OfferedService:
-        """Offer a service; returns a handle with ``close()``.
+        """Offer a service, and return an object with ``close()``.
 
-        ``block(request)`` runs in a thread of the caller's connection. It returns a response, a
-        dict, tuple or list of its fields, or its only field; None for an empty response.
+        ``block(request)`` runs in a thread of the caller's connection, or in the caller's thread if
+        that is one of this process. Several calls may run at once. The block returns a response, a
+        dict, tuple or list of its fields, or its only field; None for an empty response. If the
+        block raises an exception, the caller gets an error, and :attr:`failures` an entry.
+
+        :raises PharosError: if the node offers the service already
+        :raises UnknownTypeError: if the type is not known
         """
         return OfferedService(self, self._resolve(name), messages.service_class(typed_as), block)
 
     def lookup_service(self, name: str) -> Service:
-        """Return the service of that name, resolved as the node's names are."""
+        """Return the service of a name that the node resolves, or raise UnknownServiceError."""
         return self._settings.master.lookup_service(self._resolve(name), self._settings.name)
 
     def wait_for_service(self, name: str, timeout: float | None = None) -> Service:
-        """Wait until a service of that name is offered, and return it."""
+        """Wait until a service of that name is offered, and return the service.
+
+        :param timeout: seconds, None: without limit; the node's stop ends the wait, too
+        :raises UnknownServiceError: if nobody offers the service in time
+        """
         return wait_for(lambda: self.lookup_service(name), timeout, self)
 
     def parameter(self, name: str, initialized=None) -> Parameter:
-        """Return a parameter of the server, bound both ways; '~rate' is private.
+        """Return a parameter of the server, bound both ways; '~rate' is private to the node.
 
-        :param initialized: the value that it gets if it has none
+        :param name: each call with the same name returns the same object
+        :param initialized: the value that the parameter gets if the server has none
         """
         name = self._resolve(name)
         for parameter in self._parameters:
@@ -649,7 +679,7 @@ class Node(DelegateHolder):
 
 
 def check_node_class(node_class):
-    """Raise TypeError if it is not a class of nodes, or replaces private methods of Node."""
+    """Raise TypeError if the class is not one of nodes, or replaces private methods of Node."""
     if not (isinstance(node_class, type) and issubclass(node_class, Node)):
         raise TypeError(f'a node is made of a subclass of Node, not {node_class!r}')
     own_names = {name for name in vars(Node) if re.match('_[a-z]', name)}

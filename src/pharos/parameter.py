@@ -8,9 +8,9 @@ from pharos.channels import Endpoint
 
 
 class Parameter(Endpoint):
-    """A parameter of the server, as a node sees it; see :meth:`Node.parameter`.
+    """A parameter of the server, bound to a node; see :meth:`Node.parameter`.
 
-    :ivar name: its full name
+    :ivar name: the parameter's full name
     """
 
     def __init__(self, node, name, initialized):
@@ -22,7 +22,7 @@ class Parameter(Endpoint):
         self.open()
 
     def subscribe(self):
-        """Hear of changes, and set the value that the node knows if the master has none."""
+        """Have the master report changes; set the node's value if the server has none."""
         run = self._run
         run.master.call('subscribeParam', run.uri, self.name, caller_id=run.name)
         if self._value is not None and self.name not in run.master.parameters:
@@ -32,40 +32,53 @@ class Parameter(Endpoint):
     _open = subscribe
 
     def _close(self):
-        """Hear of no more changes."""
+        """Have the master report no more changes."""
         run = self._run
         run.master.call('unsubscribeParam', run.uri, self.name, caller_id=run.name)
 
     @property
     def value(self):
-        """The value: a bool, int, float, str, list or dict; None if it has none."""
+        """The value: a bool, int, float, str, list or dict; None if the server has none.
+
+        Each access returns a copy of the value that was read last. The master calls the node at
+        changes by others; the node then reads again.
+
+        :raises NodeStoppedError: if the node has not started, or has stopped
+        """
         self.node._check_active()
         return deepcopy(self._value)
 
     def set(self, value) -> None:
-        """Set the value on the server.
+        """Set the value on the server, and run the node's blocks if the value is another one.
 
         :raises ValueError: if the server cannot hold such a value
         :raises MasterUnreachableError: if the master does not answer
+        :raises NodeStoppedError: if the node has not started, or has stopped
         """
         self.node._check_active()
         self._run.master.parameters[self.name] = value
         self._run.read_parameters()
 
     def read(self):
-        """Take the value that the server has, and run the blocks if it is another one."""
+        """Read the value from the server, and run the blocks if the value is another one."""
         with self._read_lock:
             former = self._value
             value = self._run.master.parameters.get(self.name)
             self._value = value
         is_same = value == former and type(value) is type(former)
-        if is_same or self.closed:  # open() reads while the parameter is still closed
+        if is_same or self.closed:  # open() reads before the parameter is open: blocks do not run
             return
         for block in self.delegate:
             self._run_block(block, deepcopy(value))
 
     def on_change(self, block: Block) -> Block:
-        """Have ``block(value)`` run when the value changes, also by others."""
+        """Have ``block(value)`` run when the value changes, also by other nodes; return the block.
+
+        The block runs in the thread that sets or reads the value, not in the node's pool. An
+        exception of the block goes to :attr:`Node.failures`.
+
+        :raises TypeError: if the block does not take one argument
+        """
         self.delegate = [*self.delegate, with_arguments(block, 'block of on_change', 1, 1)]
         return block
 

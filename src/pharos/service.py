@@ -1,4 +1,4 @@
-"""Services: offered by a node, or called by name alone."""
+"""Services: OfferedService for the node that answers, Service for the caller."""
 from __future__ import annotations
 
 import io
@@ -31,7 +31,7 @@ from pharos.private_rospy.run import call_local_service, find_local_service
 from pharos.private_rospy.tcpros import keep_alive
 from pharos.waiting import current
 
-LOOK_UP_LIMIT = 0.25  # seconds that a look-up waits for the type; a call asks again
+LOOK_UP_LIMIT = 0.25  # seconds that look_up() waits for the type; call() asks again
 TYPE_LIMIT = 5.0  # seconds that a call without a timeout waits for the type
 _MAX_HEADER = 1 << 16  # bytes
 _MAX_PART = 1 << 20  # bytes that are read at once
@@ -40,7 +40,7 @@ _MAX_PART = 1 << 20  # bytes that are read at once
 class OfferedService(Endpoint):
     """A service that a node offers; made by :meth:`Node.serve`.
 
-    :ivar name: its full name
+    :ivar name: the service's full name
     """
 
     def __init__(self, node, name, service_class, block):
@@ -79,11 +79,11 @@ class Service:
 
     The report: ``service := master lookupService: '/clear' with: '/myID'. service call``.
 
-    :ivar name: its full name
+    :ivar name: the service's full name
     :ivar caller_id: the name of the calling node
     :ivar uri: the address of the provider
-    :ivar type: the name of its type, as the provider says
-    :ivar md5sum: the md5sum sent with a call; the provider's unless it is set
+    :ivar type: the name of the service's type; None until the provider answers
+    :ivar md5sum: the md5sum sent with a call: the provider's, unless a program sets another
     :ivar response: the response of the last call, or None
     """
 
@@ -100,7 +100,9 @@ class Service:
     def look_up(self) -> None:
         """Ask the master for the provider, and the provider for the type.
 
-        :raises UnknownServiceError: if nobody offers the service
+        A provider that does not answer at once is asked again by call().
+
+        :raises UnknownServiceError: if nobody offers the service, or the provider has died
         """
         self.uri = self.master.call('lookupService', self.name)
         if not self.uri:
@@ -113,23 +115,29 @@ class Service:
             raise UnknownServiceError(
                 f'{self.name} was offered at {self.uri}, which has died: rosnode cleanup forgets it'
             ) from None
-        except (OSError, ROSHandshakeException):  # a call asks again
+        except (OSError, ROSHandshakeException):  # call() asks again
             pass
 
     def _ask_type(self, timeout):
-        """Ask the provider for the service's type."""
+        """Ask the provider for the service's type and md5sum, within ``timeout`` seconds."""
         sock, header = self._connect('*', timeout, probe='1')
         self.type = header['type']
         self.md5sum = header['md5sum']
         sock.close()
 
     def call(self, block: Block | None = None, *, timeout: float | None = None, **fields):
-        """Call the service. The request is ready, or filled by ``block(request)``, a dict or keywords.
+        """Call the service, and return the response.
 
-        :param timeout: seconds for the whole call, None: without limit
+        Without a timeout, a provider of this process answers in this thread. The stop of a node
+        ends the calls of its souls to other processes.
+
+        :param block: ``block(request)`` fills a new request; or a dict, or a ready request
+        :param timeout: seconds, None: without limit; a slow connection may add to them
+        :param fields: fill the request by name
         :returns: the response; also in :attr:`response`
         :raises ServiceCallError: if the provider fails, is gone, or does not answer in time
-        :raises ServiceTypeError: if the provider's md5sum is not ours
+        :raises ServiceTypeError: if :attr:`md5sum` differs from that of the type in this process
+        :raises UnknownTypeError: if this process has no definition of the service's type
         :raises MessageTypeError: if the request cannot be sent
         """
         self.response = None
@@ -140,7 +148,7 @@ class Service:
             request = self._build_request(service_class, block, fields)
             self._check_md5sum(service_class)
             local = None
-            if timeout is None:  # nothing ends a local call
+            if timeout is None:  # a timeout could not end a local call
                 local = find_local_service(self.name, self.uri)
             if local:
                 self.response = call_local_service(local, request, self.caller_id)
@@ -171,7 +179,10 @@ class Service:
             )
 
     def _call(self, service_class, data, timeout):
-        """Call the provider by a socket."""
+        """Call the provider by a socket, and return the response.
+
+        :param data: the bytes of the request
+        """
         deadline = None if timeout is None else monotonic() + timeout
         try:
             sock, _ = self._connect(self.md5sum, timeout)
@@ -187,10 +198,14 @@ class Service:
         return service_class._response_class().deserialize(answer)
 
     def _connect(self, md5sum, timeout, **fields):
-        """Return a socket to the provider, and the header of its answer."""
+        """Connect to the provider, and return the socket and the header of the answer.
+
+        :param fields: more fields of the header to send
+        :raises ConnectionError: if the provider refuses
+        """
         sock = socket.create_connection(parse_rosrpc_uri(self.uri), timeout)
         keep_alive(sock)
-        if current.node:  # its stop ends the call
+        if current.node:  # the node's stop ends the call
             current.node._current_run.calls.add(sock)
         names = {'callerid': self.caller_id, 'service': self.name, 'md5sum': md5sum}
         write_ros_handshake_header(sock, {**names, **fields})

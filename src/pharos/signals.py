@@ -1,4 +1,4 @@
-"""The nodes of this process, and their ends: by spin(), signals, the exit, or a fork."""
+"""The nodes of this process, and their ends: by spin(), by signals, at the exit, in a fork."""
 from __future__ import annotations
 
 import atexit
@@ -21,19 +21,23 @@ started_nodes = []
 #: the nodes between the stop and the start of a restart()
 restarting_nodes = []
 
-_signal_time: float | None = None  # of the first signal that ends the program, as time.monotonic()
+#: the time of the first signal that ends the program, as of time.monotonic()
+_signal_time: float | None = None
 _is_exiting = False
 
 
 def own_nodes():
-    """Return the nodes of this process that have started, or restart."""
+    """Return the nodes of this process that start, run, stop or restart."""
     between = [node for node in restarting_nodes if node not in started_nodes]
     return [*started_nodes, *between]
 
 
 @contextlib.contextmanager
 def quiet_wait():
-    """End without an exception at the stop of a node, and at a signal of ours, which stops all."""
+    """End a wait without an exception if a node stops or a signal stops all nodes.
+
+    Other KeyboardInterrupts and SystemExits go on.
+    """
     try:
         with contextlib.suppress(rospy.ROSInterruptException):
             yield
@@ -43,13 +47,13 @@ def quiet_wait():
 
 
 def stop_all():
-    """Stop every node of this process, whatever the stop() of its class raises."""
+    """Stop every node of this process, also if the stop() of a class raises an exception."""
     for node in own_nodes():
         node._stop_safely()
 
 
 def spin() -> None:
-    """Block until every node of this process has stopped. Ctrl-C, SIGTERM and SIGHUP stop them."""
+    """Wait until every node of this process has stopped. Ctrl-C, SIGTERM and SIGHUP stop them."""
     handle_signals()
     with contextlib.suppress(KeyboardInterrupt), quiet_wait():
         # a program may have called rospy.init_node(): then a signal is rospy's
@@ -59,7 +63,11 @@ def spin() -> None:
 
 
 def handle_signals():
-    """Have signals stop the nodes and end the program, unless somebody else handles them."""
+    """Have SIGINT, SIGTERM and SIGHUP stop the nodes and end the program.
+
+    Do nothing outside the main thread, and for a signal that the program handles. An interactive
+    session keeps its SIGINT.
+    """
     if threading.current_thread() is not threading.main_thread():
         return
     defaults = signal.default_int_handler, signal.SIG_DFL, signal.SIG_IGN
@@ -72,7 +80,7 @@ def handle_signals():
 
 
 def is_ending():
-    """True after a signal that ends the program."""
+    """True if a signal that ends the program has come."""
     return _signal_time is not None
 
 
@@ -86,7 +94,10 @@ def may_be_signal():
 
 
 def _handle_signal(number, frame):
-    """Handle the signal of that number."""
+    """Stop all nodes in another thread, and raise KeyboardInterrupt or SystemExit here.
+
+    A second signal that comes more than SAME_SIGNAL later ends the process at once.
+    """
     global _signal_time
     if _signal_time is not None:
         if time.monotonic() - _signal_time > SAME_SIGNAL:  # pragma: no cover: it ends the process
@@ -109,7 +120,7 @@ def _stop_at_exit():
 
 
 def _forget_nodes():
-    """Have no nodes in a forked child: they run in the parent."""
+    """Forget all nodes in a forked child: they run in the parent."""
     for node in own_nodes():
         node._current_run.mark_stopped()
     started_nodes.clear()

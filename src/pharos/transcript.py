@@ -5,20 +5,23 @@ from pharos.blocks import Block
 
 
 class _Transcript:
-    """Shows things, a line each, from any thread. The report: ``Transcript show: message``."""
+    """The Transcript: shows lines, from any thread. The report: ``Transcript show: message``."""
 
     _receiver: Any = None
 
     def show(self, *things) -> None:
-        """Show one line on standard output, or to the receiver."""
+        """Show things in one line, on standard output or to the receiver."""
         line = ' '.join(map(str, things))
         if self._receiver:
             self._receiver(line)
         else:
-            print(f'{line}\n', end='', flush=True)  # in one piece
+            print(f'{line}\n', end='', flush=True)  # in one piece: other threads print, too
 
     def on_show(self, receiver: Block | None) -> Block | None:
-        """Have ``receiver(line)`` take the lines, None: standard output; returns the former one."""
+        """Have ``receiver(line)`` take the lines, and return the former receiver.
+
+        :param receiver: None: standard output
+        """
         former_receiver = self._receiver
         self._receiver = receiver
         return former_receiver

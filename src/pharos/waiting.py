@@ -1,4 +1,4 @@
-"""Waiting, which the stop of a node ends."""
+"""Waiting: the stop of a node ends each wait on its behalf."""
 import contextlib
 import math
 import threading
@@ -9,7 +9,7 @@ from pharos.errors import PharosError
 
 
 class _Current(threading.local):
-    """The node that has its soul or its program in this thread."""
+    """The node with its soul or its program in this thread, or None."""
 
     node: Any = None
 
@@ -21,7 +21,7 @@ def wait(predicate, timeout=None, node=None):
     """Wait until ``predicate()`` is true.
 
     :param timeout: seconds; None: without limit
-    :param node: its stop ends the wait, too; default: the one with its soul in this thread
+    :param node: the node's stop ends the wait, too; default: the node with its soul in this thread
     :returns: the last value of ``predicate()``, false if the wait ended otherwise
     """
     deadline = math.inf if timeout is None else time.monotonic() + timeout
@@ -41,10 +41,13 @@ def wait(predicate, timeout=None, node=None):
 
 
 def wait_for(find, timeout, node=None):
-    """Return ``find()``, tried again while it raises errors of ours."""
+    """Return ``find()``; try again for ``timeout`` seconds while ``find()`` raises a PharosError.
+
+    :raises PharosError: the error of ``find()`` after that time, or after the stop of the node
+    """
 
     def attempt():
         with contextlib.suppress(PharosError):
             return find()
 
-    return wait(attempt, timeout, node) or find()  # which raises the error
+    return wait(attempt, timeout, node) or find()  # the last attempt raises the error

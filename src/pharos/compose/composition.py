@@ -22,15 +22,15 @@ from pharos.node import Settings
 from pharos.private_rospy.run import Lifecycle
 from pharos.transcript import Transcript
 
-INIT_LIMIT = 2.0  # seconds that a node may take to start before the next one does
-TERMINATE_LIMIT = 40.0  # seconds: half of it for roslaunch, which gives each node 17
+INIT_LIMIT = 2.0  # seconds until the next node starts, if a node has not started by then
+TERMINATE_LIMIT = 40.0  # seconds: 20 after the SIGINT, since roslaunch gives its nodes 17
 POLL_PERIOD = 0.02  # seconds between two looks at the nodes that have ended
 
 
 class Composition:
     """Programs that run in this process, unmodified, and the rest of their launch file.
 
-    Made by :meth:`Master.compose`; ends with its ``with`` block.
+    :meth:`Master.compose` makes a composition. The end of its ``with`` block ends the composition.
 
     :ivar nodes: the ScriptNodes of this process, in the order of the launch file
     :ivar process: the RosProcess in which roslaunch runs the others, or None
@@ -40,8 +40,8 @@ class Composition:
         self.master = master
         self.process: RosProcess | None = None
         self.nodes: list[ScriptNode] = []
-        self._processes: list[RosProcess] = []  # of scripts that need one each
-        self._end_times: dict[ScriptNode, float] = {}  # as time.monotonic()
+        self._processes: list[RosProcess] = []  # of scripts that need a process each
+        self._end_times: dict[ScriptNode, float] = {}  # as of time.monotonic()
         self._stopping = threading.Event()
         self._watcher = threading.Thread(target=self._watch, name='composition', daemon=True)
         self._is_process_required = False  # True if roslaunch runs a required node
@@ -51,6 +51,9 @@ class Composition:
     def launch(self, launch_file):
         """Set the parameters of a launch file, and start its nodes.
 
+        The Transcript shows why a node does not start, or runs in a process of its own.
+
+        :param launch_file: the :class:`LaunchFile`
         :raises PharosError: if the master does not answer, or refuses a parameter
         """
         run_id = self.master.parameters.setdefault('/run_id', roslaunch.core.generate_run_id())
@@ -63,7 +66,7 @@ class Composition:
             self._start_roslaunch(launch_file)
         log_folder = os.path.join(rospkg.get_log_dir(), run_id)
         for number, entry in enumerate(launch_file.entries, 1):
-            log_name = f'{entry.name[1:].replace("/", "-")}-{number}.log'  # as roslaunch has it
+            log_name = f'{entry.name[1:].replace("/", "-")}-{number}.log'  # as roslaunch names logs
             arguments = [*entry.args, f'__log:={log_folder}/{log_name}']
             with self._show_failure(entry.name):
                 self.start(entry.name, entry.path, arguments, entry.roslaunch_node)
@@ -79,9 +82,9 @@ class Composition:
         self.process = RosProcess(command, self.master.url, Transcript.show)
 
     def run_scripts(self, programs, programs_here):
-        """Run programs; the Transcript says why one does not start.
+        """Run programs without a launch file; the Transcript shows why a program does not start.
 
-        :param programs: each as PACKAGE/EXECUTABLE, or a path
+        :param programs: texts: PACKAGE/EXECUTABLE, or a path
         :param programs_here: those of them that run in this process even if they show windows
         """
         for text in programs:
@@ -107,16 +110,19 @@ class Composition:
 
     @contextlib.contextmanager
     def _show_failure(self, name):
-        """Show why a program is not started, and go on with the others."""
+        """Show a PharosError of a start in the Transcript, and go on: the other programs start."""
         try:
             yield
         except PharosError as error:
             Transcript.show(f'{name} is not started: {error}')
 
     def start(self, name, path, arguments, roslaunch_node=None):
-        """Start a program as the node of that name, and return it.
+        """Start a program as the node of that name, and return the node.
 
-        :param roslaunch_node: roslaunch's, if a launch file named the program
+        :param path: the file of the program
+        :param arguments: the arguments of the program, with ROS's
+        :param roslaunch_node: roslaunch's Node, if the program comes from a launch file
+        :raises PharosError: if the program failed before ``init_node``
         """
         node = ScriptNode.__new__(ScriptNode)
         node._configure(Settings(name, self.master, None, (0, 0), ()), None, None)
@@ -133,7 +139,7 @@ class Composition:
 
     @property
     def is_over(self) -> bool:
-        """True if all that it started has ended."""
+        """True if all started nodes and processes have ended, and no node respawns."""
         for node in self.nodes:
             respawns = node.roslaunch_node and node.roslaunch_node.respawn
             if respawns or node.lifecycle is not Lifecycle.STOPPED:
@@ -144,7 +150,7 @@ class Composition:
         return [*self._processes, self.process] if self.process else self._processes
 
     def _watch(self):
-        """Start again nodes that respawn, and end all if a required node has ended."""
+        """Show ends, start again nodes that respawn, and end all if a required node has ended."""
         while not self.is_over:
             is_stopping = self._stopping.wait(POLL_PERIOD)
             if is_stopping:
@@ -191,14 +197,15 @@ class Composition:
             self.stop()
 
     def wait(self, timeout: float | None = None) -> int:
-        """Wait until all nodes have ended; returns 0, or 1 if a required one has, or none started.
+        """Wait until all nodes have ended, or Ctrl-C, and stop the composition.
 
         :param timeout: seconds, None: without limit
-        :raises TimeoutError: if they have not in that time
+        :returns: 0; or 1 if a required node has ended, or no node has started
+        :raises TimeoutError: if not all nodes have ended in time
         """
         wait_for_end(self._must_end, timeout, 'the composition')
         if self.is_over:
-            self._watcher.join()  # it has shown all ends
+            self._watcher.join()  # the watcher shows all ends before this returns
         self.stop()
         return 1 if self._has_lost_required or not self._has_started else 0
 
@@ -206,7 +213,7 @@ class Composition:
         return self.is_over or self._stopping.is_set() or signals.is_ending()
 
     def stop(self) -> None:
-        """End all nodes, also those in processes of their own."""
+        """End all nodes, also those in processes of their own, and wait for their ends."""
         self._stopping.set()
         threads = [threading.Thread(target=node._stop_safely) for node in self.nodes]
         for thread in threads:

@@ -1,4 +1,4 @@
-"""The node that a composition is for others: it loads and unloads programs by nodelet's services."""
+"""A node that loads programs into a composition, and unloads them, by nodelet's services."""
 import contextlib
 from typing import Any
 
@@ -13,9 +13,11 @@ from pharos.node import Node
 
 
 class Container(Node):
-    """Loads programs as nodelet's manager loads nodelets: ``nodelet load PACKAGE/EXECUTABLE NAME``.
+    """Loads programs as nodelet's manager loads nodelets.
 
-    :param composition: the nodes become nodes of this composition
+    Use: ``rosrun nodelet nodelet load PACKAGE/EXECUTABLE CONTAINER __name:=NAME``.
+
+    :param composition: the programs become nodes of this composition
     """
 
     def __init__(self, composition: Composition):
@@ -45,7 +47,8 @@ class Container(Node):
         name = requested_name
         if name in self._running_nodes():
             raise PharosError(f'{name} is loaded already: unload it first, or name another')
-        if request._connection_header.get('callerid') == name:  # nodelet load has that name itself
+        # the program `nodelet load` is itself a node of that name
+        if request._connection_header.get('callerid') == name:
             name += f'_in_{self.name.rpartition("/")[2]}'
             self.master.parameters[name] = self.master.parameters.get(requested_name, {})
         remappings = zip(request.remap_source_args, request.remap_target_args)
@@ -58,7 +61,7 @@ class Container(Node):
         return True
 
     def _start_bond(self, name, bond_id):
-        """Unload a program when the process that has loaded it is gone."""
+        """Unload a program as soon as the process that has loaded the program is gone."""
         bond_class = self.ros_import('bondpy.bondpy').Bond
         bond = bond_class(f'{self.name}/bond', bond_id, on_broken=lambda: self._drop(name))
         self._bonds[name] = bond

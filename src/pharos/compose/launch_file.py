@@ -18,7 +18,13 @@ from pharos.transcript import Transcript
 
 
 class Entry(NamedTuple):
-    """A node of a launch file that runs in this process."""
+    """A node of a launch file that runs in this process.
+
+    :ivar name: the full name
+    :ivar path: the file of the program
+    :ivar args: the arguments of the program, with ROS's
+    :ivar roslaunch_node: roslaunch's Node
+    """
 
     name: str
     path: str
@@ -27,18 +33,23 @@ class Entry(NamedTuple):
 
 
 class LaunchFile:
-    """A launch file and all that it includes.
+    """A launch file with all included files.
 
-    :param args: its arguments
+    A name of a node may lack its slash, or its namespace. The Transcript shows why a node cannot
+    start at all.
+
+    :param url: the URL of the master
+    :param package: None: ``file`` is a path
+    :param args: names of the launch file's arguments -> values
     :param only: the names of the nodes that run; none: all
     :param apart: the names of nodes that run in processes of their own
     :param here: the names of nodes that run in this process even if they show windows
     :ivar config: roslaunch's configuration
     :ivar entries: an :class:`Entry` for each node of this process
     :ivar nodes_apart: roslaunch's nodes for other processes
-    :ivar reasons: their names -> why
+    :ivar reasons: the names of these nodes -> texts that say why they run apart
     :raises UnknownNodeError: if there is no such package, file, argument or node
-    :raises PharosError: if roslaunch cannot read it
+    :raises PharosError: if roslaunch cannot read the file
     """
 
     def __init__(self, url, package, file, args, only=(), apart=(), here=()):
@@ -67,7 +78,7 @@ class LaunchFile:
             self.config = roslaunch.config.load_config_default(
                 [(self.path, arguments)], None, loader=loader, verbose=False
             )
-        except Exception as error:  # of roslaunch, or of a substitution in the file
+        except Exception as error:  # roslaunch's own, or any other of a substitution in the file
             raise PharosError(f'{self.path}: {error}') from error
         self._check(args, loader.root_context.resolve_dict.get('arg_doc', {}), 'arg')
 
@@ -86,7 +97,7 @@ class LaunchFile:
                     node, node.machine, env=os.environ
                 )
                 reason = why_apart(command[0], is_here)
-        except Exception as error:  # of roslaunch, or of a file that cannot be read
+        except Exception as error:  # of roslaunch, or of a program that cannot be read
             Transcript.show(f'{name} is not started: {error}')
             return
         if reason:
@@ -96,7 +107,7 @@ class LaunchFile:
             self.entries.append(Entry(name, source_of(command[0]), command[1:], node))
 
     def _why_apart(self, node, is_apart):
-        """Return why the launch file or --apart wants a process for a node; '' if nothing does."""
+        """Return why the launch file or --apart wants a process for a node, as text; else ''."""
         if is_apart:
             return 'as --apart says'
         if node.launch_prefix:
@@ -108,11 +119,12 @@ class LaunchFile:
         return ''
 
     def set_parameters(self, run_id):
-        """Run the commands of rosparam, clear and set the parameters, as roslaunch does.
+        """Run the commands of rosparam, and clear and set the parameters, as roslaunch does.
 
-        :raises PharosError: if a command fails, or the master refuses
+        :param run_id: the /run_id of the master
+        :raises PharosError: if a command fails, or the master refuses a parameter
         """
-        # with a monitor that never runs: roslaunch's own takes the signals of the program
+        # this monitor never runs: roslaunch's own would take the signals of this program
         monitor = roslaunch.pmon.ProcessMonitor()
         runner = roslaunch.launch.ROSLaunchRunner(run_id, self.config, pmon=monitor)
         try:
@@ -122,7 +134,7 @@ class LaunchFile:
             raise PharosError(f'{self.path}: {error}') from error
 
     def config_apart(self):
-        """Return the configuration that is left for roslaunch: the nodes apart alone."""
+        """Return a configuration with nothing but the nodes apart, for a process of roslaunch."""
         config = copy.copy(self.config)
         config.nodes = self.nodes_apart
         config.nodes_core = []

@@ -1,7 +1,7 @@
-"""Run the nodes of a launch file that need their own processes: ``roslaunch_parent.py FILE PARENT``.
+"""Run the nodes of a launch file that need their own processes: ``roslaunch_parent.py FILE PID``.
 
-roslaunch runs them, with the configuration that is pickled in FILE. The program ends as roslaunch
-does, and when the process PARENT has ended.
+roslaunch runs these nodes. FILE has roslaunch's configuration, pickled. The program ends as
+roslaunch does, and also if its parent, the process PID, has ended.
 """
 import os
 import pickle
@@ -25,9 +25,9 @@ def _end_with(parent):
 
 
 def main(path, parent):
-    """Run the nodes; returns the exit status.
+    """Run the nodes, and return the exit status.
 
-    :param path: the file with the configuration, which is removed
+    :param path: the file with the pickled configuration; this removes the file
     :param parent: the number of the parent process
     """
     with open(path, 'rb') as file:

@@ -20,12 +20,15 @@ from pharos.waiting import wait
 class ScriptNode(Node):
     """A program of rospy, unmodified, as a node of this process; made by :meth:`Master.load`.
 
-    A start runs it from its first line, in a thread of its own; its ``rospy.init_node``
-    registers the node. :meth:`stop` ends it. The node stops when the program has ended.
+    Each start runs the program from its first line, in a thread of its own. The program's call of
+    ``rospy.init_node`` registers the node. :meth:`stop` ends the program as Ctrl-C does. The node
+    stops when the program has ended.
 
+    :param params: names of private parameters -> values; set before the node is registered
+    :param env: environment variables of the program: pairs, or a dict
     :ivar path: the file of the program
-    :ivar args: its arguments, ROS's among them
-    :ivar exit_code: the exit status that its process would have; None while it runs
+    :ivar args: the program's arguments, with ROS's
+    :ivar exit_code: the exit status that the program's process would have; None while it runs
     """
 
     #: seconds that a start waits for the program to call ``rospy.init_node``, or to end
@@ -33,9 +36,9 @@ class ScriptNode(Node):
     #: seconds that :meth:`stop` waits for the program, as long as roslaunch waits after its SIGINT
     stop_timeout = 15.0
     exit_code: int | None = None
-    roslaunch_node: Any = None  # roslaunch's, if a launch file named it
+    roslaunch_node: Any = None  # roslaunch's Node, if the program comes from a launch file
     _run_class = ScriptRun
-    _has_own_start = True  # its program does
+    _has_own_start = True  # the program itself opens its endpoints at each start
 
     def __init__(self, path: str, args: list[str], params: dict | None = None, env: Any = ()):
         self.path = path
@@ -45,17 +48,21 @@ class ScriptNode(Node):
         self._settings.remappings = args
 
     def wait(self, timeout: float | None = None) -> int | None:
-        """Wait until the program has ended, and return its :attr:`exit_code`.
+        """Wait until the program has ended, or Ctrl-C, and return its :attr:`exit_code`.
 
         :param timeout: seconds, None: without limit
-        :raises TimeoutError: if it has not in that time
+        :raises TimeoutError: if the program has not ended in time
         """
         wait_for_end(lambda: self.lifecycle is Lifecycle.STOPPED, timeout, self.name)
         return self.exit_code
 
 
 def wait_for_end(predicate, timeout, name):
-    """Wait until ``predicate()`` is true, or Ctrl-C; raise TimeoutError if it is not in time."""
+    """Wait until ``predicate()`` is true, or Ctrl-C.
+
+    :param name: the name of the thing that must end, for the error
+    :raises TimeoutError: if ``predicate()`` is not true within ``timeout`` seconds
+    """
     with signals.quiet_wait():
         has_ended = wait(predicate, timeout)
         if not has_ended:
@@ -76,7 +83,7 @@ def load(master, package, executable, arguments, name, namespace, params, here):
     if name:
         node_name = name
         arguments = [*arguments, f'__name:={name.rpartition("/")[2]}']
-    else:  # until it calls init_node, it is called after its file
+    else:  # the node has its file's name until the program calls init_node
         file_name = os.path.basename(path).removesuffix('.py')
         node_name = re.sub(r'\W|^(?=[^A-Za-z])', 'x', file_name)
     if namespace:

@@ -1,4 +1,7 @@
-"""One run of a script: the program in a thread, with stand-ins for what it has of a process."""
+"""One run of a script: the program in a thread, with stand-ins for parts of a process.
+
+These are signals, atexit, sys.argv, the output, the environment, and the main thread.
+"""
 import asyncio
 import collections
 import contextlib
@@ -31,17 +34,23 @@ SPIN_PERIOD = 0.01  # seconds
 
 @patch('subprocess', 'Popen.__init__')
 def start_child(original, run, self, *args, env=None, **kwargs):
-    """Python gives a child the environment of this process; this gives it the program's."""
+    """Python gives a child the environment of this process. This passes on the program's."""
     original(self, *args, env=run.environ if env is None else env, **kwargs)
 
 
 class ScriptRun(Run):
     """One run of a program.
 
-    At its end these are set, in this order: ``is_end_requested``; ``has_signal`` and
-    ``pending_signal`` (a signal waits for the main thread); ``signal_accepted`` (the program's
-    handlers run); ``has_run_hooks``; ``stopping`` (``is_shutdown()`` is True); ``main_has_ended``;
-    ``finished`` (threads that are left end).
+    "The main thread" is the thread that runs the program. A stop sets the following attributes, in
+    this order.
+
+    :ivar is_end_requested: True: the stop has begun
+    :ivar has_signal, pending_signal: a signal waits for the main thread
+    :ivar signal_accepted: the program's handlers run
+    :ivar has_run_hooks: True: the hooks of rospy.on_shutdown() run, or have run
+    :ivar stopping: ``is_shutdown()`` is True
+    :ivar main_has_ended: True: the program and its exit functions have ended
+    :ivar finished: threads left behind end
     """
 
     error = None  # raised by the program before it was a node
@@ -51,14 +60,14 @@ class ScriptRun(Run):
     is_end_requested = False
     has_signal = False
     has_run_hooks = False
-    main_has_ended = True  # it has not begun
+    main_has_ended = True  # there is no main thread yet; False from start() on
 
     def __init__(self, node, settings):
         self.exit_functions = []  # of atexit
-        self.thread_exit_functions = []  # of threading, which run before
-        self.threads_to_join = []  # those that are no daemons
+        self.thread_exit_functions = []  # of threading._register_atexit, which run before
+        self.threads_to_join = []  # those that are not daemons
         self.handlers = {}  # number of a signal -> the program's handler
-        self.created_nodes = []  # by the program, with pharos
+        self.created_nodes = []  # the nodes that the program has created with pharos
         self.pending_signal = threading.Event()
         self.signal_accepted = threading.Event()
         self.handler_lock = threading.RLock()  # held while a signal is handled
@@ -81,11 +90,12 @@ class ScriptRun(Run):
         run = self
 
         class Thread(self.Thread):
-            """A thread of the program. The program's end waits for it, unless it is a daemon."""
+            """A thread of the program. The program's end waits for the thread if not a daemon."""
 
             def __init__(self, *args, **kwargs):
                 super().__init__(*args, **kwargs)
-                if threading.current_thread() is run.main:  # a daemon here, but not as a process
+                # run.main is a daemon, and would pass that on; a process's main thread is not one
+                if threading.current_thread() is run.main:
                     self.daemon = bool(kwargs.get('daemon'))
 
             def start(self):
@@ -112,7 +122,7 @@ class ScriptRun(Run):
         self.stderr = NamedLines(sys.__stderr__, self)
         stand_ins['sys'].stdout = self.stdout
         stand_ins['sys'].stderr = self.stderr
-        # a line has the node's name in front
+        # without ${node}: NamedLines puts the node's name in front
         self.environ['ROSCONSOLE_FORMAT'] = os.environ.get(
             'ROSCONSOLE_FORMAT', '[${severity}] [${time}]: ${message}'
         )
@@ -132,7 +142,7 @@ class ScriptRun(Run):
         return former_handler
 
     def print(self, *values, file=None, **options):
-        """Stand in for ``print``: the program may have replaced its sys.stdout."""
+        """Stand in for ``print``: write to the program's own sys.stdout, not to the process's."""
         print(*values, file=file or self.modules.modules['sys'].stdout, **options)
 
     def print_error(self, error, title=''):
@@ -142,9 +152,12 @@ class ScriptRun(Run):
     # -- start
 
     def start(self):
-        """Run the program until its node is registered, or it has ended, or ``init_timeout``.
+        """Start the program, and wait until its node is registered.
 
-        :raises PharosError: if the program raised an exception by then, its cause
+        Return at the end of the program, too, and after the node's ``init_timeout``. The program
+        goes on in the main thread.
+
+        :raises PharosError: if the program raised an exception before it was a node
         """
         node = self.node
         node.exit_code = 1  # stays if the program cannot be read
@@ -167,7 +180,12 @@ class ScriptRun(Run):
         return self.is_registered or bool(self.created_nodes)
 
     def init_node(self, name, argv=None, anonymous=False, disable_signals=False, **options):
-        """Register the node; stands in for ``rospy.init_node``."""
+        """Stand in for ``rospy.init_node``: give the node its name, and register the node.
+
+        A second call does nothing.
+
+        :raises NodeNameInUseError, PortInUseError, MasterUnreachableError: as for a start
+        """
         if self.is_registered:
             return
         if anonymous:
@@ -190,10 +208,10 @@ class ScriptRun(Run):
     # -- the program
 
     def run_thread(self, target):
-        """Run the target of a thread of the program."""
+        """Run the target of a thread of the program; print and keep its exception."""
         try:
             target()
-        except SystemExit:  # ends a thread alone
+        except SystemExit:  # ends the thread, not the program
             pass
         except Exception as error:
             name = target.__self__.name
@@ -201,7 +219,7 @@ class ScriptRun(Run):
             self.keep_failure(error, name)
 
     def run_main(self):
-        """Run the program, and its exit functions, as Python does."""
+        """Run the program to its end, with its threads and exit functions; stop the node."""
         current.node = self.node
         main_module = types.ModuleType('__main__')
         main_module.__file__ = self.node.path
@@ -216,7 +234,7 @@ class ScriptRun(Run):
         finally:
             self.stdout.flush()
             self.stderr.flush()
-            if self.node._current_run is self:  # else it is late, and the node runs again
+            if self.node._current_run is self:  # else the node has started again before this end
                 if self.exit_request is not None:
                     status = self._status_of(self.exit_request)
                 self.node.exit_code = status
@@ -257,13 +275,13 @@ class ScriptRun(Run):
                 self.keep_failure(error, function)
 
     def exit_now(self, status):
-        """Stand in for os._exit: end the program, not the process."""
+        """Stand in for ``os._exit``: end the program, not the process."""
         self.exit_request = SystemExit(status)
         self.request_stop()
         raise self.exit_request
 
     def _join_threads(self):
-        """Wait for the threads that are no daemons; a signal ends this, as with Python."""
+        """Wait for the threads that are not daemons; a signal ends the wait, as in Python."""
         with contextlib.suppress(KeyboardInterrupt, SystemExit):
             while self.threads_to_join and not self.finished.is_set():
                 self.checkpoint()
@@ -271,7 +289,7 @@ class ScriptRun(Run):
                 self.threads_to_join = [each for each in self.threads_to_join if each.is_alive()]
 
     def _status_of(self, exit_request):
-        """Return the exit status that a SystemExit means."""
+        """Return the exit status of a SystemExit; print its text if it has one."""
         if isinstance(exit_request.code, str):
             self.print(exit_request.code, file=self.modules.modules['sys'].stderr)
             return 1
@@ -280,7 +298,11 @@ class ScriptRun(Run):
     # -- signals
 
     def sleep(self, seconds):
-        """Stand in for ``time.sleep``: a signal ends it; after the end, programs sleep as usual."""
+        """Stand in for ``time.sleep``: a signal ends a sleep of the main thread.
+
+        A stop ends sleeps of other threads. Once ``stopping`` is set, the main thread sleeps as
+        usual, and other threads end with the run.
+        """
         if threading.current_thread() is not self.main:
             if not self.stopping.is_set():
                 super().sleep(seconds)
@@ -295,12 +317,12 @@ class ScriptRun(Run):
             self.checkpoint()
 
     def checkpoint(self):
-        """Handle a pending signal, if this is the main thread, or wait until it is handled."""
+        """Handle a pending signal if this is the main thread; wait if another thread handles it."""
         if self.has_signal and threading.current_thread() is self.main:
             self.handle_signal()
 
     def handle_signal(self):
-        """Call the program's handlers, once."""
+        """Call the program's handlers for a stop, once; they may raise an exception."""
         with self.handler_lock:
             if not self.pending_signal.is_set():
                 return
@@ -314,7 +336,7 @@ class ScriptRun(Run):
                     handler(number, None)
 
     def _signal_numbers(self):
-        """Return SIGINT; SIGTERM, too, if the program has a handler of its own for this alone."""
+        """Return [SIGINT], and SIGTERM if the program has a handler of its own for that alone."""
         defaults = signal.default_int_handler, self.core._ros_signal
         handler = self._handler_of(signal.SIGTERM)
         is_own = callable(handler) and handler not in defaults
@@ -323,15 +345,18 @@ class ScriptRun(Run):
         return [signal.SIGINT]
 
     def _start_handling(self):
-        """Have another thread handle the signal, and return the threads that do."""
+        """Have another thread handle the signal; return a list of that thread."""
         try:
             return [self.start_thread(self.handle_signal_for_main)]
-        except RuntimeError:  # the interpreter ends, and starts none
+        except RuntimeError:  # the interpreter ends, and starts no thread
             self.handle_signal_for_main()
             return []
 
     def handle_signal_for_main(self):
-        """Handle the signal while the main thread stands still, or is busy with something else."""
+        """Handle the signal in this thread: the main thread is blocked or computes.
+
+        An exception of a handler is raised in the main thread.
+        """
         try:
             self.handle_signal()
         except (Exception, KeyboardInterrupt, SystemExit) as error:
@@ -340,7 +365,7 @@ class ScriptRun(Run):
             self.raise_in_main(error)
 
     def raise_in_main(self, error):
-        """Raise an exception in the main thread, at the next line that it runs."""
+        """Raise an exception of this class in the main thread, at its next line of Python."""
         if isinstance(error, SystemExit):
             self.exit_request = error
         if self.main.is_alive() and not self.main_has_ended:
@@ -351,7 +376,10 @@ class ScriptRun(Run):
     # -- stop
 
     def signal_shutdown(self, reason):
-        """Run the program's hooks, and close rospy; stands in for rospy's own."""
+        """Stand in for ``rospy.signal_shutdown``: run the program's hooks, and close rospy.
+
+        A second call does nothing.
+        """
         if self.has_run_hooks:
             return
         self.has_run_hooks = True
@@ -373,14 +401,17 @@ class ScriptRun(Run):
             node._stop_safely()
 
     def spin(self):
-        """Wait until the nodes that the program has created have stopped; stands in for pharos.spin."""
+        """Stand in for ``pharos.spin``: wait until the nodes of the program have stopped."""
         with contextlib.suppress(KeyboardInterrupt):
             while any(node in signals.own_nodes() for node in self.created_nodes):
                 self.sleep(SPIN_PERIOD)
         self.stop_created_nodes()
 
     def end_program(self, timeout):
-        """End the program as Ctrl-C does: its handlers and hooks first, then its main thread."""
+        """End the program as Ctrl-C does: handlers and hooks, main thread, then created nodes.
+
+        :param timeout: seconds for the main thread, which then gets a SystemExit
+        """
         self.is_end_requested = True
         if not self.main_has_ended:
             self.has_signal = True
@@ -396,30 +427,34 @@ class ScriptRun(Run):
                 self.threads.discard(self.main)
         self.signal_shutdown('stop')
         self.stop_created_nodes()
-        self.finished.set()  # threads that are left end at their next sleep
+        self.finished.set()  # threads left behind end at their next sleep
 
 
 class NamedLines:
-    """A stream that puts the node's name before each line."""
+    """A stream that puts the node's name before each line.
+
+    :param stream: the stream to write to, such as the process's stdout
+    :param run: the run with the name
+    """
 
     def __init__(self, stream, run):
         self._stream = stream
         self._run = run
-        self._partial_line = ''  # not written yet
+        self._partial_line = ''  # the text after the last line end, not written yet
         self._is_within_line = False  # True if a part of the line is written
 
     def __getattr__(self, name):
         return getattr(self._stream, name)
 
     def write(self, text):
-        """Write the complete lines."""
+        """Write the complete lines, keep the rest, and return the number of characters."""
         *lines, self._partial_line = (self._partial_line + text).split('\n')
         if lines:
             self._write('\n'.join(lines) + '\n')
         return len(text)
 
     def flush(self):
-        """Write the rest, which has no end yet."""
+        """Write the rest of the text, which is not a complete line yet."""
         if self._partial_line:
             self._write(self._partial_line)
             self._partial_line = ''
@@ -429,7 +464,7 @@ class NamedLines:
         named_text = ''.join(f'{prefix}{line}' for line in text.splitlines(keepends=True))
         if self._is_within_line:
             named_text = named_text.removeprefix(prefix)
-        # the reader of a pipe may have gone: the program goes on, and stops its motors
+        # the reader of a pipe may have gone: the program must go on, and stop its motors
         with contextlib.suppress(OSError, ValueError):
             self._stream.write(named_text)
             self._stream.flush()
@@ -437,7 +472,10 @@ class NamedLines:
 
 
 class _Asyncio(Shim):
-    """asyncio; a program's main thread has a loop, as asyncio makes one in the main thread alone."""
+    """A stand-in for asyncio that gives the main thread of a program an event loop.
+
+    asyncio itself makes a loop in the main thread of the process alone.
+    """
 
     def __init__(self, run):
         super().__init__(asyncio, _run=run, _has_loop=False)
@@ -450,7 +488,10 @@ class _Asyncio(Shim):
 
 
 class _Pharos(Shim):
-    """pharos; the nodes that a program creates belong to its entry, and end with it."""
+    """A stand-in for pharos: the nodes that a program creates end with the program.
+
+    They get the name and remappings of its entry in the launch file. Its Transcript prints lines.
+    """
 
     def __init__(self, run):
         class EntryMaster(Master):

@@ -1,4 +1,4 @@
-"""The sources of programs: they tell if a program needs a process of its own."""
+"""Read the sources of programs, to find out which ones need a process of their own."""
 import ast
 import pathlib
 import re
@@ -8,7 +8,7 @@ from pharos.errors import PharosError
 from pharos.private_rospy.loader import source_places
 
 _PYTHON = re.compile(r'#!.*\bpython(3(\.\d+)?)?\b')
-#: catkin puts this into a devel space for a script: it runs the file that it names
+#: catkin's stand-in for a script in a devel space, which names and runs the script's file
 _WRAPPER = re.compile(r'^python_script = (.+?)$.*exec\(compile\(', re.MULTILINE | re.DOTALL)
 _WRAPPER_LENGTH = 4000  # characters
 #: code that shows windows or takes signals, and so needs the main thread of a process
@@ -26,16 +26,19 @@ _SYSTEM_FOLDERS = '/usr/', '/opt/ros/'
 
 
 def source_of(path):
-    """Return the file with the source of a program: catkin's devel space has a wrapper."""
+    """Return the file with the source of a program.
+
+    :param path: the program, or the wrapper that catkin's devel space has for a program
+    """
     with open(path, errors='replace') as file:
         wrapper = _WRAPPER.search(file.read(_WRAPPER_LENGTH))
     return str(ast.literal_eval(wrapper[1])) if wrapper else path
 
 
 def compile_program(path):
-    """Return the code of a program.
+    """Return the compiled code of a program.
 
-    :raises PharosError: if it is not a program of Python 3
+    :raises PharosError: if the file cannot be read as Python 3
     """
     try:
         with tokenize.open(path) as file:
@@ -47,7 +50,11 @@ def compile_program(path):
 
 
 def why_apart(path, may_show_windows=False):
-    """Return why a program of a launch file cannot run in this process, as text; '' if it can."""
+    """Return why a program of a launch file cannot run in this process, as text; else ''.
+
+    :param path: the program, whose first line must name Python 3
+    :param may_show_windows: True: do not ask if the program needs the main thread
+    """
     with open(path, errors='replace') as file:
         first_line = file.readline(256)
     if not _PYTHON.match(first_line):
@@ -58,9 +65,9 @@ def why_apart(path, may_show_windows=False):
 
 
 def needs_main_thread(path):
-    """Return why a Python program needs the main thread of a process, as text; '' if it does not.
+    """Return why a Python program needs the main thread of a process, as text; else ''.
 
-    Its modules are read, too, if they lie beside it or in a package of the user's.
+    This also reads the program's modules that lie beside the program or in a package of the user.
     """
     files = [pathlib.Path(source_of(path))]
     for file in files:  # the list grows meanwhile
@@ -86,8 +93,8 @@ def _imported_names(text):
 
 
 def _user_file(module, folder):
-    """Return the file of a module beside a program, or in a package of the user's, or None."""
-    top_name, *rest = module.lstrip('.').split('.')  # a relative one lies beside it, too
+    """Return the file of a module in a folder, or in a package outside of the system's, or None."""
+    top_name, *rest = module.lstrip('.').split('.')  # a relative one is sought in the folder, too
     if not top_name:
         return None
     _, folders = source_places(top_name)

@@ -2,9 +2,9 @@
 
 A publisher puts a message into the Inbox of each receiver, and wakes a worker. A worker takes the
 next callback queue that has a job. The worker wakes another one for the rest, unless the callbacks
-of that queue were fast. There are at most as many workers as nodes, so that a callback that blocks
-holds up its own node alone. Workers end with the last node. A publisher's thread runs inline
-inboxes. A subscription of plain rospy has a thread of its own, as with rospy.
+of that queue were fast. There are at most as many workers as nodes: a callback that blocks holds up
+its own node alone. Workers end with the last node. A publisher's thread runs inline inboxes. A
+subscription of plain rospy has a thread of its own, as with rospy.
 """
 import collections
 import threading
@@ -13,13 +13,13 @@ from time import perf_counter, sleep
 
 from pharos.intraprocess.copier import size_of
 
-BURST = 100e-6  # seconds; a publisher that woke a worker less than this ago does not wait for it
+BURST = 100e-6  # seconds; a publisher that woke a thread less than this ago does not wait for one
 YIELD_LIMIT = 1e-3  # seconds that a publisher waits at most until the receiver's thread runs
-YIELD_PAUSE = 0.02  # seconds without such a wait after one that was in vain
+YIELD_PAUSE = 0.02  # seconds without such a wait after one that reached its limit
 FAST = 50e-6  # seconds; a callback that takes less may run in the thread that reads the socket
-FAST_RUNS = 10  # such callbacks in a row, until the thread that reads runs the next one
+FAST_RUNS = 10  # fast callbacks in a row, until the thread that reads runs the next one
 SENTRY_PERIOD = 4e-3  # seconds that a callback may hold up those of other nodes
-SENTRY_REST = 1.0  # seconds without such callbacks until the sentry rests
+SENTRY_REST = 1.0  # seconds without an alert until the sentry rests
 #: seconds until rospy's first callback: a connection between processes takes so long
 FIRST_PAUSE = 0.05
 
@@ -37,9 +37,14 @@ _sentry = None
 class CallbackQueue:
     """Runs callbacks one at a time: those of a node, or of one subscription of plain rospy.
 
-    ``jobs`` has an Inbox once for each of its messages, or more often if some were dropped. Each message
-    waits in its Inbox as ``(value, thaw, header)``: a frozen one, or, if ``thaw`` is None, the message
-    itself, which came from a socket or is shared.
+    ``jobs`` has an Inbox once for each of its messages, or more often if some were dropped. Each
+    message waits in its Inbox as ``(value, thaw, header)``. The value is a frozen message. If
+    ``thaw`` is None, the value is the message itself, which came from a socket or is shared.
+
+    :ivar is_pooled: True if workers run the jobs, False if a thread of the queue's own does
+    :ivar is_scheduled: True from schedule() until a thread takes the queue
+    :ivar is_fast: True if the last callbacks were fast
+    :ivar is_held: True between hold() and release()
     """
 
     is_pooled = True
@@ -48,7 +53,7 @@ class CallbackQueue:
     is_held = False
     closed = False
     own_thread = None
-    running_thread = None  # the identifier of the thread that runs or holds it
+    running_thread = None  # the identifier of the thread that runs or holds the queue
 
     def __init__(self):
         self.jobs = collections.deque()
@@ -60,7 +65,7 @@ class CallbackQueue:
             _pooled_queues.add(self)
 
     def hold(self):
-        """Run nothing until release(), except calls by this thread itself."""
+        """Run nothing until release(), except blocks that this thread passes to call()."""
         self._jobs_lock.acquire()
         self.running_thread = get_ident()
         self.is_held = True
@@ -76,12 +81,12 @@ class CallbackQueue:
             self.request_thread()
 
     def release_before_sleep(self):
-        """End a hold by this thread."""
+        """End a hold by this thread, which would sleep while delegates wait."""
         if self.running_thread == get_ident():
             self.release()
 
     def run_jobs(self):
-        """Run the jobs. If another thread runs jobs of this queue, return: that thread runs all."""
+        """Run all jobs in this thread, unless another thread does so already."""
         jobs = self.jobs
         while jobs and not self.closed and self._jobs_lock.acquire(False):
             self.running_thread = get_ident()
@@ -99,7 +104,7 @@ class CallbackQueue:
                         inbox.callback(message)
                     elif inbox.inline:
                         inbox.callback(value)
-                    else:  # receive() asks if the callbacks are fast
+                    else:  # from a socket or shared: Inbox.receive() reads fast_runs
                         start_time = perf_counter()
                         inbox.callback(value)
                         is_fast = perf_counter() - start_time < FAST
@@ -111,7 +116,10 @@ class CallbackQueue:
             self._leave_pool()
 
     def call(self, block):
-        """Run ``block()`` as if it were a callback, unless the queue is closed."""
+        """Run ``block()`` in this thread, while no callback runs, unless the queue is closed.
+
+        If this thread runs a callback of the queue, run the block at once.
+        """
         if self.running_thread == get_ident():
             block()
             return
@@ -128,7 +136,10 @@ class CallbackQueue:
             self.request_thread()
 
     def schedule(self):
-        """Put the queue into the pool's list; True if a worker must be woken for that."""
+        """Put the queue into the pool's list, if it has jobs and is not there.
+
+        :returns: True if the caller must wake a worker
+        """
         if self.is_scheduled or not self.jobs:
             return False
         self.is_scheduled = True
@@ -136,20 +147,24 @@ class CallbackQueue:
         return True
 
     def request_thread(self):
-        """Have a thread run the jobs."""
+        """Wake a thread to run the jobs."""
         if self.schedule():
             _wake_worker()
 
     def close(self, timeout):
-        """Drop all jobs, and wait for the callback that runs; True if that ended in time."""
+        """Drop all jobs, and wait for the callback that runs.
+
+        :param timeout: seconds
+        :returns: True if that callback has ended, or runs in this thread
+        """
         self.closed = True
         self.release()
         has_ended = self.running_thread == get_ident()
         if not has_ended and self._jobs_lock.acquire(True, timeout):
-            self._jobs_lock.release()  # call() may wait for it
+            self._jobs_lock.release()  # call() may wait for the lock
             has_ended = True
         self.jobs.clear()
-        if has_ended:  # else the pool still counts it, and replaces the blocked worker
+        if has_ended:  # else the queue still counts: another worker may replace the blocked one
             self._leave_pool()
         return has_ended
 
@@ -161,11 +176,11 @@ class CallbackQueue:
 
 
 class ThreadedCallbackQueue(CallbackQueue):
-    """Runs the callbacks of one subscription of plain rospy in one thread, which ends with it.
+    """Runs the callbacks of one subscription of plain rospy in one thread of its own.
 
-    Objects bound to their thread (a connection of SQLite, a context of CUDA) keep working. The first
-    callback runs some time after the subscription. The constructor that subscribes may not have set
-    yet all that its callback uses.
+    The thread ends with the subscription. Objects bound to their thread (a connection of SQLite, a
+    context of CUDA) keep working. The first callback runs FIRST_PAUSE after the subscription: many
+    constructors subscribe before they have set all that their callback uses.
     """
 
     is_pooled = False
@@ -178,7 +193,7 @@ class ThreadedCallbackQueue(CallbackQueue):
         """Stay out of the pool."""
 
     def schedule(self):
-        """Wake the queue's own thread; the pool has nothing to do."""
+        """Wake the queue's own thread; return False, since no worker is needed."""
         if not self.is_scheduled and self.jobs:
             self.is_scheduled = True
             if self.own_thread:
@@ -194,7 +209,7 @@ class ThreadedCallbackQueue(CallbackQueue):
                 self.own_thread.start()
 
     def call(self, block):
-        """Run ``block()`` as if it were a callback, not before the first one may run."""
+        """Run ``block()`` as CallbackQueue.call() does; wait until FIRST_PAUSE is over."""
         self._wait_for_first_run()
         super().call(block)
 
@@ -215,7 +230,7 @@ class ThreadedCallbackQueue(CallbackQueue):
 
 
 class _RestingThread:
-    """A thread that rests until another one wakes it."""
+    """A thread that rests until another thread wakes this one."""
 
     def __init__(self, loop, name):
         self._rest_lock = allocate_lock()  # released to wake the thread
@@ -224,26 +239,26 @@ class _RestingThread:
         self.start = threading.Thread(target=loop, name=name, daemon=True).start
 
     def wake(self):
-        """End its rest, or its next one."""
+        """End the thread's rest; if the thread does not rest, its next rest ends at once."""
         self._start_lock.acquire(False)
         try:
             self._rest_lock.release()
-        except RuntimeError:  # another thread has woken it already
+        except RuntimeError:  # another thread has woken this one already
             pass
 
     def rest(self):
-        """Wait until another thread calls wake()."""
+        """Wait until another thread calls wake(); called by this thread alone."""
         self._rest_lock.acquire()
         if self._start_lock.locked():
             self._start_lock.release()
 
     def wait_until_running(self, timeout):
-        """Wait until the thread runs after a wake(); True if it runs in time."""
+        """Wait until the thread runs after a wake(); return True if the thread runs in time."""
         return self._start_lock.acquire(True, timeout)
 
 
 class _Worker(_RestingThread):
-    """A thread of the pool."""
+    """A thread of the pool; runs callback queues that are ready until the last node has ended."""
 
     def __init__(self):
         super().__init__(self._loop, 'pharos worker')
@@ -259,7 +274,7 @@ class _Worker(_RestingThread):
                         break
                 _idle_workers.append(self)
                 if _ready_queues or not _pooled_queues:
-                    _wake_worker()  # whoever scheduled since then may not have seen this worker
+                    _wake_worker()  # a thread that scheduled before the append() saw no idle worker
                 self.rest()
                 continue
             if _ready_queues:
@@ -276,9 +291,10 @@ class _Worker(_RestingThread):
 
 
 def _wake_worker():
-    """Wake an idle worker and return it. If all are busy and fewer than nodes, start one.
+    """Wake an idle worker, and return the worker.
 
-    Nobody waits for a worker that starts: it is not returned.
+    If all workers are busy and fewer than the pooled queues, start one. Return None then: a
+    publisher does not wait for a worker that starts.
     """
     try:
         worker = _idle_workers.pop()
@@ -296,7 +312,8 @@ def _wake_worker():
 class _Sentry(_RestingThread):
     """Wakes a worker for the queues behind a callback that was fast so far, and now blocks.
 
-    The sentry looks while such callbacks run, and rests otherwise.
+    A worker alerts the sentry if it leaves ready queues for after a fast one. From then on the
+    sentry looks every SENTRY_PERIOD, and rests after SENTRY_REST without an alert.
     """
 
     is_needed = False
@@ -325,12 +342,12 @@ class _Sentry(_RestingThread):
 
 
 def _alert_sentry():
-    """Have the sentry look after the queues that a worker has left for later."""
+    """Have the sentry look after the ready queues that a worker leaves for later."""
     global _sentry
     sentry = _sentry
     if sentry is None:
         sentry = _Sentry()
-        _sentry = sentry  # before it starts: its loop asks for that
+        _sentry = sentry  # before the start: the loop compares itself with _sentry
         sentry.start()
     sentry.is_needed = True
     if not sentry.is_looking:
@@ -340,8 +357,13 @@ def _alert_sentry():
 class Inbox:
     """The messages that wait for one callback; a full one drops the oldest.
 
+    :param callback_queue: the CallbackQueue that runs the callback
     :param callback: called as ``callback(message)``; raises nothing
     :param queue_size: number of messages; None or 0: as many as ``queue_bytes`` hold
+    :param inline: True: the thread of the publisher runs the callback
+    :param shared: True: the callback gets the published object, not a copy
+    :ivar dropped: the number of dropped messages
+    :ivar taken_count: the number of messages taken for the callback
     """
 
     queue_bytes = 64 << 20
@@ -360,10 +382,11 @@ class Inbox:
         self.capacity = self.queue_size
 
     def put(self, item, size=0):
-        """Add ``(value, thaw, header)``; the callback queue must be woken or run then.
+        """Add a message; the caller then wakes or runs the callback queue.
 
-        :param item: one tuple for all receivers: many make the collector of garbage run often
-        :param size: the bytes of the value, if they are known
+        :param item: ``(value, thaw, header)``; a publisher has one tuple for all receivers, since
+            many tuples make the collector of garbage run often
+        :param size: the bytes of the value; 0: unknown
         """
         queue = self.queue
         count = len(queue)
@@ -372,11 +395,11 @@ class Inbox:
             self.callback_queue.jobs.append(self)
             return
         is_power_of_two = not count & (count - 1)
-        if count >= self.capacity or is_power_of_two:  # the size is estimated now and then
+        if count >= self.capacity or is_power_of_two:  # not each time: the estimate takes long
             self.capacity = min(self.queue_size, self.capacity_for(size or size_of(item[0])))
             if count >= self.capacity and self.taken_count != self._count_at_yield:
-                # the receiver has taken messages since the last such sleep: without another one, a
-                # publisher that never sleeps would starve it
+                # the receiver has taken messages since the last such sleep: a publisher that never
+                # sleeps would starve the receiver
                 self._count_at_yield = self.taken_count
                 sleep(1e-6)
         # append, then drop: a receiver that runs meanwhile must not find the queue empty
@@ -390,15 +413,17 @@ class Inbox:
             self.callback_queue.jobs.append(self)
 
     def capacity_for(self, size):
-        """Return how many messages of a size may wait."""
+        """Return how many messages of ``size`` bytes may wait."""
         return max(1, self.queue_bytes // size)
 
     def receive(self, message, size):
-        """Take a message from the thread that reads a socket.
+        """Take a message from a socket; the thread that reads the socket calls this.
 
-        That thread runs the callback, too, if it was fast ten times running: waking another takes
-        longer. That thread also runs callbacks of plain rospy without a queue_size, as in rospy.
-        Meanwhile messages wait in the sockets and in the publisher, and none is lost.
+        If the callback was fast ten times in a row, this thread runs the next one, too: to wake
+        another thread takes longer. This thread also runs callbacks of plain rospy without a
+        queue_size, as in rospy. Meanwhile messages wait in the sockets and in the publisher.
+
+        :param size: the bytes of the message; 0: unknown
         """
         callback_queue = self.callback_queue
         if not callback_queue.is_pooled and self.queue_size == INFINITE:
@@ -412,11 +437,11 @@ class Inbox:
 
 
 def hand_over(callback_queues, last_wake, may_wait):
-    """Have threads run the jobs of some callback queues.
+    """Wake threads to run the jobs of some callback queues; a publisher calls this.
 
-    :param last_wake: the last time that the same publisher woke a thread
-    :param may_wait: True: wait a moment until the thread runs
-    :returns: the time now, if a thread was woken, else ``last_wake``
+    :param last_wake: the last time that the same publisher woke a thread, as of perf_counter()
+    :param may_wait: True: wait up to YIELD_LIMIT until the thread runs
+    :returns: the time now if a thread was woken, else ``last_wake``
     """
     global _no_yield_before
     is_worker_needed = False
@@ -426,7 +451,7 @@ def hand_over(callback_queues, last_wake, may_wait):
             is_worker_needed |= callback_queue.schedule()
             thread = callback_queue.own_thread
     if is_worker_needed:
-        thread = _wake_worker()  # which wakes another one, if there is more
+        thread = _wake_worker()  # this worker wakes another one if there are more queues
     if not thread:
         return last_wake
     now = perf_counter()
@@ -447,7 +472,7 @@ def _end_pool():
 
 
 def reset_after_fork():
-    """Have no workers in a forked child."""
+    """Forget all workers in a forked child: their threads run in the parent alone."""
     global _sentry
     for collection in _ready_queues, _idle_workers, _workers, _pooled_queues:
         collection.clear()

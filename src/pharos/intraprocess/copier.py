@@ -1,10 +1,12 @@
 """Copy messages in two halves: the publisher freezes once, each receiver thaws one of its own.
 
-A thawed message equals, in the value and type of every field, what the wire delivers. The functions
-are generated for each class, as genpy generates its serializers. Three rules make them right:
-numbers pass through the struct codes of the wire; only values of the very type that arrives (float,
-str, bytes) are shared; a message with anything else is serialized, and so is every message of a
-class that genpy did not generate in the usual way.
+A thawed message equals the one that the wire delivers, in the value and type of every field. The
+functions are generated for each class, as genpy generates its serializers. Three rules keep the
+copies equal. Numbers pass through the struct codes of the wire. Only values of the very type that
+arrives (float, str, bytes) are shared. A message with anything else is serialized, and so is every
+message of a class that genpy did not generate in the usual way.
+
+A frozen message is a tuple with the values of all fields, or the bytes of a serialized message.
 """
 import functools
 import io
@@ -21,7 +23,7 @@ _TIMES = {'time': genpy.Time, 'duration': genpy.Duration}
 
 
 class _UnusualError(Exception):
-    """Only genpy's serializer knows what to make of this."""
+    """A class or value that only genpy's serializer handles."""
 
 
 def serialize(message):
@@ -33,15 +35,18 @@ def serialize(message):
 
 @functools.cache
 def copier_for(cls):
-    """Return ``freeze(message)``, which raises what ``serialize`` raises, and ``thaw(frozen)``."""
+    """Return two functions for a message class: ``freeze(message)`` and ``thaw(frozen)``.
+
+    ``freeze`` raises the exceptions of ``serialize``.
+    """
     try:
         return _generate(cls)
-    except Exception:  # a class that is not understood costs time, never a wrong copy
+    except Exception:  # serializing is slower, but right for every class
         return serialize, lambda frozen: cls().deserialize(frozen)
 
 
 def copy_of(message):
-    """Return a copy of a message."""
+    """Return a copy of a message; raise the exceptions of ``serialize``."""
     freeze, thaw = copier_for(type(message))
     return thaw(freeze(message))
 
@@ -60,7 +65,7 @@ def thaw_function(sent_class, wanted_class):
 
 
 def size_of(frozen):
-    """Estimate the bytes that a message, frozen or not, holds."""
+    """Estimate the memory of a message, frozen or not, in bytes; sample 20 items of each list."""
     if isinstance(frozen, genpy.Message):
         frozen = [getattr(frozen, name) for name in frozen.__slots__]
     if isinstance(frozen, (list, tuple)):
@@ -135,9 +140,10 @@ _GLOBALS.update(
 
 
 class _Source:
-    """The lines of the two functions for one class. ``m`` is the message in them.
+    """The lines of ``freeze`` and ``thaw`` for one class. In them, ``m`` is the message.
 
-    :ivar namespace: the names that the functions use
+    :param depth: the number of messages around this one; 1 for an element of an array
+    :ivar namespace: the names that the functions use -> their values
     :ivar freeze_lines: read the fields into variables
     :ivar thaw_lines: set the fields of a new message
     :ivar variables: the parts of a frozen message
@@ -161,7 +167,7 @@ class _Source:
         return name
 
     def _pack_numbers(self):
-        """Send all single numbers through one pack and unpack, so that they come out as the wire's."""
+        """Pass all single numbers through one pack and unpack, to make them those of the wire."""
         bases, fields, variables = zip(*self._numbers)
         sent_codes = ''.join(CODES[base] for base in bases)
         received_codes = ''.join('?' if base == 'bool' else CODES[base] for base in bases)
@@ -210,12 +216,16 @@ class _Source:
         self.freeze_lines.append(f'{variable} = {field}')
         self.thaw_lines.append(f'{variable} = {field} = new({self.name_for(cls)})')
         self._add_fields(cls, variable, depth + 1)
-        if depth == 0 and cls in _TIMES.values():  # genpy does so for top-level fields alone
+        if depth == 0 and cls in _TIMES.values():  # genpy canonizes top-level fields alone
             self.thaw_lines.append(f'{variable}.canon()')
 
 
 def nested_class(base, cls):
-    """Return the class of a nested field; a class made at run time knows its own."""
+    """Return the class of a nested field.
+
+    :param base: the type's name, such as 'std_msgs/Header' or 'time'
+    :param cls: the message class with the field; one made at run time brings its nested classes
+    """
     if base in _TIMES:
         return _TIMES[base]
     base = 'std_msgs/Header' if base == 'Header' else base
@@ -234,7 +244,7 @@ def _generate(cls, depth=0):
             f'if m.__class__ is not {class_name}: return serialize(m)',
             'try:',
             *(f'    {line}' for line in freeze_lines or ['pass']),
-            'except Exception: return serialize(m)',  # which says what is wrong
+            'except Exception: return serialize(m)',  # the serializer's exception names the error
         ]
     freeze = ['def freeze(m):', *freeze_lines, f'return ({variables})']
     thaw = [

@@ -16,14 +16,16 @@ runs_lock = threading.Lock()  # of runs and their relays
 
 
 def peer_of(connection):
-    """Return the name of the node at the other end; None if that has not said its name yet."""
+    """Return the name of the node at the other end; None if its header has not come yet."""
     if connection.direction == 'o':
         return connection.endpoint_id
     return connection.header and connection.header['callerid']
 
 
 class Link(Transport):
-    """One end of a link.
+    """One end of a link, which looks like a connection of rospy's.
+
+    No message passes through this object. A publisher puts messages into the inboxes of its links.
 
     :param direction: 'o' for the publisher's end, 'i' for the subscription's
     :param run: the run of the receiving node
@@ -31,10 +33,10 @@ class Link(Transport):
     """
 
     has_own_queue = True  # the inboxes
-    latch = None  # for rospy, which would resend it; the overlay has latches of its own
+    latch = None  # rospy would send a latched message again; the overlay has its own latches
     header = property(lambda self: self.publisher.header)
-    callerid_pub = property(peer_of)  # actionlib asks for it
-    # not counted for each message: to touch ten links takes as long as to run ten delegates
+    callerid_pub = property(peer_of)  # actionlib reads this
+    # the publisher counts for all links: to touch ten links takes as long as to run ten delegates
     stat_num_msg = property(lambda self: self.publisher.seq, lambda self, zero: None)
 
     def __init__(self, direction, publisher, run, endpoint_id, transport_type, thaw):
@@ -49,7 +51,7 @@ class Link(Transport):
         return f'{self.transport_type} connection to [{self.endpoint_id}]'
 
     def close(self):
-        """Close both ends: nothing else closes a link, a publisherUpdate closes no connection."""
+        """Close both ends: rospy closes no connection of a publisher that has left the topic."""
         if self.done:
             return
         self.done = True
@@ -60,7 +62,14 @@ class Link(Transport):
 
 
 def link_topic(sender, receiver, topic):
-    """Link the publisher and the subscription of a topic of two runs of this process."""
+    """Link two runs of this process on a topic, if one publishes and the other subscribes.
+
+    A publisher of another type is reported as a failure of the receiver.
+
+    :param sender: the run of the publishing node
+    :param receiver: the run of the receiving node
+    :param topic: the full name of the topic
+    """
     publisher = sender.topic_manager.pubs.get(topic)
     subscription = receiver.topic_manager.subs.get(topic)
     if not publisher or not subscription:
@@ -77,10 +86,15 @@ def link_topic(sender, receiver, topic):
 
 
 def link(publisher, uri, subscription, receiver, transport_type):
-    """Link a publisher and a subscription.
+    """Link a publisher and a subscription, and hand over the latched messages.
 
-    :param uri: the address of the publisher's node
-    :param receiver: the run that the subscription belongs to
+    Do nothing if one of them is closed, or if they are connected already.
+
+    :param publisher: rospy's _PublisherImpl
+    :param uri: the URI of the publisher's node
+    :param subscription: rospy's _SubscriberImpl
+    :param receiver: the run of the subscription's node
+    :param transport_type: shown by tools of ROS: 'INTRAPROCESS', or 'TCPROS' for a relay
     """
     thaw = thaw_function(publisher.data_class, subscription.data_class)
     with publisher.lock:
@@ -100,5 +114,5 @@ def link(publisher, uri, subscription, receiver, transport_type):
 
 
 def links_of(connections):
-    """Return the links of some connections."""
+    """Return those of some connections that are links."""
     return [connection for connection in connections if isinstance(connection, Link)]

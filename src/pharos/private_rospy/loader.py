@@ -1,8 +1,8 @@
-"""Load rospy once more, with globals of its own: one process, many nodes.
+"""Load rospy once more for each run, with globals of its own: one process, many nodes.
 
-``sys.modules`` is as before afterwards. Each private module has ``__builtins__`` of its own. Their
-``__import__`` finds rospy, rosgraph and libraries written on rospy in the private set, and all else
-as usual.
+``sys.modules`` stays as before. Private modules have ``__builtins__`` of their own. The
+``__import__`` in there finds rospy, rosgraph and libraries written on rospy among the private
+modules of the run, and all other modules as usual.
 """
 import builtins
 import importlib
@@ -28,14 +28,14 @@ COMMON = sys.stdlib_module_names.union(
     'genpy genmsg roslib rospkg rosmaster catkin catkin_pkg pharos'.split(),
     'numpy yaml matplotlib cv2 PIL'.split(),
 )
-#: logging: rospy takes its handlers away; smach: it keeps what is being built in its classes;
+#: logging: rospy takes its handlers away; smach: its classes keep the container under construction;
 #: the others use sys.argv, sys.path, os.environ or threads
 PRIVATE = 'logging argparse optparse subprocess concurrent pkgutil smach'.split()
 MAX_FILES = 300  # of a package that could be written on rospy
 
 
 class Shim:
-    """Looks like a module, with some names replaced."""
+    """A stand-in for a module, with some names replaced."""
 
     def __init__(self, module, **replacements):
         self.__dict__.update(replacements, _module=module)
@@ -45,10 +45,10 @@ class Shim:
 
 
 def private_path():
-    """Return a copy of sys.path, with the source folders that catkin put in front of it at its end.
+    """Return a copy of sys.path; source folders that catkin has put in front go to the end.
 
     The ``__init__`` of a package in a devel space puts its source folder in front. A program that
-    then imports the package anew would find it there, without its messages.
+    then imports the package anew would find the source, without the package's messages.
     """
     path = list(sys.path)
     for package in list(sys.modules.values()):
@@ -75,7 +75,10 @@ def _code_of(loader, name, change_time):
 
 
 def _find(name, path):
-    """Return the spec of a module, and its code, which is read again if the file has changed."""
+    """Return the spec of a module, and its code; read the code again if the file has changed.
+
+    :raises ModuleNotFoundError: if there is no such module on the path
+    """
     spec = _spec_of(name, path)
     if not spec.has_location:
         return spec, None
@@ -86,13 +89,16 @@ def _find(name, path):
 
 
 def source_places(top_name):
-    """Return the file of a top-level module of Python, and its folders if it is a package."""
+    """Return the file of a top-level module, and the folders of a package.
+
+    :returns: ``(file, folders)``; ``(None, [])`` for a common module or one without source
+    """
     spec = getattr(sys.modules.get(top_name), '__spec__', None) or PathFinder.find_spec(top_name)
     if top_name in COMMON or spec is None or not str(spec.origin).endswith('.py'):
         return None, []
     file = pathlib.Path(spec.origin)
     folders = list(spec.submodule_search_locations or ())
-    # a file of catkin's devel space names the source
+    # an __init__ in a devel space of catkin names the source folder
     source = re.search(r'__extended_path = [\'"]([^\'"]*)', file.read_text(errors='replace'))
     if source:
         folders.append(f'{source[1]}/{top_name}')
@@ -101,7 +107,10 @@ def source_places(top_name):
 
 @cache
 def _imports_of(top_name):
-    """Return the names that a package of Python imports; none of a large one or one in C."""
+    """Return the top-level names that a package imports; an empty set for a large one or one in C.
+
+    A package that contains the word rospy counts as one that imports rospy.
+    """
     file, folders = source_places(top_name)
     if file is None:
         return set()
@@ -118,10 +127,7 @@ def _imports_of(top_name):
 
 @cache
 def _reaches_rospy(top_name):
-    """True if the code of a package says rospy, or imports a package that does, and so on.
-
-    A package that uses pharos does, too.
-    """
+    """True if a package names rospy, imports rosgraph or pharos, or imports a package that does."""
     seen_names = set()
     new_names = {top_name}
     while new_names and new_names.isdisjoint(('rospy', 'rosgraph', 'pharos')):
@@ -132,7 +138,7 @@ def _reaches_rospy(top_name):
 
 
 def _is_generated(name):
-    """True for generated messages, which all nodes share."""
+    """True if a module has generated messages or services, which all nodes share."""
     top_name, *rest = name.split('.')
     return rest[:1] in (['msg'], ['srv']) and top_name not in ('rospy', 'rosgraph')
 
@@ -142,7 +148,7 @@ _owners = weakref.WeakKeyDictionary()
 
 
 def _private_module(thing):
-    """Return the private module of a class, function, method or frame; None if it has none."""
+    """Return the private module of a class, function, method or frame, or None."""
     owner = None
     if inspect.isclass(thing):
         name = thing.__module__
@@ -164,7 +170,7 @@ def _owner_of_builtins(module_builtins):
 
 
 def _getmodule(thing, _filename=None, original=inspect.getmodule):
-    """Find private modules, too: inspect looks through all of sys.modules, in vain, each time."""
+    """Find private modules, too: inspect looks for them in all of sys.modules, in vain."""
     return _private_module(thing) or original(thing, _filename)
 
 
@@ -175,7 +181,7 @@ def _getfile(thing, original=inspect.getfile):
 
 
 def _getsourcefile(thing, original=inspect.getsourcefile):
-    """Return the file of a frame if it is in the cache: a look at the disk lets other threads run."""
+    """Return the file of a frame from linecache: a look at the disk lets other threads run."""
     if inspect.isframe(thing) and thing.f_code.co_filename in linecache.cache:
         return thing.f_code.co_filename
     return original(thing)
@@ -187,10 +193,13 @@ inspect.getsourcefile = _getsourcefile
 
 
 class PrivateModules:
-    """A set of private modules.
+    """The private modules of one run.
 
-    :param substitutes: the stand-ins that private modules import for some modules of Python
-    :param patch: ``patch(module)`` is called right after the code of each private module
+    :param substitutes: names of modules -> the stand-ins that private modules import instead
+    :param patch: ``patch(module)`` is called right after the code of each private module has run
+    :ivar modules: names -> private modules and stand-ins
+    :ivar program_folder: the folder of a script's program, or None
+    :ivar builtins: the ``__builtins__`` of all private modules
     """
 
     def __init__(self, substitutes, patch):
@@ -198,7 +207,7 @@ class PrivateModules:
             **substitutes,
             # one for all: ``except rospy.ROSException`` catches every node's
             'rospy.exceptions': rospy.exceptions,
-            # one for all: it numbers the connections, INTRAPROCESS and TCPROS ones
+            # one for all: this module numbers the connections, INTRAPROCESS and TCPROS ones
             'rospy.impl.transport': rospy.impl.transport,
         }
         self.modules['importlib'] = Shim(importlib, import_module=self._import_module)
@@ -213,13 +222,14 @@ class PrivateModules:
 
     @property
     def path(self):
-        """The folders that are searched, as the program's ``sys.path`` has them now."""
+        """The folders to search: the current ``sys.path`` of the node."""
         return self.modules['sys'].path
 
     def _is_private(self, name):
         """True if each node has a copy of the module.
 
-        Also modules beside the program, or in folders that it has put on sys.path, are private.
+        These are libraries that reach rospy, and those in PRIVATE. For a script, modules beside the
+        program and in folders that the program has put on its sys.path are private, too.
         """
         top_name = name.partition('.')[0]
         if _is_generated(name):
@@ -233,7 +243,10 @@ class PrivateModules:
         return _reaches_rospy(top_name) or self._is_added(top_name)
 
     def _is_added(self, top_name):
-        """True if a module lies in a folder that the process does not search."""
+        """True if a module lies in a folder that the node searches and the process does not.
+
+        A site-packages folder is added to the process's sys.path instead.
+        """
         added_folders = [folder for folder in self.path if folder not in sys.path]
         if not added_folders:
             return False
@@ -245,19 +258,22 @@ class PrivateModules:
         if folder not in added_folders:
             return False
         if os.path.basename(folder) == 'site-packages':
-            sys.path.append(folder)  # a library such as torch cannot be loaded twice
+            sys.path.append(folder)  # shared: a library such as torch cannot be loaded twice
             return False
         return True
 
     def load(self, name):
-        """Return the module of that name, as private modules import it."""
+        """Return the module of that full name, private or not; execute a new private module.
+
+        :raises ModuleNotFoundError: if there is no such module
+        """
         parent, _, leaf = name.rpartition('.')
         if name not in self.modules and not self._is_private(name):
             module = importlib.import_module(name)
             if parent and self._is_private(parent):  # a package with code and messages
                 setattr(self.load(parent), leaf, module)
             return module
-        with self._lock:  # or another thread would see a module that is half loaded
+        with self._lock:  # other threads must not see a module that is half loaded
             if name not in self.modules:
                 # folders that the process has added since the start of the run come last
                 path = self.load(parent).__path__ if parent else [*self.path, *sys.path]
@@ -272,7 +288,7 @@ class PrivateModules:
         module = module_from_spec(spec)
         self.modules[name] = module
         vars(module)['__builtins__'] = self.builtins
-        is_added = sys.modules.setdefault(name, module) is module  # @dataclass looks there
+        is_added = sys.modules.setdefault(name, module) is module  # @dataclass reads sys.modules
         try:
             if code is None and spec.loader and spec.has_location:  # an extension in C
                 spec.loader.exec_module(module)
@@ -310,7 +326,10 @@ class PrivateModules:
         return module
 
     def _with_private_modules(self, module):
-        """Return a module for ``import *``: generated messages bring sys, which must be private."""
+        """Return a stand-in for ``import *``, with private modules among its names.
+
+        Generated messages import sys: a star import would replace the program's stand-in for sys.
+        """
         starred = Shim(module)
         for key, value in vars(module).items():
             if isinstance(value, ModuleType):

@@ -1,9 +1,9 @@
 """Mend rospy: a table of patches, applied to each node's own copy.
 
 Over ``def f(original, run, *args)``, ``@patch(module, target)`` has ``f`` called instead of the
-target; ``run`` is the Run whose copy is patched. Over ``def f(original, run)``, ``@replace(module,
-target)`` puts the returned object in the target's place. Each docstring says first what rospy does,
-then what this does instead.
+target. ``original`` is the former function, and ``run`` the Run that owns the private module. Over
+``def f(original, run)``, ``@replace(module, target)`` puts the returned object in the target's
+place. Each docstring names first the behaviour of rospy, then that of the patch ("this").
 """
 import functools
 import socket
@@ -18,13 +18,16 @@ from pharos.private_rospy import tcpros, topics
 from pharos.private_rospy.loader import Shim
 
 MAX_REQUEST = 1 << 20  # bytes of a connection header, and of an XML-RPC request
-POLL_INTERVAL = 60  # seconds; a stop wakes the server sooner
+POLL_INTERVAL = 60  # seconds between two looks for a stop; the stop itself wakes the server
 #: module -> [(target, function that makes the replacement)]
 TABLE = {}
 
 
 class _CurrentClient(threading.local):
-    """The client that this thread answers."""
+    """The client that this thread answers.
+
+    :ivar address: ``(host, port)``
+    """
 
     address = ()
 
@@ -33,7 +36,7 @@ _current_client = _CurrentClient()
 
 
 def replace(module, target):
-    """Enter a function that makes a replacement into the table."""
+    """Return a decorator that enters a maker of replacements into the table."""
 
     def add_to_table(make_replacement):
         TABLE.setdefault(module, []).append((target, make_replacement))
@@ -43,7 +46,7 @@ def replace(module, target):
 
 
 def patch(module, target):
-    """Enter a function that is called instead of another one into the table."""
+    """Return a decorator that enters a function into the table, to be called for the target."""
 
     def add_to_table(function):
         def make_replacement(original, run):
@@ -56,7 +59,10 @@ def patch(module, target):
 
 
 def apply(module, run):
-    """Patch a private module, right after its code has run; a missing target is an AttributeError."""
+    """Patch a private module, right after its code has run.
+
+    :raises AttributeError: if a target is missing: this is not the rospy that the table is for
+    """
     for target, make_replacement in TABLE.get(module.__name__, ()):
         class_name, _, name = target.rpartition('.')
         owner = getattr(module, class_name) if class_name else module
@@ -64,9 +70,10 @@ def apply(module, run):
 
 
 def overlay(cls, methods, run):
-    """Set the methods of a plain class on a private class; ``rospy_NAME`` is the method before.
+    """Set the methods of a plain class on a private class, and return the private class.
 
-    A subclass would recurse: rospy calls ``super(_PublisherImpl, self)``, and would find it.
+    ``rospy_NAME`` is the former method, or None. A subclass would recurse:
+    ``super(_PublisherImpl, self)`` in rospy's code would find the subclass.
     """
     cls.run = run
     for name, method in vars(methods).items():
@@ -81,7 +88,7 @@ def overlay(cls, methods, run):
 
 @patch('rosgraph.network', 'read_ros_handshake_header')
 def read_handshake(original, run, sock, *buffer):
-    """rospy waits for ever for a peer that says nothing, too little, or announces 4 GiB; this has limits."""
+    """rospy waits for ever for a silent peer, and reads headers of 4 GiB. This has limits."""
     run.limit_silence(sock)
     head = sock.recv(4, socket.MSG_WAITALL)
     size = int.from_bytes(head, 'little')
@@ -89,14 +96,17 @@ def read_handshake(original, run, sock, *buffer):
     if size <= MAX_REQUEST:
         data += sock.recv(size, socket.MSG_WAITALL)
     run.deadlines.pop(sock, None)
-    if len(data) < 4 + size:  # too much, too little, or nothing in time
+    if len(data) < 4 + size:  # more than MAX_REQUEST, too little, or nothing in time
         raise ROSHandshakeException(f'no connection header of {size} bytes came in time')
     return decode_ros_handshake_header(data)
 
 
 @patch('rospy.impl.tcpros_base', 'TCPROSServer._tcp_server_callback')
 def accept(original, run, self, sock, address):
-    """rospy shakes hands in the thread that accepts, and a silent client keeps out others; this has a thread."""
+    """rospy shakes hands in the thread that accepts: a silent client keeps out others.
+
+    This starts a thread for each client.
+    """
 
     def shake_hands():
         _current_client.address = address
@@ -109,19 +119,22 @@ def accept(original, run, self, sock, address):
 
 @patch('rospy.impl.tcpros_base', 'logwarn')
 def name_client(original, run, text, *args):
-    """rospy does not say which client it refused; this names its address."""
+    """rospy logs a refusal without the client. This names the client's address."""
     original(f'{":".join(map(str, _current_client.address))}: {text}', *args)
 
 
 @patch('rospy.impl.tcpros_base', 'rospyerr')
 @patch('rospy.impl.tcpros_base', 'rospywarn')
 def log_no_traceback(original, run, *args):
-    """rospy logs a traceback for each client that says nonsense; this logs none, since a line says so."""
+    """rospy logs a traceback for each client with a bad header. This leaves it to name_client()."""
 
 
 @patch('rospy.impl.tcpros_base', 'TCPServer.shutdown')
 def shutdown_server(original, run, self):
-    """rospy closes the socket, which does not wake accept(), and the port stays taken; this wakes it."""
+    """rospy closes the socket, which does not wake accept(): the port stays taken.
+
+    This wakes accept(), and closes the socket.
+    """
     self.is_shutdown = True
     tcpros.shutdown_socket(self.server_sock)
     self.server_sock.close()
@@ -129,19 +142,22 @@ def shutdown_server(original, run, self):
 
 @patch('rospy.impl.tcpros_pubsub', '_configure_pub_socket')
 def no_delay(original, run, sock, is_tcp_nodelay):
-    """rospy sends some messages 40 ms late, unless a subscriber asks for tcp_nodelay; this never does."""
+    """rospy sends some messages 40 ms late, unless the subscriber asks for tcp_nodelay.
+
+    This sets TCP_NODELAY for all subscribers.
+    """
     original(sock, True)
 
 
 @patch('rosgraph.xmlrpc', 'XmlRpcNode.start')
 def start_xmlrpc(original, run, self):
-    """rospy binds the port in another thread, and prints an error; this binds here, and raises."""
+    """rospy binds the port in another thread, and prints an error. This binds here, and raises."""
     original.__globals__['print'] = lambda text: None
     self._run_init()
     server = self.server
 
     def serve():
-        with server:  # closes it
+        with server:  # closes the server's socket at the end
             server.serve_forever(poll_interval=POLL_INTERVAL)
 
     run.start_thread(serve)
@@ -149,7 +165,7 @@ def start_xmlrpc(original, run, self):
 
 @patch('rosgraph.xmlrpc', 'XmlRpcNode.shutdown')
 def shutdown_xmlrpc(original, run, self, reason):
-    """rospy only closes the socket, and its thread spins (ros_comm #2238); this ends the thread."""
+    """rospy only closes the socket, and its thread spins (ros_comm #2238). This ends the thread."""
     self.is_shutdown = True
     if self.server:
         self.handler._shutdown(reason)
@@ -159,7 +175,10 @@ def shutdown_xmlrpc(original, run, self, reason):
 
 @patch('rosgraph.xmlrpc', 'ThreadingXMLRPCServer.process_request')
 def process_request(original, run, self, request, address):
-    """rospy's threads and sockets outlive it, and wait for silent clients; these end with the run."""
+    """rospy's threads and sockets wait for silent clients, even after a shutdown.
+
+    The threads and sockets of this end with the run.
+    """
 
     def answer():
         _current_client.address = address
@@ -175,7 +194,7 @@ def process_request(original, run, self, request, address):
 
 @patch('rosgraph.xmlrpc', 'SilenceableXMLRPCRequestHandler.do_POST')
 def limit_request(original, run, self):
-    """rospy reads requests of any size; this refuses large ones."""
+    """rospy reads requests of any size. This refuses large ones."""
     if int(self.headers.get('content-length', 0)) > MAX_REQUEST:
         self.send_error(413)
         return
@@ -188,14 +207,17 @@ def limit_request(original, run, self):
 
 @replace('rospy.core', 'signal_shutdown')
 def signal_shutdown(original, run):
-    """rospy ends itself alone; this stops the node."""
+    """rospy ends itself alone. This stops the node."""
     run.rospy_signal_shutdown = original
     return run.signal_shutdown
 
 
 @patch('rospy.core', 'is_shutdown')
 def is_shutdown(original, run):
-    """rospy says so too late for loops that a stop waits for; this says so when the stop begins."""
+    """rospy is shut down only at the end of a stop, which waits for loops that ask this.
+
+    This is True once the stop has begun. A script handles its signals here, too.
+    """
     run.checkpoint()
     if run.stopping.is_set():
         return True
@@ -204,13 +226,19 @@ def is_shutdown(original, run):
 
 @replace('rosgraph.roslogging', 'rospkg')
 def cached_packages(original, run):
-    """rosgraph searches all packages for its configuration of the log for each node; this does once."""
+    """rosgraph searches all packages for the log's configuration, for each node.
+
+    This searches once for all nodes.
+    """
     return Shim(original, RosPack=rospkg.RosPack.get_instance)
 
 
 @patch('rospy.impl.masterslave', 'ROSHandler._ready')
 def ready(original, run, self, uri):
-    """rospy starts a thread that looks for departed subscribers; this has the watcher of all runs do so."""
+    """rospy registers in another thread, which then looks for departed peers for ever.
+
+    This registers in this thread, and the watcher of all runs looks.
+    """
     self.uri = uri
     run.make_findable(self, uri)
     self.reg_man.start(uri, self.masterUri)
@@ -218,25 +246,32 @@ def ready(original, run, self, uri):
 
 @patch('rospy.impl.registration', 'RegManager.run')
 def run_registration(original, run, self):
-    """rospy looks for new publishers in a thread for each node; this returns, and the watcher looks."""
+    """rospy connects to new publishers and looks for departed peers, in a thread for each node.
+
+    This returns at once: publisher_update() connects, and the watcher of all runs looks.
+    """
 
 
 @patch('rospy.impl.masterslave', 'ROSHandler._shutdown')
 def shut_down(original, run, self, reason=''):
-    """rospy closes all here; this leaves it to the run's stop."""
+    """rospy closes all connections here. This leaves the closing to the run's stop."""
     self.done = True
 
 
 @patch('rospy.impl.masterslave', 'ROSHandler.shutdown')
 def shut_down_from_outside(original, run, self, caller_id, msg=''):
-    """rospy obeys everybody, also if an earlier node at its URI is meant (ros_comm #2241); this checks."""
+    """rospy obeys every caller, also a call for an earlier node at its URI (ros_comm #2241).
+
+    This obeys callers on this host and on the master's, or all if allow_remote_shutdown is True.
+    A call of the master must name this node.
+    """
     host = _current_client.address[0]
     master_host = urlsplit(self.masterUri).hostname
     obeys = run.node.allow_remote_shutdown
     if host == socket.gethostbyname(master_host) or is_local_address(host):
         obeys = True
     if caller_id == '/master' and f'[{self.name}]' not in str(msg):
-        obeys = False  # the master means an earlier node
+        obeys = False  # the call is for an earlier node, which had this URI
     if obeys:
         run.request_stop()
     else:
@@ -246,7 +281,7 @@ def shut_down_from_outside(original, run, self, caller_id, msg=''):
 
 @patch('rospy.timer', 'Timer.__init__')
 def start_timer(original, run, self, period, callback, *args, **kwargs):
-    """rospy calls once more when a stop ends the timer's sleep; this does not."""
+    """rospy calls the callback once more if a stop ends the timer's sleep. This does not."""
 
     def call_unless_stopping(event):
         if not run.stopping.is_set():
@@ -260,27 +295,27 @@ def start_timer(original, run, self, period, callback, *args, **kwargs):
 
 @replace('rospy.topics', '_PublisherImpl')
 def overlay_publisher(original, run):
-    """rospy serializes for all receivers; see PublisherOverlay."""
+    """rospy serializes for all receivers. This freezes for links; see PublisherOverlay."""
     return overlay(original, topics.PublisherOverlay, run)
 
 
 @replace('rospy.topics', '_SubscriberImpl')
 def overlay_subscription(original, run):
-    """rospy runs all callbacks in the thread that reads; see SubscriptionOverlay."""
+    """rospy runs callbacks in the threads that read. This has inboxes; see SubscriptionOverlay."""
     return overlay(original, topics.SubscriptionOverlay, run)
 
 
 @patch('rospy.topics', 'Subscriber.__init__')
 def subscribe(original, run, self, *args, **kwargs):
-    """rospy connects before it has the callback; this connects after, as add_callback() does."""
+    """rospy connects before the callback is there. This connects after, as add_callback() does."""
     original(self, *args, **kwargs)
-    if self.callback is None:  # otherwise add_callback() has connected it
+    if self.callback is None:  # otherwise add_callback() has connected
         run.connect_all(self.resolved_name)
 
 
 @patch('rospy.topics', 'QueuedConnection')
 def queue_connection(original, run, connection, queue_size):
-    """rospy's queue is not bounded; see Sender."""
+    """rospy's queue is not bounded. This one is; see Sender. Some connections have their own."""
     if getattr(connection, 'has_own_queue', False):
         return connection
     return tcpros.Sender(connection, queue_size, run)
@@ -288,7 +323,10 @@ def queue_connection(original, run, connection, queue_size):
 
 @patch('rospy.impl.tcpros_pubsub', 'robust_connect_subscriber')
 def receive_and_retry(original, run, connection, address, port, uri, callback, topic):
-    """rospy gives up silently, or tries ever more rarely; this reports, and tries each second."""
+    """rospy gives up silently, or tries ever more rarely. This logs, and tries each second.
+
+    A publisher of another type is a failure of the node, and is not tried again.
+    """
     subscription = callback.__self__
     receive = functools.partial(tcpros.receive, connection, address, port, uri, subscription, run)
     tcpros.receive_until_end(run, subscription, connection, uri, receive)
@@ -296,13 +334,19 @@ def receive_and_retry(original, run, connection, address, port, uri, callback, t
 
 @patch('rospy.impl.registration', 'RegManager.reg_added')
 def register_once(original, run, self, name, data, registry):
-    """rospy tries for ever with the lock of all topics held; this tries once, and the watcher repairs."""
+    """rospy tries for ever, and holds the lock of all topics. This tries once.
+
+    The watcher registers later whatever the master lacks.
+    """
     run.register(registry, name, data)
 
 
 @patch('rospy.impl.registration', 'RegManager.publisher_update')
 def publisher_update(original, run, self, name, uris):  # with the same list each time
-    """rospy leaves the connecting to its thread, once for each publisher; this connects to all."""
+    """rospy calls this once for each publisher, and leaves the connecting to a thread.
+
+    This connects to all at the first call.
+    """
     if uris != run.publisher_uris.get(name):
         run.publisher_uris[name] = uris
         run.connect_all(name)
@@ -310,11 +354,11 @@ def publisher_update(original, run, self, name, uris):  # with the same list eac
 
 @patch('rospy.impl.masterslave', 'ROSHandler.publisherUpdate')
 def publishers_changed(original, run, self, *args):
-    """rospy does not hear that the last publisher has left; this does.
+    """rospy ignores an update that the last publisher has left. This forgets the publishers.
 
     rospy then calls publisher_update() above, unless the list is empty.
     """
-    if len(args) > 1:  # rospy refuses a call with too few
+    if len(args) > 1:  # rospy refuses a call with too few arguments
         topic = args[1]
         run.publisher_uris.pop(topic, None)
     return original(self, *args)
@@ -322,7 +366,7 @@ def publishers_changed(original, run, self, *args):
 
 @patch('rospy.impl.registration', 'RegManager.cleanup')
 def cleanup(original, run, self, reason):
-    """rospy trips over a time-out, and then closes nothing; this closes all topics."""
+    """rospy closes nothing if the master does not answer in time. This closes all topics."""
     try:
         original(self, reason)
     finally:
@@ -332,7 +376,7 @@ def cleanup(original, run, self, reason):
 @patch('actionlib.simple_action_client', 'SimpleActionClient.send_goal')
 @patch('actionlib.simple_action_client', 'SimpleActionClient._handle_transition')
 def keep_goal(original, run, self, *args, **kwargs):
-    """actionlib drops an answer that comes before send_goal() returns; this has the answer wait."""
+    """actionlib drops an answer that comes before send_goal() returns. Here the answer waits."""
     with self.done_condition:
         return original(self, *args, **kwargs)
 
@@ -342,7 +386,7 @@ def keep_goal(original, run, self, *args, **kwargs):
 
 @patch('rospy.impl.masterslave', 'ROSHandler.paramUpdate')
 def parameter_changed(original, run, self, *args):
-    """rospy tells its own cache alone; this tells the node's parameters, too."""
+    """rospy updates its own cache alone. This updates the node's parameters, too."""
     run.read_parameters()
     return original(self, *args)
 
@@ -350,26 +394,29 @@ def parameter_changed(original, run, self, *args):
 @patch('rospy.msproxy', 'MasterProxy.__setitem__')
 @patch('rospy.msproxy', 'MasterProxy.__delitem__')
 def set_parameter(original, run, self, key, *value):
-    """the master tells the other nodes of the change; this tells this node, too."""
+    """The master calls all other nodes at a change. This updates the node's own parameters, too."""
     original(self, key, *value)
     run.read_parameters()
 
 
 @replace('rospy.impl.rosout', 'rospy')
 def rosout_without_master(original, run):
-    """rospy asks the master for each line, which registers a stopping node anew; this asks nobody."""
+    """rospy asks the master at each log line, which registers a stopping node anew.
+
+    This returns the default, and asks nobody.
+    """
     return Shim(original, get_param_cached=lambda name, default=None: default)
 
 
 @replace('rospy.service', 'ServiceException')
 def service_exception(original, run):
-    """rospy's exception is another class for each node; this is the one that all can catch."""
+    """rospy's ServiceException would be another class for each node. Here all nodes share one."""
     return rospy.ServiceException
 
 
 @patch('rospy.impl.tcpros_service', 'ServiceImpl.handle')
 def handle_call(original, run, self, connection, header):
-    """rospy's thread ends with an exception if the client has gone; this closes the connection."""
+    """rospy's thread ends with an exception if the client has gone. This closes the connection."""
     try:
         original(self, connection, header)
     except (rospy.exceptions.TransportException, OSError):

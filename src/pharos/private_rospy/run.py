@@ -1,4 +1,7 @@
-"""A node's life from a start to a stop: its own rospy, souls, endpoints and failures."""
+"""Run: a node's life from a start to a stop, with its own rospy, souls, endpoints and failures.
+
+One thread of this process, the watcher, looks after all runs.
+"""
 from __future__ import annotations
 
 import atexit
@@ -43,11 +46,11 @@ from pharos.transcript import Transcript
 MASTER_LIMIT = 5.0  # seconds for each question to a master or node
 NAME_LIMIT = 1.0  # seconds for the question whether another node has the name
 STOP_LIMIT = 2.0  # seconds that a stop waits for threads of rospy
-HOLD_LIMIT = 2.0  # seconds that delegates wait for the end of start(), which may wait for them
+HOLD_LIMIT = 2.0  # seconds that delegates wait for the end of start(); start() may wait for them
 RETRY_DELAY = 1.0  # seconds until the next attempt to connect
-WATCH_PERIOD = 0.25  # seconds between two looks
-LOOKS_PER_MASTER = 4  # each fourth look is at the masters, too
-BACKLOG = 128  # clients that may wait for a connection; rospy lets five
+WATCH_PERIOD = 0.25  # seconds between two looks of the watcher
+LOOKS_PER_MASTER = 4  # looks of the watcher for each one at the masters
+BACKLOG = 128  # clients that may wait for a connection; rospy allows five
 UNREACHABLE = OSError, xmlrpc.client.Error, HTTPException, ExpatError
 #: rospy's names of registries, in the order of the master's system state -> methods of the master
 _REGISTER_METHODS = {
@@ -77,12 +80,15 @@ class _Transport(xmlrpc.client.Transport):
     def single_request(self, *args):
         try:
             return super().single_request(*args)
-        finally:  # a call that Ctrl-C ended would spoil the next one
+        finally:  # a call that Ctrl-C ended leaves an answer, which the next call would read
             self.close()
 
 
 class ServerProxy(xmlrpc.client.ServerProxy):
-    """A proxy of an XML-RPC server that gives up after ``limit`` seconds."""
+    """A proxy of the XML-RPC server at a URI; a call raises one of UNREACHABLE after a limit.
+
+    :param limit: seconds
+    """
 
     def __init__(self, uri, limit=MASTER_LIMIT):
         transport = _Transport()
@@ -91,15 +97,19 @@ class ServerProxy(xmlrpc.client.ServerProxy):
 
 
 class Run:
-    """One run of a node. Its start() makes it; the next start replaces it.
+    """One run of a node. The node's start() makes the run; the next start makes another one.
 
-    A stopped run stays with its node, so that its failures can be read.
+    A stopped run stays with its node: its failures can still be read.
 
     :param node: the Node
     :param settings: the :class:`Settings` of the node
+    :ivar ros: the node's own rospy
+    :ivar modules: the private modules
+    :ivar callback_queue: the CallbackQueue of the node's delegates
+    :ivar ros_handler: rospy's ROSHandler, from make_findable() on
     """
 
-    uri = ''
+    uri = ''  # of the XML-RPC server; '' until the server runs
     lifecycle = Lifecycle.STARTING
 
     def __init__(self, node, settings):
@@ -109,20 +119,20 @@ class Run:
         self.master = settings.master
         self.failures = Failures()
         self.souls = {}  # thread -> its block, None for the node's soul
-        self.endpoints = []  # also those that the stop has closed
-        self.stopping = threading.Event()
-        self.finished = threading.Event()  # set when threads left behind have nothing more to do
+        self.endpoints = []  # also those that the stop has closed, for the next start
+        self.stopping = threading.Event()  # set when a stop begins: sleeps and waits end
+        self.finished = threading.Event()  # set at the end of a stop: threads left behind end
         self.threads = WeakSet()
         self.sockets = WeakSet()
         self.calls = WeakSet()  # sockets of calls of services
         self.deadlines = {}  # socket of a silent client -> the time when it is closed
-        self.publisher_uris = {}  # topic -> URIs, as the master last said
-        self.connecting = set()  # (topic, URI, id of the subscription)
+        self.publisher_uris = {}  # topic -> URIs, the last list of the master
+        self.connecting = set()  # (topic, URI, id of the subscription) of attempts that go on
         self.relays = {}  # (topic, URI, class) -> publisher to the nodes that share a connection
         self.callback_queue = CallbackQueue()
         self.callback_queue.hold()  # until the node's start() has returned
-        self.hold_deadline = monotonic()  # the watcher releases then
-        if node._holds_delegates:  # otherwise nobody knows when start() has returned
+        self.hold_deadline = monotonic()  # the watcher then ends the hold
+        if node._holds_delegates:  # else a user calls start(): there is no release after its end
             self.hold_deadline += HOLD_LIMIT
         namespace, _, self.base_name = self.name.rpartition('/')
         self.environ = {
@@ -149,7 +159,7 @@ class Run:
         run = self
 
         class Thread(threading.Thread):
-            """A daemon thread of the node's; the node's stop waits for it."""
+            """A daemon thread of the node; the node's stop waits for its end."""
 
             def start(self):
                 self.daemon = True
@@ -170,13 +180,16 @@ class Run:
         }
 
     def start_thread(self, target):
-        """Start a thread of the node's, and return it."""
+        """Start a thread of the node, and return the thread."""
         thread = self.Thread(target=target)
         thread.start()
         return thread
 
     def sleep(self, seconds):
-        """Stand in for ``time.sleep``: the stop of the node ends it."""
+        """Stand in for ``time.sleep``: the node's stop ends the sleep.
+
+        After the stop, a sleep ends its thread.
+        """
         if self.finished.is_set():
             raise SystemExit  # in a thread that was left behind
         if seconds <= 0:
@@ -189,11 +202,11 @@ class Run:
     def checkpoint(self):
         """Do nothing: a run of a script handles its signals here.
 
-        rospy's loops call it, since they publish and ask ``is_shutdown()``.
+        publish() and is_shutdown() call this, and so all loops of rospy programs do.
         """
 
     def signal_shutdown(self, reason):
-        """Stop the node; stands in for ``rospy.signal_shutdown``."""
+        """Stand in for ``rospy.signal_shutdown``: stop the node in another thread."""
         self.request_stop()
 
     # -- state
@@ -212,13 +225,13 @@ class Run:
         ]
 
     def mark_stopped(self):
-        """Be stopped: nothing is open any more."""
+        """Mark the run as stopped, and its endpoints as closed."""
         for endpoint in self.endpoints:
             endpoint.closed = True
         self.lifecycle = Lifecycle.STOPPED
 
     def health_facts(self):
-        """Return the facts of Node.health() that the master is not asked for; top asks for them."""
+        """Return the facts of Node.health(), without the master's; ``pharos top`` asks for them."""
         from pharos.live.snapshot import health_facts
 
         return health_facts(self)
@@ -226,9 +239,13 @@ class Run:
     # -- failures
 
     def report_failure(self, error, block, role, message=None, channel=None, retry=None):
-        """Keep an exception of a block, and tell it at the 1st, 10th, 100th time; Ctrl-C goes on.
+        """Keep an exception of a block; at the 1st, 10th, 100th time, log and show the exception.
+
+        An exception that may come from a signal is raised again: Ctrl-C ends the program.
 
         :param role: the word for the block in the text, such as 'delegate'
+        :param message: the message, request or value that the block was run on
+        :param channel: the message's channel, or None
         :param retry: ``retry(message)`` runs the block again
         """
         if isinstance(error, (KeyboardInterrupt, SystemExit)) and may_be_signal():
@@ -237,7 +254,7 @@ class Run:
         is_power_of_ten = str(failure.count).strip('0') == '1'
         if not is_power_of_ten:
             return
-        with suppress(Exception):  # neither log nor Transcript can be written
+        with suppress(Exception):  # log or Transcript may not be writable: the node goes on
             text = f'{role} {block_name(block)} of {self.name}'
             if channel:
                 text += f' on {channel.topic}'
@@ -250,36 +267,35 @@ class Run:
                 Transcript.show(text)
 
     def keep_failure(self, error, block, message=None, channel=None, retry=None):
-        """Keep an exception of a block, without telling it, and return the Failure."""
+        """Keep an exception of a block, without a log line, and return the Failure."""
         failure = Failure(error, block, message, channel, retry)
         self.failures.keep(failure)
         return failure
 
     def report_refusal(self, topic, reason):
-        """Report that a publisher sends another type."""
+        """Report a publisher that sends another type as a failure of the node."""
         error = MessageTypeError(f'{self.name} does not receive from {topic}: {reason}')
         self.report_failure(error, topic, 'connection')
 
     # -- start
 
     def start(self, **options):
-        """Bind the ports, then register; tell the node its address.
+        """Bind the ports, start the servers, and set the address and ports of the node.
 
-        :param options: more of those of ``rospy.init_node``
-
-        :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: stop() undoes the rest
+        :param options: further options of ``rospy.init_node``
+        :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: stop() then cleans up
         """
         self._check_name_free()
         tcpros_base = self.modules.load('rospy.impl.tcpros_base')
         port, xmlrpc_port = self.settings.ports
         try:
-            # rospy's own start finds this server, and makes none; it could not raise a busy port
+            # rospy's own start finds this server, and makes none: rospy does not report a busy port
             server = tcpros_base.init_tcpros_server(port)
             tcp_server = tcpros_base.TCPServer(server._tcp_server_callback, port)
             server.tcp_ros_server = tcp_server
             tcp_server.server_sock.listen(BACKLOG)
             tcp_server.start()
-            port = xmlrpc_port  # init_node() binds it
+            port = xmlrpc_port  # init_node() binds this port
             ports = {'xmlrpc_port': port, 'tcpros_port': tcp_server.port}
             options = {'disable_signals': True, **options, **ports}
             self.modules.load('rospy.client').init_node(self.base_name, self.argv, **options)
@@ -298,7 +314,7 @@ class Run:
         node.domain = self.settings.domain
 
     def _check_name_free(self):
-        """Raise NodeNameInUseError if a node of this name answers."""
+        """Raise NodeNameInUseError if a node of this name answers within NAME_LIMIT."""
         uri = self.master.call('lookupNode', self.name)
         if not uri:
             return
@@ -309,7 +325,13 @@ class Run:
             )
 
     def make_findable(self, handler, uri):
-        """Be found and watched: the servers run, and nothing is registered yet."""
+        """Enter the run into ``links.runs``, for other runs and the watcher.
+
+        rospy's XML-RPC server calls this when the server runs, and before anything is registered.
+
+        :param handler: rospy's ROSHandler
+        :param uri: the URI of the node's XML-RPC server
+        """
         self.ros_handler = handler
         self.uri = uri
         if self.master.shared_memory:
@@ -326,19 +348,28 @@ class Run:
     # -- registration and connections
 
     def register(self, registry, name, data):
-        """Tell the master of a topic or service; the watcher repairs what the master misses."""
+        """Register a topic or service at the master; try once, since the watcher repairs the rest.
+
+        Have all nodes of this process connect to a new publisher.
+
+        :param registry: rospy's name of the registry: 'pub', 'sub' or 'srv'
+        :param data: the name of the topic's type, or the URI of the service
+        """
         method = _REGISTER_METHODS[registry]
         with suppress(MasterUnreachableError):
             publishers = self.master.call(method, name, data, self.uri, caller_id=self.name)
             if registry == 'sub' and publishers:
                 self.publisher_uris[name] = publishers
-        if registry == 'pub':  # nodes of this process connect sooner than the master has them do
+        if registry == 'pub':  # sooner than by the master's publisherUpdate
             for run in list(runs.values()):
                 if run.master.url == self.master.url:
                     run.connect(name, self.uri)
 
     def connect_all(self, topic):
-        """Connect to the publishers of a topic that the master has named."""
+        """Connect to the publishers of a topic, from the last list of the master.
+
+        Link those of this process in this thread, and connect to others in threads.
+        """
         for uri in self.publisher_uris.get(topic, ()):
             if uri in runs:
                 self.connect(topic, uri)
@@ -346,7 +377,12 @@ class Run:
                 self.start_thread(functools.partial(self.connect, topic, uri))
 
     def connect(self, topic, uri):
-        """Connect a subscription to a publisher, unless it is or is about to be."""
+        """Connect the subscription of a topic to a publisher, by a link, a relay or TCPROS.
+
+        Do nothing if they are connected, or if another thread connects them already.
+
+        :param uri: the URI of the publisher's node
+        """
         subscription = self.topic_manager.subs.get(topic)
         if self.stopping.is_set() or not subscription or subscription.has_connection(uri):
             return
@@ -367,7 +403,8 @@ class Run:
 
     def _connect_by_tcpros(self, topic, uri, subscription):
         code = None
-        with suppress(AttributeError, UnboundLocalError):  # rospy's, if it was closed meanwhile
+        # rospy raises these if the subscription is closed meanwhile
+        with suppress(AttributeError, UnboundLocalError):
             code, _, _ = self.ros_handler._connect_topic(topic, uri)
         if code == 1:
             return
@@ -376,7 +413,10 @@ class Run:
             self.start_thread(functools.partial(self.connect_again, topic, uri))
 
     def connect_again(self, topic, uri, reason=''):
-        """Connect once more after a while, if the master still names the publisher."""
+        """Wait for RETRY_DELAY; connect once more if the master still names the publisher.
+
+        :param reason: the text of the last error, for the log, or ''
+        """
         is_stopping = self.stopping.wait(RETRY_DELAY)
         if is_stopping or uri not in self.publisher_uris.get(topic, ()):
             return
@@ -387,36 +427,47 @@ class Run:
         self.connect(topic, uri)
 
     def register_missing(self, state):
-        """Register the topics and services that the master's system state lacks."""
+        """Register the topics and services that the master's system state lacks.
+
+        If the master knows nothing of the node, set its parameters anew, too.
+
+        :param state: lists of (name, nodes) for publishers, subscribers and services
+        """
         registered = set()
         for registry, entries in zip(_REGISTER_METHODS, state):
             registered.update((registry, name) for name, nodes in entries if self.name in nodes)
         topics = self.topic_manager
         services = self.service_manager
         getters = topics.get_publications, topics.get_subscriptions, services.get_services
-        with topics.lock, services.lock:  # a topic that is closed meanwhile stays closed
+        with topics.lock, services.lock:  # or a topic closed meanwhile would be registered again
             for registry, get_entries in zip(_REGISTER_METHODS, getters):
                 for name, data in get_entries():
                     is_known = (registry, name) in registered
                     if not is_known and not self.stopping.is_set():
                         self.register(registry, name, data)
                         self.connect_all(name)
-        if not registered and not self.stopping.is_set():  # the master has begun anew
+        if not registered and not self.stopping.is_set():  # this is a new master
             self.modules.load('rospy.client')._init_node_params(self.argv, self.name)
             for parameter in self.node._parameters:
                 parameter.subscribe()
 
     def read_parameters(self):
-        """Have the node's parameters read their values."""
+        """Have the node's parameters read their values from the server."""
         for parameter in self.node._parameters:
             parameter.read()
 
     def limit_silence(self, sock):
-        """Close a client's socket if it says nothing within the node's client_timeout."""
+        """Have the watcher shut a client's socket after the node's client_timeout.
+
+        A client that speaks in time is taken out of ``deadlines``.
+        """
         self.deadlines[sock] = monotonic() + self.node.client_timeout
 
     def check_peers(self):
-        """Find peers that have left (ros_comm #927) or are silent, and end a hold that is too long."""
+        """Drop peers that have left (ros_comm #927) or are silent, and end an overlong hold.
+
+        The watcher calls this every WATCH_PERIOD.
+        """
         self.topic_manager.check_all()
         now = monotonic()
         if now > self.hold_deadline:
@@ -430,10 +481,14 @@ class Run:
 
     def request_stop(self):
         """Stop the node, in another thread."""
-        threading.Thread(target=self.node._stop_safely).start()  # no stop waits for it
+        # not one of the node's threads: another stop would wait for that
+        threading.Thread(target=self.node._stop_safely).start()
 
     def end_program(self, timeout):
-        """Do nothing: a run of a script ends its program here, before all else stops."""
+        """Do nothing: a run of a script ends its program here, before all else stops.
+
+        :param timeout: seconds for the program
+        """
 
     def close_rospy(self, timeout):
         """Send messages under way, unregister, and close all topics and services.
@@ -451,7 +506,7 @@ class Run:
         self.rospy_signal_shutdown('stop')
 
     def _begin_stop(self):
-        """End sleeps and calls of services."""
+        """End sleeps, waits and service calls of the node."""
         self.stopping.set()
         for sock in list(self.calls):
             shutdown_socket(sock)
@@ -459,7 +514,8 @@ class Run:
     def stop(self, timeout):
         """Send messages under way, unregister, free ports and threads; log threads left behind.
 
-        :param timeout: seconds for souls, and as long for messages under way
+        :param timeout: seconds for souls, as long for the delegate that runs, and as long for
+            messages under way
         """
         self.lifecycle = Lifecycle.STOPPING
         self.end_program(timeout)
@@ -478,7 +534,7 @@ class Run:
         join(set(self.threads) - set(self.souls), STOP_LIMIT)
         self.finished.set()
         logging = self.modules.load('logging')
-        logging.disable()  # or a thread that is late opens the file again
+        logging.disable()  # or a thread left behind would open the file again
         logging.shutdown()
         for sock in list(self.sockets):
             sock.close()
@@ -486,7 +542,10 @@ class Run:
 
 
 def join(threads, timeout):
-    """Wait for the end of threads other than this one; returns those that go on."""
+    """Wait for the end of threads other than this one, and return those that go on.
+
+    :param timeout: seconds for all of them together
+    """
     deadline = monotonic() + timeout
     others = [thread for thread in threads if thread is not threading.current_thread()]
     for thread in others:
@@ -495,7 +554,7 @@ def join(threads, timeout):
 
 
 def _watch_runs():
-    """Look after all runs; ask each master once a second for the nodes that it knows."""
+    """Look after all runs until the last one ends; once a second, compare with the masters."""
     look_count = 0
     while True:
         is_over = _end_of_watch.wait(WATCH_PERIOD)
@@ -509,7 +568,7 @@ def _watch_runs():
 
 
 def _ask_masters():
-    """Register again all that the masters do not know."""
+    """Ask each master for its system state, and have the runs register again what is missing."""
     all_runs = list(runs.values())
     for url in {run.master.url for run in all_runs}:
         with suppress(*UNREACHABLE, PharosError):
@@ -523,7 +582,7 @@ def _ask_masters():
 
 
 def find_local_service(name, uri):
-    """Return the rospy.Service of a node of this process, or None."""
+    """Return the rospy.Service of a node of this process by its name and URI, or None."""
     for run in list(runs.values()):
         service = run.service_manager.get_service(name)
         if service and service.uri == uri:
@@ -532,8 +591,10 @@ def find_local_service(name, uri):
 
 
 def call_local_service(service, request, caller_id):
-    """Have a rospy.Service of this process answer in this thread, and return its response.
+    """Have a rospy.Service of this process answer in this thread; return a copy of its response.
 
+    :param request: the request, which the service may change
+    :param caller_id: the name of the calling node
     :raises ServiceException: if the service fails
     """
     answers = []

@@ -11,14 +11,14 @@ import time
 from pharos.intraprocess.links import link, runs, runs_lock
 
 MAX_MESSAGE = 1_000_000_000  # bytes, as in roscpp
-MAX_DIRECT = 256 << 10  # bytes of a message that a publisher writes itself; more would hold it up
+MAX_DIRECT = 256 << 10  # bytes; the write of a larger message would hold up the publisher
 CONNECT_LIMIT = 10.0  # seconds
 _READ_BUFFER = 1 << 16  # bytes
 _LENGTH = struct.Struct('<I')
 
 
 def shutdown_socket(sock):
-    """Have a thread that reads from a socket find it closed."""
+    """Shut a socket down, which wakes a thread that reads from the socket; close() wakes none."""
     with contextlib.suppress(OSError):
         sock.shutdown(socket.SHUT_RDWR)
 
@@ -51,7 +51,15 @@ def receive_until_end(run, subscription, connection, uri, receive_messages):
 
 
 def receive(connection, address, port, uri, subscription, run):
-    """Connect to a publisher and receive its messages until the connection ends."""
+    """Connect to a publisher and receive its messages until the connection ends.
+
+    Each message goes to the relay of the connection, if there is one, and to all inboxes of the
+    subscription. This runs in rospy's thread of the connection.
+
+    :param connection: rospy's TCPROSTransport
+    :param uri: the URI of the publisher's node
+    :raises Exception: if the connection cannot be made or breaks, or a message cannot be read
+    """
     connection.connect(address, port, uri, timeout=CONNECT_LIMIT)
     sock = connection.socket
     keep_alive(sock)
@@ -85,15 +93,19 @@ def _read_message(stream):
 
 
 def join_relay(run, topic, uri, subscription):
-    """Link the subscription to the relay of the node that has the connection; True if there is one.
+    """Link a subscription to the relay of a node of this process with a connection to a publisher.
 
-    If no node of this process has the connection, this one must make it: make its relay.
+    If no node of this process has such a connection, make a relay for this node. The caller then
+    connects.
+
+    :param uri: the URI of the publisher's node
+    :returns: True if the subscription is linked, False if the caller must connect
     """
     key = topic, uri, subscription.data_class
     with runs_lock:
         for other in runs.values():
             if key in other.relays:
-                # the connection of the relay is one of TCPROS
+                # 'TCPROS' since the relay's connection is one of TCPROS
                 link(other.relays[key], uri, subscription, run, 'TCPROS')
                 return True
         relay = run.modules.load('rospy.topics')._PublisherImpl(topic, subscription.data_class)
@@ -103,7 +115,7 @@ def join_relay(run, topic, uri, subscription):
 
 
 def close_relay(run, topic, uri, subscription):
-    """Close the relay of a connection that has ended, or never began: its followers connect anew."""
+    """Close the relay of a connection that has ended or failed; the linked nodes connect anew."""
     with runs_lock:
         relay = run.relays.pop((topic, uri, subscription.data_class), None)
         if not relay:
@@ -118,14 +130,18 @@ def close_relay(run, topic, uri, subscription):
 
 
 class Sender:
-    """A bounded queue before a connection, and a thread for bytes that the socket does not take at once.
+    """A connection to a subscriber, with a bounded queue for messages that must wait.
 
-    Stands in for rospy's QueuedConnection. The thread of that one writes everything, and takes all
-    out of its queue at once, so that it neither bounds nor flushes the queue.
+    Stands in for rospy's QueuedConnection. rospy's thread writes everything, and takes all messages
+    out of the queue at once: the queue is neither bounded nor flushed. Here the publisher writes,
+    and a thread writes the rest.
+
+    :param queue_size: messages that wait at most; None: as many as the node's queue_bytes hold
+    :ivar is_busy: True while a thread writes the queue
     """
 
     is_busy = False
-    _rest = b''  # of a message that the socket has taken in part
+    _rest = b''  # the bytes of a message that the socket has not taken yet
 
     def __init__(self, connection, queue_size, run):
         self._connection = connection
@@ -138,7 +154,10 @@ class Sender:
         return getattr(self._connection, name)
 
     def write_data(self, data):
-        """Send a message with its length; never waits for the subscriber."""
+        """Send a message, or queue the rest if the socket is full; never wait for the subscriber.
+
+        :param data: the bytes of the message, with their length in front
+        """
         with self._lock:
             if self.is_busy or len(data) > MAX_DIRECT:
                 self._enqueue(data)
@@ -149,7 +168,7 @@ class Sender:
             if not self.is_busy:
                 self.is_busy = True
                 self._run.start_thread(self._send_queue)
-        time.sleep(0)  # or a busy publisher keeps the interpreter for 5 ms
+        time.sleep(0)  # let the new thread run: a busy publisher keeps the interpreter for 5 ms
 
     def _enqueue(self, data):
         self._queue.append(data)
@@ -159,7 +178,7 @@ class Sender:
             self._queue.popleft()
 
     def _send_directly(self, data):
-        """Send the bytes that the socket takes at once; True if it takes all."""
+        """Send the bytes that the socket takes at once; True if these are all."""
         connection = self._connection
         try:
             sent_bytes = connection.socket.send(data, socket.MSG_DONTWAIT)
@@ -184,5 +203,5 @@ class Sender:
                 self._rest = b''
             try:
                 connection.write_data(data)
-            except Exception:  # its peer has gone
+            except Exception:  # the peer has gone
                 connection.close()

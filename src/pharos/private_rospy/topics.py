@@ -1,6 +1,6 @@
-"""Methods for rospy's publishers and subscriptions: they send to links and sockets, and receive.
+"""Overlays for rospy's publishers and subscriptions: they send to links and sockets, and receive.
 
-:mod:`pharos.private_rospy.patches` sets them on each node's own copy of rospy's classes.
+:mod:`pharos.private_rospy.patches` sets these methods on each node's own copy of rospy's classes.
 """
 import contextlib
 import io
@@ -18,7 +18,7 @@ from pharos.intraprocess.callback_queues import (
 from pharos.intraprocess.copier import copier_for, copy_of
 from pharos.intraprocess.links import links_of
 
-SOCKET_BYTES = 6 << 20  # that the sockets between a publisher and a subscriber hold about
+SOCKET_BYTES = 6 << 20  # bytes that the two sockets of a connection hold, roughly
 FLUSH_PERIOD = 0.001  # seconds between two looks
 ROSOUT = '/rosout'
 
@@ -26,9 +26,13 @@ ROSOUT = '/rosout'
 class PublisherOverlay:
     """Methods for a node's own rospy.topics._PublisherImpl; ``rospy_NAME`` is rospy's method.
 
-    rospy serializes for all, and latches the user's object, one for all Publishers of a topic. It
-    keeps bytes that did not serialize in its buffer, and they corrupt the next message. These are no
-    methods of a subclass: rospy calls ``super(_PublisherImpl, self)``, would find it, and recurse.
+    rospy serializes for all receivers. rospy latches the user's object, one for all Publishers of
+    a topic. If a message does not serialize, rospy keeps its first bytes in a buffer, and they
+    corrupt the next message. These methods freeze for links, and serialize into a new buffer for
+    sockets.
+
+    They do not make a subclass: ``super(_PublisherImpl, self)`` in rospy's code would find the
+    subclass, and recurse.
     """
 
     def __init__(self, name, data_class):
@@ -40,27 +44,27 @@ class PublisherOverlay:
         self.has_header = getattr(data_class, '_has_header', False)
         self.header = None
         self.memory = None  # the shared_memory.MessageMemory, if a reader shares memory
-        # the connections that the receivers were found for: rospy makes a new list at each change
+        # the list of connections of self.receivers: rospy makes a new list at each change
         self.receivers_are_for = None
 
     def acquire(self):
-        """Let a signal be handled first: rospy locks here for the whole of a publish().
+        """Handle a pending signal of a script; rospy holds a lock from here to release().
 
-        publish() has a lock of its own, which it does not hold while it runs inline delegates.
+        Instead, publish() has a lock of its own, and frees that one before inline delegates run.
         """
-        if self.resolved_name != ROSOUT:  # the log's lock is held
+        if self.resolved_name != ROSOUT:  # this thread holds the log's lock
             self.run.checkpoint()
 
     def release(self):
         """Do nothing: rospy unlocks here after a publish()."""
 
-    def enable_latch(self):  # rospy calls it after registering, when links may exist
+    def enable_latch(self):  # rospy calls this after registering, when links may exist
         self.is_latch = True
         if self.header:
             self.header['latching'] = '1'
 
     def make_header(self):
-        """Make the connection header for links, as TCPROS sends it."""
+        """Make the connection header for links: the one that TCPROS sends."""
         with self.lock:
             if self.header is None:
                 protocol_class = self.run.modules.load('rospy.impl.tcpros_pubsub').TCPROSPub
@@ -72,7 +76,7 @@ class PublisherOverlay:
     def add_connection(self, connection):
         with self.lock:
             self.rospy_add_connection(connection)
-            new_connections = self.connections[-1:]  # rospy has wrapped it in a Sender
+            new_connections = self.connections[-1:]  # rospy has wrapped the connection in a Sender
             for frozen in list(self.latches.values()):
                 self.write(self.thaw(frozen), new_connections)
         return True
@@ -84,12 +88,16 @@ class PublisherOverlay:
     def publish(self, message, connection_override=None, channel=None):
         """Publish to the links, then to the sockets.
 
-        :param connection_override: to that connection alone
+        Inline delegates run in this thread, after the lock is free.
+
+        :param connection_override: publish to that connection alone; None: to all
         :param channel: the OutputChannel that publishes; None: a Publisher of plain rospy
+        :raises rospy.ROSException: if the topic is closed; plain rospy returns if the node stops
         """
         with self.lock:
             if self.closed:
-                if channel is None and self.run.stopping.is_set():  # rospy's ends quietly, too
+                # rospy's publish() returns in this case, too
+                if channel is None and self.run.stopping.is_set():
                     return
                 raise rospy.ROSException('publish() to a closed topic')
             self.seq += 1
@@ -106,7 +114,8 @@ class PublisherOverlay:
                 is_latched = False
             if self.has_header:  # as serialize_message does
                 message.header.seq = self.seq
-            if inboxes or is_latched or not others:  # if nobody receives, freeze() checks it
+            # if nobody receives, freeze() still checks the fields
+            if inboxes or is_latched or not others:
                 frozen = self.freeze(message)
                 if is_latched:
                     self.latches[channel] = frozen
@@ -119,7 +128,7 @@ class PublisherOverlay:
         for callback_queue in inline_queues:
             callback_queue.run_jobs()
         if other_queues:
-            # actionlib keeps a goal after publish() only: plain rospy never waits for a receiver
+            # actionlib stores a goal after publish(): the answer must not come before that
             may_wait = channel is not None
             self.last_wake = hand_over(other_queues, self.last_wake, may_wait)
 
@@ -132,7 +141,8 @@ class PublisherOverlay:
             if not connections:
                 return
             serialize_message(buffer, self.seq, message)
-        except Exception:  # copying makes bytes of numpy's arrays, or says what is wrong
+        # a thawed copy has lists or bytes for numpy's arrays; freeze() raises if that is not enough
+        except Exception:
             self.write(self.thaw(self.freeze(message)), connections)
             return
         data = buffer.getvalue()
@@ -140,18 +150,21 @@ class PublisherOverlay:
         for connection in connections:
             try:
                 connection.write_data(data)
-            except Exception:  # its peer has gone
+            except Exception:  # the peer has gone
                 connection.close()
 
     def flush(self, deadline):
-        """Wait until the sockets have taken all messages, or time.monotonic() reaches a deadline."""
+        """Wait until the sockets have taken all messages, or until a deadline as monotonic time."""
         while any(getattr(connection, 'is_busy', False) for connection in self.connections):
             if time.monotonic() > deadline:
                 break
             time.sleep(FLUSH_PERIOD)
 
     def flush_for_last(self, timeout):
-        """Flush if only one Publisher is left, which closes the topic."""
+        """Flush if only one Publisher is left: its end closes the topic.
+
+        :param timeout: seconds
+        """
         if self.ref_count == 1:
             self.flush(time.monotonic() + timeout)
 
@@ -164,7 +177,7 @@ class PublisherOverlay:
 
 
 class PlainInbox(Inbox):
-    """The messages that wait for the callbacks of plain rospy of a subscription."""
+    """The messages that wait for a subscription's callbacks of plain rospy; all share one Inbox."""
 
     def __init__(self, subscription):
         super().__init__(ThreadedCallbackQueue(), subscription.call_plain, subscription.queue_size)
@@ -172,13 +185,13 @@ class PlainInbox(Inbox):
         self.queue_bytes = subscription.run.node.queue_bytes
 
     def capacity_for(self, size):
-        """Let as many wait as with processes: in the queues of publishers, and in sockets."""
+        """Return how many messages would wait between processes: in publishers and in sockets."""
         connections = self.subscription.connections
         links = links_of(connections)
         queue_sizes = [link.publisher.queue_size for link in links]
         if self.queue_size != INFINITE or not links or len(links) < len(connections):
             return super().capacity_for(size)
-        if not all(queue_sizes):  # nothing is lost between processes
+        if not all(queue_sizes):  # a publisher without a queue_size loses no message
             return super().capacity_for(size)
         socket_messages = min(SOCKET_BYTES, self.queue_bytes) // size
         return sum(queue_sizes) + max(1, socket_messages)
@@ -187,8 +200,11 @@ class PlainInbox(Inbox):
 class SubscriptionOverlay:
     """Methods for a node's own rospy.topics._SubscriberImpl; ``rospy_NAME`` is rospy's method.
 
-    A callback that is an Inbox gets messages directly. All others of a topic share one inbox, and
-    run one after another. Those of two topics run side by side: one may wait for the other.
+    A callback that is an Inbox gets messages directly: these are the node's channels. All other
+    callbacks of a topic share one PlainInbox, and run one after another. Those of two topics run
+    side by side: one may wait for the other.
+
+    :ivar inboxes: the inboxes of all callbacks; links share this very list
     """
 
     def __init__(self, name, data_class):
@@ -198,7 +214,10 @@ class SubscriptionOverlay:
         self.plain_inbox = None
 
     def add_link(self, link):
-        """Add a link unless the topic is closed or has a connection to that node; True if added."""
+        """Add a link, unless the topic is closed or has a connection to that node.
+
+        :returns: True if the link was added
+        """
         with self.c_lock:
             if self.closed or self.has_connection(link.endpoint_id):
                 return False
@@ -206,7 +225,10 @@ class SubscriptionOverlay:
             return True
 
     def update_inboxes(self):
-        """Find the inboxes of all callbacks anew, have the publishers do so, and return the links."""
+        """Find the inboxes of all callbacks anew, have the publishers do so, and return the links.
+
+        A change of the callbacks calls this.
+        """
         callbacks = self.callbacks or ()
         inboxes = [callback for callback, _ in callbacks if isinstance(callback, Inbox)]
         if len(inboxes) < len(callbacks):
@@ -244,10 +266,10 @@ class SubscriptionOverlay:
             connection.latch = message
 
     def call_plain(self, message):
-        """Run the callbacks that are no Inbox."""
+        """Run the callbacks of plain rospy on a message."""
         for callback, args in self.callbacks or ():
             if not isinstance(callback, Inbox):
-                with contextlib.suppress(SystemExit):  # it would end a worker
+                with contextlib.suppress(SystemExit):  # would end the thread of the callbacks
                     self._invoke_callback(message, callback, args)
 
     def add_callback(self, callback, args):
@@ -270,10 +292,10 @@ class SubscriptionOverlay:
 
 
 def receivers_of(connections):
-    """Find the receivers of messages that are published to some connections.
+    """Return the receivers of messages that are published to some connections.
 
-    :returns: lists of inboxes by the function that thaws for them, the callback queues of those that
-        are inline, the callback queues of the others, and the connections that are not links
+    :returns: four values: ``{thaw: inboxes}``, the callback queues of inline inboxes, the callback
+        queues of the other inboxes, and the connections that are not links
     """
     links = links_of(connections)
     inboxes = {}
@@ -289,7 +311,11 @@ def receivers_of(connections):
 
 
 def close_topic(impl):
-    """Close a publisher or subscription: links without rospy's lock, the rest, then its epoll."""
+    """Close a publisher or subscription.
+
+    Links close before rospy's close() holds its lock: a link needs the locks of both its ends.
+    rospy closes the rest, but leaves its epoll object open.
+    """
     for link in links_of(impl.connections):
         link.close()
     impl.rospy_close()
@@ -301,6 +327,6 @@ def connections_of(ros_object):
     impl = ros_object.impl
     if not impl or impl.closed:
         return []
-    impl.check()  # rospy looks now and then which peers have left (ros_comm #927)
-    with impl.c_lock:  # the watcher may be removing one
+    impl.check()  # rospy notices only now and then that peers have left (ros_comm #927)
+    with impl.c_lock:  # the watcher may remove a connection meanwhile
         return impl.connections
