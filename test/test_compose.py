@@ -561,6 +561,41 @@ def test_required_node_ends_all(master, compose, apart):
     assert not any(each.is_running for each in composition.nodes)
 
 
+def test_group_respawns_its_node(master, compose):
+    compose(ending('respawn="true"'), groups=[['ends']])
+    until(lambda: master.parameters.get('/ends/starts', 0) >= 3)
+
+
+GROUPED = node('sonar', 'robot') + node('avoider', 'robot') + node('heartbeat', 'robot')
+
+
+def test_groups_share_memory(master, compose):
+    composition = compose(GROUPED, groups=[['sonar'], ['/avoider']])
+    assert [each.name for each in composition.nodes] == ['/heartbeat']
+    sonar, avoider = (master.wait_for_node(f'/{name}', TIMEOUT) for name in ('sonar', 'avoider'))
+    until(lambda: ('/range', '/avoider', 'SHARED_MEMORY') in links(sonar), TIMEOUT)
+    assert len({sonar.pid, avoider.pid, os.getpid()}) == 3
+    composition.stop()
+    until(lambda: not (sonar.is_alive() or avoider.is_alive()))
+
+
+def test_launch_file_names_groups(master, compose):
+    group = '<param name="pharos_group" value="senses"/>'
+    compose(node('sonar', 'robot', inside=group) + node('avoider', 'robot', inside=group))
+    pids = {master.wait_for_node(f'/{name}', TIMEOUT).pid for name in ('sonar', 'avoider')}
+    assert len(pids) == 1 and os.getpid() not in pids
+
+
+def test_program_takes_groups(master, program):
+    composed = program('robot', 'sensing.launch', '--group', 'sonar')
+    assert master.wait_for_node('/avoider', TIMEOUT).pid == composed.pid
+    sonar = master.wait_for_node('/sonar', TIMEOUT)
+    assert sonar.pid != composed.pid
+    composed.signal(signal.SIGINT)
+    composed.wait()
+    assert not sonar.is_alive()
+
+
 def test_wait_returns_when_all_ended(master, compose):
     master.parameters['/stay'] = True
     composition = compose(ending())

@@ -436,6 +436,7 @@ class Master:
         only: Sequence[str] = (),
         apart: Sequence[str] = (),
         here: Sequence[str] = (),
+        groups: Sequence[Sequence[str]] = (),
         share_connections: bool = False,
         **args,
     ) -> Composition:
@@ -448,6 +449,7 @@ class Master:
         :param only: the names of the nodes that run; none: all
         :param apart: the names of nodes that run in processes of their own
         :param here: the names of nodes that run in this process even if they show windows
+        :param groups: lists of names; the nodes of each list run in one process
         :param share_connections: as for :class:`Master`; True here or there is enough
         :param args: the arguments of the launch file
         :raises UnknownNodeError: if there is no such file, argument or node
@@ -456,7 +458,7 @@ class Master:
         from pharos.compose.composition import Composition
         from pharos.compose.launch_file import LaunchFile
 
-        launch_file = LaunchFile(self.url, package, file, args, only, apart, here)
+        launch_file = LaunchFile(self.url, package, file, args, only, apart, here, groups)
         master = Master(self.url, share_connections or self.share_connections, self.shared_memory)
         composition = Composition(master)
         composition.launch(launch_file)

@@ -301,7 +301,8 @@ class Node(DelegateHolder):
         :returns: an object with ``registered`` (True if the master has the node, None if the master
             is silent), ``kind`` (the class's name), ``connections`` ({transport: number}),
             ``dropped`` (number of messages), ``errors`` (how often blocks failed), ``threads``
-            (number), ``souls`` (number of those that run in threads), ``ended_souls`` (names)
+            (number), ``cpu_seconds``, ``souls`` (number of those that run in threads),
+            ``ended_souls`` (names)
         """
         registered = None
         with suppress(MasterUnreachableError):

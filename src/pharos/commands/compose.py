@@ -19,12 +19,9 @@ import rospkg
 from rosgraph.names import anonymous_name
 
 from pharos import Master, NodeNameInUseError, PharosError, spin
-from pharos.compose.composition import Composition
+from pharos.compose.composition import SWITCH_INTERVAL, Composition
 from pharos.compose.container import Container
 from pharos.compose.launch_file import LaunchFile
-
-#: seconds; beside a node that computes, others wait a tenth of the time that they do by default
-SWITCH_INTERVAL = 0.5e-3
 
 
 def main(argv=None):
@@ -54,11 +51,14 @@ def _parse(arguments):
         '--here', nargs='+', default=[], help='these here, though they show windows'
     )
     parser.add_argument(
+        '--group', nargs='+', action='append', default=[], help='these in one other process'
+    )
+    parser.add_argument(
         '--share-connections', action='store_true', help='one connection to each other publisher'
     )
     options = parser.parse_args([each for each in arguments if ':=' not in each])
     mappings = [each for each in arguments if ':=' in each]
-    needs_file = options.file or options.only or options.apart
+    needs_file = options.file or options.only or options.apart or options.group
     if needs_file and (options.script or len(options.file) not in (1, 2)):
         parser.error('give one launch file, by package and name or by its path, first; or --script')
     return options, mappings
@@ -96,7 +96,7 @@ def _read_launch_file(url, options, mappings):
     """Return the launch file; its nodes run in the folder where roslaunch runs them."""
     args = dict(each.split(':=', 1) for each in mappings if not each.startswith('_'))
     package = options.file[0] if len(options.file) == 2 else None
-    names = options.only, options.apart, options.here
+    names = options.only, options.apart, options.here, options.group
     launch_file = LaunchFile(url, package, options.file[-1], args, *names)
     home = rospkg.get_ros_home()
     os.makedirs(home, exist_ok=True)

@@ -41,3 +41,5 @@ def top(arguments: list[str]) -> None:
     console = Console(width=None if sys.stdout.isatty() else FILE_WIDTH)
     for rows in tables.values():
         console.print(table(rows))
+    if meter.advice:
+        console.print(meter.advice)

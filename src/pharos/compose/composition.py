@@ -1,6 +1,7 @@
 """Compositions: launch files whose Python nodes run in this process."""
 from __future__ import annotations
 
+import collections
 import contextlib
 import os
 import pickle
@@ -15,6 +16,7 @@ import rospkg
 from pharos import signals
 from pharos.child_process import RosProcess, find_program
 from pharos.compose import roslaunch_parent
+from pharos.compose.launch_file import Group
 from pharos.compose.script import ScriptNode, wait_for_end
 from pharos.compose.sources import needs_main_thread
 from pharos.errors import PharosError
@@ -25,6 +27,8 @@ from pharos.transcript import Transcript
 INIT_LIMIT = 2.0  # seconds until the next node starts, if a node has not started by then
 TERMINATE_LIMIT = 40.0  # seconds: 20 after the SIGINT, since roslaunch gives its nodes 17
 POLL_PERIOD = 0.02  # seconds between two looks at the nodes that have ended
+#: seconds; beside a node that computes, others wait a tenth of the time that they do by default
+SWITCH_INTERVAL = 0.5e-3
 
 
 class Composition:
@@ -40,11 +44,11 @@ class Composition:
         self.master = master
         self.process: RosProcess | None = None
         self.nodes: list[ScriptNode] = []
-        self._processes: list[RosProcess] = []  # of scripts that need a process each
+        self._processes: list[RosProcess] = []  # of groups, and of scripts that need one each
+        self._required_processes: list[RosProcess] = []  # those with a required node
         self._end_times: dict[ScriptNode, float] = {}  # as of time.monotonic()
         self._stopping = threading.Event()
         self._watcher = threading.Thread(target=self._watch, name='composition', daemon=True)
-        self._is_process_required = False  # True if roslaunch runs a required node
         self._has_started = False  # True if one node was started
         self._has_lost_required = False
 
@@ -65,21 +69,52 @@ class Composition:
         if launch_file.nodes_apart:
             self._start_roslaunch(launch_file)
         log_folder = os.path.join(rospkg.get_log_dir(), run_id)
+        groups = collections.defaultdict(list)
         for number, entry in enumerate(launch_file.entries, 1):
             log_name = f'{entry.name[1:].replace("/", "-")}-{number}.log'  # as roslaunch names logs
             arguments = [*entry.args, f'__log:={log_folder}/{log_name}']
+            groups[entry.group].append(entry._replace(args=arguments))
+            if entry.group not in ('', entry.name):
+                Transcript.show(f'{entry.name} runs in the group {entry.group}')
+        own_entries = groups.pop('', [])
+        for entries in groups.values():
+            self._start_group(entries)
+        self.start_entries(own_entries)
+
+    def start_entries(self, entries):
+        """Start the nodes of this process, in the order of the launch file."""
+        for entry in entries:
             with self._show_failure(entry.name):
-                self.start(entry.name, entry.path, arguments, entry.roslaunch_node)
+                self.start(entry.name, entry.path, entry.args, entry.roslaunch_node)
         self._watcher.start()
+
+    def _start_group(self, entries):
+        """Start nodes in a process of this package."""
+        master = self.master
+        group = Group(entries, master.url, master.share_connections, master.shared_memory)
+        search_path = os.pathsep.join(folder for folder in sys.path if folder)
+        module = 'pharos.compose.group'
+        command = ['env', f'PYTHONPATH={search_path}', sys.executable, '-m', module]
+        process = self._start_process(command, group)
+        self._processes.append(process)
+        if any(entry.roslaunch_node.required for entry in entries):
+            self._required_processes.append(process)
+
+    def _start_process(self, command, data):
+        """Start a program of this package; it gets a file with pickled data, and our number."""
+        with tempfile.NamedTemporaryFile('wb', delete=False) as file:
+            pickle.dump(data, file)
+        self._has_started = True
+        command = [*command, file.name, str(os.getpid())]
+        return RosProcess(command, self.master.url, Transcript.show)
 
     def _start_roslaunch(self, launch_file):
         """Start the nodes apart in a process of roslaunch."""
-        with tempfile.NamedTemporaryFile('wb', suffix='.launch', delete=False) as file:
-            pickle.dump(launch_file.config_apart(), file)
-        command = [sys.executable, roslaunch_parent.__file__, file.name, str(os.getpid())]
-        self._is_process_required = any(node.required for node in launch_file.nodes_apart)
-        self._has_started = True
-        self.process = RosProcess(command, self.master.url, Transcript.show)
+        command = [sys.executable, roslaunch_parent.__file__]
+        process = self._start_process(command, launch_file.config_apart())
+        self.process = process
+        if any(node.required for node in launch_file.nodes_apart):
+            self._required_processes.append(process)
 
     def run_scripts(self, programs, programs_here):
         """Run programs without a launch file; the Transcript shows why a program does not start.
@@ -164,8 +199,9 @@ class Composition:
                 return
             if node.lifecycle is Lifecycle.STOPPED:
                 self._look_at_ended(node)
-        if self._is_process_required and self.process and self.process.poll() is not None:
-            self._end('a node in a process of its own')
+        for process in self._required_processes:
+            if process.poll() is not None:  # roslaunch or a group ends with its required node
+                self._end('a node in another process')
 
     def _look_at_ended(self, node):
         name = node._settings.name
@@ -216,10 +252,10 @@ class Composition:
         """End all nodes, also those in processes of their own, and wait for their ends."""
         self._stopping.set()
         threads = [threading.Thread(target=node._stop_safely) for node in self.nodes]
+        for process in self._all_processes():
+            threads.append(threading.Thread(target=process.terminate, args=[TERMINATE_LIMIT]))
         for thread in threads:
             thread.start()
-        for process in self._all_processes():
-            process.terminate(TERMINATE_LIMIT)
         for thread in threads:
             thread.join()
 

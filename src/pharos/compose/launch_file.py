@@ -17,19 +17,34 @@ from pharos.errors import PharosError, UnknownNodeError
 from pharos.transcript import Transcript
 
 
+#: a node with this private parameter belongs to the group of that name
+GROUP_PARAMETER = 'pharos_group'
+
+
 class Entry(NamedTuple):
-    """A node of a launch file that runs in this process.
+    """A node of a launch file that runs in this process, or in the process of a group.
 
     :ivar name: the full name
     :ivar path: the file of the program
     :ivar args: the arguments of the program, with ROS's
     :ivar roslaunch_node: roslaunch's Node
+    :ivar group: the name of the group; '' for this process
     """
 
     name: str
     path: str
     args: list[str]
     roslaunch_node: Any
+    group: str
+
+
+class Group(NamedTuple):
+    """The nodes of a process, and the settings of their master."""
+
+    entries: list[Entry]
+    url: str
+    share_connections: bool
+    shared_memory: bool
 
 
 class LaunchFile:
@@ -44,15 +59,16 @@ class LaunchFile:
     :param only: the names of the nodes that run; none: all
     :param apart: the names of nodes that run in processes of their own
     :param here: the names of nodes that run in this process even if they show windows
+    :param groups: lists of names of nodes that run in one process each
     :ivar config: roslaunch's configuration
-    :ivar entries: an :class:`Entry` for each node of this process
-    :ivar nodes_apart: roslaunch's nodes for other processes
-    :ivar reasons: the names of these nodes -> texts that say why they run apart
+    :ivar entries: an :class:`Entry` for each node of this process and of groups
+    :ivar nodes_apart: roslaunch's nodes for its own processes
+    :ivar reasons: the names of nodes apart -> texts that say why they run apart
     :raises UnknownNodeError: if there is no such package, file, argument or node
     :raises PharosError: if roslaunch cannot read the file
     """
 
-    def __init__(self, url, package, file, args, only=(), apart=(), here=()):
+    def __init__(self, url, package, file, args, only=(), apart=(), here=(), groups=()):
         self.path = find_launch_file(package, file)
         self._read(args)
         self.config.master.uri = url
@@ -64,12 +80,13 @@ class LaunchFile:
         }
         # a user may leave out the slash, or the namespace
         short_names = {name: {name, name[1:], name.rpartition('/')[2]} for name in nodes}
-        self._check([*only, *apart, *here], set().union(*short_names.values()), 'node')
+        given_names = [*only, *apart, *here, *(name for group in groups for name in group)]
+        self._check(given_names, set().union(*short_names.values()), 'node')
         for name, node in nodes.items():
             if not only or short_names[name] & set(only):
-                is_apart = not short_names[name].isdisjoint(apart)
+                group = self._group_of(name, short_names[name], apart, groups)
                 is_here = not short_names[name].isdisjoint(here)
-                self._sort(name, node, is_apart, is_here)
+                self._sort(name, node, group, is_here)
 
     def _read(self, args):
         loader = roslaunch.xmlloader.XmlLoader()
@@ -88,10 +105,20 @@ class LaunchFile:
                 known_text = ', '.join(sorted(known_names)) or 'none'
                 raise UnknownNodeError(f'{self.path} has no {role} {name!r}; it has {known_text}')
 
-    def _sort(self, name, node, is_apart, is_here):
-        """Put a node into the entries of this process, or among the nodes apart."""
+    def _group_of(self, name, short_names, apart, groups):
+        """Return the name of the group of a node; '' if the node runs in this process."""
+        if not short_names.isdisjoint(apart):
+            return name
+        for number, group in enumerate(groups, 1):
+            if not short_names.isdisjoint(group):
+                return str(number)
+        parameter = self.config.params.get(f'{name}/{GROUP_PARAMETER}')
+        return str(parameter.value) if parameter else ''
+
+    def _sort(self, name, node, group, is_here):
+        """Put a node into the entries, or among the nodes apart."""
         try:
-            reason = self._why_apart(node, is_apart)
+            reason = self._why_apart(node)
             if not reason:
                 command = roslaunch.node_args.create_local_process_args(
                     node, node.machine, env=os.environ
@@ -103,13 +130,13 @@ class LaunchFile:
         if reason:
             self.reasons[name] = reason
             self.nodes_apart.append(node)
-        else:
-            self.entries.append(Entry(name, source_of(command[0]), command[1:], node))
+            return
+        if group == name:
+            self.reasons[name] = 'as --apart says'
+        self.entries.append(Entry(name, source_of(command[0]), command[1:], node, group))
 
-    def _why_apart(self, node, is_apart):
-        """Return why the launch file or --apart wants a process for a node, as text; else ''."""
-        if is_apart:
-            return 'as --apart says'
+    def _why_apart(self, node):
+        """Return why the launch file wants a process for a node, as text; else ''."""
         if node.launch_prefix:
             return 'it has a launch-prefix'
         if node.cwd:

@@ -18,10 +18,15 @@ import roslaunch.rlutil
 PARENT_PERIOD = 1.0  # seconds between two looks at the parent
 
 
-def _end_with(parent):
-    while os.getppid() == parent:
-        time.sleep(PARENT_PERIOD)
-    os.kill(os.getpid(), signal.SIGINT)
+def end_with(parent):
+    """Have this process end, as by Ctrl-C, when its parent has ended."""
+
+    def watch():
+        while os.getppid() == parent:
+            time.sleep(PARENT_PERIOD)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def main(path, parent):
@@ -33,7 +38,7 @@ def main(path, parent):
     with open(path, 'rb') as file:
         config = pickle.load(file)
     os.unlink(path)
-    threading.Thread(target=_end_with, args=[parent], daemon=True).start()
+    end_with(parent)
     run_id = roslaunch.rlutil.get_or_generate_uuid(None, False)
     roslaunch.configure_logging(run_id)
     launch = roslaunch.parent.ROSLaunchParent(run_id, [], show_summary=False)

@@ -9,7 +9,7 @@ subscription of plain rospy has a thread of its own, as with rospy.
 import collections
 import threading
 from _thread import allocate_lock, get_ident
-from time import perf_counter, sleep
+from time import perf_counter, sleep, thread_time
 
 from pharos.intraprocess.copier import size_of
 
@@ -52,6 +52,7 @@ class CallbackQueue:
     is_fast = False
     is_held = False
     closed = False
+    cpu_seconds = 0.0  # that its jobs took in threads of the pool, or in its own
     own_thread = None
     running_thread = None  # the identifier of the thread that runs or holds the queue
 
@@ -221,6 +222,7 @@ class ThreadedCallbackQueue(CallbackQueue):
         while not self.closed:
             self.is_scheduled = False
             self.run_jobs()
+            self.cpu_seconds = thread_time()
             self.own_thread.rest()
 
     def _leave_pool(self):
@@ -285,7 +287,9 @@ class _Worker(_RestingThread):
             callback_queue.is_scheduled = False
             job_count = len(callback_queue.jobs)
             start_time = perf_counter()
+            start_cpu = thread_time()
             callback_queue.run_jobs()
+            callback_queue.cpu_seconds += thread_time() - start_cpu
             callback_queue.is_fast = perf_counter() - start_time < FAST * job_count
         _wake_worker()  # each worker that ends has the next one end
 

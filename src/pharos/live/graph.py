@@ -27,10 +27,14 @@ COMMON_NAMES = re.compile(
 ARROW_STYLES = {
     'INTRAPROCESS': 'color="#0072B2", penwidth=2.6',
     'TCPROS': 'color="#D55E00", penwidth=1.2, style=dashed',
+    'SHARED_MEMORY': 'color="#CC79A7", penwidth=2.6, style=dashed',
     'UDPROS': 'color="#009E73", penwidth=1.2, style=dotted',
 }
 LOOSE_STYLE = 'color="#8A8A8A", style=dotted, arrowhead=empty'  # of arrows without a connection
-LEGEND = 'blue: INTRAPROCESS, no socket; red: TCPROS; grey: not connected; frames: processes'
+LEGEND = (
+    'blue: INTRAPROCESS, no socket; purple: SHARED_MEMORY; red: TCPROS; grey: not connected;'
+    ' frames: processes'
+)
 NODE_STYLE = 'shape=box, style="rounded,filled", fillcolor="#D9EAF7"'
 DEAD_NODE_STYLE = 'shape=box, style="rounded,filled", fillcolor="#EEEEEE"'
 TOPIC_STYLE = 'shape=box, style=filled, fillcolor="#FFF6D5"'

@@ -26,7 +26,7 @@ class Link(NamedTuple):
     topic: str
     publisher: str  # a node's name, or its URI if the master knows no node there
     subscriber: str
-    transport: str  # 'INTRAPROCESS', 'TCPROS' or 'UDPROS'
+    transport: str  # 'INTRAPROCESS', 'SHARED_MEMORY', 'TCPROS' or 'UDPROS'
 
     def peer_of(self, node_name: str) -> str:
         """Return the name of the node at the other end."""
@@ -193,6 +193,7 @@ def health_facts(run: Run) -> dict[str, Any]:
         'dropped': sum(getattr(each, 'dropped', 0) for each in run.open_endpoints(object)),
         'errors': run.failures.total,
         'threads': sum(thread.is_alive() for thread in list(run.threads)),
+        'cpu_seconds': round(run.cpu_seconds(), 3),
         'souls': len(run.souls) - len(ended_souls),
         'ended_souls': ended_souls,
     }

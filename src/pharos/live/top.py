@@ -25,6 +25,8 @@ VIEWS = {'n': 'nodes', 'p': 'processes', 't': 'topics'}  # key -> view
 KEY_HELP = 'n nodes  p processes  t topics  s sort by the next column  q quit'
 WIDE_COLUMNS = 'NODE', 'TOPIC', 'PID'  # are never cut, however narrow the terminal is
 ALARM_COLUMNS = 'DROP', 'FAIL', 'PROBLEM'  # are red unless the value is 0 or empty
+BUSY_PROCESS = 90  # percent of a core
+BUSY_NODE = 20  # percent of a core
 SUM_COLUMNS = 'IN/S', 'OUT/S', 'IN B/S', 'OUT B/S', 'DROP', 'FAIL'
 
 
@@ -39,6 +41,7 @@ class Meter:
         self._master = master
         self._names = names
         self._snapshot = take_snapshot(master)
+        self.advice = ''  # of the last measurement
         self._processes: dict[int, psutil.Process] = {}  # each keeps its last CPU time
 
     def measure(self) -> dict[str, list[dict[str, Any]]]:
@@ -49,9 +52,10 @@ class Meter:
         start = self._snapshot
         self._snapshot = take_snapshot(self._master)
         link_rates = self._snapshot.rates_since(start)
-        node_rows = self._select(_node_rows(self._snapshot, link_rates), 'NODE')
+        node_rows = self._select(_node_rows(self._snapshot, start, link_rates), 'NODE')
         topic_rows = self._select(_topic_rows(self._snapshot, link_rates), 'TOPIC')
         process_rows = list(self._process_rows(node_rows))
+        self.advice = '\n'.join(_advice(node_rows, process_rows))
         return {'nodes': node_rows, 'processes': process_rows, 'topics': topic_rows}
 
     def _select(self, rows, column):
@@ -88,7 +92,32 @@ class Meter:
             return {}
 
 
-def _node_rows(snapshot, link_rates):
+def _advice(node_rows, process_rows):
+    """Yield a line for each process of this host that keeps a core busy with several nodes."""
+    for process in process_rows:
+        rows = [row for row in node_rows if row['PID'] == process['PID'] and row['CPU%']]
+        if len(rows) < 2 or (process['CPU%'] or 0) < BUSY_PROCESS:
+            continue
+        rows.sort(key=lambda row: -row['CPU%'])
+        names = [f'{row["NODE"]} {row["CPU%"]:.0f} %' for row in rows if row['CPU%'] >= BUSY_NODE]
+        yield (
+            f'process {process["PID"]} keeps a core busy, and Python runs one thread at a time;'
+            f' put apart: {", ".join(names) or "half of its nodes"}'
+        )
+
+
+def _cpu_percent(name, snapshot, start):
+    """Return the load of a node of pharos since the snapshot before, None if it is unknown."""
+    if name not in start.nodes:
+        return None
+    end_seconds = snapshot.nodes[name].health.get('cpu_seconds')
+    start_seconds = start.nodes[name].health.get('cpu_seconds')
+    if end_seconds is None or start_seconds is None:
+        return None
+    return max(0.0, 100 * (end_seconds - start_seconds) / (snapshot.time - start.time))
+
+
+def _node_rows(snapshot, start, link_rates):
     message_rates = publisher_rates(link_rates, 'messages')
     for name, node in snapshot.nodes.items():
         input_traffic = [rate for link, rate in link_rates.items() if link.subscriber == name]
@@ -101,11 +130,13 @@ def _node_rows(snapshot, link_rates):
             'CLASS': node.health.get('kind'),
             'HOST': node.host,
             'PID': node.pid,
+            'CPU%': _cpu_percent(name, snapshot, start),
             'IN/S': sum(rate.messages for rate in input_traffic),
             'OUT/S': sum(output_rates),  # a message counts once, however many nodes receive it
             'IN B/S': sum(rate.bytes for rate in input_traffic),
             'OUT B/S': sum(rate.bytes for rate in output_traffic),
             'LOCAL': transports.count('INTRAPROCESS'),
+            'SHM': transports.count('SHARED_MEMORY'),
             'TCP': transports.count('TCPROS'),
             'DROP': node.health.get('dropped'),
             'FAIL': node.health.get('errors'),
@@ -127,6 +158,7 @@ def _topic_rows(snapshot, link_rates):
             'PUB': sum(name in node.publishes for node in nodes),
             'SUB': sum(name in node.subscribes for node in nodes),
             'LOCAL': transports.count('INTRAPROCESS'),
+            'SHM': transports.count('SHARED_MEMORY'),
             'TCP': transports.count('TCPROS'),
         }
 
@@ -186,8 +218,8 @@ def show(meter: Meter, interval: float) -> None:
 def _show_views(screen, meter, interval, keyboard):
     view = 'nodes'
     sort_column = 0
-    problem = ''
     tables = meter.measure()
+    problem = meter.advice
     deadline = time.monotonic() + interval
     while True:
         screen.update(Group(KEY_HELP, problem, table(tables[view], sort_column)), refresh=True)
@@ -205,6 +237,6 @@ def _show_views(screen, meter, interval, keyboard):
             deadline = time.monotonic() + interval
             try:
                 tables = meter.measure()
-                problem = ''
+                problem = meter.advice
             except MasterUnreachableError as error:
                 problem = str(error)

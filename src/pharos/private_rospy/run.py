@@ -123,6 +123,7 @@ class Run:
         self.stopping = threading.Event()  # set when a stop begins: sleeps and waits end
         self.finished = threading.Event()  # set at the end of a stop: threads left behind end
         self.threads = WeakSet()
+        self.ended_cpu_seconds = 0.0  # of threads that have ended
         self.sockets = WeakSet()
         self.calls = WeakSet()  # sockets of calls of services
         self.deadlines = {}  # socket of a silent client -> the time when it is closed
@@ -165,6 +166,12 @@ class Run:
                 self.daemon = True
                 super().start()
                 run.threads.add(self)
+
+            def run(self):
+                try:
+                    super().run()
+                finally:
+                    run.ended_cpu_seconds += time.thread_time()
 
         self.Thread = Thread
         client = Shim(xmlrpc.client, ServerProxy=ServerProxy)
@@ -235,6 +242,18 @@ class Run:
         from pharos.live.snapshot import health_facts
 
         return health_facts(self)
+
+    def cpu_seconds(self):
+        """Return the CPU time of the node's threads, and of its callbacks in other threads."""
+        seconds = self.ended_cpu_seconds + self.callback_queue.cpu_seconds
+        for thread in list(self.threads):
+            with suppress(OSError):  # the thread ends at this moment
+                if thread.is_alive():
+                    seconds += time.clock_gettime(time.pthread_getcpuclockid(thread.ident))
+        for subscription in list(self.topic_manager.subs.values()):
+            if subscription.plain_inbox:
+                seconds += subscription.plain_inbox.callback_queue.cpu_seconds
+        return seconds
 
     # -- failures
 

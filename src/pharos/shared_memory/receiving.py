@@ -16,7 +16,7 @@ from rosgraph.network import (
     decode_ros_handshake_header,
     encode_ros_handshake_header,
 )
-from rospy.impl.transport import ProtocolHandler, Transport
+from rospy.impl.transport import ProtocolHandler
 
 from pharos.private_rospy.run import UNREACHABLE, ServerProxy
 from pharos.private_rospy.tcpros import receive_until_end, shutdown_socket
@@ -24,9 +24,9 @@ from pharos.shared_memory.sending import (
     MAX_PACKET,
     NO_FILE,
     PACKET,
-    TRANSPORT_TYPE,
     WHOLE,
     MemorySender,
+    MemoryTransport,
     MessageMemory,
     is_plain,
 )
@@ -166,22 +166,16 @@ class SharedMemoryHandler(ProtocolHandler):
         return self._tcpros_handler.create_transport(topic, uri, answer)
 
 
-class MemoryReceiver(Transport):
+class MemoryReceiver(MemoryTransport):
     """The subscription's end of a connection."""
 
-    transport_type = TRANSPORT_TYPE
     is_latched = False
     latch = None
     header = None
 
     def __init__(self, topic, uri, sock):
-        super().__init__('i', topic)
-        self.endpoint_id = uri
-        self._socket = sock
+        super().__init__('i', topic, uri, sock)
         self._maps = {}  # position -> map of a file
-
-    def fileno(self):
-        return self._socket.fileno()
 
     def receive(self, subscription, run):
         """Shake hands, and receive messages until the connection ends."""

@@ -29,7 +29,6 @@ from rospy.msg import serialize_message
 
 from pharos.private_rospy.tcpros import shutdown_socket
 
-TRANSPORT_TYPE = 'SHARED_MEMORY'
 MAX_PACKET = 1 << 16  # bytes of a message, or a part of one, that the socket takes itself
 MAX_FILES = 4  # of a publisher
 POLL_LIMIT = 1000  # milliseconds between two looks if the connection is closed
@@ -136,27 +135,38 @@ class Entry(NamedTuple):
     data: bytes  # the rest of the message
 
 
-class MemorySender(Transport):
+class MemoryTransport(Transport):
+    """One end of a connection."""
+
+    transport_type = 'SHARED_MEMORY'
+    has_own_queue = True
+
+    def __init__(self, direction, topic, endpoint_id, sock):
+        super().__init__(direction, topic)
+        self.endpoint_id = endpoint_id
+        self._socket = sock
+
+    def fileno(self):
+        return self._socket.fileno()
+
+    def get_transport_info(self):
+        return f'{self.transport_type} connection to [{self.endpoint_id}]'
+
+
+class MemorySender(MemoryTransport):
     """The publisher's end of a connection."""
 
-    transport_type = TRANSPORT_TYPE
-    has_own_queue = True
     is_busy = False  # True while a thread sends the queue
     is_broken = False
     announced = None  # the file that the reader has no receipt for yet
 
     def __init__(self, topic, reader_name, sock, memory, queue_size):
-        super().__init__('o', topic)
-        self.endpoint_id = reader_name
-        self._socket = sock
+        super().__init__('o', topic, reader_name, sock)
         self._memory = memory
         self._queue_size = queue_size or math.inf
         self._queue = collections.deque()
         self._known_files = {}  # position -> the file that the reader has mapped
         self._dropped = 0  # messages since the last packet
-
-    def fileno(self):
-        return self._socket.fileno()
 
     def put(self, entry):
         """Add a message to the queue, and send all that the socket takes; never waits."""
