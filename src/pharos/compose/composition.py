@@ -24,7 +24,8 @@ from pharos.node import Settings
 from pharos.private_rospy.run import Lifecycle
 from pharos.transcript import Transcript
 
-INIT_LIMIT = 2.0  # seconds until the next node starts, if a node has not started by then
+#: seconds until the next node starts side by side with one that has not registered yet
+INIT_LIMIT = 0.1
 TERMINATE_LIMIT = 40.0  # seconds: 20 after the SIGINT, since roslaunch gives its nodes 17
 POLL_PERIOD = 0.02  # seconds between two looks at the nodes that have ended
 #: seconds; beside a node that computes, others wait a tenth of the time that they do by default
@@ -151,7 +152,7 @@ class Composition:
         except PharosError as error:
             Transcript.show(f'{name} is not started: {error}')
 
-    def start(self, name, path, arguments, roslaunch_node=None):
+    def start(self, name, path, arguments, roslaunch_node=None, init_timeout=INIT_LIMIT):
         """Start a program as the node of that name, and return the node.
 
         :param path: the file of the program
@@ -164,7 +165,7 @@ class Composition:
         ScriptNode.__init__(
             node, path, arguments, None, roslaunch_node.env_args if roslaunch_node else ()
         )
-        node.init_timeout = INIT_LIMIT
+        node.init_timeout = init_timeout
         node.roslaunch_node = roslaunch_node
         self.nodes.append(node)
         Transcript.show(f'{name} starts')

@@ -12,6 +12,9 @@ from pharos.errors import PharosError, UnknownNodeError, UnknownTypeError
 from pharos.node import Node
 
 
+LOAD_LIMIT = 2.0  # seconds in which a program that fails is an error of the call
+
+
 class Container(Node):
     """Loads programs as nodelet's manager loads nodelets.
 
@@ -54,7 +57,7 @@ class Container(Node):
         remappings = zip(request.remap_source_args, request.remap_target_args)
         arguments = [*request.my_argv, *(f'{source}:={target}' for source, target in remappings)]
         arguments.append(f'__name:={name.rpartition("/")[2]}')
-        node = self.composition.start(name, source_of(path), arguments)
+        node = self.composition.start(name, source_of(path), arguments, init_timeout=LOAD_LIMIT)
         self._loaded_nodes[requested_name] = node
         if request.bond_id:
             self._start_bond(requested_name, request.bond_id)

@@ -5,6 +5,7 @@
 modules of the run, and all other modules as usual.
 """
 import builtins
+import collections
 import importlib
 import inspect
 import itertools
@@ -143,6 +144,10 @@ def _is_generated(name):
     return rest[:1] in (['msg'], ['srv']) and top_name not in ('rospy', 'rosgraph')
 
 
+#: name of a private module in sys.modules -> number of modules of that name with running code
+_shown_counts = collections.Counter()
+_shown_lock = threading.Lock()
+
 #: class of a private module -> its PrivateModules, as a weak reference
 _owners = weakref.WeakKeyDictionary()
 
@@ -190,6 +195,23 @@ def _getsourcefile(thing, original=inspect.getsourcefile):
 inspect.getmodule = _getmodule
 inspect.getfile = _getfile
 inspect.getsourcefile = _getsourcefile
+
+
+def _show_module(name, module):
+    """Have sys.modules show a private module while its code runs: @dataclass looks there."""
+    with _shown_lock:
+        if _shown_counts[name] or name not in sys.modules:
+            sys.modules[name] = module
+            _shown_counts[name] += 1
+
+
+def _hide_module(name):
+    """Take a private module out of sys.modules, unless the code of one of its name still runs."""
+    with _shown_lock:
+        if _shown_counts[name]:
+            _shown_counts[name] -= 1
+            if not _shown_counts[name]:
+                del sys.modules[name]
 
 
 class PrivateModules:
@@ -288,7 +310,7 @@ class PrivateModules:
         module = module_from_spec(spec)
         self.modules[name] = module
         vars(module)['__builtins__'] = self.builtins
-        is_added = sys.modules.setdefault(name, module) is module  # @dataclass reads sys.modules
+        _show_module(name, module)
         try:
             if code is None and spec.loader and spec.has_location:  # an extension in C
                 spec.loader.exec_module(module)
@@ -298,8 +320,7 @@ class PrivateModules:
             del self.modules[name]
             raise
         finally:
-            if is_added:
-                del sys.modules[name]
+            _hide_module(name)
         self._patch(module)
 
     def _build_class(self, function, name, *bases, **options):
