@@ -596,6 +596,27 @@ def test_program_takes_groups(master, program):
     assert not sonar.is_alive()
 
 
+def test_commands_control_a_node(master, compose):
+    composition = compose(node('sonar', 'robot') + ending('respawn="true"'))
+    box = Mailbox(create(master, '/ear'), '/range', 'sensor_msgs/Range')
+    (sonar, _) = composition.nodes
+
+    def command(action, name='sonar'):
+        with Program(['rosrun', 'pharos', action, name], master.url) as program:
+            return program.wait(), program.output
+
+    box.next()
+    assert command('stop') == (0, '')
+    assert not sonar.is_running and not composition.is_over
+    assert command('start') == (0, '')
+    assert sonar.is_running
+    first_run = sonar.uri
+    assert command('restart') == (0, '')
+    assert sonar.is_running and sonar.uri == first_run
+    status, output = command('restart', 'nobody')
+    assert status == 1 and '/nobody is not a node of a composition' in output
+
+
 def test_wait_returns_when_all_ended(master, compose):
     master.parameters['/stay'] = True
     composition = compose(ending())

@@ -7,6 +7,7 @@ usage: pharos COMMAND [ARGUMENT ...]
   compose         run the Python nodes of a launch file in one process
   top             a live table of nodes, processes and topics
   graph           the nodes, topics and links, as text or as a picture
+  restart, stop, start    do so with a node of a composition
   create_package  make a catkin package with nodes and tests
 
 'pharos COMMAND --help' tells the arguments of a command.
@@ -24,8 +25,17 @@ import rospkg
 
 import pharos
 
-#: each is a function of its name in the module of its name; compose has a main(), for its status
-COMMANDS = 'workspace', 'compose', 'top', 'graph', 'create_package'
+#: name of a command, and of its function -> module; compose has a main(), for its status
+COMMANDS = {
+    'workspace': 'workspace',
+    'compose': 'compose',
+    'top': 'top',
+    'graph': 'graph',
+    'restart': 'control',
+    'stop': 'control',
+    'start': 'control',
+    'create_package': 'create_package',
+}
 
 
 def main() -> int:
@@ -38,7 +48,7 @@ def main() -> int:
         print(__doc__)
         return 0 if name.startswith('-') else 1
     sys.argv[:2] = [f'pharos {name}']
-    module = importlib.import_module(f'pharos.commands.{name}')
+    module = importlib.import_module(f'pharos.commands.{COMMANDS[name]}')
     if name == 'compose':
         return module.main()
     return run_command(getattr(module, name))

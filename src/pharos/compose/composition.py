@@ -5,6 +5,7 @@ import collections
 import contextlib
 import os
 import pickle
+import socket
 import sys
 import tempfile
 import threading
@@ -15,13 +16,14 @@ import rospkg
 
 from pharos import signals
 from pharos.child_process import RosProcess, find_program
-from pharos.compose import roslaunch_parent
+from pharos.compose import control, roslaunch_parent
 from pharos.compose.launch_file import Group
 from pharos.compose.script import ScriptNode, wait_for_end
 from pharos.compose.sources import needs_main_thread
 from pharos.errors import PharosError
 from pharos.node import Settings
 from pharos.private_rospy.run import Lifecycle
+from pharos.private_rospy.tcpros import shutdown_socket
 from pharos.transcript import Transcript
 
 #: seconds until the next node starts side by side with one that has not registered yet
@@ -48,7 +50,9 @@ class Composition:
         self._processes: list[RosProcess] = []  # of groups, and of scripts that need one each
         self._required_processes: list[RosProcess] = []  # those with a required node
         self._end_times: dict[ScriptNode, float] = {}  # as of time.monotonic()
+        self._stopped_nodes: set[ScriptNode] = set()  # by control(); they do not respawn
         self._stopping = threading.Event()
+        self._listener: socket.socket | None = None  # of control()
         self._watcher = threading.Thread(target=self._watch, name='composition', daemon=True)
         self._has_started = False  # True if one node was started
         self._has_lost_required = False
@@ -87,6 +91,10 @@ class Composition:
         for entry in entries:
             with self._show_failure(entry.name):
                 self.start(entry.name, entry.path, entry.args, entry.roslaunch_node)
+        self._begin_watch()
+
+    def _begin_watch(self):
+        self._listener = control.listen(self)
         self._watcher.start()
 
     def _start_group(self, entries):
@@ -126,7 +134,7 @@ class Composition:
         for text in programs:
             with self._show_failure(text):
                 self._run_script(text, text in programs_here)
-        self._watcher.start()
+        self._begin_watch()
 
     def _run_script(self, text, may_show_windows):
         path = text
@@ -176,6 +184,8 @@ class Composition:
     @property
     def is_over(self) -> bool:
         """True if all started nodes and processes have ended, and no node respawns."""
+        if self._stopped_nodes:
+            return False
         for node in self.nodes:
             respawns = node.roslaunch_node and node.roslaunch_node.respawn
             if respawns or node.lifecycle is not Lifecycle.STOPPED:
@@ -198,7 +208,7 @@ class Composition:
         for node in self.nodes:
             if self._stopping.is_set():
                 return
-            if node.lifecycle is Lifecycle.STOPPED:
+            if node.lifecycle is Lifecycle.STOPPED and node not in self._stopped_nodes:
                 self._look_at_ended(node)
         for process in self._required_processes:
             if process.poll() is not None:  # roslaunch or a group ends with its required node
@@ -227,6 +237,21 @@ class Composition:
         if self._stopping.is_set():  # stop() may have looked before the start
             node._stop_safely()
 
+    def control(self, node, action):
+        """Restart, stop or start a node; a required one may stop, too.
+
+        :raises PharosError: if the node does not start
+        """
+        Transcript.show(f'{node._settings.name}: {action}')
+        self._stopped_nodes.add(node)
+        if action != 'start':
+            node._stop_safely()
+        if action != 'stop':
+            if not node.is_running:
+                node._start_held()
+            self._end_times.pop(node, None)
+            self._stopped_nodes.discard(node)
+
     def _end(self, name):
         if not self._stopping.is_set():
             Transcript.show(f'{name}, which is required, has ended: all others end')
@@ -252,6 +277,8 @@ class Composition:
     def stop(self) -> None:
         """End all nodes, also those in processes of their own, and wait for their ends."""
         self._stopping.set()
+        if self._listener:
+            shutdown_socket(self._listener)
         threads = [threading.Thread(target=node._stop_safely) for node in self.nodes]
         for process in self._all_processes():
             threads.append(threading.Thread(target=process.terminate, args=[TERMINATE_LIMIT]))

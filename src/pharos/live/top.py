@@ -16,13 +16,15 @@ from rich.console import Group
 from rich.live import Live
 from rich.table import Table
 
-from pharos.errors import MasterUnreachableError
+from pharos.errors import MasterUnreachableError, PharosError
 from pharos.live.snapshot import LOCAL_HOST, publisher_rates, take_snapshot, topic_rates
 from pharos.live.text_format import short_number
 from pharos.master import Master
 
 VIEWS = {'n': 'nodes', 'p': 'processes', 't': 'topics'}  # key -> view
 KEY_HELP = 'n nodes  p processes  t topics  s sort by the next column  q quit'
+CONTROL_HELP = 'j k choose a node of a composition  r restart  x stop  a start'
+ACTIONS = {'r': 'restart', 'x': 'stop', 'a': 'start'}  # key -> action
 WIDE_COLUMNS = 'NODE', 'TOPIC', 'PID'  # are never cut, however narrow the terminal is
 ALARM_COLUMNS = 'DROP', 'FAIL', 'PROBLEM'  # are red unless the value is 0 or empty
 BUSY_PROCESS = 90  # percent of a core
@@ -163,13 +165,11 @@ def _topic_rows(snapshot, link_rates):
         }
 
 
-def table(rows: list[dict[str, Any]], sort_column: int = 0) -> Table:
-    """Return a table of rows, sorted by a column: texts by the alphabet, numbers from the largest.
-
-    :param sort_column: the index of the column; after the last one comes the first again
-    """
-    columns = list(rows[0]) if rows else ['nothing there']
-    sort_title = columns[sort_column % len(columns)]
+def sorted_rows(rows: list[dict[str, Any]], sort_column: int) -> list[dict[str, Any]]:
+    """Return the rows sorted by a column: texts by the alphabet, numbers from the largest."""
+    if not rows:
+        return []
+    sort_title = list(rows[0])[sort_column % len(rows[0])]
 
     def sort_key(row):
         value = row[sort_title]
@@ -177,14 +177,27 @@ def table(rows: list[dict[str, Any]], sort_column: int = 0) -> Table:
             return value, 0
         return '', 0 if value is None else -value
 
+    return sorted(rows, key=sort_key)
+
+
+def table(rows: list[dict[str, Any]], sort_column: int = 0, chosen_node: str = '') -> Table:
+    """Return a table of rows, sorted by a column.
+
+    :param sort_column: the index of the column; after the last one comes the first again
+    :param chosen_node: the row of this node is marked
+    """
+    columns = list(rows[0]) if rows else ['nothing there']
+    sort_title = columns[sort_column % len(columns)]
     rich_table = Table(box=None, padding=(0, 1, 0, 0))
     for column in columns:
         has_text = any(isinstance(row[column], str) for row in rows)
         title = f'[reverse]{column}[/]' if column == sort_title else column
         justify: Any = 'left' if has_text else 'right'
         rich_table.add_column(title, justify=justify, no_wrap=column in WIDE_COLUMNS)
-    for row in sorted(rows, key=sort_key):
-        rich_table.add_row(*[_cell_text(column, value) for column, value in row.items()])
+    for row in sorted_rows(rows, sort_column):
+        style = 'reverse' if row.get('NODE') == chosen_node else None
+        cells = [_cell_text(column, value) for column, value in row.items()]
+        rich_table.add_row(*cells, style=style)
     return rich_table
 
 
@@ -218,11 +231,14 @@ def show(meter: Meter, interval: float) -> None:
 def _show_views(screen, meter, interval, keyboard):
     view = 'nodes'
     sort_column = 0
+    chosen_node = ''
     tables = meter.measure()
-    problem = meter.advice
+    line = meter.advice
     deadline = time.monotonic() + interval
     while True:
-        screen.update(Group(KEY_HELP, problem, table(tables[view], sort_column)), refresh=True)
+        rows = tables[view]
+        help_text = f'{KEY_HELP}\n{CONTROL_HELP}'
+        screen.update(Group(help_text, line, table(rows, sort_column, chosen_node)), refresh=True)
         timeout = max(0, deadline - time.monotonic())
         if select.select([keyboard], [], [], timeout)[0]:
             key = os.read(keyboard, 1).decode('latin-1')
@@ -233,10 +249,34 @@ def _show_views(screen, meter, interval, keyboard):
             elif key in VIEWS:
                 view = VIEWS[key]
                 sort_column = 0
+            elif key in 'jk' and view == 'nodes':
+                step = 1 if key == 'j' else -1
+                chosen_node = _next_node(sorted_rows(rows, sort_column), chosen_node, step)
+            elif key in ACTIONS and chosen_node:
+                line = _control(ACTIONS[key], chosen_node)
         else:
             deadline = time.monotonic() + interval
             try:
                 tables = meter.measure()
-                problem = meter.advice
+                line = meter.advice
             except MasterUnreachableError as error:
-                problem = str(error)
+                line = str(error)
+
+
+def _next_node(rows, chosen_node, step):
+    """Return the node that comes after the chosen one, or before; the first if there is none."""
+    names = [row['NODE'] for row in rows]
+    if chosen_node not in names:
+        return names[0] if names else ''
+    return names[(names.index(chosen_node) + step) % len(names)]
+
+
+def _control(action, name):
+    """Restart, stop or start a node, and return a line that says how that went."""
+    from pharos.compose.control import control
+
+    try:
+        control(action, name)
+    except PharosError as error:
+        return str(error)
+    return f'{name}: {action} done'

@@ -3,6 +3,7 @@ import collections
 import contextlib
 import functools
 import math
+import os
 import socket
 import struct
 import threading
@@ -14,6 +15,7 @@ MAX_MESSAGE = 1_000_000_000  # bytes, as in roscpp
 MAX_DIRECT = 256 << 10  # bytes; the write of a larger message would hold up the publisher
 CONNECT_LIMIT = 10.0  # seconds
 _READ_BUFFER = 1 << 16  # bytes
+_CREDENTIALS = struct.Struct('3i')  # numbers of the process, the user, and the group
 _LENGTH = struct.Struct('<I')
 
 
@@ -29,6 +31,14 @@ def keep_alive(sock):
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 10)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 5)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 4)
+
+
+def check_user(sock):
+    """Raise PermissionError if the process at the other end of a local socket has another user."""
+    credentials = sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+    _, user, _ = _CREDENTIALS.unpack(credentials)
+    if user != os.getuid():
+        raise PermissionError(f'a process of user {user}')
 
 
 # -- receiving

@@ -19,7 +19,7 @@ from rosgraph.network import (
 from rospy.impl.transport import ProtocolHandler
 
 from pharos.private_rospy.run import UNREACHABLE, ServerProxy
-from pharos.private_rospy.tcpros import receive_until_end, shutdown_socket
+from pharos.private_rospy.tcpros import check_user, receive_until_end, shutdown_socket
 from pharos.shared_memory.sending import (
     MAX_PACKET,
     NO_FILE,
@@ -34,7 +34,6 @@ from pharos.shared_memory.sending import (
 PROTOCOL = 'PHAROS-SHM'
 MAX_HEADER = 1 << 17  # bytes of a connection header
 RECEIPT = b'\0'
-_CREDENTIALS = struct.Struct('3i')  # numbers of the process, the user, and the group
 _DESCRIPTOR_SIZE = array.array('i').itemsize
 
 
@@ -43,14 +42,6 @@ def host_and_user():
     """Return values that are equal for processes that may share memory."""
     with open('/proc/sys/kernel/random/boot_id') as file:
         return [file.read().strip(), os.getuid()]
-
-
-def check_user(sock):
-    """Raise PermissionError if the process at the other end belongs to another user."""
-    credentials = sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
-    _, user, _ = _CREDENTIALS.unpack(credentials)
-    if user != os.getuid():
-        raise PermissionError(f'a process of user {user}')
 
 
 class SharedMemoryHandler(ProtocolHandler):

@@ -1,0 +1,82 @@
+"""Stop, start and restart the nodes of a composition from another process of the same user.
+
+Each composition listens on a socket that is not in a file system; its name has the process's number.
+"""
+import contextlib
+import os
+import re
+import socket
+import threading
+
+from pharos.errors import PharosError, UnknownNodeError
+from pharos.private_rospy.tcpros import check_user
+
+ACTIONS = 'restart', 'stop', 'start'
+ANSWER_LIMIT = 60.0  # seconds
+MAX_TEXT = 4096  # bytes
+_PREFIX = 'pharos-compose-'
+DONE = 'done'
+
+
+def listen(composition):
+    """Obey other processes, in a thread, until the composition has stopped."""
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with contextlib.suppress(OSError):  # a second composition of this process is not controlled
+        listener.bind(f'\0{_PREFIX}{os.getpid()}')
+        listener.listen()
+        threading.Thread(target=_serve, args=[listener, composition], daemon=True).start()
+    return listener
+
+
+def _serve(listener, composition):
+    with listener:
+        while True:
+            try:
+                client, _ = listener.accept()
+            except OSError:  # the composition has stopped
+                return
+            with client, contextlib.suppress(OSError):
+                check_user(client)
+                action, name = client.recv(MAX_TEXT).decode().split()
+                client.send(_answer(composition, action, name).encode())
+
+
+def _answer(composition, action, name):
+    """Do what a client wants, and return the text for it; '' if the node is not of this composition."""
+    for node in composition.nodes:
+        if node._settings.name == name:
+            try:
+                composition.control(node, action)
+            except PharosError as error:
+                return str(error)
+            return DONE
+    return ''
+
+
+def control(action: str, name: str) -> None:
+    """Restart, stop or start a node of any composition of this user on this host.
+
+    :param action: 'restart', 'stop' or 'start'
+    :raises UnknownNodeError: if no such composition has the node
+    :raises PharosError: if the node does not start
+    """
+    name = '/' + name.lstrip('/')
+    with open('/proc/net/unix') as file:
+        socket_names = set(re.findall(f'@({_PREFIX}\\d+)', file.read()))
+    for socket_name in socket_names:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as sock:
+            sock.settimeout(ANSWER_LIMIT)
+            try:
+                sock.connect(f'\0{socket_name}')
+                check_user(sock)
+                sock.send(f'{action} {name}'.encode())
+                answer = sock.recv(MAX_TEXT).decode()
+            except OSError:  # it belongs to another user, or ends
+                continue
+        if answer == DONE:
+            return
+        if answer:
+            raise PharosError(answer)
+    raise UnknownNodeError(
+        f'{name} is not a node of a composition of this user on this host: see rosrun pharos top'
+    )
