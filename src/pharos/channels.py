@@ -86,7 +86,7 @@ class Channel(Endpoint):
 
     @property
     def connections(self) -> list[tuple[str, str]]:
-        """The connected peers: ``(name of the node, 'INTRAPROCESS' or 'TCPROS')``."""
+        """The connected peers: ``(name of the node, 'INTRAPROCESS', 'SHARED_MEMORY' or 'TCPROS')``."""
         connections = [each for each in connections_of(self.ros_object) if peer_of(each)]
         return [(peer_of(connection), connection.transport_type) for connection in connections]
 

@@ -89,8 +89,8 @@ class RosProcess(subprocess.Popen):
     def terminate(self, timeout: float = 5.0) -> int:  # type: ignore[override]
         """End the program and its children.
 
-        Send SIGINT, as Ctrl-C does, then SIGTERM after half of the timeout. Kill them after all of
-        the timeout.
+        Send SIGINT, as Ctrl-C does, and wait for half of the timeout; then SIGTERM, and wait as
+        long; then SIGKILL. Once the program has ended, its children get the next signal at once.
 
         :param timeout: seconds
         :returns: the program's exit code

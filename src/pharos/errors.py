@@ -15,7 +15,7 @@ class NodeNameInUseError(PharosError):
 
 
 class PortInUseError(PharosError):
-    """The TCPROS or XML-RPC port asked for cannot be bound."""
+    """Another program has the TCPROS or XML-RPC port asked for."""
 
 
 class UnknownNodeError(PharosError):

@@ -20,8 +20,8 @@ from pharos.child_process import RosProcess, find_launch_file, find_program
 from pharos.errors import MasterUnreachableError, PortInUseError
 from pharos.external_node import ExternalNode
 from pharos.names import full_name, node_name
-from pharos.node import Node, Settings, check_node_class
-from pharos.private_rospy.run import UNREACHABLE, ServerProxy
+from pharos.node import Node, check_node_class
+from pharos.private_rospy.run import UNREACHABLE, ServerProxy, Settings
 from pharos.service import Service
 from pharos.waiting import wait_for
 
@@ -128,7 +128,9 @@ class Master:
         """
         environ = dict(os.environ)
         environ['PYTHONPATH'] = os.pathsep.join(folder for folder in sys.path if folder)
-        environ.setdefault('ROS_HOSTNAME', environ.pop('ROS_IP', '127.0.0.1'))
+        # rospy prefers ROS_HOSTNAME to ROS_IP
+        address = environ.pop('ROS_IP', '127.0.0.1')
+        environ.setdefault('ROS_HOSTNAME', address)
         pipes = {'stdin': subprocess.PIPE, 'stdout': subprocess.PIPE, 'text': True}
         command = [sys.executable, '-m', 'pharos.embedded_master', str(port)]
         process = subprocess.Popen(command, env=environ, start_new_session=True, **pipes)  # type: ignore

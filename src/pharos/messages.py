@@ -210,6 +210,7 @@ class _Definition:
             if nested_text is None:
                 nested_text = _nested_definition(name)
             self.nested_texts[name] = nested_text
+            # other types may nest this one without its definition
             _given_definitions.setdefault(('msg', name), nested_text)
             self._add_nested(name, nested_text)
 
@@ -259,6 +260,7 @@ def _make_message(type_name, text):
         known_class = message_class(name)
         if known_class._md5sum == classes[name]._md5sum:
             classes[name] = known_class
+            # genpy's deserialize() makes nested messages of this name
             cls.serialize.__globals__['_' + name.replace('/', '__')] = known_class
     return cls
 

@@ -1,7 +1,6 @@
 """Nodes: real ROS nodes of this process, written with blocks."""
 from __future__ import annotations
 
-import dataclasses
 import functools
 import re
 import threading
@@ -27,30 +26,13 @@ from pharos.external_node import ExternalNode
 from pharos.failures import Failures
 from pharos.names import legal_name, node_name
 from pharos.parameter import Parameter
-from pharos.private_rospy.run import Lifecycle, Run
+from pharos.private_rospy.run import Lifecycle, Run, Settings
 from pharos.service import OfferedService, Service
 from pharos.transcript import Transcript
 from pharos.waiting import current, wait, wait_for
 
 if TYPE_CHECKING:
     from pharos.master import Master
-
-
-@dataclasses.dataclass
-class Settings:
-    """The settings of a node that hold for all its runs.
-
-    :ivar name: the full name
-    :ivar domain: the address that the node advertises; None until the first run has found one
-    :ivar ports: for messages, and for ROS's calls; 0 until the first run has found one
-    :ivar remappings: ROS's remappings and private parameters, such as '/a:=/b' and '_rate:=5'
-    """
-
-    name: str
-    master: Master
-    domain: str | None
-    ports: tuple[int, int]
-    remappings: Sequence[str]
 
 
 class Node(DelegateHolder):
@@ -173,7 +155,11 @@ class Node(DelegateHolder):
         return type(self).start is not Node.start
 
     def _start_held(self):
-        """Start, and let delegates run when the start() of the node's class has returned."""
+        """Start, and let delegates run when the start() of the node's class has returned.
+
+        Node.start() itself lets delegates run, if the class has no start(). If a user calls the
+        start() of a class, the watcher lets delegates run.
+        """
         self._holds_delegates = True
         try:
             self.start()
@@ -189,12 +175,23 @@ class Node(DelegateHolder):
         Do nothing if the node is stopped. Wait up to :attr:`stop_timeout` for souls, then for the
         delegate that runs, then for messages. The log names threads that go on after that.
         """
+        run = self._current_run
+        if (
+            run
+            and run.stopping.is_set()
+            and (current.node is self or run.callback_queue.is_current())
+        ):
+            return  # the stop that goes on waits for this soul or delegate
         with self._life_lock:
             if self.is_running:
                 self._stop_run()
 
     def _stop_run(self):
-        self._current_run.stop(self.stop_timeout)
+        try:
+            self._current_run.stop(self.stop_timeout)
+        except (KeyboardInterrupt, SystemExit):  # of a signal, whose own stop ends the node
+            self._current_run.lifecycle = Lifecycle.RUNNING
+            raise
         signals.started_nodes.remove(self)
 
     def _stop_safely(self):
@@ -332,14 +329,15 @@ class Node(DelegateHolder):
         """Run the soul, or ``block(node)``, in a thread of its own, and return the thread.
 
         The report (listing 3.8): ``[node execute] fork``. :meth:`stop` ends the soul at its next
-        :meth:`sleep` or turn of :meth:`every`. An exception of the soul goes to :attr:`failures`.
+        :meth:`sleep` or turn of :meth:`every`. An exception of the soul goes to :attr:`failures`,
+        but for a rospy.ROSException after a stop has begun.
 
         :param name: the thread's name; default: the block's
         """
         soul = self._check_soul(block or self.soul)
         run = self._current_run
         thread = run.Thread(target=self._run_soul, args=[soul], name=name or block_name(soul))
-        run.souls[thread] = block
+        run.souls[thread] = block  # None: a restart runs the soul that the node has then
         thread.start()
         return thread
 

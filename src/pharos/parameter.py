@@ -29,7 +29,7 @@ class Parameter(Endpoint):
             self.set(self._value)
         self.read()
 
-    _open = subscribe
+    _open = subscribe  # Run.register_missing() calls subscribe(), too, for a new master
 
     def _close(self):
         """Have the master report no more changes."""

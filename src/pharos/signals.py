@@ -72,6 +72,7 @@ def handle_signals():
         return
     defaults = signal.default_int_handler, signal.SIG_DFL, signal.SIG_IGN
     is_interactive = hasattr(sys, 'ps1')
+    # a shell gives SIG_IGN to background programs; kill -INT shall stop the nodes all the same
     if signal.getsignal(signal.SIGINT) in defaults and not is_interactive:
         signal.signal(signal.SIGINT, _handle_signal)
     for number in signal.SIGTERM, signal.SIGHUP:
@@ -87,10 +88,10 @@ def is_ending():
 def may_be_signal():
     """True if an exception of this thread may come from a signal."""
     if threading.current_thread() is not threading.main_thread():
-        return False
+        return False  # signals come in the main thread
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        return True
-    return is_ending()
+        return True  # Python's own handler raises at any time
+    return is_ending()  # ours raises, and sets this
 
 
 def _handle_signal(number, frame):

@@ -8,6 +8,7 @@ subscription of plain rospy has a thread of its own, as with rospy.
 """
 import collections
 import threading
+from contextlib import suppress
 from _thread import allocate_lock, get_ident
 from time import perf_counter, sleep, thread_time
 
@@ -105,7 +106,7 @@ class CallbackQueue:
                         inbox.callback(message)
                     elif inbox.inline:
                         inbox.callback(value)
-                    else:  # from a socket or shared: Inbox.receive() reads fast_runs
+                    else:  # receive() runs fast callbacks in the thread that reads a socket
                         start_time = perf_counter()
                         inbox.callback(value)
                         is_fast = perf_counter() - start_time < FAST
@@ -113,15 +114,19 @@ class CallbackQueue:
             finally:
                 self.running_thread = None
                 self._jobs_lock.release()
-        if self.closed:  # close() gave up waiting for a callback of this thread
+        if self.closed:  # close() may have given up waiting for a callback of this thread
             self._leave_pool()
+
+    def is_current(self):
+        """True if this thread runs one of the callbacks."""
+        return self.running_thread == get_ident()
 
     def call(self, block):
         """Run ``block()`` in this thread, while no callback runs, unless the queue is closed.
 
         If this thread runs a callback of the queue, run the block at once.
         """
-        if self.running_thread == get_ident():
+        if self.is_current():
             block()
             return
         with self._jobs_lock:
@@ -255,7 +260,10 @@ class _RestingThread:
             self._start_lock.release()
 
     def wait_until_running(self, timeout):
-        """Wait until the thread runs after a wake(); return True if the thread runs in time."""
+        """Wait until the thread runs after a wake(); return True if the thread runs in time.
+
+        The lock stays locked until the next rest(), which frees it.
+        """
         return self._start_lock.acquire(True, timeout)
 
 
@@ -410,8 +418,9 @@ class Inbox:
         queue.append(item)
         is_full = False
         while len(queue) > self.capacity:
-            queue.popleft()
-            self.dropped += 1
+            with suppress(IndexError):  # the receiver has taken all meanwhile
+                queue.popleft()
+                self.dropped += 1
             is_full = True
         if not is_full:  # else the job of the dropped message is left for this one
             self.callback_queue.jobs.append(self)
@@ -450,7 +459,7 @@ def hand_over(callback_queues, last_wake, may_wait):
     global _no_yield_before
     is_worker_needed = False
     thread = None
-    for callback_queue in callback_queues:
+    for callback_queue in callback_queues:  # any one of the threads that wake will do
         if not callback_queue.is_scheduled:
             is_worker_needed |= callback_queue.schedule()
             thread = callback_queue.own_thread

@@ -30,6 +30,8 @@ class Link(Transport):
     :param direction: 'o' for the publisher's end, 'i' for the subscription's
     :param run: the run of the receiving node
     :param thaw: makes a message of the subscription's class from a frozen one
+    :ivar other_end: the Link at the other end
+    :ivar inboxes: those of the subscription; the publisher's end has them
     """
 
     has_own_queue = True  # the inboxes
@@ -37,6 +39,7 @@ class Link(Transport):
     header = property(lambda self: self.publisher.header)
     callerid_pub = property(peer_of)  # actionlib reads this
     # the publisher counts for all links: to touch ten links takes as long as to run ten delegates
+    # rospy sets the count to 0 at first
     stat_num_msg = property(lambda self: self.publisher.seq, lambda self, zero: None)
 
     def __init__(self, direction, publisher, run, endpoint_id, transport_type, thaw):

@@ -135,7 +135,7 @@ def _reaches_rospy(top_name):
         seen_names |= new_names
         imported_names = set().union(*map(_imports_of, new_names))
         new_names = imported_names - seen_names
-    return bool(new_names)
+    return bool(new_names)  # else all are seen, and none is rospy
 
 
 def _is_generated(name):

@@ -276,7 +276,7 @@ def shut_down_from_outside(original, run, self, caller_id, msg=''):
         run.request_stop()
     else:
         run.ros.logwarn(f'does not stop for {caller_id} at {host}: {msg}')
-    return int(obeys), 'only this host and the master may do that', 0
+    return int(obeys), '' if obeys else 'only this host and the master may do that', 0
 
 
 @patch('rospy.timer', 'Timer.__init__')
@@ -342,11 +342,12 @@ def register_once(original, run, self, name, data, registry):
 
 
 @patch('rospy.impl.registration', 'RegManager.publisher_update')
-def publisher_update(original, run, self, name, uris):  # with the same list each time
+def publisher_update(original, run, self, name, uris):
     """rospy calls this once for each publisher, and leaves the connecting to a thread.
 
     This connects to all at the first call.
     """
+    # publishers_changed() below has forgotten the list: it is equal at the further calls alone
     if uris != run.publisher_uris.get(name):
         run.publisher_uris[name] = uris
         run.connect_all(name)

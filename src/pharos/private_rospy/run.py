@@ -5,6 +5,7 @@ One thread of this process, the watcher, looks after all runs.
 from __future__ import annotations
 
 import atexit
+import dataclasses
 import enum
 import errno
 import functools
@@ -19,6 +20,7 @@ from contextlib import suppress
 from http.client import HTTPException
 from time import monotonic
 from types import SimpleNamespace
+from typing import TYPE_CHECKING, Sequence
 from urllib.parse import urlsplit
 from weakref import WeakSet
 from xml.parsers.expat import ExpatError
@@ -42,6 +44,9 @@ from pharos.private_rospy.loader import PrivateModules, Shim, private_path
 from pharos.private_rospy.tcpros import close_relay, join_relay, shutdown_socket
 from pharos.signals import may_be_signal
 from pharos.transcript import Transcript
+
+if TYPE_CHECKING:
+    from pharos.master import Master
 
 MASTER_LIMIT = 5.0  # seconds for each question to a master or node
 NAME_LIMIT = 1.0  # seconds for the question whether another node has the name
@@ -69,6 +74,23 @@ class Lifecycle(enum.Enum):
     RUNNING = 'running'
     STOPPING = 'stopping'
     STOPPED = 'stopped'
+
+
+@dataclasses.dataclass
+class Settings:
+    """The settings of a node that hold for all its runs.
+
+    :ivar name: the full name
+    :ivar domain: the address that the node advertises; None until the first run has found one
+    :ivar ports: for messages, and for ROS's calls; 0 until the first run has found one
+    :ivar remappings: ROS's remappings and private parameters, such as '/a:=/b' and '_rate:=5'
+    """
+
+    name: str
+    master: Master
+    domain: str | None
+    ports: tuple[int, int]
+    remappings: Sequence[str]
 
 
 class _Transport(xmlrpc.client.Transport):
@@ -107,6 +129,7 @@ class Run:
     :ivar modules: the private modules
     :ivar callback_queue: the CallbackQueue of the node's delegates
     :ivar ros_handler: rospy's ROSHandler, from make_findable() on
+    :ivar rospy_signal_shutdown: rospy's own function, which a patch replaces
     """
 
     uri = ''  # of the XML-RPC server; '' until the server runs
@@ -306,23 +329,24 @@ class Run:
         """
         self._check_name_free()
         tcpros_base = self.modules.load('rospy.impl.tcpros_base')
-        port, xmlrpc_port = self.settings.ports
+        tcp_port, xmlrpc_port = self.settings.ports
+        asked_port = tcp_port
         try:
             # rospy's own start finds this server, and makes none: rospy does not report a busy port
-            server = tcpros_base.init_tcpros_server(port)
-            tcp_server = tcpros_base.TCPServer(server._tcp_server_callback, port)
+            server = tcpros_base.init_tcpros_server(tcp_port)
+            tcp_server = tcpros_base.TCPServer(server._tcp_server_callback, tcp_port)
             server.tcp_ros_server = tcp_server
             tcp_server.server_sock.listen(BACKLOG)
             tcp_server.start()
-            port = xmlrpc_port  # init_node() binds this port
-            ports = {'xmlrpc_port': port, 'tcpros_port': tcp_server.port}
+            asked_port = xmlrpc_port
+            ports = {'xmlrpc_port': xmlrpc_port, 'tcpros_port': tcp_server.port}
             options = {'disable_signals': True, **options, **ports}
             self.modules.load('rospy.client').init_node(self.base_name, self.argv, **options)
         except OSError as error:
             if error.errno != errno.EADDRINUSE:
                 raise
             raise PortInUseError(
-                f'{self.name}: port {port} is in use: choose another one, or 0 for any'
+                f'{self.name}: port {asked_port} is in use: choose another one, or 0 for any'
             ) from None
         address = urlsplit(self.uri)
         self.settings.ports = tcp_server.port, address.port
@@ -344,9 +368,9 @@ class Run:
             )
 
     def make_findable(self, handler, uri):
-        """Enter the run into ``links.runs``, for other runs and the watcher.
+        """Offer shared memory and the facts for top; enter the run into ``links.runs``.
 
-        rospy's XML-RPC server calls this when the server runs, and before anything is registered.
+        The patch ``ready`` calls this when the XML-RPC server runs, before anything is registered.
 
         :param handler: rospy's ROSHandler
         :param uri: the URI of the node's XML-RPC server
@@ -377,7 +401,7 @@ class Run:
         method = _REGISTER_METHODS[registry]
         with suppress(MasterUnreachableError):
             publishers = self.master.call(method, name, data, self.uri, caller_id=self.name)
-            if registry == 'sub' and publishers:
+            if registry == 'sub' and publishers is not None:
                 self.publisher_uris[name] = publishers
         if registry == 'pub':  # sooner than by the master's publisherUpdate
             for run in list(runs.values()):
@@ -396,7 +420,7 @@ class Run:
                 self.start_thread(functools.partial(self.connect, topic, uri))
 
     def connect(self, topic, uri):
-        """Connect the subscription of a topic to a publisher, by a link, a relay or TCPROS.
+        """Connect the subscription of a topic to a publisher, by a link, a relay or a socket.
 
         Do nothing if they are connected, or if another thread connects them already.
 
@@ -416,11 +440,12 @@ class Run:
                 return
             if self.master.share_connections and join_relay(self, topic, uri, subscription):
                 return
-            self._connect_by_tcpros(topic, uri, subscription)
+            self._negotiate(topic, uri, subscription)
         finally:
             self.connecting.discard(attempt)
 
-    def _connect_by_tcpros(self, topic, uri, subscription):
+    def _negotiate(self, topic, uri, subscription):
+        """Have rospy offer the protocols of make_findable() and TCPROS, and connect by one."""
         code = None
         # rospy raises these if the subscription is closed meanwhile
         with suppress(AttributeError, UnboundLocalError):

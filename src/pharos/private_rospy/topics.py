@@ -48,9 +48,10 @@ class PublisherOverlay:
         self.receivers_are_for = None
 
     def acquire(self):
-        """Handle a pending signal of a script; rospy holds a lock from here to release().
+        """Take no lock, but handle a pending signal of a script.
 
-        Instead, publish() has a lock of its own, and frees that one before inline delegates run.
+        rospy locks here for the whole of a publish(). Our publish() has a lock of its own, and
+        frees it before inline delegates run.
         """
         if self.resolved_name != ROSOUT:  # this thread holds the log's lock
             self.run.checkpoint()
@@ -88,7 +89,8 @@ class PublisherOverlay:
     def publish(self, message, connection_override=None, channel=None):
         """Publish to the links, then to the sockets.
 
-        Inline delegates run in this thread, after the lock is free.
+        If a node has inline delegates, all its waiting jobs run in this thread, after the lock is
+        free.
 
         :param connection_override: publish to that connection alone; None: to all
         :param channel: the OutputChannel that publishes; None: a Publisher of plain rospy
@@ -103,6 +105,7 @@ class PublisherOverlay:
             self.seq += 1
             if connection_override is None:
                 if self.receivers_are_for is not self.connections:
+                    # set first: update_inboxes() sets None if the inboxes change meanwhile
                     self.receivers_are_for = self.connections
                     self.receivers = receivers_of(self.connections)
                 inboxes, inline_queues, other_queues, others = self.receivers
@@ -114,7 +117,7 @@ class PublisherOverlay:
                 is_latched = False
             if self.has_header:  # as serialize_message does
                 message.header.seq = self.seq
-            # if nobody receives, freeze() still checks the fields
+            # frozen unless sockets alone receive; if nobody does, freeze() checks the fields
             if inboxes or is_latched or not others:
                 frozen = self.freeze(message)
                 if is_latched:
@@ -133,18 +136,22 @@ class PublisherOverlay:
             self.last_wake = hand_over(other_queues, self.last_wake, may_wait)
 
     def write(self, message, connections):
-        """Serialize a message, and write it to some connections."""
-        buffer = io.BytesIO()
+        """Write a message to some connections."""
         try:
-            if self.memory:
-                connections = self.memory.write(message, self.seq, connections)
-            if not connections:
-                return
-            serialize_message(buffer, self.seq, message)
+            self._write(message, connections)
         # a thawed copy has lists or bytes for numpy's arrays; freeze() raises if that is not enough
         except Exception:
-            self.write(self.thaw(self.freeze(message)), connections)
-            return
+            self._write(self.thaw(self.freeze(message)), connections)
+
+    def _write(self, message, connections):
+        """Serialize a message, and write it to memory files and sockets."""
+        buffer = io.BytesIO()
+        if self.memory:
+            senders, connections = self.memory.split(connections)
+        if connections:
+            serialize_message(buffer, self.seq, message)
+        if self.memory:  # after serializing for sockets: that may raise, and write() tries again
+            self.memory.write(message, self.seq, senders)
         data = buffer.getvalue()
         self.message_data_sent += len(data)
         for connection in connections:
@@ -255,6 +262,7 @@ class SubscriptionOverlay:
         if relay:
             relay.header = connection.header
             relay.is_latch = connection.is_latched
+            relay.transport_type = connection.transport_type
             relay.publish(message)
         inboxes = [*self.inboxes]
         # copied before the first callback may change the message

@@ -66,11 +66,15 @@ class MessageMemory:
         self._files = []
         self._numbers = itertools.count(1)
 
-    def write(self, message, seq, connections):
-        """Send a message by the connections that share memory, and return the other connections."""
+    def split(self, connections):
+        """Return the connections that share memory, and the others."""
         senders = [each for each in connections if isinstance(each, MemorySender)]
+        return senders, [each for each in connections if each not in senders]
+
+    def write(self, message, seq, senders):
+        """Send a message by the connections that share memory."""
         if not senders:
-            return connections
+            return
         slot, value, rest = _split(message, seq)
         size = len(value)
         with self.lock:
@@ -89,7 +93,6 @@ class MessageMemory:
             sender.close_if_broken()
         if any(sender.is_busy for sender in senders):
             time.sleep(0)  # or a busy publisher keeps the interpreter for 5 ms
-        return [each for each in connections if each not in senders]
 
     def _free_file(self, size):
         """Return a file that no reader needs, with room for so many bytes."""
