@@ -6,7 +6,7 @@ import re
 import threading
 import types
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, Iterator
 
 from genpy import Message
 import rosgraph.names
