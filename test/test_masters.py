@@ -197,7 +197,7 @@ def test_connections_have_own_numbers(master, peer):
     ask = xmlrpc.client.ServerProxy(peer.value('talker.uri')).getBusInfo
     until(lambda: len(ask('/test')[2]) == 12)
     numbers, _, _, transports, *_ = zip(*ask('/test')[2])
-    assert set(transports) == {'INTRAPROCESS', 'TCPROS'}
+    assert set(transports) == {'INTRAPROCESS', 'SHARED_MEMORY'}
     assert len(set(numbers)) == 12
 
 

@@ -25,9 +25,11 @@ from pharos.errors import PharosError
 from pharos.private_rospy.run import Lifecycle, Settings
 from pharos.private_rospy.tcpros import shutdown_socket
 from pharos.transcript import Transcript
+from pharos.waiting import wait
 
 #: seconds until the next node starts side by side with one that has not registered yet
-INIT_LIMIT = 0.1
+HEAD_START = 0.1
+INIT_LIMIT = 2.0  # seconds that a launch waits until all nodes have registered
 TERMINATE_LIMIT = 40.0  # seconds: 20 after the SIGINT, since roslaunch gives its nodes 17
 POLL_PERIOD = 0.02  # seconds between two looks at the nodes that have ended
 #: seconds; beside a node that computes, others wait a tenth of the time that they do by default
@@ -91,6 +93,7 @@ class Composition:
         for entry in entries:
             with self._show_failure(entry.name):
                 self.start(entry.name, entry.path, entry.args, entry.roslaunch_node)
+        wait(lambda: all(map(_has_begun, self.nodes)), INIT_LIMIT)
         self._begin_watch()
 
     def _begin_watch(self):
@@ -160,7 +163,7 @@ class Composition:
         except PharosError as error:
             Transcript.show(f'{name} is not started: {error}')
 
-    def start(self, name, path, arguments, roslaunch_node=None, init_timeout=INIT_LIMIT):
+    def start(self, name, path, arguments, roslaunch_node=None, init_timeout=HEAD_START):
         """Start a program as the node of that name, and return the node.
 
         :param path: the file of the program
@@ -292,3 +295,8 @@ class Composition:
 
     def __exit__(self, *error):
         self.stop()
+
+
+def _has_begun(node):
+    """True if a program has registered its node, or has ended."""
+    return not node.is_running or node._current_run.is_known

@@ -76,6 +76,7 @@ def receive(connection, address, port, uri, subscription, run):
     run.sockets.add(sock)
     sock.settimeout(None)
     message_class = subscription.data_class
+    subscription.begin_delivery(connection)
     with sock.makefile('rb', _READ_BUFFER) as stream:
         while not connection.done:
             data = _read_message(stream)
@@ -120,7 +121,7 @@ def join_relay(run, topic, uri, subscription):
                 link(relay, uri, subscription, run, relay.transport_type)
                 return True
         relay = run.modules.load('rospy.topics')._PublisherImpl(topic, subscription.data_class)
-        relay.transport_type = 'TCPROS'  # deliver() knows better
+        relay.transport_type = 'TCPROS'  # begin_delivery() knows better
         relay.has_header = False  # messages keep the publisher's header.seq
         run.relays[key] = relay
     return False

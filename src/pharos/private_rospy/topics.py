@@ -248,6 +248,20 @@ class SubscriptionOverlay:
             link.publisher.receivers_are_for = None
         return links
 
+    def _relay_of(self, connection):
+        return self.run.relays.get((self.resolved_name, connection.endpoint_id, self.data_class))
+
+    def begin_delivery(self, connection):
+        """Pass facts of a connection that has shaken hands to its relay, if there is one."""
+        relay = self._relay_of(connection)
+        if relay:
+            relay.header = connection.header
+            relay.is_latch = connection.is_latched
+            relay.transport_type = connection.transport_type
+            for end in relay.connections:  # nodes that have joined before
+                end.transport_type = connection.transport_type
+                end.other_end.transport_type = connection.transport_type
+
     def deliver(self, message, connection, size):
         """Count a message that came by a connection, and give each inbox a message of its own.
 
@@ -257,12 +271,8 @@ class SubscriptionOverlay:
         connection.stat_num_msg += 1
         if self.statistics_logger:
             self.statistics_logger.callback(message, connection.callerid_pub, connection.stat_bytes)
-        key = self.resolved_name, connection.endpoint_id, self.data_class
-        relay = self.run.relays.get(key)
+        relay = self._relay_of(connection)
         if relay:
-            relay.header = connection.header
-            relay.is_latch = connection.is_latched
-            relay.transport_type = connection.transport_type
             relay.publish(message)
         inboxes = [*self.inboxes]
         # copied before the first callback may change the message

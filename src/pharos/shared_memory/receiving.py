@@ -172,6 +172,7 @@ class MemoryReceiver(MemoryTransport):
         """Shake hands, and receive messages until the connection ends."""
         message_class = subscription.data_class
         self._shake_hands(message_class, run)
+        subscription.begin_delivery(self)
         while not self.done:
             packet, ancillary, _, _ = self._socket.recvmsg(
                 MAX_PACKET + PACKET.size, socket.CMSG_SPACE(_DESCRIPTOR_SIZE)
