@@ -149,6 +149,15 @@ def test_both_ends_name_the_transport(master, node, listener, topic):
     until(lambda: listener.channel(topic, 'connections') == [('/node', SHARED)])
 
 
+def test_rosnode_info_names_the_transport(master, node, listener, topic):
+    listener.listen(topic)
+    node.output_channel(topic, IMAGE)
+    for name in '/node', '/listener':
+        output = subprocess.check_output(['rosnode', 'info', name], text=True, timeout=TIMEOUT)
+        shown = output.split(f'topic: {topic}\n')[1].split('topic:')[0]
+        assert f'transport: {SHARED}\n' in shown
+
+
 @pytest.mark.skipif(not os.path.exists(RELAY), reason='needs topic-tools')
 def test_other_programs_get_the_same(master, node, listener, topic):
     """rospy, rostopic and roscpp, beside a process that shares memory."""
@@ -316,6 +325,23 @@ def test_restarted_nodes_connect_again(node, listener, topic):
     listener.run('node.stop(); node.start()')
     until(lambda: out.connections == [('/listener', SHARED)], TIMEOUT)
     send_and_wait(out, topic, [bytes(LARGE)], listener)
+
+
+@pytest.mark.parametrize('sizes', [[48] * 50, [LARGE], [LARGE, 48]])
+def test_last_messages_survive_stop(node, listener, topic, sizes):
+    """The reader is late, and gets all that a node sent before it stopped."""
+    listener.listen(topic)
+    out = node.output_channel(topic, IMAGE)
+    send_and_wait(out, topic, [b''], listener)
+    listener.pause()
+    for size in sizes:
+        out.send(data=bytes(size))
+    stopping = threading.Thread(target=node.stop)
+    stopping.start()
+    until(lambda: not node.is_running)
+    listener.process.send_signal(signal.SIGCONT)
+    stopping.join()
+    assert [note[1] for note in listener.notes(topic, 1 + len(sizes))] == [0, *sizes]
 
 
 def test_from_and_to_select(master, node, listener, topic):
