@@ -108,11 +108,15 @@ class Peer:
 
     ``peer.run(code)`` executes statements, ``peer.value(expression)`` returns a value; both know
     rospy, pharos' message_class, and what earlier code defined.
+
+    :param command: what runs the process, such as ['setpriv', ...]
     """
 
-    def __init__(self, url, name='peer'):
-        environ = {**os.environ, 'ROS_MASTER_URI': url}
-        command = [*DEFAULT_SIGNALS, PYTHON, __file__, name]
+    library = 'rospy'
+
+    def __init__(self, url, name='peer', command=(), **environ):
+        environ = {**os.environ, 'ROS_MASTER_URI': url, **environ}
+        command = [*DEFAULT_SIGNALS, *command, PYTHON, __file__, name, self.library]
         self.name = '/' + name.lstrip('/')
         self.process = subprocess.Popen(
             command, env=environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE
@@ -178,6 +182,12 @@ class Peer:
         self.close()
 
 
+class PharosPeer(Peer):
+    """A node of pharos in a process of its own: ``node`` in the code, whose ``rospy`` is its own."""
+
+    library = 'pharos'
+
+
 class Program:
     """A program in a child process, whose lines of output a test can wait for.
 
@@ -236,12 +246,18 @@ class Program:
 
 def _serve_as_peer():
     """Answer the requests of a Peer until standard input ends."""
-    import rospy
-
     answers = os.fdopen(os.dup(1), 'wb')
     os.dup2(2, 1)  # what is printed must not come between
-    rospy.init_node(sys.argv[1])
-    scope = {'rospy': rospy, 'message_class': pharos.message_class, 'heard': {}, 'subscribers': []}
+    scope = {'message_class': pharos.message_class, 'heard': {}, 'subscribers': []}
+    _, name, library = sys.argv
+    if library == 'pharos':
+        node = Master().create(BlockNode, name)
+        scope.update(node=node, rospy=node.ros, pharos=pharos)
+    else:
+        import rospy
+
+        rospy.init_node(name)
+        scope['rospy'] = rospy
     answer = 'ready'
     while True:
         pickle.dump(answer, answers)

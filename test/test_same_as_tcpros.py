@@ -1,4 +1,4 @@
-"""Messages arrive alike within a process and over TCPROS: whoever moves a node sees no difference."""
+"""Messages arrive alike within a process, by shared memory, and over TCPROS."""
 import inspect
 import math
 import threading
@@ -59,11 +59,11 @@ class Both:
         return plain(here), self.peer.value(f'plain(heard[{topic!r}][-1])')
 
 
-@pytest.fixture(scope='module')
-def both():
+@pytest.fixture(scope='module', params=[helpers.Peer, helpers.PharosPeer])
+def both(request):
     ros_master = helpers.InProcessMaster()
     master = pharos.Master(ros_master.url)
-    with helpers.Peer(ros_master.url) as peer:
+    with request.param(ros_master.url) as peer:
         yield Both(master, peer)
         helpers.stop_nodes(master)
     ros_master.stop()
