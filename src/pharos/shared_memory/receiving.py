@@ -33,6 +33,7 @@ from pharos.shared_memory.sending import (
 
 PROTOCOL = 'PHAROS-SHM'
 MAX_HEADER = 1 << 17  # bytes of a connection header
+ACCEPT_PAUSE = 1.0  # seconds after an error
 RECEIPT = b'\0'
 _DESCRIPTOR_SIZE = array.array('i').itemsize
 
@@ -81,8 +82,9 @@ class SharedMemoryHandler(ProtocolHandler):
         while not self.run.stopping.is_set():
             try:
                 sock, _ = self._listener.accept()
-            except OSError:  # the stop has closed it
-                return
+            except OSError:  # the stop has closed it, or no descriptor is left
+                self.run.stopping.wait(ACCEPT_PAUSE)
+                continue
             self.run.sockets.add(sock)
             self.run.start_thread(functools.partial(self._add_reader, sock))
 
@@ -174,11 +176,13 @@ class MemoryReceiver(MemoryTransport):
         self._shake_hands(message_class, run)
         subscription.begin_delivery(self)
         while not self.done:
-            packet, ancillary, _, _ = self._socket.recvmsg(
+            packet, ancillary, flags, _ = self._socket.recvmsg(
                 MAX_PACKET + PACKET.size, socket.CMSG_SPACE(_DESCRIPTOR_SIZE)
             )
             if not packet:
                 return
+            if flags & socket.MSG_CTRUNC:
+                raise OSError('this process has no descriptor left for a memory file')
             position, slot, size, dropped = PACKET.unpack_from(packet)
             for _, _, descriptor in ancillary:
                 self._map(position, descriptor)
@@ -227,3 +231,4 @@ class MemoryReceiver(MemoryTransport):
             super().close()
             shutdown_socket(self._socket)
             self._socket.close()
+            self._maps.clear()

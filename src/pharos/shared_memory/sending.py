@@ -91,7 +91,7 @@ class MessageMemory:
                 sender.put(entry)
         for sender in senders:
             sender.close_if_broken()
-        if any(sender.is_busy for sender in senders):
+        if any(sender.is_sending for sender in senders):
             time.sleep(0)  # or a busy publisher keeps the interpreter for 5 ms
 
     def _free_file(self, size):
@@ -149,9 +149,6 @@ class MemoryTransport(Transport):
         self.endpoint_id = endpoint_id
         self._socket = sock
 
-    def fileno(self):
-        return self._socket.fileno()
-
     def get_transport_info(self):
         return f'{self.transport_type} connection to [{self.endpoint_id}]'
 
@@ -159,7 +156,7 @@ class MemoryTransport(Transport):
 class MemorySender(MemoryTransport):
     """The publisher's end of a connection."""
 
-    is_busy = False  # True while a thread sends the queue
+    is_sending = False  # True while a thread sends the queue
     is_broken = False
     announced = None  # the file that the reader has no receipt for yet
 
@@ -170,6 +167,18 @@ class MemorySender(MemoryTransport):
         self._queue = collections.deque()
         self._known_files = {}  # position -> the file that the reader has mapped
         self._dropped = 0  # messages since the last packet
+
+    def fileno(self):
+        """Let rospy find readers that have left; a reader has none, since it reads to the end."""
+        return self._socket.fileno()
+
+    @property
+    def is_busy(self):
+        """True until the reader has read all: the end of the socket would take the last message."""
+        with self._memory.lock:
+            if self.announced:
+                self.take_receipts()
+            return bool(self._queue or self.announced)
 
     def put(self, entry):
         """Add a message to the queue, and send all that the socket takes; never waits."""
@@ -183,8 +192,8 @@ class MemorySender(MemoryTransport):
         while len(self._queue) > capacity:
             self._drop_entry(self._queue[0])
         self._send_ready()
-        if self._queue and not self.is_busy:
-            self.is_busy = True
+        if self._queue and not self.is_sending:
+            self.is_sending = True
             self._memory.run.start_thread(self._send_queue)
 
     def _drop_entry(self, entry):
@@ -206,6 +215,7 @@ class MemorySender(MemoryTransport):
         shutdown_socket(self._socket)
         if self.announced:
             self.announced.readers.discard(self)
+            self.announced = None
         for entry in list(self._queue):
             self._drop_entry(entry)
 
@@ -260,7 +270,7 @@ class MemorySender(MemoryTransport):
                 self.take_receipts()
                 self._send_ready()
                 if not self._queue:
-                    self.is_busy = False
+                    self.is_sending = False
                     break
                 waits_for_receipt = self._queue[0].file and self.announced
             poller.register(self._socket, select.POLLIN if waits_for_receipt else select.POLLOUT)
