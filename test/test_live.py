@@ -15,7 +15,7 @@ import pytest
 
 import helpers
 import pharos
-from helpers import DEFAULT_SIGNALS, TIMEOUT, create
+from helpers import DEFAULT_SIGNALS, TIMEOUT, Program, create
 from pharos import BlockNode, MasterUnreachableError, UnknownTopicError
 from pharos.testing import until
 
@@ -407,6 +407,35 @@ def test_top_json_tells_of_topics(scene):
     row = scene.json_row('topics', '/traffic')
     assert STRING in row.values()
     assert any(isinstance(value, float) and is_about(value) for value in row.values())
+
+
+def test_top_tells_cpu_of_nodes(master):
+    def compute(me):
+        for _ in me.every(1e-6):
+            sum(range(9999))
+
+    create(master, '/computing', soul=compute).fork()
+    create(master, '/idle').interested_in('/topic', STRING)
+    with Program(['rosrun', 'pharos', 'top', '--json'], master.url) as top:
+        assert top.wait() == 0
+        rows = {row['NODE']: row['CPU%'] for row in json.loads(top.output)['nodes']}
+    assert rows['/computing'] > 10 * rows['/idle']
+
+
+def test_keys_of_top_restart_a_node(master, tmp_path):
+    path = tmp_path / 'clock'
+    path.write_text('import rospy\nrospy.init_node("clock")\nrospy.spin()\n')
+    with Program(['rosrun', 'pharos', 'compose', '--script', str(path)], master.url) as composed:
+        uri = master.wait_for_node('/clock', TIMEOUT).uri
+        with Terminal(master.url, 'rosrun', 'pharos', 'top', '--interval', '0.2', '/clock') as top:
+            top.wait_for('/clock')
+            top.press('j', '/clock')
+            top.press('x', '/clock: stop done')
+            assert not master.call('lookupNode', '/clock')
+            top.press('a', '/clock: start done')
+            assert master.node('/clock').uri == uri
+        composed.signal(signal.SIGINT)
+        composed.wait()
 
 
 def test_keys_of_top_sort_and_quit(master, traffic):
