@@ -12,9 +12,12 @@ import time
 from pharos.intraprocess.links import link, runs, runs_lock
 
 MAX_MESSAGE = 1_000_000_000  # bytes, as in roscpp
-MAX_DIRECT = 256 << 10  # bytes; the write of a larger message would hold up the publisher
+MAX_DIRECT = 2 << 20  # bytes; the write of a larger message would hold up the publisher
+MAX_PARTS = 1024  # that a system call takes
+LARGE_PART = 1 << 16  # bytes
+THREAD_REST = 0.3  # seconds without a message until a sender's thread ends
 CONNECT_LIMIT = 10.0  # seconds
-_READ_BUFFER = 1 << 16  # bytes
+_READ_BUFFER = 1 << 17  # bytes
 _CREDENTIALS = struct.Struct('3i')  # numbers of the process, the user, and the group
 _LENGTH = struct.Struct('<I')
 
@@ -142,79 +145,117 @@ def close_relay(run, topic, uri, subscription):
 # -- sending
 
 
+class MessageParts(list):
+    """The bytes of a message in parts. Large parts are not joined: that would copy them."""
+
+    write = list.append  # genpy's serialize() calls this
+
+    def with_length(self):
+        """Return a list of parts with the length of the message in front, and the bytes of all."""
+        size = sum(map(len, self))
+        parts = []
+        small_parts = [_LENGTH.pack(size)]
+        for part in self:
+            if len(part) < LARGE_PART:
+                small_parts.append(part)
+            else:
+                parts += [b''.join(small_parts), part]
+                small_parts = []
+        parts.append(b''.join(small_parts))
+        return parts, size + _LENGTH.size
+
+
 class Sender:
     """A connection to a subscriber, with a bounded queue for messages that must wait.
 
     Stands in for rospy's QueuedConnection. rospy's thread writes everything, and takes all messages
     out of the queue at once: the queue is neither bounded nor flushed. Here the publisher writes,
-    and a thread writes the rest.
+    and a thread writes the rest. The thread rests between messages: to start one takes long.
 
     :param queue_size: messages that wait at most; None: as many as the node's queue_bytes hold
     :ivar is_busy: True while a thread writes the queue
     """
 
     is_busy = False
-    _rest = b''  # the bytes of a message that the socket has not taken yet
+    _has_thread = False
+    _rest = ()  # the parts of a message that the socket has not taken yet
 
     def __init__(self, connection, queue_size, run):
         self._connection = connection
         self._queue_size = queue_size or math.inf
         self._run = run
-        self._queue = collections.deque()
-        self._lock = threading.Lock()
+        self._queue = collections.deque()  # of lists of parts
+        self._condition = threading.Condition()  # notified to wake the thread
 
     def __getattr__(self, name):
         return getattr(self._connection, name)
 
-    def write_data(self, data):
+    def write_data(self, parts, size):
         """Send a message, or queue the rest if the socket is full; never wait for the subscriber.
 
-        :param data: the bytes of the message, with their length in front
+        :param parts: the bytes of the message, with their length in front
+        :param size: the number of bytes
         """
-        with self._lock:
-            if self.is_busy or len(data) > MAX_DIRECT:
-                self._enqueue(data)
+        with self._condition:
+            if self.is_busy or size > MAX_DIRECT:
+                self._enqueue(parts, size)
             else:
-                is_sent = self._send_directly(data)
-                if is_sent:
+                self._rest = parts
+                with contextlib.suppress(BlockingIOError):
+                    self._send_rest(socket.MSG_DONTWAIT)
+                if not self._rest:
                     return
             if not self.is_busy:
                 self.is_busy = True
-                self._run.start_thread(self._send_queue)
-        time.sleep(0)  # let the new thread run: a busy publisher keeps the interpreter for 5 ms
+                self._wake_thread()
+        time.sleep(0)  # let the thread run: a busy publisher keeps the interpreter for 5 ms
 
-    def _enqueue(self, data):
-        self._queue.append(data)
-        queue_bytes = self._run.node.queue_bytes
-        capacity = min(self._queue_size, max(1, queue_bytes // len(data)))
+    def _enqueue(self, parts, size):
+        self._queue.append(parts)
+        capacity = min(self._queue_size, max(1, self._run.node.queue_bytes // size))
         while len(self._queue) > capacity:
             self._queue.popleft()
 
-    def _send_directly(self, data):
-        """Send the bytes that the socket takes at once; True if these are all."""
-        connection = self._connection
-        try:
-            sent_bytes = connection.socket.send(data, socket.MSG_DONTWAIT)
-        except BlockingIOError:
-            sent_bytes = 0
-        connection.stat_bytes += sent_bytes
-        if sent_bytes == len(data):
-            connection.stat_num_msg += 1
-            return True
-        self._rest = data[sent_bytes:]
-        return False
+    def _wake_thread(self):
+        if self._has_thread:
+            self._condition.notify()
+        else:
+            self._has_thread = True
+            self._run.start_thread(self._send_queue)
+
+    def _send_rest(self, flags=0):
+        """Send the bytes that the socket takes, and keep the others."""
+        parts = [*self._rest]
+        sent_bytes = self._connection.socket.sendmsg(parts[:MAX_PARTS], [], flags)
+        self._connection.stat_bytes += sent_bytes
+        while parts and sent_bytes >= len(parts[0]):
+            sent_bytes -= len(parts.pop(0))
+        if parts:
+            parts[0] = memoryview(parts[0])[sent_bytes:]
+        else:
+            self._connection.stat_num_msg += 1
+        self._rest = parts
 
     def _send_queue(self):
         connection = self._connection
         while True:
-            with self._lock:
-                has_data = self._rest or self._queue
-                if connection.done or not has_data:
+            with self._condition:
+                if not self._rest and not self._queue:
                     self.is_busy = False
+                    self._condition.wait(THREAD_REST)
+                if connection.done or not self.is_busy:
+                    self.is_busy = False
+                    self._has_thread = False
                     return
-                data = self._rest or self._queue.popleft()
-                self._rest = b''
+                if not self._rest:
+                    self._rest = self._queue.popleft()
             try:
-                connection.write_data(data)
+                self._send_rest()
             except Exception:  # the peer has gone
                 connection.close()
+
+    def close(self):
+        """Close the connection, and end the thread."""
+        self._connection.close()
+        with self._condition:
+            self._condition.notify()

@@ -3,11 +3,9 @@
 :mod:`pharos.private_rospy.patches` sets these methods on each node's own copy of rospy's classes.
 """
 import contextlib
-import io
 import time
 
 import rospy
-from rospy.msg import serialize_message
 
 from pharos.intraprocess.callback_queues import (
     INFINITE,
@@ -17,6 +15,7 @@ from pharos.intraprocess.callback_queues import (
 )
 from pharos.intraprocess.copier import copier_for, copy_of
 from pharos.intraprocess.links import links_of
+from pharos.private_rospy.tcpros import MessageParts
 
 SOCKET_BYTES = 6 << 20  # bytes that the two sockets of a connection hold, roughly
 FLUSH_PERIOD = 0.001  # seconds between two looks
@@ -145,18 +144,20 @@ class PublisherOverlay:
 
     def _write(self, message, connections):
         """Serialize a message, and write it to memory files and sockets."""
-        buffer = io.BytesIO()
+        buffer = MessageParts()
         if self.memory:
             senders, connections = self.memory.split(connections)
         if connections:
-            serialize_message(buffer, self.seq, message)
+            if self.has_header and message.header.frame_id is None:  # as serialize_message does
+                message.header.frame_id = '0'
+            message.serialize(buffer)
         if self.memory:  # after serializing for sockets: that may raise, and write() tries again
             self.memory.write(message, self.seq, senders)
-        data = buffer.getvalue()
-        self.message_data_sent += len(data)
+        parts, size = buffer.with_length()
+        self.message_data_sent += size
         for connection in connections:
             try:
-                connection.write_data(data)
+                connection.write_data(parts, size)
             except Exception:  # the peer has gone
                 connection.close()
 
