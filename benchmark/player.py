@@ -26,6 +26,7 @@ from sensor_msgs.msg import Image
 
 clock = time.perf_counter  # CLOCK_MONOTONIC, the same in all processes
 STAMPS = 1 << 21  # messages of a slice at most
+SIZES = {'1KB': 1000, '70KB': 70_000, '300KB': 300_000, '1MB': 1_000_000, '6MB': 6_220_800}
 SAMPLES = 4000  # latencies of a slice that are answered
 PATIENCE = 10.0  # seconds that connecting may take
 
@@ -34,7 +35,7 @@ def make(name):
     """Return a message, ``mark(message, index)`` and ``index_of(message)``."""
     if name == 'twist':
         return Twist(), lambda m, i: setattr(m.linear, 'x', float(i)), lambda m: int(m.linear.x)
-    image = Image(width=1920, height=1080, encoding='rgb8', data=bytes(3 * 1920 * 1080))
+    image = Image(encoding='rgb8', data=bytes(SIZES.get(name, SIZES['6MB'])))
     # rospy overwrites header.seq
     return image, lambda m, i: setattr(m, 'step', i), lambda m: m.step
 
@@ -55,6 +56,7 @@ class Player:
         self.name, self.options = name, options
         role = options.get('role')
         self.sends, self.receives = role != 'receive', role != 'send'
+        self.is_one_receiver = 'one' in options  # the others are processes, too
         self.took, self.sent = [], [0.0] * STAMPS
         if role:
             with open(options['stamps'], 'r+b') as file:
@@ -140,7 +142,7 @@ class Pharos(Player):
         super().__init__(name, options)
         master = pharos.Master(share_connections='sharing' in options)
         self._node = lambda each: master.create(
-            pharos.BlockNode, named=f'{name}/{each}', domain='127.0.0.1'
+            pharos.BlockNode, named=f'{name}/{each}{options.get("one", "")}', domain='127.0.0.1'
         )
         self._nodes, self._heard = [], []
         self._publisher = self._node('publisher') if self.sends else None
@@ -152,7 +154,7 @@ class Pharos(Player):
     def opened(self, name, topic, receivers, queue_size):
         options = self.options
         ros_type = type(make(name)[0])
-        for number in range(receivers) if self.receives else ():
+        for number in range(1 if self.is_one_receiver else receivers) if self.receives else ():
             self._nodes += [self._node(f'receiver{number}')] if number == len(self._nodes) else []
             modes = {'inline': 'inline' in options, 'shared': 'shared' in options}
             self._heard.append(
@@ -179,18 +181,21 @@ class Rospy(Player):
 
         super().__init__(name, options)
         self._rospy = rospy
-        rospy.init_node(f'{name}_{options.get("role")}', disable_signals=True)
+        rospy.init_node(f'{name}_{options.get("role")}', disable_signals=True, anonymous=True)
 
     def opened(self, name, topic, receivers, queue_size):
         tuned = {'tcp_nodelay': True} if 'tuned' in self.options else {}
         ros_type, settings = type(make(name)[0]), {'queue_size': queue_size, **tuned}
         buffer = {'buff_size': 1 << (20 if 'role' in self.options else 24)} if tuned else {}
-        for _ in range(receivers) if self.receives else ():
+        if 'buffer' in self.options:
+            buffer = {'buff_size': int(self.options['buffer'])}
+        for _ in range(1 if self.is_one_receiver else receivers) if self.receives else ():
             self._rospy.Subscriber(topic, ros_type, self.noter(name), **settings, **buffer)
         if not self.sends:
             return None
         publisher = self._rospy.Publisher(topic, ros_type, **settings)
-        wait_until(publisher.get_num_connections)
+        connections = receivers if self.is_one_receiver else 1
+        wait_until(lambda: publisher.get_num_connections() >= connections)
         return publisher.publish
 
 
