@@ -19,6 +19,7 @@ YIELD_LIMIT = 1e-3  # seconds that a publisher waits at most until the receiver'
 YIELD_PAUSE = 0.02  # seconds without such a wait after one that reached its limit
 FAST = 50e-6  # seconds; a callback that takes less may run in the thread that reads the socket
 FAST_RUNS = 10  # fast callbacks in a row, until the thread that reads runs the next one
+SHORT_RUN = 1e-3  # seconds
 SENTRY_PERIOD = 4e-3  # seconds that a callback may hold up those of other nodes
 SENTRY_REST = 1.0  # seconds without an alert until the sentry rests
 #: seconds until rospy's first callback: a connection between processes takes so long
@@ -272,6 +273,22 @@ class _Worker(_RestingThread):
 
     def __init__(self):
         super().__init__(self._loop, 'pharos worker')
+        self._last_cpu = 0.0  # of this thread, when it was read
+        self._short_seconds = 0.0  # of short runs since then
+
+    def _count_cpu(self, callback_queue, duration):
+        """Add the CPU time of a run to the queue's.
+
+        A short run is taken for busy all the time: to read the clock takes as long as a delegate.
+        """
+        if duration < SHORT_RUN:
+            self._short_seconds += duration
+            callback_queue.cpu_seconds += duration
+            return
+        cpu = thread_time()
+        callback_queue.cpu_seconds += max(0.0, cpu - self._last_cpu - self._short_seconds)
+        self._last_cpu = cpu
+        self._short_seconds = 0.0
 
     def _loop(self):
         while True:
@@ -295,10 +312,10 @@ class _Worker(_RestingThread):
             callback_queue.is_scheduled = False
             job_count = len(callback_queue.jobs)
             start_time = perf_counter()
-            start_cpu = thread_time()
             callback_queue.run_jobs()
-            callback_queue.cpu_seconds += thread_time() - start_cpu
-            callback_queue.is_fast = perf_counter() - start_time < FAST * job_count
+            duration = perf_counter() - start_time
+            callback_queue.is_fast = duration < FAST * job_count
+            self._count_cpu(callback_queue, duration)
         _wake_worker()  # each worker that ends has the next one end
 
 
