@@ -32,8 +32,8 @@ HEAD_START = 0.1
 INIT_LIMIT = 2.0  # seconds that a launch waits until all nodes have registered
 TERMINATE_LIMIT = 40.0  # seconds: 20 after the SIGINT, since roslaunch gives its nodes 17
 POLL_PERIOD = 0.02  # seconds between two looks at the nodes that have ended
-#: seconds; beside a node that computes, others wait a tenth of the time that they do by default
-SWITCH_INTERVAL = 0.5e-3
+#: seconds; with Python's default of 5 ms, nodes wait ten times as long beside a node that computes
+SWITCH_INTERVAL = 0.3e-3
 
 
 class Composition:
