@@ -133,7 +133,10 @@ def _reaches_rospy(top_name):
     new_names = {top_name}
     while new_names and new_names.isdisjoint(('rospy', 'rosgraph', 'pharos')):
         seen_names |= new_names
-        imported_names = set().union(*map(_imports_of, new_names))
+        # not union(*map(...)): a program that calls gc.get_objects() meanwhile would see the tuple
+        imported_names = set()
+        for name in new_names:
+            imported_names |= _imports_of(name)
         new_names = imported_names - seen_names
     return bool(new_names)  # else all are seen, and none is rospy
 
