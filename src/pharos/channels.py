@@ -122,7 +122,7 @@ class InputChannel(DelegateHolder, Channel, Inbox):
         self.ros_object = self.node.ros.Subscriber(self.topic, self.message_class, self)
 
     def __call__(self, message):
-        """Take a latched message: rospy calls this if the connection is older than the channel."""
+        """Take a latched message of a connection or link that is older than the channel."""
         self.receive(message, 0)
 
     def _deliver(self, message):

@@ -89,7 +89,7 @@ class Master:
     :raises ValueError: if the URL is malformed
     """
 
-    _environ = os.environ  # a script's Master has another environment
+    _environ = os.environ  # for ROS_NAMESPACE; a script's Master has its own
     _first_nodes: dict = {}  # argv -> the first node that was created with it
 
     def __init__(

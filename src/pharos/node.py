@@ -50,7 +50,8 @@ class Node(DelegateHolder):
                 self.send_to('/cmd_vel', typed_as='turtlesim/Velocity', linear=1.0)
 
     All methods may be called from any thread. A node's delegates run one at a time, in a pool of
-    threads. The first one runs when :meth:`start` has returned. All private names of this class
+    threads. The first one runs when :meth:`start` has returned, or sleeps, or after 2 s. All private
+    names of this class
     begin with an underscore: a subclass may have a ``run``, ``report`` or ``state``. Methods that
     need a started node raise NodeStoppedError if the node has not started, or has stopped.
 
@@ -189,7 +190,8 @@ class Node(DelegateHolder):
     def _stop_run(self):
         try:
             self._current_run.stop(self.stop_timeout)
-        except (KeyboardInterrupt, SystemExit):  # of a signal, whose own stop ends the node
+        except (KeyboardInterrupt, SystemExit):
+            # of a signal: the stop that it asks for does nothing unless the node runs
             self._current_run.lifecycle = Lifecycle.RUNNING
             raise
         signals.started_nodes.remove(self)

@@ -242,7 +242,8 @@ class _RestingThread:
 
     def __init__(self, loop, name):
         self._rest_lock = allocate_lock()  # released to wake the thread
-        self._start_lock = allocate_lock()  # held from the wake until the thread runs
+        # held from the wake until the thread runs, and then by a publisher that waited for that
+        self._start_lock = allocate_lock()
         self._rest_lock.acquire()
         self.start = threading.Thread(target=loop, name=name, daemon=True).start
 
@@ -263,7 +264,7 @@ class _RestingThread:
     def wait_until_running(self, timeout):
         """Wait until the thread runs after a wake(); return True if the thread runs in time.
 
-        The lock stays locked until the next rest(), which frees it.
+        This caller then holds the lock until the end of the thread's next rest().
         """
         return self._start_lock.acquire(True, timeout)
 
@@ -427,8 +428,8 @@ class Inbox:
         if count >= self.capacity or is_power_of_two:  # not each time: the estimate takes long
             self.capacity = min(self.queue_size, self.capacity_for(size or size_of(item[0])))
             if count >= self.capacity and self.taken_count != self._count_at_yield:
-                # the receiver has taken messages since the last such sleep: a publisher that never
-                # sleeps would starve the receiver
+                # sleep, or a publisher that never sleeps would starve the receiver; not again until
+                # the receiver has taken a message: it may be blocked
                 self._count_at_yield = self.taken_count
                 sleep(1e-6)
         # append, then drop: a receiver that runs meanwhile must not find the queue empty
@@ -476,7 +477,8 @@ def hand_over(callback_queues, last_wake, may_wait):
     global _no_yield_before
     is_worker_needed = False
     thread = None
-    for callback_queue in callback_queues:  # any one of the threads that wake will do
+    # schedule() wakes own threads; ``thread`` is the one to wait for, and any will do
+    for callback_queue in callback_queues:
         if not callback_queue.is_scheduled:
             is_worker_needed |= callback_queue.schedule()
             thread = callback_queue.own_thread

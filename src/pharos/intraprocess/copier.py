@@ -142,8 +142,8 @@ _GLOBALS.update(
 class _Source:
     """The lines of ``freeze`` and ``thaw`` for one class. In them, ``m`` is the message.
 
-    :param depth: the number of messages around this one. Elements of arrays have 1, too: only a
-        message of its own, with 0, is checked, and has its times made canonical
+    :param depth: 0 for a message of its own, which is checked and has its times made canonical;
+        more for a nested message or an element of an array
     :ivar namespace: the names that the functions use -> their values
     :ivar freeze_lines: read the fields into variables
     :ivar thaw_lines: set the fields of a new message

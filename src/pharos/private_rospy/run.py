@@ -155,7 +155,7 @@ class Run:
         self.relays = {}  # (topic, URI, class) -> publisher to the nodes that share a connection
         self.callback_queue = CallbackQueue()
         self.callback_queue.hold()  # until the node's start() has returned
-        self.hold_deadline = monotonic()  # the watcher then ends the hold
+        self.hold_deadline = monotonic()  # the watcher ends the hold at its next look after this
         if node._holds_delegates:  # else a user calls start(): there is no release after its end
             self.hold_deadline += HOLD_LIMIT
         namespace, _, self.base_name = self.name.rpartition('/')
@@ -539,7 +539,7 @@ class Run:
 
         :param timeout: seconds for messages under way
         """
-        self._begin_stop()
+        self._begin_stop()  # the end of a script calls close_rospy() before stop()
         with runs_lock:
             runs.pop(self.uri, None)
             if not runs:

@@ -42,8 +42,9 @@ class PublisherOverlay:
         self.freeze, self.thaw = copier_for(data_class)
         self.has_header = getattr(data_class, '_has_header', False)
         self.header = None
-        self.memory = None  # the shared_memory.MessageMemory, if a reader shares memory
-        # the list of connections of self.receivers: rospy makes a new list at each change
+        self.memory = None  # a MessageMemory, from SharedMemoryHandler's first reader on
+        # the connections that self.receivers were found for, None: find them anew; rospy makes a new
+        # list at each change
         self.receivers_are_for = None
 
     def acquire(self):
