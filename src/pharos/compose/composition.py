@@ -21,7 +21,6 @@ from pharos.compose.launch_file import Group
 from pharos.compose.script import ScriptNode, wait_for_end
 from pharos.compose.sources import needs_main_thread
 from pharos.errors import PharosError
-
 from pharos.private_rospy.run import Lifecycle, Settings
 from pharos.private_rospy.tcpros import shutdown_socket
 from pharos.transcript import Transcript

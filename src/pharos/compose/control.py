@@ -11,7 +11,6 @@ import threading
 from pharos.errors import PharosError, UnknownNodeError
 from pharos.private_rospy.tcpros import check_user
 
-ACTIONS = 'restart', 'stop', 'start'
 ANSWER_LIMIT = 60.0  # seconds
 MAX_TEXT = 4096  # bytes
 _PREFIX = 'pharos-compose-'
@@ -35,7 +34,7 @@ def _serve(listener, composition):
                 client, _ = listener.accept()
             except OSError:  # the composition has stopped
                 return
-            with client, contextlib.suppress(OSError):
+            with client, contextlib.suppress(OSError, ValueError):  # it has gone, or sends nonsense
                 check_user(client)
                 action, name = client.recv(MAX_TEXT).decode().split()
                 client.send(_answer(composition, action, name).encode())

@@ -119,12 +119,11 @@ def join_relay(run, topic, uri, subscription):
     with runs_lock:
         for other in runs.values():
             if key in other.relays:
-                # 'TCPROS' since the relay's connection is one of TCPROS
                 relay = other.relays[key]
                 link(relay, uri, subscription, run, relay.transport_type)
                 return True
         relay = run.modules.load('rospy.topics')._PublisherImpl(topic, subscription.data_class)
-        relay.transport_type = 'TCPROS'  # begin_delivery() knows better
+        relay.transport_type = 'TCPROS'  # until begin_delivery() knows the connection's
         relay.has_header = False  # messages keep the publisher's header.seq
         run.relays[key] = relay
     return False
