@@ -53,7 +53,7 @@ NAME_LIMIT = 1.0  # seconds for the question whether another node has the name
 STOP_LIMIT = 2.0  # seconds that a stop waits for threads of rospy
 HOLD_LIMIT = 2.0  # seconds that delegates wait for the end of start(); start() may wait for them
 RETRY_DELAY = 1.0  # seconds until the next attempt to connect
-WATCH_PERIOD = 0.25  # seconds between two looks of the watcher
+WATCH_PERIOD = 0.5  # seconds between two looks of the watcher
 LOOKS_PER_MASTER = 4  # looks of the watcher for each one at the masters
 BACKLOG = 128  # clients that may wait for a connection; rospy allows five
 UNREACHABLE = OSError, xmlrpc.client.Error, HTTPException, ExpatError
@@ -598,7 +598,7 @@ def join(threads, timeout):
 
 
 def _watch_runs():
-    """Look after all runs until the last one ends; once a second, compare with the masters."""
+    """Look after all runs until the last one ends; every two seconds, compare with the masters."""
     look_count = 0
     while True:
         is_over = _end_of_watch.wait(WATCH_PERIOD)

@@ -273,7 +273,8 @@ class MemorySender(MemoryTransport):
                     self.is_sending = False
                     break
                 waits_for_receipt = self._queue[0].file and self.announced
-            poller.register(self._socket, select.POLLIN if waits_for_receipt else select.POLLOUT)
+                event = select.POLLIN if waits_for_receipt else select.POLLOUT
+                poller.register(self._socket, event)
             poller.poll(POLL_LIMIT)
         self.close_if_broken()
 
