@@ -34,6 +34,13 @@ collect_ignore = ['programs', 'robot']
 SERVER_THREADS = 'process_request_thread', 'Dummy-'
 
 
+def pytest_configure(config):
+    """Have a test fail if a thread raises; the pytest of Debian 11 does not see that."""
+    if hasattr(pytest, 'PytestUnhandledThreadExceptionWarning'):
+        warning = 'error::pytest.PytestUnhandledThreadExceptionWarning'
+        config.addinivalue_line('filterwarnings', warning)
+
+
 @pytest.fixture(scope='session')
 def ros_master():
     """One ROS master for the whole run; a test leaves nothing on it."""

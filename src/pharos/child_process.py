@@ -1,4 +1,6 @@
 """Programs of ROS as children of this process."""
+from __future__ import annotations
+
 import atexit
 import collections
 import contextlib

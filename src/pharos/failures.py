@@ -33,7 +33,9 @@ class Failure:
         self.message = message
         self.channel = channel
         self.time = time.time()
-        self.traceback = ''.join(traceback.format_exception(error))
+        self.traceback = ''.join(
+            traceback.format_exception(type(error), error, error.__traceback__)
+        )
         self._retry = retry
         self._frames = error.__traceback__
         #: equal for failures of one kind, which share one entry

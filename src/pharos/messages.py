@@ -1,4 +1,6 @@
 """Message and service types: find or make their classes, and fill messages by name."""
+from __future__ import annotations
+
 import functools
 import pathlib
 import re
@@ -236,7 +238,7 @@ def _once(make_class):
 
     Each exception becomes an UnknownTypeError.
     """
-    cached_function = functools.cache(make_class)
+    cached_function = functools.lru_cache(None)(make_class)
 
     def make_once(type_name, text):
         try:

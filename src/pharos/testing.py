@@ -7,6 +7,8 @@ In a ``conftest.py``: ``pytest_plugins = ['pharos.testing']``; and a test is::
         create_node(Driver).send_to('/greetings', data='hello')
         assert greetings.next().data == 'hello'
 """
+from __future__ import annotations
+
 import queue
 import re
 import threading

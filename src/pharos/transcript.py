@@ -1,4 +1,6 @@
 """The Transcript: where blocks show things, as in Pharo."""
+from __future__ import annotations
+
 from typing import Any
 
 from pharos.blocks import Block

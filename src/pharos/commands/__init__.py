@@ -12,6 +12,8 @@ usage: pharos COMMAND [ARGUMENT ...]
 
 'pharos COMMAND --help' tells the arguments of a command.
 """
+from __future__ import annotations
+
 import argparse
 import importlib
 import inspect

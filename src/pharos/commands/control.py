@@ -1,4 +1,6 @@
 """The commands restart, stop and start."""
+from __future__ import annotations
+
 from pharos.commands import argument_parser
 from pharos.compose.control import control
 

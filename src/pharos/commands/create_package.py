@@ -1,13 +1,15 @@
 """The command create_package."""
+from __future__ import annotations
+
 import argparse
 import keyword
 import pathlib
 import re
-import sys
 
 import rospkg
 
 from pharos.commands import argument_parser
+from pharos.python_versions import STANDARD_MODULES
 
 NAME_PATTERN = re.compile(r'[a-z][a-z0-9]*(_[a-z0-9]+)*')
 NODE_LINE = re.compile('.*my_node.*\n')
@@ -43,7 +45,7 @@ def package_name(text: str) -> str:
 
     :raises argparse.ArgumentTypeError: if not
     """
-    is_module = text in sys.stdlib_module_names
+    is_module = text in STANDARD_MODULES
     if is_module or keyword.iskeyword(text) or not NAME_PATTERN.fullmatch(text):
         raise argparse.ArgumentTypeError(
             f'{text!r} cannot be a name: give small letters, digits and single underscores, and no'

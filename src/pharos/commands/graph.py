@@ -1,4 +1,6 @@
 """The command graph."""
+from __future__ import annotations
+
 import json
 
 from pharos.commands import argument_parser

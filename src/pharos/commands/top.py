@@ -1,4 +1,6 @@
 """The command top."""
+from __future__ import annotations
+
 import json
 import sys
 import time

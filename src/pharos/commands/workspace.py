@@ -1,4 +1,6 @@
 """The command workspace."""
+from __future__ import annotations
+
 import argparse
 import sys
 

@@ -1,4 +1,6 @@
 """A node that loads programs into a composition, and unloads them, by nodelet's services."""
+from __future__ import annotations
+
 import contextlib
 from typing import Any
 

@@ -1,4 +1,6 @@
 """Launch files, read by roslaunch itself: some of their nodes can run in this process."""
+from __future__ import annotations
+
 import copy
 import os
 from typing import Any, NamedTuple

@@ -84,7 +84,7 @@ def load(master, package, executable, arguments, name, namespace, params, here):
         node_name = name
         arguments = [*arguments, f'__name:={name.rpartition("/")[2]}']
     else:  # the node has its file's name until the program calls init_node
-        file_name = os.path.basename(path).removesuffix('.py')
+        file_name = re.sub(r'\.py$', '', os.path.basename(path))
         node_name = re.sub(r'\W|^(?=[^A-Za-z])', 'x', file_name)
     if namespace:
         node_name = ns_join(namespace, node_name)

@@ -147,7 +147,9 @@ class ScriptRun(Run):
 
     def print_error(self, error, title=''):
         """Print a traceback, as Python does at the end of a program or thread."""
-        self.stderr.write(title + ''.join(traceback.format_exception(error)))
+        self.stderr.write(
+            title + ''.join(traceback.format_exception(type(error), error, error.__traceback__))
+        )
 
     # -- start
 
@@ -463,7 +465,7 @@ class NamedLines:
         prefix = f'[{self._run.name}] '
         named_text = ''.join(f'{prefix}{line}' for line in text.splitlines(keepends=True))
         if self._is_within_line:
-            named_text = named_text.removeprefix(prefix)
+            named_text = named_text[len(prefix) :]
         # the reader of a pipe may have gone: the program must go on, and stop its motors
         with contextlib.suppress(OSError, ValueError):
             self._stream.write(named_text)

@@ -33,7 +33,7 @@ def serialize(message):
     return buffer.getvalue()
 
 
-@functools.cache
+@functools.lru_cache(None)
 def copier_for(cls):
     """Return two functions for a message class: ``freeze(message)`` and ``thaw(frozen)``.
 
@@ -51,7 +51,7 @@ def copy_of(message):
     return thaw(freeze(message))
 
 
-@functools.cache
+@functools.lru_cache(None)
 def thaw_function(sent_class, wanted_class):
     """Return the function that thaws a message of one class as one of another, such as AnyMsg."""
     _, thaw = copier_for(sent_class)
@@ -233,7 +233,7 @@ def nested_class(base, cls):
     return getattr(cls, '_classes', {}).get(base) or genpy.message.get_message_class(base)
 
 
-@functools.cache
+@functools.lru_cache(None)
 def _generate(cls, depth=0):
     """Return ``freeze`` and ``thaw`` for a class; depth 1 is an element of an array."""
     source = _Source(cls, depth)

@@ -1,4 +1,6 @@
 """Draw messages by matplotlib: images, scans, clouds, paths, maps."""
+from __future__ import annotations
+
 import io
 from typing import Any
 

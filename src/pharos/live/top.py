@@ -2,6 +2,8 @@
 
 Nodes count their messages anyway. Two snapshots give rates, so top subscribes to nothing.
 """
+from __future__ import annotations
+
 import collections
 import os
 import select

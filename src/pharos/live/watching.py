@@ -1,4 +1,6 @@
 """Receive from a topic for a while. Each function starts a node of its own, and stops the node."""
+from __future__ import annotations
+
 import contextlib
 import itertools
 import operator

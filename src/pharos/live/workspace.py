@@ -2,6 +2,8 @@
 
 ``rosrun pharos workspace`` opens one; ``%load_ext pharos.live.workspace`` makes a notebook one.
 """
+from __future__ import annotations
+
 import os
 import pathlib
 import re

@@ -38,7 +38,7 @@ RECEIPT = b'\0'
 _DESCRIPTOR_SIZE = array.array('i').itemsize
 
 
-@functools.cache
+@functools.lru_cache(None)
 def host_and_user():
     """Return values that are equal for processes that may share memory."""
     with open('/proc/sys/kernel/random/boot_id') as file:

@@ -295,7 +295,7 @@ def is_plain(message_class):
     return message_class.__bases__ == (genpy.Message,) and message_class._md5sum != '*'
 
 
-@functools.cache
+@functools.lru_cache(None)
 def _byte_fields(message_class):
     """Return the slots of the fields that may lie in a file by themselves."""
     if not is_plain(message_class):
