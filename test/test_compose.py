@@ -324,19 +324,36 @@ def test_script_waits_for_its_threads(master, ends, how):
 # -- what is a script's own
 
 
-PLACES = 'from __future__ import annotations\nfrom dataclasses import dataclass\n@dataclass\nclass P:\n  x: int'
+DATA = '''
+from __future__ import annotations
+import dataclasses, typing
+@dataclasses.dataclass
+class Place:
+    count: typing.ClassVar[int] = 0
+    x: int = 0
+'''
 
 
 def test_helpers_beside_scripts_are_their_own(master, write):
     for side in 'left', 'right':
         write(f'SIDE = {side!r}', f'{side}/helpers.py')
-        write(PLACES, f'{side}/places.py', '')
+        write(DATA, f'{side}/places.py', '')
         path = write(
             "import helpers, places\nrospy.init_node('program')\nrospy.set_param('~side', helpers.SIDE)",
             f'{side}/program',
         )
         master.load(path, name=side).wait(TIMEOUT)
     assert [master.parameters[f'/{side}/side'] for side in ('left', 'right')] == ['left', 'right']
+
+
+def test_dataclass_of_program_may_have_class_variable(master, write):
+    path = write(
+        f"{DATA}\nimport rospy\nrospy.init_node('program')\n"
+        "rospy.set_param('~fields', [each.name for each in dataclasses.fields(Place)])\n",
+        head='',
+    )
+    assert master.load(path).wait(TIMEOUT) == 0
+    assert master.parameters['/program/fields'] == ['x']
 
 
 def test_each_run_has_modules_anew(master, write):

@@ -89,6 +89,16 @@ def test_rospy_hears_what_pharos_sends(peer, node):
     assert [message.data for message in heard] == [str(number) for number in range(20)]
 
 
+@pytest.mark.filterwarnings('ignore:The publisher should be created:SyntaxWarning')
+def test_publisher_of_plain_rospy_needs_no_queue_size(peer, node):
+    peer.hear('/plain', STRING)
+    publisher = node.ros.Publisher('/plain', std_msgs.msg.String)
+    until(publisher.get_num_connections, TIMEOUT)
+    for text in 'a', 'b':
+        publisher.publish(text)
+    assert [message.data for message in peer.heard('/plain', 2)] == ['a', 'b']
+
+
 def test_pharos_hears_what_rospy_sends(peer, node):
     box = Mailbox(node, '/sends', STRING)
     peer.run("sends = rospy.Publisher('/sends', std_msgs.msg.String, queue_size=100)")

@@ -368,6 +368,22 @@ def test_stuck_subscriber_starves_nobody(master):
         assert [int(text(receive(reader))[:2]) for _ in range(20)] == list(range(20))
 
 
+@pytest.mark.filterwarnings('ignore:The publisher should be created:SyntaxWarning')
+def test_stop_ends_publisher_that_waits_for_subscriber(master):
+    """Without a queue_size, rospy's publish() waits for the socket."""
+    node = create(master)
+    publisher = node.ros.Publisher('/stuck', std_msgs.msg.String)
+    with subscribe(node.tcp_port, '/stuck') as client:
+        receive(client)
+        until(publisher.get_num_connections)
+        sender = threading.Thread(target=publisher.publish, args=[30 * LARGE])
+        sender.start()
+        client.recv(1)  # the rest of the message does not fit into the sockets
+        node.stop()
+        sender.join(TIMEOUT)
+    assert not sender.is_alive()
+
+
 def test_delegates_run_one_at_a_time(master, peer):
     """One message comes through INTRAPROCESS, the other through TCPROS."""
     began, go_on = Mailbox(), threading.Event()

@@ -92,8 +92,8 @@ class Composition:
         for entry in entries:
             with self._show_failure(entry.name):
                 self.start(entry.name, entry.path, entry.args, entry.roslaunch_node)
-        wait(lambda: all(map(_has_begun, self.nodes)), INIT_LIMIT)
         self._begin_watch()
+        wait(lambda: all(map(_has_begun, self.nodes)), INIT_LIMIT)
 
     def _begin_watch(self):
         self._listener = control.listen(self)

@@ -6,6 +6,7 @@ modules of the run, and all other modules as usual.
 """
 import builtins
 import collections
+import dataclasses
 import importlib
 import inspect
 import itertools
@@ -17,7 +18,7 @@ import sys
 import threading
 import weakref
 from contextlib import suppress
-from functools import cache
+from functools import lru_cache
 from importlib.machinery import PathFinder
 from importlib.util import module_from_spec, resolve_name
 from types import ModuleType
@@ -25,7 +26,9 @@ from types import ModuleType
 import rospy.exceptions
 import rospy.impl.transport
 
-COMMON = sys.stdlib_module_names.union(
+from pharos.python_versions import STANDARD_MODULES
+
+COMMON = STANDARD_MODULES.union(
     'genpy genmsg roslib rospkg rosmaster catkin catkin_pkg pharos'.split(),
     'numpy yaml matplotlib cv2 PIL'.split(),
 )
@@ -62,7 +65,7 @@ def private_path():
     return path
 
 
-@cache
+@lru_cache(None)
 def _spec_of(name, path):
     spec = PathFinder.find_spec(name, path)
     if spec is None:
@@ -70,7 +73,7 @@ def _spec_of(name, path):
     return spec
 
 
-@cache
+@lru_cache(None)
 def _code_of(loader, name, change_time):
     return loader.get_code(name)
 
@@ -106,7 +109,7 @@ def source_places(top_name):
     return file, folders
 
 
-@cache
+@lru_cache(None)
 def _imports_of(top_name):
     """Return the top-level names that a package imports; an empty set for a large one or one in C.
 
@@ -126,7 +129,7 @@ def _imports_of(top_name):
     return names
 
 
-@cache
+@lru_cache(None)
 def _reaches_rospy(top_name):
     """True if a package names rospy, imports rosgraph or pharos, or imports a package that does."""
     seen_names = set()
@@ -195,6 +198,28 @@ def _getsourcefile(thing, original=inspect.getsourcefile):
     return original(thing)
 
 
+def _process_class(cls, *args, original=dataclasses._process_class, **kwargs):
+    """Have @dataclass find the module of a private class: it looks in sys.modules for ClassVar.
+
+    Another node may be importing a module of the same name.
+    """
+    module = _private_module(cls)
+    if module is None:
+        return original(cls, *args, **kwargs)
+    name = cls.__module__
+    with _shown_lock:
+        shown_module = sys.modules.get(name)
+        sys.modules[name] = module
+        try:
+            return original(cls, *args, **kwargs)
+        finally:
+            if shown_module:
+                sys.modules[name] = shown_module
+            else:
+                del sys.modules[name]
+
+
+dataclasses._process_class = _process_class
 inspect.getmodule = _getmodule
 inspect.getfile = _getfile
 inspect.getsourcefile = _getsourcefile

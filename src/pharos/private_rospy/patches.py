@@ -315,10 +315,8 @@ def subscribe(original, run, self, *args, **kwargs):
 
 @patch('rospy.topics', 'QueuedConnection')
 def queue_connection(original, run, connection, queue_size):
-    """rospy's queue is not bounded. This one is; see Sender. Some connections have their own."""
-    if getattr(connection, 'has_own_queue', False):
-        return connection
-    return tcpros.Sender(connection, queue_size, run)
+    """rospy's queue is not bounded. A Sender's is; PublisherOverlay has put one there."""
+    return connection
 
 
 @patch('rospy.impl.tcpros_pubsub', 'robust_connect_subscriber')

@@ -17,6 +17,7 @@ MAX_PARTS = 1024  # that a system call takes
 LARGE_PART = 1 << 16  # bytes
 THREAD_REST = 0.3  # seconds without a message until a sender's thread ends
 CONNECT_LIMIT = 10.0  # seconds
+CLOSED = OSError, AttributeError  # a connection that rospy has closed has no socket
 _READ_BUFFER = 1 << 17  # bytes
 _CREDENTIALS = struct.Struct('3i')  # numbers of the process, the user, and the group
 _LENGTH = struct.Struct('<I')
@@ -171,7 +172,9 @@ class Sender:
     out of the queue at once: the queue is neither bounded nor flushed. Here the publisher writes,
     and a thread writes the rest. The thread rests between messages: to start one takes long.
 
-    :param queue_size: messages that wait at most; None: as many as the node's queue_bytes hold
+    :param publication: the PublisherOverlay; its queue_size is the number of messages that wait at
+        most. 0: as many as the node's queue_bytes hold. None: the publisher waits for the socket,
+        as in rospy. rospy sets the size after the first connections may have been made.
     :ivar is_busy: True while a thread writes the queue
     """
 
@@ -179,10 +182,9 @@ class Sender:
     _has_thread = False
     _rest = ()  # the parts of a message that the socket has not taken yet
 
-    def __init__(self, connection, queue_size, run):
+    def __init__(self, connection, publication):
         self._connection = connection
-        self._queue_size = queue_size or math.inf
-        self._run = run
+        self._publication = publication
         self._queue = collections.deque()  # of lists of parts
         self._condition = threading.Condition()  # notified to wake the thread
 
@@ -190,12 +192,17 @@ class Sender:
         return getattr(self._connection, name)
 
     def write_data(self, parts, size):
-        """Send a message, or queue the rest if the socket is full; never wait for the subscriber.
+        """Send a message, or queue the rest if the socket is full.
 
         :param parts: the bytes of the message, with their length in front
         :param size: the number of bytes
         """
         with self._condition:
+            if self._publication.queue_size is None:
+                self._rest = parts
+                while self._rest:
+                    self._send_rest()
+                return
             if self.is_busy or size > MAX_DIRECT:
                 self._enqueue(parts, size)
             else:
@@ -211,7 +218,8 @@ class Sender:
 
     def _enqueue(self, parts, size):
         self._queue.append(parts)
-        capacity = min(self._queue_size, max(1, self._run.node.queue_bytes // size))
+        queue_size = self._publication.queue_size or math.inf
+        capacity = min(queue_size, max(1, self._publication.run.node.queue_bytes // size))
         while len(self._queue) > capacity:
             self._queue.popleft()
 
@@ -220,7 +228,7 @@ class Sender:
             self._condition.notify()
         else:
             self._has_thread = True
-            self._run.start_thread(self._send_queue)
+            self._publication.run.start_thread(self._send_queue)
 
     def _send_rest(self, flags=0):
         """Send the bytes that the socket takes, and keep the others."""
@@ -250,7 +258,7 @@ class Sender:
                     self._rest = self._queue.popleft()
             try:
                 self._send_rest()
-            except Exception:  # the peer has gone
+            except CLOSED:
                 connection.close()
 
     def close(self):

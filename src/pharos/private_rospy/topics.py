@@ -15,7 +15,7 @@ from pharos.intraprocess.callback_queues import (
 )
 from pharos.intraprocess.copier import copier_for, copy_of
 from pharos.intraprocess.links import links_of
-from pharos.private_rospy.tcpros import MessageParts
+from pharos.private_rospy.tcpros import CLOSED, MessageParts, Sender
 
 SOCKET_BYTES = 6 << 20  # bytes that the two sockets of a connection hold, roughly
 FLUSH_PERIOD = 0.001  # seconds between two looks
@@ -75,11 +75,12 @@ class PublisherOverlay:
                 self.header = protocol.get_header_fields()
 
     def add_connection(self, connection):
+        if not getattr(connection, 'has_own_queue', False):
+            connection = Sender(connection, self)
         with self.lock:
             self.rospy_add_connection(connection)
-            new_connections = self.connections[-1:]  # rospy has wrapped the connection in a Sender
             for frozen in list(self.latches.values()):
-                self.write(self.thaw(frozen), new_connections)
+                self.write(self.thaw(frozen), [connection])
         return True
 
     def remove_connection(self, connection):
@@ -159,7 +160,7 @@ class PublisherOverlay:
         for connection in connections:
             try:
                 connection.write_data(parts, size)
-            except Exception:  # the peer has gone
+            except CLOSED:
                 connection.close()
 
     def flush(self, deadline):
