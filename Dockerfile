@@ -4,4 +4,4 @@ RUN apt-get update && /pharos/tools/package deb
 
 FROM debian:13
 COPY --from=build /pharos/build/packages/*.deb /tmp/
-RUN apt-get update && apt-get install -y /tmp/*.deb && rm -r /tmp/*.deb /var/lib/apt/lists/*
+RUN apt-get update && apt-get install -y --no-install-recommends /tmp/*.deb python3-pil python3-rostopic rosbash
