@@ -70,7 +70,7 @@ def left_threads(before):
     return [
         thread
         for thread in set(threading.enumerate()) - before
-        if not any(name in thread.name for name in SERVER_THREADS)
+        if not any(name in f'{thread.name} {thread._target}' for name in SERVER_THREADS)
     ]
 
 

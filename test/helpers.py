@@ -21,6 +21,7 @@ PYTHON = '/usr/bin/python3'
 #: begins a command whose signals do what they do by default, also under nohup
 DEFAULT_SIGNALS = ['env', '--default-signal=INT,TERM,HUP']
 TIMEOUT = 30  # seconds; a test that passes never waits so long
+threading.Thread.isAlive = threading.Thread.is_alive  # the rospy of Debian 11 calls it at its end
 _created = []
 
 

@@ -8,6 +8,7 @@ import sys
 import textwrap
 import traceback
 import xmlrpc.client
+from unittest import mock
 
 import genpy
 import pytest
@@ -129,8 +130,7 @@ def behaviour(start):
 def robots(packages):
     """Facts that others find out about the robot: composed, and started by roslaunch."""
     path = os.pathsep.join([str(packages), '/usr/share'])
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv('ROS_PACKAGE_PATH', path)
+    with mock.patch.dict(os.environ, ROS_PACKAGE_PATH=path):
         composed = behaviour(lambda master: master.compose('robot', 'robot.launch'))
         launched = behaviour(lambda master: master.launch('robot', 'robot.launch'))
     return composed, launched

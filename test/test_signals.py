@@ -15,6 +15,7 @@ SIGNALS = pytest.mark.parametrize(
 )
 PREPARED = """
 import multiprocessing, os, signal, sys, threading
+threading.Thread.isAlive = threading.Thread.is_alive  # the rospy of Debian 11 calls it at its end
 import pharos
 from pharos import BlockNode, Master
 

@@ -90,7 +90,7 @@ def message_png(message: Message) -> bytes | None:
         return None
     from matplotlib.figure import Figure
 
-    figure = Figure(layout='constrained')
+    figure = Figure(constrained_layout=True)
     axes = figure.add_subplot(title=message.header.frame_id, aspect='equal')
     try:
         draw(axes, message)

@@ -14,7 +14,6 @@ import tty
 from typing import Any, Sequence
 
 import psutil
-from rich.console import Group
 from rich.live import Live
 from rich.table import Table
 
@@ -240,7 +239,10 @@ def _show_views(screen, meter, interval, keyboard):
     while True:
         rows = tables[view]
         help_text = f'{KEY_HELP}\n{CONTROL_HELP}'
-        screen.update(Group(help_text, line, table(rows, sort_column, chosen_node)), refresh=True)
+        page = Table.grid()
+        for part in help_text, line, table(rows, sort_column, chosen_node):
+            page.add_row(part)
+        screen.update(page, refresh=True)
         timeout = max(0, deadline - time.monotonic())
         if select.select([keyboard], [], [], timeout)[0]:
             key = os.read(keyboard, 1).decode('latin-1')

@@ -134,7 +134,7 @@ def plot(topic: Topic, fields: Sequence[str], seconds: float) -> Any:
 
     with arrival_queue(topic) as arrivals:
         arrival_list = _collect_arrivals(arrivals, seconds)
-    figure = Figure(figsize=(8, 4), layout='constrained')
+    figure = Figure(figsize=(8, 4), constrained_layout=True)
     axes = figure.add_subplot(title=topic.name, xlabel='seconds')
     times = [arrival.time - arrival_list[0].time for arrival in arrival_list]
     for field in fields:

@@ -4,6 +4,7 @@
 """
 from __future__ import annotations
 
+import atexit
 import os
 import pathlib
 import re
@@ -104,7 +105,8 @@ def load_ipython_extension(shell: Any, names: dict[str, Any] | None = None) -> N
         names = namespace()
     master = names['master']
     shell.push(names)
-    end_session = shell._atexit_once
+    atexit.register(signals.stop_all)  # in the IPython of Debian 11, before it clears the names
+    end_session = getattr(shell, '_atexit_once', lambda: None)
 
     def stop_nodes():
         signals.stop_all()
