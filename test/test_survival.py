@@ -102,7 +102,7 @@ class LogOf:
 
 
 WISHES = """
-second_node starts_again no_core_is_busy_after_the_shutdown port_is_free_after_the_shutdown
+second_node starts_again no_core_is_busy_after_the_shutdown
 silent_client_blocks_none busy_xmlrpc_port_is_named busy_tcpros_port_is_named
 shutdown_for_an_earlier_owner_is_ignored first_messages_arrive small_messages_without_delay
 latched_by_value each_latched_publisher_keeps_its_message subscriber_that_left_is_known
