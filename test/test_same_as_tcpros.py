@@ -254,9 +254,7 @@ def test_any_message_is_alike(both):
     assert box.next()._buff == both.peer.value("heard['/any'][0]._buff") == b'\1\0\0\0x'
 
 
-@pytest.mark.skipif(
-    not hasattr(numpy.ndarray, 'tostring'), reason='genpy needs ndarray.tostring, on bare rospy too'
-)
+@pytest.mark.skipif(not hasattr(numpy.ndarray, 'tostring'), reason='genpy needs ndarray.tostring')
 def test_numpy_messages_are_alike(both):
     numpy_msg = both.hearer.ros_import('rospy.numpy_msg').numpy_msg
     box = Mailbox()
