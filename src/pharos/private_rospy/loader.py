@@ -5,7 +5,6 @@
 modules of the run, and all other modules as usual.
 """
 import builtins
-import collections
 import dataclasses
 import importlib
 import inspect
@@ -150,9 +149,7 @@ def _is_generated(name):
     return rest[:1] in (['msg'], ['srv']) and top_name not in ('rospy', 'rosgraph')
 
 
-#: name of a private module in sys.modules -> number of modules of that name with running code
-_shown_counts = collections.Counter()
-_shown_lock = threading.Lock()
+_dataclass_lock = threading.Lock()
 
 #: class of a private module -> its PrivateModules, as a weak reference
 _owners = weakref.WeakKeyDictionary()
@@ -207,7 +204,7 @@ def _process_class(cls, *args, original=dataclasses._process_class, **kwargs):
     if module is None:
         return original(cls, *args, **kwargs)
     name = cls.__module__
-    with _shown_lock:
+    with _dataclass_lock:
         shown_module = sys.modules.get(name)
         sys.modules[name] = module
         try:
@@ -223,23 +220,6 @@ dataclasses._process_class = _process_class
 inspect.getmodule = _getmodule
 inspect.getfile = _getfile
 inspect.getsourcefile = _getsourcefile
-
-
-def _show_module(name, module):
-    """Have sys.modules show a private module while its code runs: @dataclass looks there."""
-    with _shown_lock:
-        if _shown_counts[name] or name not in sys.modules:
-            sys.modules[name] = module
-            _shown_counts[name] += 1
-
-
-def _hide_module(name):
-    """Take a private module out of sys.modules, unless the code of one of its name still runs."""
-    with _shown_lock:
-        if _shown_counts[name]:
-            _shown_counts[name] -= 1
-            if not _shown_counts[name]:
-                del sys.modules[name]
 
 
 class PrivateModules:
@@ -338,7 +318,6 @@ class PrivateModules:
         module = module_from_spec(spec)
         self.modules[name] = module
         vars(module)['__builtins__'] = self.builtins
-        _show_module(name, module)
         try:
             if code is None and spec.loader and spec.has_location:  # an extension in C
                 spec.loader.exec_module(module)
@@ -347,8 +326,6 @@ class PrivateModules:
         except BaseException:
             del self.modules[name]
             raise
-        finally:
-            _hide_module(name)
         self._patch(module)
 
     def _build_class(self, function, name, *bases, **options):
