@@ -34,7 +34,7 @@ quietly() {
 # install_packages NAME...: those that are missing.
 install_packages() {
   local installed package missing=()
-  command -v apt-get >/dev/null || fail "no apt-get here: this command is for Debian 12 and 13"
+  command -v apt-get >/dev/null || fail "no apt-get here: this command is for Debian 11 to 14"
   installed=" $(dpkg-query -W -f '${Package}:${db:Status-Status} ' "$@" 2>/dev/null)" || true
   for package; do
     [[ $installed == *" $package:installed "* ]] || missing+=("$package")

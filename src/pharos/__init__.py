@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from pharos.compose.script import ScriptNode
     from pharos.live.graph import Graph
 
-__version__ = '0.2.0'
+__version__ = '0.3.0'
 __all__ = [
     'Master',
     'Node',
