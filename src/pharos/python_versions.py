@@ -1,14 +1,15 @@
 """Cover the differences between the versions of Python, from 3.8 on."""
+import os
 import pkgutil
 import sys
-import sysconfig
 
 
 def _standard_modules():
     """Return the names of the standard library's modules."""
     if sys.version_info >= (3, 10):
         return sys.stdlib_module_names
-    folders = [sysconfig.get_path('stdlib'), sysconfig.get_config_var('DESTSHARED')]
+    folder = os.path.dirname(os.__file__)
+    folders = [folder, os.path.join(folder, 'lib-dynload')]
     found_names = [module.name for module in pkgutil.iter_modules(folders)]
     return frozenset([*found_names, *sys.builtin_module_names])
 

@@ -199,14 +199,14 @@ class Sender:
         """
         with self._condition:
             if self._publication.queue_size is None:
-                self._rest = parts
+                self._rest = [*self._rest, *parts]  # a signal may have ended an earlier call
                 while self._rest:
                     self._send_rest()
                 return
             if self.is_busy or size > MAX_DIRECT:
                 self._enqueue(parts, size)
             else:
-                self._rest = parts
+                self._rest = [*self._rest, *parts]
                 with contextlib.suppress(BlockingIOError):
                     self._send_rest(socket.MSG_DONTWAIT)
                 if not self._rest:
