@@ -358,6 +358,11 @@ def test_impossible_peer_raises_value_error(node, name):
     assert '/chatter' not in registrations(node.master, '/sender')[1]
 
 
+def test_shared_message_names_no_sender(node):
+    with pytest.raises(ValueError, match='/chatter: give shared or from_, not both'):
+        node.interested_in('/chatter', STRING, shared=True, from_='/other')
+
+
 # -- channels
 
 

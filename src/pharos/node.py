@@ -468,8 +468,13 @@ class Node(DelegateHolder):
         :raises UnknownTopicError, UnknownTypeError: if the type is not known
         :raises MessageTypeError: if the node has the topic open with another type
         :raises MasterUnreachableError: if the master does not answer; nothing is left behind
+        :raises ValueError: if both shared and from_ are given
         """
         topic = self._resolve(topic)
+        if shared and from_:
+            raise ValueError(
+                f'{topic}: give shared or from_, not both: a shared message does not name its sender'
+            )
         peer_name = self._peer_name(from_) if from_ else None
         message_class = self._class_to_receive(topic, typed_as)
         return InputChannel(
