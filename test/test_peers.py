@@ -326,8 +326,12 @@ def test_rosbag_plays_to_pharos(node, tmp_path):
         for number in range(10):
             bag.write('/played', std_msgs.msg.String(str(number)), genpy.Time(100, number))
     box = Mailbox(node, '/played', STRING)
-    ros('rosbag', 'play', '--quiet', '--wait-for-subscribers', str(path))
-    assert [box.next().data for _ in range(10)] == [str(number) for number in range(10)]
+    # without --keep-alive it ends at once, perhaps before roscpp has sent anything
+    options = ['--quiet', '--wait-for-subscribers', '--keep-alive']
+    with Program(['rosrun', 'rosbag', 'play', *options, str(path)], node.master.url) as player:
+        assert [box.next().data for _ in range(10)] == [str(number) for number in range(10)]
+        player.signal(signal.SIGINT)
+        player.wait()
 
 
 # -- roscpp
