@@ -151,7 +151,7 @@ def test_messages_of_package_arrive_alike():
                 continue
             for cls in vars(importlib.import_module(f'{package}.{kind}')).values():
                 if inspect.isclass(cls) and issubclass(cls, genpy.Message):
-                    for message in cls(), *[random_message(chance, cls) for _ in range(5)]:
+                    for message in [cls(), *[random_message(chance, cls) for _ in range(5)]]:
                         assert_as_on_the_wire(message)
 
 

@@ -397,7 +397,7 @@ def test_five_stopped_readers_hold_up_nobody(master, node, listener, topic):
     with contextlib.ExitStack() as stack:
         names = [f'stopped{number}' for number in range(5)]
         stopped = [stack.enter_context(Listener(master.url, name)) for name in names]
-        for each in *stopped, listener:
+        for each in [*stopped, listener]:
             each.listen(topic)
         out = node.output_channel(topic, IMAGE)
         send_and_wait(out, topic, [bytes(LARGE)], *stopped, listener)

@@ -260,7 +260,8 @@ def test_slow_receiver_gets_newest_next(master, peer):
     assert began.next().data == 'first'
     peer.run('for number in range(1, 40): publisher.publish(f"{number:02}" + "x" * 100000)')
     until(lambda: channel.dropped == 38)
-    go_on.release(40)
+    for _ in range(40):
+        go_on.release()
     assert began.next().data[:2] == '39'
 
 

@@ -75,6 +75,8 @@ def write_package(package: str, nodes: list[str]) -> None:
     template = pathlib.Path(rospkg.RosPack().get_path('pharos'), 'template')
     pathlib.Path(package).mkdir()
     for path in filter(pathlib.Path.is_file, template.rglob('*')):
+        if path.suffix == '.pyc':
+            continue
         text = path.read_text()
         file_nodes = nodes
         if 'my_node' not in path.name:

@@ -98,7 +98,7 @@ def _user_file(module, folder):
     if not top_name:
         return None
     _, folders = source_places(top_name)
-    for place in folder / top_name, *map(pathlib.Path, folders):
+    for place in [folder / top_name, *map(pathlib.Path, folders)]:
         base = place.joinpath(*rest)
         for file in base.with_suffix('.py'), base / '__init__.py':
             if file.is_file() and not str(file).startswith(_SYSTEM_FOLDERS):
