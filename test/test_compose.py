@@ -634,6 +634,23 @@ def test_commands_control_a_node(master, compose):
     assert status == 1 and '/nobody is not a node of a composition' in output
 
 
+def test_commands_leave_other_masters_alone(compose):
+    (sonar,) = compose(node('sonar', 'robot')).nodes
+    with Program(['rosrun', 'pharos', 'stop', 'sonar'], 'http://127.0.0.1:1/') as program:
+        assert program.wait() == 1
+    assert sonar.is_running
+
+
+def test_node_runs_on_if_its_new_program_cannot_be_read(compose, write):
+    path = write(SPIN)
+    composition = compose(node('program'))
+    (program,) = composition.nodes
+    pathlib.Path(path).write_text('def')
+    with pytest.raises(PharosError, match='cannot be read as Python 3'):
+        composition.control(program, 'restart')
+    assert program.is_running
+
+
 def test_wait_returns_when_all_ended(master, compose):
     master.parameters['/stay'] = True
     composition = compose(ending())

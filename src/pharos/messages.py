@@ -176,8 +176,9 @@ def _find_definition(suffix, type_name, ask=None):
     raise UnknownTypeError(
         f'unknown type {type_name!r}: Python has no {package}.{suffix}.{name}, there is no'
         f' {package}/{suffix}/{name}.{suffix} on ROS_PACKAGE_PATH'
-        f' ({":".join(rospkg.get_ros_paths())}), and no definition was given; install {package}, source'
-        f' its workspace, or call {function_name}(type, text)'
+        f' ({":".join(rospkg.get_ros_paths())}), and no definition was given; install {package} (on'
+        f' Debian python3-{package.replace("_", "-")}), source its workspace, or call'
+        f' {function_name}(type, text)'
     )
 
 

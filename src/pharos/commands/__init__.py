@@ -50,10 +50,9 @@ def main() -> int:
         print(__doc__)
         return 0 if name.startswith('-') else 1
     sys.argv[:2] = [f'pharos {name}']
-    module = importlib.import_module(f'pharos.commands.{COMMANDS[name]}')
     if name == 'compose':
-        return module.main()
-    return run_command(getattr(module, name))
+        return importlib.import_module('pharos.commands.compose').main()
+    return run_command(name)
 
 
 def argument_parser(command: Callable[[list[str]], None]) -> argparse.ArgumentParser:
@@ -63,18 +62,23 @@ def argument_parser(command: Callable[[list[str]], None]) -> argparse.ArgumentPa
     )
 
 
-def run_command(command: Callable[[list[str]], None]) -> int:
-    """Run a command with the program's arguments, and return the exit status.
+def run_command(name: str) -> int:
+    """Run the command of that name with the program's arguments, and return the exit status.
 
     Remappings of ROS are not passed on. An error that the user can mend is printed in one line.
     """
     try:
-        command(rosgraph.myargv()[1:])
+        module = importlib.import_module(f'pharos.commands.{COMMANDS[name]}')
+        getattr(module, name)(rosgraph.myargv()[1:])
         sys.stdout.flush()
     except BrokenPipeError:  # by `| head`; the exit of Python flushes once more
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (pharos.PharosError, ValueError, OSError, re.error, rospkg.ResourceNotFound) as error:
-        print(f'{command.__name__}: {error}', file=sys.stderr)
+        print(f'{name}: {error}', file=sys.stderr)
+        return 1
+    except ModuleNotFoundError as error:
+        package = str(error.name).lower()
+        print(f'{name}: {error}: on Debian, apt install python3-{package}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:  # the usual end of a command that runs on
         pass

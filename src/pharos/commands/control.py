@@ -3,24 +3,25 @@ from __future__ import annotations
 
 from pharos.commands import argument_parser
 from pharos.compose.control import control
+from pharos.master import Master
 
 
 def restart(arguments: list[str]) -> None:
     """Restart a node of a composition of this user on this host; its program is read anew."""
-    control('restart', _name(restart, arguments))
+    _control(restart, arguments)
 
 
 def stop(arguments: list[str]) -> None:
     """Stop a node of a composition of this user on this host; it stays stopped until a start."""
-    control('stop', _name(stop, arguments))
+    _control(stop, arguments)
 
 
 def start(arguments: list[str]) -> None:
     """Start a stopped node of a composition of this user on this host."""
-    control('start', _name(start, arguments))
+    _control(start, arguments)
 
 
-def _name(command, arguments):
+def _control(command, arguments):
     parser = argument_parser(command)
     parser.add_argument('node', metavar='NODE', help='the full name of the node')
-    return parser.parse_args(arguments).node
+    control(command.__name__, parser.parse_args(arguments).node, Master())

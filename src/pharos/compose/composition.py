@@ -19,7 +19,7 @@ from pharos.child_process import RosProcess, find_program
 from pharos.compose import control, roslaunch_parent
 from pharos.compose.launch_file import Group
 from pharos.compose.script import ScriptNode, wait_for_end
-from pharos.compose.sources import needs_main_thread
+from pharos.compose.sources import compile_program, needs_main_thread
 from pharos.errors import PharosError
 from pharos.private_rospy.run import Lifecycle, Settings
 from pharos.private_rospy.tcpros import shutdown_socket
@@ -142,6 +142,8 @@ class Composition:
         path = text
         if not os.path.isfile(text):
             package, _, executable = text.partition('/')
+            if not executable:
+                raise PharosError(f'there is no file {text} here: give a path, or PACKAGE/PROGRAM')
             path = find_program(package, executable)
         reason = '' if may_show_windows else needs_main_thread(path)
         if reason:
@@ -244,6 +246,8 @@ class Composition:
 
         :raises PharosError: if the node does not start
         """
+        if action == 'restart':
+            compile_program(node.path)  # the node runs on if its new program cannot be read
         Transcript.show(f'{node._settings.name}: {action}')
         self._stopped_nodes.add(node)
         if action != 'start':

@@ -9,6 +9,7 @@ import socket
 import threading
 
 from pharos.errors import PharosError, UnknownNodeError
+from pharos.master import Master
 from pharos.private_rospy.tcpros import check_user
 
 ANSWER_LIMIT = 60.0  # seconds
@@ -36,8 +37,9 @@ def _serve(listener, composition):
                 return
             with client, contextlib.suppress(OSError, ValueError):  # it has gone, or sends nonsense
                 check_user(client)
-                action, name = client.recv(MAX_TEXT).decode().split()
-                client.send(_answer(composition, action, name).encode())
+                action, name, url = client.recv(MAX_TEXT).decode().split()
+                if url == composition.master.url:
+                    client.send(_answer(composition, action, name).encode())
 
 
 def _answer(composition, action, name):
@@ -52,8 +54,8 @@ def _answer(composition, action, name):
     return ''
 
 
-def control(action: str, name: str) -> None:
-    """Restart, stop or start a node of any composition of this user on this host.
+def control(action: str, name: str, master: Master) -> None:
+    """Restart, stop or start a node of any composition of this user on this host, at a master.
 
     :param action: 'restart', 'stop' or 'start'
     :raises UnknownNodeError: if no such composition has the node
@@ -68,7 +70,7 @@ def control(action: str, name: str) -> None:
             try:
                 sock.connect(f'\0{socket_name}')
                 check_user(sock)
-                sock.send(f'{action} {name}'.encode())
+                sock.send(f'{action} {name} {master.url}'.encode())
                 answer = sock.recv(MAX_TEXT).decode()
             except OSError:  # it belongs to another user, or ends
                 continue
@@ -77,5 +79,6 @@ def control(action: str, name: str) -> None:
         if answer:
             raise PharosError(answer)
     raise UnknownNodeError(
-        f'{name} is not a node of a composition of this user on this host: see rosrun pharos top'
+        f'{name} is not a node of a composition of this user on this host at {master.url}:'
+        ' see rosrun pharos top'
     )

@@ -44,9 +44,7 @@ def compile_program(path):
         with tokenize.open(path) as file:
             return compile(file.read(), path, 'exec', dont_inherit=True)
     except (SyntaxError, ValueError, OSError) as error:
-        raise PharosError(
-            f'{path} cannot be read as Python 3: {error}; master.run() starts others'
-        ) from error
+        raise PharosError(f'{path} cannot be read as Python 3: {error}') from error
 
 
 def why_apart(path, may_show_windows=False):

@@ -41,7 +41,7 @@ class Meter:
     """
 
     def __init__(self, master: Master, names: Sequence[str] = ()):
-        self._master = master
+        self.master = master
         self._names = names
         self._snapshot = take_snapshot(master)
         self.advice = ''  # of the last measurement
@@ -53,7 +53,7 @@ class Meter:
         :raises MasterUnreachableError: if the master does not answer
         """
         start = self._snapshot
-        self._snapshot = take_snapshot(self._master)
+        self._snapshot = take_snapshot(self.master)
         link_rates = self._snapshot.rates_since(start)
         node_rows = self._select(_node_rows(self._snapshot, start, link_rates), 'NODE')
         topic_rows = self._select(_topic_rows(self._snapshot, link_rates), 'TOPIC')
@@ -257,7 +257,7 @@ def _show_views(screen, meter, interval, keyboard):
                 step = 1 if key == 'j' else -1
                 chosen_node = _next_node(sorted_rows(rows, sort_column), chosen_node, step)
             elif key in ACTIONS and chosen_node:
-                line = _control(ACTIONS[key], chosen_node)
+                line = _control(ACTIONS[key], chosen_node, meter.master)
         else:
             deadline = time.monotonic() + interval
             try:
@@ -275,12 +275,12 @@ def _next_node(rows, chosen_node, step):
     return names[(names.index(chosen_node) + step) % len(names)]
 
 
-def _control(action, name):
+def _control(action, name, master):
     """Restart, stop or start a node, and return a line that says how that went."""
     from pharos.compose.control import control
 
     try:
-        control(action, name)
+        control(action, name, master)
     except PharosError as error:
         return str(error)
     return f'{name}: {action} done'
