@@ -121,7 +121,8 @@ def behaviour(start):
             facts = peer.value('observe()')
             names = [f'/rover/{name}' for name in SCRIPTS]
             facts['registrations'] = [registrations(master, name) for name in names]
-        facts['switched_off'] = master.parameters['/switched_off']
+        # the roslaunch of Debian 11 may end before its nodes do
+        facts['switched_off'] = until(lambda: master.parameters.get('/switched_off'))
         facts['left'] = [registrations(master, name) for name in names]
         return facts
 
