@@ -1,5 +1,6 @@
 """Unmodified rospy programs and launch files run as nodes of one process."""
 import importlib
+import inspect
 import os
 import pathlib
 import shutil
@@ -12,6 +13,7 @@ from unittest import mock
 
 import genpy
 import pytest
+import rospy
 
 import pharos
 from helpers import TIMEOUT, Peer, Program, create, registrations
@@ -121,8 +123,7 @@ def behaviour(start):
             facts = peer.value('observe()')
             names = [f'/rover/{name}' for name in SCRIPTS]
             facts['registrations'] = [registrations(master, name) for name in names]
-        # the roslaunch of Debian 11 may end before its nodes do
-        facts['switched_off'] = until(lambda: master.parameters.get('/switched_off'))
+        facts['switched_off'] = master.parameters['/switched_off']
         facts['left'] = [registrations(master, name) for name in names]
         return facts
 
@@ -137,6 +138,10 @@ def robots(packages):
     return composed, launched
 
 
+@pytest.mark.skipif(
+    'isAlive' in inspect.getsource(rospy.core.signal_shutdown),
+    reason='rospy of Debian 11 ends by an AttributeError, roslaunch too: hooks may not run',
+)
 def test_composed_robot_behaves_as_launched(robots):
     composed, launched = robots
     for fact in FACTS:
