@@ -3,6 +3,7 @@ import concurrent.futures
 import datetime
 import functools
 import queue
+import threading
 
 import numpy
 import pytest
@@ -208,6 +209,34 @@ def test_raising_block_goes_to_failures(node):
     assert isinstance(failure.error, KeyError)
     assert failure.message == 2
     assert heard == [3]
+
+
+def test_blocks_end_in_order_of_values(node, server):
+    """A slow block gets each value, the last one last, though another thread sets it meanwhile."""
+    speed, applied = node.parameter('~speed', 0.5), []
+    has_begun, may_end = threading.Event(), threading.Event()
+
+    @speed.on_change
+    def apply(value):
+        has_begun.set()
+        if value == 1.0:
+            may_end.wait(30)
+        applied.append(value)
+
+    server.setParam(speed.name, 1.0)
+    assert has_begun.wait(30)
+    speed.set(0.0)  # does not wait for the block
+    may_end.set()
+    until(lambda: len(applied) == 2)
+    assert applied == [1.0, 0.0]
+
+
+def test_block_sets_its_parameter(node):
+    rate, heard = node.parameter('~rate', 1), []
+    rate.on_change(lambda value: value < 4 and rate.set(value + 1))
+    rate.on_change(heard.append)
+    rate.set(2)
+    assert heard == [2, 3, 4]
 
 
 # -- stop and start

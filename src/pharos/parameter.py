@@ -1,4 +1,5 @@
 """Parameters of the parameter server, bound both ways."""
+import collections
 import functools
 import threading
 from copy import deepcopy
@@ -19,6 +20,8 @@ class Parameter(Endpoint):
         self.delegate = []
         self._value = initialized
         self._read_lock = threading.Lock()
+        self._changes = collections.deque()  # the values that the blocks have not got yet
+        self._blocks_lock = threading.Lock()  # held by the thread that runs the blocks
         self.open()
 
     def subscribe(self):
@@ -51,6 +54,8 @@ class Parameter(Endpoint):
     def set(self, value) -> None:
         """Set the value on the server, and run the node's blocks if the value is another one.
 
+        If another thread runs the blocks already, that thread runs them on this value next.
+
         :raises ValueError: if the server cannot hold such a value
         :raises MasterUnreachableError: if the master does not answer
         :raises NodeStoppedError: if the node has not started, or has stopped
@@ -65,17 +70,32 @@ class Parameter(Endpoint):
             former = self._value
             value = self._run.master.parameters.get(self.name)
             self._value = value
-        is_same = value == former and type(value) is type(former)
-        if is_same or self.closed:  # open() reads before the parameter is open: blocks do not run
-            return
-        for block in self.delegate:
-            self._run_block(block, deepcopy(value))
+            is_same = value == former and type(value) is type(former)
+            if is_same or self.closed:  # open() reads before the parameter is open
+                return
+            self._changes.append(value)
+        self._run_blocks()
+
+    def _run_blocks(self):
+        """Run the blocks on all changes, one after another, unless another thread does so already.
+
+        A block may set the parameter: then the blocks run on that value, too, after this one.
+        """
+        while self._changes and self._blocks_lock.acquire(False):
+            try:
+                while self._changes:
+                    value = self._changes.popleft()
+                    for block in self.delegate:
+                        self._run_block(block, deepcopy(value))
+            finally:
+                self._blocks_lock.release()
 
     def on_change(self, block: Block) -> Block:
         """Have ``block(value)`` run when the value changes, also by other nodes; return the block.
 
-        The block runs in the thread that sets or reads the value, not in the node's pool. An
-        exception of the block goes to :attr:`Node.failures`.
+        The block runs in the thread that sets or reads the value, not in that of the node's
+        delegates. The blocks get the values in their order, and run one at a time. An exception of
+        the block goes to :attr:`Node.failures`.
 
         :raises TypeError: if the block does not take one argument
         """
