@@ -15,7 +15,6 @@ except ModuleNotFoundError as _error:
     ) from None
 
 from pharos.channels import InputChannel, OutputChannel, Topic
-from pharos.child_process import RosProcess
 from pharos.errors import (
     MasterUnreachableError,
     MessageTypeError,
@@ -42,6 +41,7 @@ from pharos.signals import spin
 from pharos.transcript import Transcript
 
 if TYPE_CHECKING:
+    from pharos.compose.child_process import RosProcess
     from pharos.compose.composition import Composition
     from pharos.compose.script import ScriptNode
     from pharos.live.graph import Graph
@@ -86,6 +86,7 @@ __all__ = [
 _EXTRA_MODULES = {
     'Composition': 'compose.composition',
     'Graph': 'live.graph',
+    'RosProcess': 'compose.child_process',
     'ScriptNode': 'compose.script',
 }
 

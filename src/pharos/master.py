@@ -16,7 +16,6 @@ from rosgraph.names import get_ros_namespace, is_legal_remap, load_mappings, ns_
 from pharos import signals
 from pharos.blocks import Block
 from pharos.channels import Topic
-from pharos.child_process import RosProcess, find_launch_file, find_program
 from pharos.errors import MasterUnreachableError, PortInUseError
 from pharos.external_node import ExternalNode
 from pharos.names import full_name, node_name
@@ -26,6 +25,7 @@ from pharos.service import Service
 from pharos.waiting import wait_for
 
 if TYPE_CHECKING:
+    from pharos.compose.child_process import RosProcess
     from pharos.compose.composition import Composition
     from pharos.compose.script import ScriptNode
     from pharos.live.graph import Graph
@@ -132,7 +132,7 @@ class Master:
         address = environ.pop('ROS_IP', '127.0.0.1')
         environ.setdefault('ROS_HOSTNAME', address)
         pipes = {'stdin': subprocess.PIPE, 'stdout': subprocess.PIPE, 'text': True}
-        command = [sys.executable, '-m', 'pharos.embedded_master', str(port)]
+        command = [sys.executable, '-m', 'pharos.commands.embedded_master', str(port)]
         process = subprocess.Popen(command, env=environ, start_new_session=True, **pipes)  # type: ignore
         url = process.stdout.readline().strip()
         if not url:
@@ -385,6 +385,8 @@ class Master:
         :param on_line: ``on_line(text)`` is called for each printed line, in another thread
         :raises UnknownNodeError: if there is no such program
         """
+        from pharos.compose.child_process import RosProcess, find_program
+
         path = find_program(package, executable)
         return RosProcess([path, *map(str, args)], self.url, on_line)
 
@@ -395,6 +397,8 @@ class Master:
         :param args: the arguments of the launch file
         :raises UnknownNodeError: if there is no such file
         """
+        from pharos.compose.child_process import RosProcess, find_launch_file
+
         path = find_launch_file(package, file)
         arguments = [f'{name}:={value}' for name, value in args.items()]
         return RosProcess(['roslaunch', '--skip-log-check', path, *arguments], self.url)

@@ -15,7 +15,7 @@ import roslaunch.core
 import rospkg
 
 from pharos import signals
-from pharos.child_process import RosProcess, find_program
+from pharos.compose.child_process import RosProcess, find_program
 from pharos.compose import control, roslaunch_parent
 from pharos.compose.launch_file import Group
 from pharos.compose.script import ScriptNode, wait_for_end

@@ -6,7 +6,7 @@ from typing import Any
 
 import rosgraph.names
 
-from pharos.child_process import find_program
+from pharos.compose.child_process import find_program
 from pharos.compose.composition import Composition
 from pharos.compose.script import ScriptNode
 from pharos.compose.sources import source_of, why_apart

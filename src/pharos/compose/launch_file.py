@@ -13,7 +13,7 @@ import roslaunch.node_args
 import roslaunch.pmon
 import roslaunch.xmlloader
 
-from pharos.child_process import find_launch_file
+from pharos.compose.child_process import find_launch_file
 from pharos.compose.sources import source_of, why_apart
 from pharos.errors import PharosError, UnknownNodeError
 from pharos.transcript import Transcript

@@ -8,7 +8,7 @@ from typing import Any
 from rosgraph.names import ns_join
 
 from pharos import signals
-from pharos.child_process import find_program
+from pharos.compose.child_process import find_program
 from pharos.compose.script_run import ScriptRun
 from pharos.compose.sources import needs_main_thread, source_of
 from pharos.errors import PharosError, UnknownNodeError

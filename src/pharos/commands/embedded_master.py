@@ -1,4 +1,4 @@
-"""The program of an embedded master: ``python3 -m pharos.embedded_master PORT``.
+"""The program of an embedded master: ``python3 -m pharos.commands.embedded_master PORT``.
 
 The program prints the URL of its master, unless the port is taken. The end of its standard input
 ends the program.
