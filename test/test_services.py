@@ -353,6 +353,27 @@ def test_call_in_process_needs_no_socket(master, node, served_by):
     assert found == [[]] * 3
 
 
+@pytest.mark.parametrize('is_persistent', [False, True])
+def test_proxy_of_rospy_needs_no_socket(mortal, is_persistent):
+    """A ServiceProxy calls a service of this process without the master, and fails as in rospy."""
+    provider, caller = create(mortal.master, '/provider'), create(mortal.master, '/caller')
+
+    def answer(request):
+        if request.data:
+            raise ValueError('not true')
+        return True, request._connection_header['callerid']
+
+    provider.ros.Service('/switch', std_srvs.srv.SetBool, answer)
+    switch = caller.ros.ServiceProxy('/switch', std_srvs.srv.SetBool, persistent=is_persistent)
+    mortal.end()
+    assert switch(False).message == '/caller'
+    text = r"service \[/switch\] responded with an error: b'error processing request: not true'"
+    with pytest.raises(rospy.ServiceException, match=text):
+        switch(True)
+    with pytest.raises(TypeError):
+        switch(1, 2)
+
+
 # -- waits and time limits
 
 

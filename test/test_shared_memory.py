@@ -1,5 +1,6 @@
 """Processes of this package on one host share memory; all others get the same by TCPROS."""
 import contextlib
+import errno
 import os
 import shutil
 import signal
@@ -312,6 +313,28 @@ def test_latched_message_reaches_late_reader(node, listener, topic, size):
     listener.listen(topic)
     assert listener.notes(topic) == expected([image])
     until(lambda: listener.channel(topic, 'connections') == [('/node', SHARED)])
+
+
+def test_lack_of_memory_files_gives_tcpros(master, node, topic, monkeypatch):
+    """If a file cannot be had, the readers of the topic get TCPROS, and the log says so once."""
+    with PharosPeer(master.url, 'ear') as ear:
+        ear.hear(topic, IMAGE)
+        channel = node.output_channel(topic, IMAGE)
+        assert channel.connections == [('/ear', 'SHARED_MEMORY')]
+        channel.send(data=b'1' * 100_000)
+
+        def fail(*args):
+            raise OSError(errno.EMFILE, 'Too many open files')
+
+        with monkeypatch.context() as moment:
+            moment.setattr(os, 'memfd_create', fail)
+            channel.send(data=b'2' * 1_000_000)  # the message has grown, and needs a new file
+            channel.send(data=b'3' * 1_000)
+        until(lambda: channel.connections == [('/ear', 'TCPROS')])
+        channel.send(data=b'4' * 1_000_000)
+        until(
+            lambda: ear.value(f'[message.data[:1] for message in heard[{topic!r}]]')[-1:] == [b'4']
+        )
 
 
 def test_restarted_nodes_connect_again(node, listener, topic):

@@ -718,6 +718,83 @@ def test_dead_subscriber_is_not_waited_for(master):
         assert not send.is_alive()
 
 
+# -- for a moment
+
+
+def test_moment_without_threads_is_told(master, peer, monkeypatch):
+    """Delegates, callbacks of rospy and slow connections go on when there are threads again."""
+    ear, mouth = create(master, '/ear'), create(master, '/mouth')
+    delegate, callback = Mailbox(ear, '/t', STRING), Mailbox()
+    ear.ros.Subscriber('/t', std_msgs.msg.String, callback, queue_size=10)
+    peer.hear('/t', STRING)
+    peer.run(f'log = []; rospy.Subscriber("/rosout", message_class("{LOG}"), log.append)')
+    channel = mouth.output_channel('/t', STRING)
+    until(lambda: len(channel.connections) == 2)
+
+    def fail(*args):
+        raise RuntimeError("can't start new thread")
+
+    large = 'x' * (3 << 20)  # a connection needs a thread for this
+    with monkeypatch.context() as moment:
+        moment.setattr(threading, '_start_new_thread', fail)
+        channel.send(data=large)
+    for data in 'one', 'two':
+        channel.send(data=data)
+    for mailbox in delegate, callback:
+        assert [mailbox.next().data for _ in range(3)] == [large, 'one', 'two']
+    assert [message.data for message in peer.heard('/t', 3)] == [large, 'one', 'two']
+    until(lambda: 'lacks a thread' in peer.value('"".join(line.msg for line in log)'))
+
+
+def test_subscription_connects_after_lack_of_threads(master, peer, monkeypatch):
+    peer.run('publisher = rospy.Publisher("/t", message_class("std_msgs/String"), queue_size=100)')
+    ear, mailbox = create(master, '/ear'), Mailbox()
+    start = threading._start_new_thread
+
+    def fail_in_ear(function, *args):
+        if 'ear' in function.__self__.name or function.__self__.name == '/t':
+            raise RuntimeError("can't start new thread")
+        return start(function, *args)
+
+    with monkeypatch.context() as moment:
+        moment.setattr(threading, '_start_new_thread', fail_in_ear)
+        ear.ros.Subscriber('/t', std_msgs.msg.String, mailbox)
+    until(lambda: peer.value('publisher.get_num_connections()') == 1)
+    peer.run('publisher.publish("hello")')
+    assert mailbox.next().data == 'hello'
+
+
+@pytest.mark.parametrize('queue_size', [None, 10])
+def test_handler_that_raises_in_publish(master, peer, queue_size):
+    """The next publish() sends the rest of a message that a signal has cut, and then its own."""
+    mouth = create(master, '/mouth')
+    peer.hear('/t', STRING)
+    publisher = mouth.ros.Publisher('/t', std_msgs.msg.String, queue_size=queue_size)
+    until(publisher.get_num_connections)
+
+    class Alarm(Exception):
+        pass
+
+    def handle(number, frame):
+        raise Alarm
+
+    former_handler = signal.signal(signal.SIGALRM, handle)
+    try:
+        os.kill(peer.pid, signal.SIGSTOP)
+        with pytest.raises(Alarm):
+            signal.setitimer(signal.ITIMER_REAL, 0.2)
+            while True:
+                publisher.publish('x' * 100_000)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, former_handler)
+        os.kill(peer.pid, signal.SIGCONT)
+
+    publisher.publish('whole')
+    until(lambda: peer.value('heard["/t"] and heard["/t"][-1].data') == 'whole')
+    assert set(peer.value('{message.data for message in heard["/t"]}')) == {'whole', 'x' * 100_000}
+
+
 # -- for a while
 
 

@@ -5,11 +5,13 @@ import dataclasses
 from typing import TYPE_CHECKING, Any
 
 from genpy import Message
+from rospy import ROSException
 
 from pharos import messages
 from pharos.blocks import Block, DelegateHolder
 from pharos.errors import MessageTypeError, NodeStoppedError, UnknownNodeError
-from pharos.intraprocess.callback_queues import Inbox
+from pharos.intraprocess.copier import SERIALIZE_ERRORS
+from pharos.intraprocess.inboxes import Inbox
 from pharos.intraprocess.links import peer_of
 from pharos.private_rospy.topics import connections_of
 from pharos.waiting import wait
@@ -115,15 +117,15 @@ class InputChannel(DelegateHolder, Channel, Inbox):
         self._open_on(node, topic, message_class)
 
     def _open(self):
-        self.queue.clear()  # the stop has dropped the jobs of these messages
-        self.callback_queue = self._run.callback_queue
+        self.messages.clear()  # the stop has dropped the jobs of these messages
+        self.attach(self._run.callback_queue)
         self.closed = False  # the first message may come before the Subscriber is made
         # the callback is an Inbox, which SubscriptionOverlay fills
         self.ros_object = self.node.ros.Subscriber(self.topic, self.message_class, self)
 
     def __call__(self, message):
         """Take a latched message of a connection or link that is older than the channel."""
-        self.receive(message, 0)
+        self.receive(message)
 
     def _deliver(self, message):
         try:
@@ -142,7 +144,7 @@ class InputChannel(DelegateHolder, Channel, Inbox):
     def _retry(self, message):
         """Run the delegate on a message once more, while no other delegate of the node runs."""
         self.node._check_active()
-        self.callback_queue.call(lambda: self._deliver(message))
+        self.callback_queue.run_exclusively(lambda: self._deliver(message))
 
 
 class OutputChannel(Channel):
@@ -215,7 +217,7 @@ class OutputChannel(Channel):
             raise NodeStoppedError(f'{self!r} cannot send: open another one, or start the node')
         try:
             self._publisher.publish(message, connection, self)
-        except Exception as error:
+        except (ROSException, *SERIALIZE_ERRORS) as error:
             if self.closed:
                 raise NodeStoppedError(f'{self!r} was closed while it sent') from error
             raise messages.explain(message, error) from error

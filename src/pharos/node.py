@@ -49,11 +49,12 @@ class Node(DelegateHolder):
             def on_pose(self, pose):
                 self.send_to('/cmd_vel', typed_as='turtlesim/Velocity', linear=1.0)
 
-    All methods may be called from any thread. A node's delegates run one at a time, in a pool of
-    threads. The first one runs when :meth:`start` has returned, or sleeps, or after 2 s. All private
-    names of this class
-    begin with an underscore: a subclass may have a ``run``, ``report`` or ``state``. Methods that
-    need a started node raise NodeStoppedError if the node has not started, or has stopped.
+    All methods may be called from any thread. A node's delegates run one at a time, in one thread of
+    the node. The first one runs when :meth:`start` has returned, or sleeps, or after 2 s. Delegates
+    and callbacks of plain rospy begin in the order in which their messages came; doc/guide.md says
+    how long one that blocks delays others. All private names of this class begin with an underscore:
+    a subclass may have a ``run``, ``report`` or ``state``. Methods that need a started node raise
+    NodeStoppedError if the node has not started, or has stopped.
 
     :ivar name: the full name, as registered at the master: '/robot1/driver'
     :ivar master: the node's :class:`Master`
@@ -252,7 +253,7 @@ class Node(DelegateHolder):
             for receiver, delegate in zip(receivers, delegates):
                 receiver.delegate = delegate
 
-        run.callback_queue.call(change)
+        run.callback_queue.run_exclusively(change)
 
     def __enter__(self):
         return self

@@ -27,7 +27,7 @@ from pharos.errors import (
     UnknownServiceError,
 )
 from pharos.intraprocess.copier import serialize
-from pharos.private_rospy.run import call_local_service, find_local_service
+from pharos.private_rospy.services import call_here, find_service
 from pharos.private_rospy.tcpros import keep_alive
 from pharos.waiting import current
 
@@ -149,9 +149,10 @@ class Service:
             self._check_md5sum(service_class)
             local = None
             if timeout is None:  # a timeout could not end a local call
-                local = find_local_service(self.name, self.uri)
+                local = find_service(self.name, self.master.url, self.uri)
             if local:
-                self.response = call_local_service(local, request, self.caller_id)
+                header = {'callerid': self.caller_id, 'service': self.name}
+                self.response = call_here(local, request, header)
             else:
                 self.response = self._call(service_class, serialize(request), timeout)
         except ServiceException as error:

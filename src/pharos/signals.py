@@ -11,7 +11,7 @@ import time
 
 import rospy
 
-from pharos.intraprocess import callback_queues, links
+from pharos.intraprocess import links
 
 SAME_SIGNAL = 1.0  # seconds; people press Ctrl-C twice, and `timeout -s INT` sends two signals
 _SPIN_PERIOD = 0.01  # seconds
@@ -127,7 +127,6 @@ def _forget_nodes():
     started_nodes.clear()
     restarting_nodes.clear()
     links.runs.clear()
-    callback_queues.reset_after_fork()
 
 
 atexit.register(_stop_at_exit)

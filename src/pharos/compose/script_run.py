@@ -348,11 +348,11 @@ class ScriptRun(Run):
 
     def _start_handling(self):
         """Have another thread handle the signal; return a list of that thread."""
-        try:
-            return [self.start_thread(self.handle_signal_for_main)]
-        except RuntimeError:  # the interpreter ends, and starts no thread
-            self.handle_signal_for_main()
-            return []
+        thread = self.start_thread(self.handle_signal_for_main)
+        if thread:
+            return [thread]
+        self.handle_signal_for_main()  # the interpreter ends, and starts no thread
+        return []
 
     def handle_signal_for_main(self):
         """Handle the signal in this thread: the main thread is blocked or computes.

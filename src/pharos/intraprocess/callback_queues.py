@@ -1,128 +1,209 @@
-"""Run the callbacks of all nodes in a pool of threads, each node's one at a time.
+"""Run the callbacks of a node in its own threads, in the order in which their messages came.
 
-A publisher puts a message into the Inbox of each receiver, and wakes a worker. A worker takes the
-next callback queue that has a job. The worker wakes another one for the rest, unless the callbacks
-of that queue were fast. There are at most as many workers as nodes: a callback that blocks holds up
-its own node alone. Workers end with the last node. A publisher's thread runs inline inboxes. A
-subscription of plain rospy has a thread of its own, as with rospy.
+A callback queue has one thread. A node has one queue for its delegates, and one for each subscription
+of plain rospy. The thread begins a callback when those on earlier messages of the node have ended, or
+have run for SLOW. There are two exceptions. A publisher's thread runs the queue of an inline channel.
+A thread that reads TCPROS runs the callbacks of plain rospy without a queue_size.
 """
 import collections
+import contextlib
+import itertools
 import threading
-from contextlib import suppress
 from _thread import allocate_lock, get_ident
-from time import perf_counter, sleep, thread_time
-
-from pharos.intraprocess.copier import size_of
+from time import perf_counter, sleep
 
 BURST = 100e-6  # seconds; a publisher that woke a thread less than this ago does not wait for one
 YIELD_LIMIT = 1e-3  # seconds that a publisher waits at most until the receiver's thread runs
 YIELD_PAUSE = 0.02  # seconds without such a wait after one that reached its limit
-FAST = 50e-6  # seconds; a callback that takes less may run in the thread that reads the socket
-FAST_RUNS = 10  # fast callbacks in a row, until the thread that reads runs the next one
-SHORT_RUN = 1e-3  # seconds
-SENTRY_PERIOD = 4e-3  # seconds that a callback may hold up those of other nodes
-SENTRY_REST = 1.0  # seconds without an alert until the sentry rests
-#: seconds until rospy's first callback: a connection between processes takes so long
-FIRST_PAUSE = 0.05
+SLOW = 1e-3  # seconds; the callbacks on later messages do not wait longer for one that runs
+TURN_LIMIT = 0.05  # seconds that a callback waits at most, also for those that have not begun
 
-INFINITE = float('inf')
-
-_ready_queues = collections.deque()
-_idle_workers = []
-_workers = set()
-_pooled_queues = set()
-_pool_lock = allocate_lock()  # of _workers, _pooled_queues, and attributes of queues
 _no_yield_before = 0.0
-_sentry = None
+
+
+class CallbackOrder:
+    """The order of the callbacks of one node.
+
+    Each message gets a number when it reaches the node. A queue that has its turn is the one with
+    the lowest number.
+
+    :param start_thread: ``start_thread(target)`` returns a thread of the node, None if the system
+        has no more threads
+    :ivar numbers: the numbers of the messages to come
+    :ivar is_paused: True: no callback begins, for TURN_LIMIT at most
+    :ivar queues: a dict with the open callback queues that have an inbox as its keys
+    """
+
+    def __init__(self, start_thread):
+        self.start_thread = start_thread
+        self.first_run_time = 0.0  # when the first pause of the newest queue ends
+        self.numbers = itertools.count()
+        self.queues = {}
+        self.is_paused = False
+
+    def has_turn(self, callback_queue, number):
+        """True if no callback on a message before this number delays the queue's next one."""
+        if self.is_paused:
+            return False
+        now = perf_counter()
+        for queue in list(self.queues):
+            if queue is not callback_queue and queue.delays(number, now):
+                return False
+        return True
+
+    def pass_turn(self):
+        """Wake the thread that waits for its turn with the lowest number."""
+        waiting_queues = [queue for queue in list(self.queues) if queue.waits_for_turn]
+        if waiting_queues:
+            min(waiting_queues, key=CallbackQueue.next_number).wake()
 
 
 class CallbackQueue:
-    """Runs callbacks one at a time: those of a node, or of one subscription of plain rospy.
+    """Runs callbacks one at a time: a node's delegates, or those of a subscription of plain rospy.
 
-    ``jobs`` has an Inbox once for each of its messages, or more often if some were dropped. Each
-    message waits in its Inbox as ``(value, thaw, header)``. The value is a frozen message. If
-    ``thaw`` is None, the value is the message itself, which came from a socket or is shared.
+    The thread starts with the first message, and ends with the queue. Objects bound to their thread
+    (a connection of SQLite, a context of CUDA) keep working.
 
-    :ivar is_pooled: True if workers run the jobs, False if a thread of the queue's own does
-    :ivar is_scheduled: True from schedule() until a thread takes the queue
-    :ivar is_fast: True if the last callbacks were fast
-    :ivar is_held: True between hold() and release()
+    :param order: the CallbackOrder of the node
+    :param first_pause: seconds until the first callback
+    :ivar jobs: the messages of all inboxes, as Inbox says
+    :ivar holder: the identifier of the thread that has called hold(), None after release()
+    :ivar may_begin: False while the queue is held, and after stop()
+    :ivar running_thread: the identifier of the thread that runs callbacks, or None
+    :ivar thread: the thread of the queue, from the first message on; None if the thread has ended
+    :ivar begin_time: the time when the callback that runs began, as of perf_counter(), or None
+    :ivar request_lock: held from a request until the thread looks for jobs; then by a publisher that
+        waited for that, until the thread looks for jobs once more
+    :ivar waits_for_turn: True while the next callback waits for those of other queues
     """
 
-    is_pooled = True
-    is_scheduled = False
-    is_fast = False
-    is_held = False
     closed = False
-    cpu_seconds = 0.0  # that its jobs took in threads of the pool, or in its own
-    own_thread = None
-    running_thread = None  # the identifier of the thread that runs or holds the queue
+    holder = None
+    may_begin = True
+    running_thread = None
+    begin_time = None
+    waits_for_turn = False
+    _is_slow = False  # True if the last callback took longer than SLOW
+    _current_number = 0  # of the message whose callback runs
+    thread = None
+    _is_requested = False  # True from request_thread() until the thread looks for jobs
 
-    def __init__(self):
+    def __init__(self, order, first_pause=0.0):
+        self.order = order
         self.jobs = collections.deque()
-        self._jobs_lock = allocate_lock()
-        self._join_pool()
-
-    def _join_pool(self):
-        with _pool_lock:
-            _pooled_queues.add(self)
+        self._running_lock = allocate_lock()  # held by the thread that runs callbacks
+        self._first_run_time = perf_counter() + first_pause
+        order.first_run_time = max(order.first_run_time, self._first_run_time)
+        self._wake_lock = allocate_lock()  # released to wake the thread
+        self._wake_lock.acquire()
+        self.request_lock = allocate_lock()
 
     def hold(self):
-        """Run nothing until release(), except blocks that this thread passes to call()."""
-        self._jobs_lock.acquire()
-        self.running_thread = get_ident()
-        self.is_held = True
+        """Run no callback until release()."""
+        self.holder = get_ident()
+        self.may_begin = False
 
     def release(self):
         """End a hold, if there is one; any thread may do so."""
-        with _pool_lock:
-            was_held = self.is_held
-            self.is_held = False
-        if was_held:
-            self.running_thread = None
-            self._jobs_lock.release()
-            self.request_thread()
+        self.holder = None
+        self.may_begin = not self.closed
+        self.request_thread()
 
     def release_before_sleep(self):
         """End a hold by this thread, which would sleep while delegates wait."""
-        if self.running_thread == get_ident():
+        if self.holder == get_ident():
             self.release()
-
-    def run_jobs(self):
-        """Run all jobs in this thread, unless another thread does so already."""
-        jobs = self.jobs
-        while jobs and not self.closed and self._jobs_lock.acquire(False):
-            self.running_thread = get_ident()
-            try:
-                while jobs and not self.closed:
-                    inbox = jobs.popleft()
-                    try:
-                        value, thaw, header = inbox.queue.popleft()
-                    except IndexError:  # several messages were dropped at once
-                        continue
-                    inbox.taken_count += 1
-                    if thaw is not None:
-                        message = thaw(value)
-                        message._connection_header = header
-                        inbox.callback(message)
-                    elif inbox.inline:
-                        inbox.callback(value)
-                    else:  # receive() runs fast callbacks in the thread that reads a socket
-                        start_time = perf_counter()
-                        inbox.callback(value)
-                        is_fast = perf_counter() - start_time < FAST
-                        inbox.fast_runs = inbox.fast_runs + 1 if is_fast else 0
-            finally:
-                self.running_thread = None
-                self._jobs_lock.release()
-        if self.closed:  # close() may have given up waiting for a callback of this thread
-            self._leave_pool()
 
     def is_current(self):
         """True if this thread runs one of the callbacks."""
         return self.running_thread == get_ident()
 
-    def call(self, block):
+    # -- the order
+
+    def next_number(self):
+        """Return the number of the next message; infinity if there is none."""
+        try:
+            return self.jobs[0][0]
+        except IndexError:  # another thread has taken the message
+            return float('inf')
+
+    def delays(self, number, now):
+        """True if a callback on the message of that number must wait for one of this queue."""
+        begin_time = self.begin_time
+        if begin_time is not None:
+            # one that was slow the last time delays nobody while it runs
+            is_slow = self._is_slow or now - begin_time > SLOW
+            return self._current_number < number and not is_slow
+        if self.holder or now < self._first_run_time:
+            return False
+        return self.next_number() < number
+
+    def _wait_for_turn(self):
+        """Wait until callbacks on earlier messages have ended, or have run for SLOW."""
+        deadline = perf_counter() + TURN_LIMIT
+        self.waits_for_turn = True
+        while not self.order.has_turn(self, self.next_number()) and not self.closed:
+            if perf_counter() > deadline:
+                break
+            self._wake_lock.acquire(True, SLOW)
+        self.waits_for_turn = False
+
+    # -- running
+
+    def run_jobs(self, waits_for_turn=True):
+        """Run all jobs in this thread, unless another thread does so already.
+
+        :param waits_for_turn: False: begin at once, whatever other queues of the node do
+        """
+        jobs = self.jobs
+        order = self.order
+        # the outer loop: a publisher that adds a job before the release finds the lock taken
+        while jobs and self.may_begin and self._running_lock.acquire(False):
+            self.running_thread = get_ident()
+            try:
+                while jobs and self.may_begin:
+                    if len(order.queues) > 1:
+                        self._run_in_order(waits_for_turn)
+                    else:
+                        self._run_next()
+            finally:
+                self.running_thread = None
+                self._running_lock.release()
+
+    def _run_next(self):
+        try:
+            job = self.jobs.popleft()
+        except IndexError:  # a publisher has dropped the last one
+            return
+        job[1].run_callback(job)
+
+    def _run_in_order(self, waits_for_turn):
+        """Run the next job in the queue's turn, and say so to the other queues of the node."""
+        if waits_for_turn:
+            self._wait_for_turn()
+        self._current_number = self.next_number()
+        self.begin_time = perf_counter()
+        if self._is_slow:  # the next callbacks need not wait for this one
+            self.order.pass_turn()
+        try:
+            if self.may_begin:  # else a stop has begun
+                self._run_next()
+        finally:
+            self._is_slow = perf_counter() - self.begin_time > SLOW
+            self.begin_time = None
+            self.order.pass_turn()
+
+    def run_jobs_here(self):
+        """Run all jobs in this thread; wait while another thread runs some of them."""
+        self._wait_for_first_run()
+        while self.jobs and self.may_begin:
+            self.run_jobs()
+            with self._running_lock:
+                pass
+        if self._is_requested or self.closed:  # a wait for a turn here may have taken the wake
+            self.wake()
+
+    def run_exclusively(self, block):
         """Run ``block()`` in this thread, while no callback runs, unless the queue is closed.
 
         If this thread runs a callback of the queue, run the block at once.
@@ -130,382 +211,106 @@ class CallbackQueue:
         if self.is_current():
             block()
             return
-        with self._jobs_lock:
+        with self._running_lock:
             self.running_thread = get_ident()
             try:
                 if not self.closed:
                     block()
             finally:
                 self.running_thread = None
-        if self.closed:  # as in run_jobs()
-            self._leave_pool()
-        else:
-            self.request_thread()
+        self.request_thread()
 
-    def schedule(self):
-        """Put the queue into the pool's list, if it has jobs and is not there.
-
-        :returns: True if the caller must wake a worker
-        """
-        if self.is_scheduled or not self.jobs:
-            return False
-        self.is_scheduled = True
-        _ready_queues.append(self)
-        return True
+    # -- the thread
 
     def request_thread(self):
-        """Wake a thread to run the jobs."""
-        if self.schedule():
-            _wake_worker()
+        """Have the thread run the jobs; return True if this has started or woken the thread."""
+        if self._is_requested or not (self.jobs and self.may_begin):
+            return False
+        self._is_requested = True
+        is_first = self.request_lock.acquire(False)
+        if self.thread:
+            self.wake()
+            return True
+        if is_first and not self.order.start_thread(self._loop):
+            self._is_requested = False  # the next message tries again
+            self.request_lock.release()
+        return False
+
+    def wake(self):
+        """End the thread's rest or wait; if there is none, the next one ends at once."""
+        with contextlib.suppress(RuntimeError):  # another thread has woken this one already
+            self._wake_lock.release()
+
+    def _wait_for_first_run(self):
+        """Sleep until the first pause is over, and that of queues made meanwhile.
+
+        A constructor that subscribes to several topics may still run.
+        """
+        pause = self._first_run_time - perf_counter()
+        if pause > 0:
+            sleep(pause)
+            self._first_run_time = self.order.first_run_time
+            sleep(max(0.0, self._first_run_time - perf_counter()))
+
+    def _loop(self):
+        self.thread = threading.current_thread()
+        self._wait_for_first_run()
+        try:
+            while not self.closed:
+                self._accept_request()
+                self.run_jobs()
+                # else the wait for a turn may have taken the wake
+                if not self._is_requested and not self.closed:
+                    self._wake_lock.acquire()
+        finally:  # after an exception the next message starts another thread
+            self.thread = None
+            self._accept_request()
+
+    def _accept_request(self):
+        self._is_requested = False
+        if self.request_lock.locked():
+            self.request_lock.release()
+
+    def stop(self):
+        """Begin no more callbacks."""
+        self.closed = True
+        self.may_begin = False
+        self.order.queues.pop(self, None)
+        self.wake()
 
     def close(self, timeout):
-        """Drop all jobs, and wait for the callback that runs.
+        """Begin no more callbacks, drop all jobs, and wait for the callback that runs.
 
         :param timeout: seconds
         :returns: True if that callback has ended, or runs in this thread
         """
-        self.closed = True
-        self.release()
-        has_ended = self.running_thread == get_ident()
-        if not has_ended and self._jobs_lock.acquire(True, timeout):
-            self._jobs_lock.release()  # call() may wait for the lock
-            has_ended = True
-        self.jobs.clear()
-        if has_ended:  # else the queue still counts: another worker may replace the blocked one
-            self._leave_pool()
+        self.stop()
+        if self.is_current():
+            return True
+        has_ended = self._running_lock.acquire(True, timeout)
+        if has_ended:
+            self._running_lock.release()  # run_exclusively() may wait for the lock
+            self.jobs.clear()
         return has_ended
-
-    def _leave_pool(self):
-        with _pool_lock:
-            _pooled_queues.discard(self)
-        if not _pooled_queues:
-            _end_pool()
-
-
-class ThreadedCallbackQueue(CallbackQueue):
-    """Runs the callbacks of one subscription of plain rospy in one thread of its own.
-
-    The thread ends with the subscription. Objects bound to their thread (a connection of SQLite, a
-    context of CUDA) keep working. The first callback runs FIRST_PAUSE after the subscription: many
-    constructors subscribe before they have set all that their callback uses.
-    """
-
-    is_pooled = False
-
-    def __init__(self):
-        super().__init__()
-        self._first_run_time = perf_counter() + FIRST_PAUSE
-
-    def _join_pool(self):
-        """Stay out of the pool."""
-
-    def schedule(self):
-        """Wake the queue's own thread; return False, since no worker is needed."""
-        if not self.is_scheduled and self.jobs:
-            self.is_scheduled = True
-            if self.own_thread:
-                self.own_thread.wake()
-            else:
-                self._start_thread()
-        return False
-
-    def _start_thread(self):
-        with _pool_lock:  # two publishers may be here
-            if not self.own_thread:
-                self.own_thread = _RestingThread(self._loop, 'pharos callbacks')
-                self.own_thread.start()
-
-    def call(self, block):
-        """Run ``block()`` as CallbackQueue.call() does; wait until FIRST_PAUSE is over."""
-        self._wait_for_first_run()
-        super().call(block)
-
-    def _wait_for_first_run(self):
-        sleep(max(0.0, self._first_run_time - perf_counter()))
-
-    def _loop(self):
-        self._wait_for_first_run()
-        while not self.closed:
-            self.is_scheduled = False
-            self.run_jobs()
-            self.cpu_seconds = thread_time()
-            self.own_thread.rest()
-
-    def _leave_pool(self):
-        """Let the queue's own thread end."""
-        if self.own_thread:
-            self.own_thread.wake()
-
-
-class _RestingThread:
-    """A thread that rests until another thread wakes this one."""
-
-    def __init__(self, loop, name):
-        self._rest_lock = allocate_lock()  # released to wake the thread
-        # held from the wake until the thread runs, and then by a publisher that waited for that
-        self._start_lock = allocate_lock()
-        self._rest_lock.acquire()
-        self.start = threading.Thread(target=loop, name=name, daemon=True).start
-
-    def wake(self):
-        """End the thread's rest; if the thread does not rest, its next rest ends at once."""
-        self._start_lock.acquire(False)
-        try:
-            self._rest_lock.release()
-        except RuntimeError:  # another thread has woken this one already
-            pass
-
-    def rest(self):
-        """Wait until another thread calls wake(); called by this thread alone."""
-        self._rest_lock.acquire()
-        if self._start_lock.locked():
-            self._start_lock.release()
-
-    def wait_until_running(self, timeout):
-        """Wait until the thread runs after a wake(); return True if the thread runs in time.
-
-        This caller then holds the lock until the end of the thread's next rest().
-        """
-        return self._start_lock.acquire(True, timeout)
-
-
-class _Worker(_RestingThread):
-    """A thread of the pool; runs callback queues that are ready until the last node has ended."""
-
-    def __init__(self):
-        super().__init__(self._loop, 'pharos worker')
-        self._last_cpu = 0.0  # of this thread, when it was read
-        self._short_seconds = 0.0  # of short runs since then
-
-    def _count_cpu(self, callback_queue, duration):
-        """Add the CPU time of a run to the queue's.
-
-        A short run is taken for busy all the time: to read the clock takes as long as a delegate.
-        """
-        if duration < SHORT_RUN:
-            self._short_seconds += duration
-            callback_queue.cpu_seconds += duration
-            return
-        cpu = thread_time()
-        callback_queue.cpu_seconds += max(0.0, cpu - self._last_cpu - self._short_seconds)
-        self._last_cpu = cpu
-        self._short_seconds = 0.0
-
-    def _loop(self):
-        while True:
-            try:
-                callback_queue = _ready_queues.popleft()
-            except IndexError:
-                with _pool_lock:
-                    if not _pooled_queues:
-                        _workers.discard(self)
-                        break
-                _idle_workers.append(self)
-                if _ready_queues or not _pooled_queues:
-                    _wake_worker()  # a thread that scheduled before the append() saw no idle worker
-                self.rest()
-                continue
-            if _ready_queues:
-                if callback_queue.is_fast:
-                    _alert_sentry()
-                else:
-                    _wake_worker()
-            callback_queue.is_scheduled = False
-            job_count = len(callback_queue.jobs)
-            start_time = perf_counter()
-            callback_queue.run_jobs()
-            duration = perf_counter() - start_time
-            callback_queue.is_fast = duration < FAST * job_count
-            self._count_cpu(callback_queue, duration)
-        _wake_worker()  # each worker that ends has the next one end
-
-
-def _wake_worker():
-    """Wake an idle worker, and return the worker.
-
-    If all workers are busy and fewer than the pooled queues, start one. Return None then: a
-    publisher does not wait for a worker that starts.
-    """
-    try:
-        worker = _idle_workers.pop()
-    except IndexError:
-        with _pool_lock:
-            if len(_workers) < len(_pooled_queues):
-                worker = _Worker()
-                _workers.add(worker)
-                worker.start()
-        return None
-    worker.wake()
-    return worker
-
-
-class _Sentry(_RestingThread):
-    """Wakes a worker for the queues behind a callback that was fast so far, and now blocks.
-
-    A worker alerts the sentry if it leaves ready queues for after a fast one. From then on the
-    sentry looks every SENTRY_PERIOD, and rests after SENTRY_REST without an alert.
-    """
-
-    is_needed = False
-    is_looking = False
-
-    def __init__(self):
-        super().__init__(self._loop, 'pharos sentry')
-
-    def _loop(self):
-        global _sentry
-        while _pooled_queues and _sentry is self:
-            self.is_looking = True
-            last_need = perf_counter()
-            while _pooled_queues and perf_counter() - last_need < SENTRY_REST:
-                sleep(SENTRY_PERIOD)
-                if self.is_needed:
-                    self.is_needed = False
-                    last_need = perf_counter()
-                if _ready_queues:
-                    _wake_worker()
-            self.is_looking = False
-            if _pooled_queues and not self.is_needed:
-                self.rest()
-        if _sentry is self:
-            _sentry = None
-
-
-def _alert_sentry():
-    """Have the sentry look after the ready queues that a worker leaves for later."""
-    global _sentry
-    sentry = _sentry
-    if sentry is None:
-        sentry = _Sentry()
-        _sentry = sentry  # before the start: the loop compares itself with _sentry
-        sentry.start()
-    sentry.is_needed = True
-    if not sentry.is_looking:
-        sentry.wake()
-
-
-class Inbox:
-    """The messages that wait for one callback; a full one drops the oldest.
-
-    :param callback_queue: the CallbackQueue that runs the callback
-    :param callback: called as ``callback(message)``; raises nothing
-    :param queue_size: number of messages; None or 0: as many as ``queue_bytes`` hold
-    :param inline: True: the thread of the publisher runs the callback
-    :param shared: True: the callback gets the published object, not a copy
-    :ivar dropped: the number of dropped messages
-    :ivar taken_count: the number of messages taken for the callback
-    """
-
-    queue_bytes = 64 << 20
-    dropped = 0
-    taken_count = 0
-    fast_runs = 0  # in a row
-    _count_at_yield = -1
-
-    def __init__(self, callback_queue, callback, queue_size=None, inline=False, shared=False):
-        self.callback_queue = callback_queue
-        self.callback = callback
-        self.inline = inline
-        self.shared = shared
-        self.queue = collections.deque()
-        self.queue_size = queue_size or INFINITE
-        self.capacity = self.queue_size
-
-    def put(self, item, size=0):
-        """Add a message; the caller then wakes or runs the callback queue.
-
-        :param item: ``(value, thaw, header)``; a publisher has one tuple for all receivers, since
-            many tuples make the collector of garbage run often
-        :param size: the bytes of the value; 0: unknown
-        """
-        queue = self.queue
-        count = len(queue)
-        if not count:
-            queue.append(item)
-            self.callback_queue.jobs.append(self)
-            return
-        is_power_of_two = not count & (count - 1)
-        if count >= self.capacity or is_power_of_two:  # not each time: the estimate takes long
-            self.capacity = min(self.queue_size, self.capacity_for(size or size_of(item[0])))
-            if count >= self.capacity and self.taken_count != self._count_at_yield:
-                # sleep, or a publisher that never sleeps would starve the receiver; not again until
-                # the receiver has taken a message: it may be blocked
-                self._count_at_yield = self.taken_count
-                sleep(1e-6)
-        # append, then drop: a receiver that runs meanwhile must not find the queue empty
-        queue.append(item)
-        is_full = False
-        while len(queue) > self.capacity:
-            with suppress(IndexError):  # the receiver has taken all meanwhile
-                queue.popleft()
-                self.dropped += 1
-            is_full = True
-        if not is_full:  # else the job of the dropped message is left for this one
-            self.callback_queue.jobs.append(self)
-
-    def capacity_for(self, size):
-        """Return how many messages of ``size`` bytes may wait."""
-        return max(1, self.queue_bytes // size)
-
-    def receive(self, message, size):
-        """Take a message from a socket; the thread that reads the socket calls this.
-
-        If the callback was fast ten times in a row, this thread runs the next one, too: to wake
-        another thread takes longer. This thread also runs callbacks of plain rospy without a
-        queue_size, as in rospy. Meanwhile messages wait in the sockets and in the publisher.
-
-        :param size: the bytes of the message; 0: unknown
-        """
-        callback_queue = self.callback_queue
-        if not callback_queue.is_pooled and self.queue_size == INFINITE:
-            callback_queue.call(lambda: self.callback(message))
-            return
-        self.put((message, None, None), size)
-        if self.inline or callback_queue.is_pooled and self.fast_runs >= FAST_RUNS:
-            callback_queue.run_jobs()
-        else:
-            callback_queue.request_thread()
 
 
 def hand_over(callback_queues, last_wake, may_wait):
-    """Wake threads to run the jobs of some callback queues; a publisher calls this.
+    """Wake the threads of some callback queues; a publisher calls this.
 
     :param last_wake: the last time that the same publisher woke a thread, as of perf_counter()
-    :param may_wait: True: wait up to YIELD_LIMIT until the thread runs
+    :param may_wait: True: wait up to YIELD_LIMIT until each thread runs
     :returns: the time now if a thread was woken, else ``last_wake``
     """
     global _no_yield_before
-    is_worker_needed = False
-    thread = None
-    # schedule() wakes own threads; ``thread`` is the one to wait for, and any will do
-    for callback_queue in callback_queues:
-        if not callback_queue.is_scheduled:
-            is_worker_needed |= callback_queue.schedule()
-            thread = callback_queue.own_thread
-    if is_worker_needed:
-        thread = _wake_worker()  # this worker wakes another one if there are more queues
-    if not thread:
-        return last_wake
     now = perf_counter()
     # a busy publisher keeps the interpreter for 5 ms, unless it waits for the thread to run
-    if may_wait and now - last_wake > BURST and now > _no_yield_before:
-        is_running = thread.wait_until_running(YIELD_LIMIT)
-        if not is_running:
-            _no_yield_before = now + YIELD_PAUSE
-    return now
-
-
-def _end_pool():
-    global _sentry
-    _wake_worker()
-    if _sentry:
-        _sentry.wake()
-        _sentry = None
-
-
-def reset_after_fork():
-    """Forget all workers in a forked child: their threads run in the parent alone."""
-    global _sentry
-    for collection in _ready_queues, _idle_workers, _workers, _pooled_queues:
-        collection.clear()
-    _sentry = None
+    waits = may_wait and now - last_wake > BURST and now > _no_yield_before
+    for callback_queue in callback_queues:
+        if not callback_queue.request_thread():
+            continue
+        last_wake = now
+        if waits:
+            waits = callback_queue.request_lock.acquire(True, YIELD_LIMIT)
+            if not waits:
+                _no_yield_before = now + YIELD_PAUSE
+    return last_wake

@@ -26,6 +26,18 @@ class _UnusualError(Exception):
     """A class or value that only genpy's serializer handles."""
 
 
+#: what genpy raises for a message that it cannot serialize; not what the handler of a signal raises
+SERIALIZE_ERRORS = (
+    genpy.SerializationError,
+    struct.error,
+    TypeError,
+    ValueError,
+    AttributeError,
+    LookupError,
+    ArithmeticError,
+)
+
+
 def serialize(message):
     """Return the bytes of a message on the wire, without their length."""
     buffer = io.BytesIO()
@@ -125,7 +137,13 @@ def _booleans(value):
     return tuple(map(bool, _bytes_of_booleans(value)))
 
 
-_GLOBALS = {'new': object.__new__, 'text': _text, 'sequence': _sequence, 'Unusual': _UnusualError}
+_GLOBALS = {
+    'new': object.__new__,
+    'text': _text,
+    'sequence': _sequence,
+    'Unusual': _UnusualError,
+    'refused': (_UnusualError, *SERIALIZE_ERRORS),
+}
 _GLOBALS.update((f'{base}_array', _number_converter(code)) for base, code in CODES.items())
 _GLOBALS.update(
     string_array=lambda value: tuple(map(_text, _sequence(value))),
@@ -245,7 +263,8 @@ def _generate(cls, depth=0):
             f'if m.__class__ is not {class_name}: return serialize(m)',
             'try:',
             *(f'    {line}' for line in freeze_lines or ['pass']),
-            'except Exception: return serialize(m)',  # the serializer's exception names the error
+            # the serializer's exception names the error
+            'except refused: return serialize(m)',
         ]
     freeze = ['def freeze(m):', *freeze_lines, f'return ({variables})']
     thaw = [

@@ -16,6 +16,7 @@ from rosgraph.network import ROSHandshakeException, decode_ros_handshake_header,
 
 from pharos.private_rospy import tcpros, topics
 from pharos.private_rospy.loader import Shim
+from pharos.private_rospy.services import call_by_proxy
 
 MAX_REQUEST = 1 << 20  # bytes of a connection header, and of an XML-RPC request
 POLL_INTERVAL = 60  # seconds between two looks for a stop; the stop itself wakes the server
@@ -114,7 +115,8 @@ def accept(original, run, self, sock, address):
         original(self, sock, address)
 
     run.sockets.add(sock)
-    run.start_thread(shake_hands)
+    if not run.start_thread(shake_hands):
+        sock.close()
 
 
 @patch('rospy.impl.tcpros_base', 'logwarn')
@@ -160,7 +162,8 @@ def start_xmlrpc(original, run, self):
         with server:  # closes the server's socket at the end
             server.serve_forever(poll_interval=POLL_INTERVAL)
 
-    run.start_thread(serve)
+    if not run.start_thread(serve):
+        raise RuntimeError(f'{run.name} cannot start: the system has no thread left, see ulimit -u')
 
 
 @patch('rosgraph.xmlrpc', 'XmlRpcNode.shutdown')
@@ -185,11 +188,11 @@ def process_request(original, run, self, request, address):
         self.process_request_thread(request, address)
         run.deadlines.pop(request, None)
 
-    run.limit_silence(request)
     run.sockets.add(request)
-    if run.stopping.is_set():
-        tcpros.shutdown_socket(request)
-    run.start_thread(answer)
+    if run.stopping.is_set() or not run.start_thread(answer):
+        self.shutdown_request(request)
+    else:
+        run.limit_silence(request)
 
 
 @patch('rosgraph.xmlrpc', 'SilenceableXMLRPCRequestHandler.do_POST')
@@ -373,11 +376,18 @@ def cleanup(original, run, self, reason):
 
 
 @patch('actionlib.simple_action_client', 'SimpleActionClient.send_goal')
-@patch('actionlib.simple_action_client', 'SimpleActionClient._handle_transition')
-def keep_goal(original, run, self, *args, **kwargs):
-    """actionlib drops an answer that comes before send_goal() returns. Here the answer waits."""
-    with self.done_condition:
-        return original(self, *args, **kwargs)
+def send_goal(original, run, self, *args, **kwargs):
+    """actionlib drops an answer that comes before send_goal() returns. Here the answer waits.
+
+    No callback of the node begins meanwhile: the feedback stays before the result.
+    """
+    order = run.callback_order
+    order.is_paused = True
+    try:
+        original(self, *args, **kwargs)
+    finally:
+        order.is_paused = False
+        order.pass_turn()
 
 
 # -- parameters, log, services
@@ -411,6 +421,19 @@ def rosout_without_master(original, run):
 def service_exception(original, run):
     """rospy's ServiceException would be another class for each node. Here all nodes share one."""
     return rospy.ServiceException
+
+
+@patch('rospy.impl.tcpros_service', 'ServiceProxy.call')
+def call_service(original, run, self, *args, **kwargs):
+    """rospy asks the master and connects for each call. A service of this process answers here.
+
+    The caller waits for the answer anyway: so its thread may run the service's handler.
+    """
+    request = rospy.msg.args_kwds_to_message(self.request_class, args, kwargs)
+    response = call_by_proxy(run, self, request)
+    if response is None:
+        return original(self, request)
+    return response
 
 
 @patch('rospy.impl.tcpros_service', 'ServiceImpl.handle')

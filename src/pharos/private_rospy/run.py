@@ -9,7 +9,6 @@ import dataclasses
 import enum
 import errno
 import functools
-import io
 import os
 import socket
 import sys
@@ -19,13 +18,10 @@ import xmlrpc.client
 from contextlib import suppress
 from http.client import HTTPException
 from time import monotonic
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Sequence
 from urllib.parse import urlsplit
 from weakref import WeakSet
 from xml.parsers.expat import ExpatError
-
-from rospy import ServiceException
 
 from pharos.blocks import block_name
 from pharos.errors import (
@@ -36,8 +32,7 @@ from pharos.errors import (
     PortInUseError,
 )
 from pharos.failures import Failure, Failures
-from pharos.intraprocess.callback_queues import CallbackQueue
-from pharos.intraprocess.copier import copy_of
+from pharos.intraprocess.callback_queues import CallbackOrder, CallbackQueue
 from pharos.intraprocess.links import link_topic, runs, runs_lock
 from pharos.private_rospy import patches
 from pharos.private_rospy.loader import PrivateModules, Shim, private_path
@@ -133,6 +128,7 @@ class Run:
     """
 
     uri = ''  # of the XML-RPC server; '' until the server runs
+    lacks_memory = False  # True if the system had no memory or descriptor for a memory file
     lifecycle = Lifecycle.STARTING
 
     def __init__(self, node, settings):
@@ -145,15 +141,18 @@ class Run:
         self.endpoints = []  # also those that the stop has closed, for the next start
         self.stopping = threading.Event()  # set when a stop begins: sleeps and waits end
         self.finished = threading.Event()  # set at the end of a stop: threads left behind end
-        self.threads = WeakSet()
+        self.threads = set()
         self.ended_cpu_seconds = 0.0  # of threads that have ended
+        self.troubles = set()  # texts for the log: a publisher must not log while it holds locks
         self.sockets = WeakSet()
         self.calls = WeakSet()  # sockets of calls of services
         self.deadlines = {}  # socket of a silent client -> the time when it is closed
         self.publisher_uris = {}  # topic -> URIs, the last list of the master
+        self.retries = {}  # (topic, URI) -> the time to connect again, and the last error
         self.connecting = set()  # (topic, URI, id of the subscription) of attempts that go on
         self.relays = {}  # (topic, URI, class) -> publisher to the nodes that share a connection
-        self.callback_queue = CallbackQueue()
+        self.callback_order = CallbackOrder(self.start_thread)
+        self.callback_queue = CallbackQueue(self.callback_order)
         self.callback_queue.hold()  # until the node's start() has returned
         self.hold_deadline = monotonic()  # the watcher ends the hold at its next look after this
         if node._holds_delegates:  # else a user calls start(): there is no release after its end
@@ -187,14 +186,15 @@ class Run:
 
             def start(self):
                 self.daemon = True
+                run.threads.add(self)  # before its start: a stop waits for it
                 super().start()
-                run.threads.add(self)
 
             def run(self):
                 try:
                     super().run()
                 finally:
                     run.ended_cpu_seconds += time.thread_time()
+                    run.threads.discard(self)
 
         self.Thread = Thread
         client = Shim(xmlrpc.client, ServerProxy=ServerProxy)
@@ -210,9 +210,20 @@ class Run:
         }
 
     def start_thread(self, target):
-        """Start a thread of the node, and return the thread."""
-        thread = self.Thread(target=target)
-        thread.start()
+        """Start a thread of the node, and return the thread.
+
+        :returns: None if the system has no thread left: the caller must try again, or close what
+            needs the thread; the watcher tells the log
+        """
+        function = getattr(target, 'func', target)
+        thread = self.Thread(target=target, name=f'{self.name} ({function.__name__.strip("_")})')
+        try:
+            thread.start()
+        except RuntimeError as error:
+            self.troubles.add(
+                f'{self.name} lacks a thread, and tries again: {error}; see ulimit -u'
+            )
+            return None
         return thread
 
     def sleep(self, seconds):
@@ -267,15 +278,12 @@ class Run:
         return health_facts(self)
 
     def cpu_seconds(self):
-        """Return the CPU time of the node's threads, and of its callbacks in other threads."""
-        seconds = self.ended_cpu_seconds + self.callback_queue.cpu_seconds
+        """Return the CPU time of the node's threads."""
+        seconds = self.ended_cpu_seconds
         for thread in list(self.threads):
             with suppress(OSError):  # the thread ends at this moment
                 if thread.is_alive():
                     seconds += time.clock_gettime(time.pthread_getcpuclockid(thread.ident))
-        for subscription in list(self.topic_manager.subs.values()):
-            if subscription.plain_inbox:
-                seconds += subscription.plain_inbox.callback_queue.cpu_seconds
         return seconds
 
     # -- failures
@@ -417,7 +425,7 @@ class Run:
             if uri in runs:
                 self.connect(topic, uri)
             else:
-                self.start_thread(functools.partial(self.connect, topic, uri))
+                self.start_connecting(topic, uri)
 
     def connect(self, topic, uri):
         """Connect the subscription of a topic to a publisher, by a link, a relay or a socket.
@@ -447,28 +455,48 @@ class Run:
     def _negotiate(self, topic, uri, subscription):
         """Have rospy offer the protocols of make_findable() and TCPROS, and connect by one."""
         code = None
-        # rospy raises these if the subscription is closed meanwhile
-        with suppress(AttributeError, UnboundLocalError):
+        reason = ''
+        try:
             code, _, _ = self.ros_handler._connect_topic(topic, uri)
+        except (
+            AttributeError,
+            UnboundLocalError,
+        ):  # of rospy: the subscription was closed meanwhile
+            pass
+        except RuntimeError as error:  # no thread is left, but rospy has added the connection
+            reason = str(error)
+            for connection in subscription.connections:
+                if connection.endpoint_id == uri:
+                    connection.close()
+            code = 0
         if code == 1:
             return
         close_relay(self, topic, uri, subscription)
         if code is not None:
-            self.start_thread(functools.partial(self.connect_again, topic, uri))
+            self.connect_later(topic, uri, reason)
 
-    def connect_again(self, topic, uri, reason=''):
-        """Wait for RETRY_DELAY; connect once more if the master still names the publisher.
+    def connect_later(self, topic, uri, reason=''):
+        """Have the watcher connect after RETRY_DELAY, if the master still names the publisher.
 
         :param reason: the text of the last error, for the log, or ''
         """
-        is_stopping = self.stopping.wait(RETRY_DELAY)
-        if is_stopping or uri not in self.publisher_uris.get(topic, ()):
-            return
-        if reason:
-            self.ros.logwarn_throttle_identical(
-                60, f'{topic}: no connection to {uri}, it is tried again: {reason}'
-            )
-        self.connect(topic, uri)
+        self.retries[topic, uri] = monotonic() + RETRY_DELAY, reason
+
+    def _retry_connections(self):
+        for (topic, uri), (retry_time, reason) in list(self.retries.items()):
+            if monotonic() < retry_time:
+                continue
+            del self.retries[topic, uri]
+            if uri not in self.publisher_uris.get(topic, ()):
+                continue
+            if reason:
+                self.troubles.add(f'{topic}: no connection to {uri}, it is tried again: {reason}')
+            self.start_connecting(topic, uri)
+
+    def start_connecting(self, topic, uri):
+        """Connect in a thread, or later if the system has none left."""
+        if not self.start_thread(functools.partial(self.connect, topic, uri)):
+            self.connect_later(topic, uri)
 
     def register_missing(self, state):
         """Register the topics and services that the master's system state lacks.
@@ -508,11 +536,16 @@ class Run:
         self.deadlines[sock] = monotonic() + self.node.client_timeout
 
     def check_peers(self):
-        """Drop peers that have left (ros_comm #927) or are silent, and end an overlong hold.
+        """Drop peers that have left (ros_comm #927) or are silent, and tell the log of troubles.
+
+        End an overlong hold, and connect again after failures.
 
         The watcher calls this every WATCH_PERIOD.
         """
         self.topic_manager.check_all()
+        self._retry_connections()
+        while self.troubles:
+            self.ros.logwarn_throttle_identical(60, self.troubles.pop())
         now = monotonic()
         if now > self.hold_deadline:
             self.callback_queue.release()
@@ -558,16 +591,20 @@ class Run:
     def stop(self, timeout):
         """Send messages under way, unregister, free ports and threads; log threads left behind.
 
+        When this has returned, no thread of the node runs, but for those that the log names.
+
         :param timeout: seconds for souls, as long for the delegate that runs, and as long for
             messages under way
         """
         self.lifecycle = Lifecycle.STOPPING
+        self.callback_queue.stop()
         self.end_program(timeout)
         self._begin_stop()
         left_behind = [thread.name for thread in join(self.souls, timeout)]
         has_ended = self.callback_queue.close(timeout)
         if not has_ended:
             left_behind.append('a delegate')
+            self.threads.discard(self.callback_queue.thread)
         if left_behind:
             self.ros.logwarn(
                 f'left behind, since they did not end in time: {", ".join(left_behind)}'
@@ -575,7 +612,7 @@ class Run:
         self.close_rospy(timeout)
         for sock in list(self.sockets):
             shutdown_socket(sock)
-        join(set(self.threads) - set(self.souls), STOP_LIMIT)
+        self._wait_for_threads(STOP_LIMIT)
         self.finished.set()
         logging = self.modules.load('logging')
         logging.disable()  # or a thread left behind would open the file again
@@ -583,6 +620,16 @@ class Run:
         for sock in list(self.sockets):
             sock.close()
         self.mark_stopped()
+
+    def _wait_for_threads(self, timeout):
+        """Wait for the end of all threads but souls; one that ends may have started another."""
+        deadline = monotonic() + timeout
+        while monotonic() < deadline:
+            threads = set(self.threads) - set(self.souls) - {threading.current_thread()}
+            live_threads = [thread for thread in threads if thread.is_alive()]
+            if not live_threads:
+                break
+            join(live_threads, deadline - monotonic())
 
 
 def join(threads, timeout):
@@ -620,37 +667,3 @@ def _ask_masters():
             for run in all_runs:
                 if run.master.url == url and not run.stopping.is_set():
                     run.register_missing(state)
-
-
-# -- services of this process
-
-
-def find_local_service(name, uri):
-    """Return the rospy.Service of a node of this process by its name and URI, or None."""
-    for run in list(runs.values()):
-        service = run.service_manager.get_service(name)
-        if service and service.uri == uri:
-            return service
-    return None
-
-
-def call_local_service(service, request, caller_id):
-    """Have a rospy.Service of this process answer in this thread; return a copy of its response.
-
-    :param request: the request, which the service may change
-    :param caller_id: the name of the calling node
-    :raises ServiceException: if the service fails
-    """
-    answers = []
-    connection = SimpleNamespace(
-        write_buff=io.BytesIO(),
-        send_message=lambda response, seq: answers.append(copy_of(response)),
-        # an error is a 0, four bytes of length, and the text
-        write_data=lambda data: answers.append(ServiceException(data[5:].decode())),
-    )
-    request._connection_header = {'callerid': caller_id, 'service': service.resolved_name}
-    service._handle_request(connection, request)
-    answer = answers[0]
-    if isinstance(answer, Exception):
-        raise answer
-    return answer

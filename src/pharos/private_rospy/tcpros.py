@@ -1,15 +1,13 @@
 """Send to sockets and receive from them, and share a connection among the nodes of a process."""
-import collections
 import contextlib
-import functools
-import math
 import os
 import socket
 import struct
 import threading
-import time
 
+from pharos.intraprocess.inboxes import BoundedQueue
 from pharos.intraprocess.links import link, runs, runs_lock
+from pharos.waiting import let_others_run
 
 MAX_MESSAGE = 1_000_000_000  # bytes, as in roscpp
 MAX_DIRECT = 2 << 20  # bytes; the write of a larger message would hold up the publisher
@@ -50,18 +48,26 @@ def check_user(sock):
 
 def receive_until_end(run, subscription, connection, uri, receive_messages):
     """Receive messages until the connection ends, then connect again, or report a refusal."""
-    topic = subscription.resolved_name
     reason = ''
     try:
         receive_messages()
     except Exception as error:
         reason = str(error)
+    end_connection(run, subscription, connection, uri, reason)
+
+
+def end_connection(run, subscription, connection, uri, reason):
+    """Close a connection; connect again later, or report a refusal.
+
+    :param reason: the text of the error that has ended the connection, or ''
+    """
+    topic = subscription.resolved_name
     connection.close()
     close_relay(run, topic, uri, subscription)
     if 'md5sum' in reason or 'do not match' in reason:  # rospy compares the names of types, too
         run.report_refusal(topic, reason)
     elif not subscription.closed:
-        run.connect_again(topic, uri, reason)
+        run.connect_later(topic, uri, reason)
 
 
 def receive(connection, address, port, uri, subscription, run):
@@ -139,7 +145,7 @@ def close_relay(run, topic, uri, subscription):
         links = [*relay.connections]
         relay.close()
     for end in links:
-        end.run.start_thread(functools.partial(end.run.connect, topic, uri))
+        end.run.start_connecting(topic, uri)
 
 
 # -- sending
@@ -165,6 +171,35 @@ class MessageParts(list):
         return parts, size + _LENGTH.size
 
 
+class _Unsent:
+    """The parts of a message, and the numbers of bytes that the socket has taken of them.
+
+    The handler of a signal may raise an exception in publish(), between any two lines of Python.
+    The next publish() then sends the rest.
+    """
+
+    def __init__(self, parts):
+        self._parts = parts
+        self.counts = []
+
+    def send(self, sock, flags):
+        """Have the socket take bytes, and keep their number.
+
+        extend() does both in C: no handler of a signal can come between.
+        """
+        self.counts.extend(map(sock.sendmsg, [self._parts[:MAX_PARTS]], [[]], [flags]))
+
+    def rest(self):
+        """Return the parts that the socket has not taken yet."""
+        parts = [*self._parts]
+        sent_bytes = sum(self.counts)
+        while parts and sent_bytes >= len(parts[0]):
+            sent_bytes -= len(parts.pop(0))
+        if parts:
+            parts[0] = memoryview(parts[0])[sent_bytes:]
+        return parts
+
+
 class Sender:
     """A connection to a subscriber, with a bounded queue for messages that must wait.
 
@@ -172,20 +207,21 @@ class Sender:
     out of the queue at once: the queue is neither bounded nor flushed. Here the publisher writes,
     and a thread writes the rest. The thread rests between messages: to start one takes long.
 
-    :param publication: the PublisherOverlay; its queue_size is the number of messages that wait at
-        most. 0: as many as the node's queue_bytes hold. None: the publisher waits for the socket,
-        as in rospy. rospy sets the size after the first connections may have been made.
+    :param publication: the PublisherOverlay; BoundedQueue says what its queue_size means. rospy sets
+        that after the first connections may have been made.
     :ivar is_busy: True while a thread writes the queue
     """
 
     is_busy = False
     _has_thread = False
-    _rest = ()  # the parts of a message that the socket has not taken yet
 
     def __init__(self, connection, publication):
         self._connection = connection
         self._publication = publication
-        self._queue = collections.deque()  # of lists of parts
+        self._bounded_queue = BoundedQueue()
+        self._bounded_queue.queue_bytes = publication.run.node.queue_bytes
+        self._queue = self._bounded_queue.messages  # lists of parts
+        self._unsent = _Unsent([])
         self._condition = threading.Condition()  # notified to wake the thread
 
     def __getattr__(self, name):
@@ -198,66 +234,59 @@ class Sender:
         :param size: the number of bytes
         """
         with self._condition:
-            if self._publication.queue_size is None:
-                self._rest = [*self._rest, *parts]  # a signal may have ended an earlier call
-                while self._rest:
-                    self._send_rest()
-                return
-            if self.is_busy or size > MAX_DIRECT:
-                self._enqueue(parts, size)
-            else:
-                self._rest = [*self._rest, *parts]
-                with contextlib.suppress(BlockingIOError):
-                    self._send_rest(socket.MSG_DONTWAIT)
-                if not self._rest:
-                    return
-            if not self.is_busy:
-                self.is_busy = True
-                self._wake_thread()
-        time.sleep(0)  # let the thread run: a busy publisher keeps the interpreter for 5 ms
+            self._write(parts, size)
+            is_waiting = self.is_busy
+        if is_waiting:
+            let_others_run()
 
-    def _enqueue(self, parts, size):
-        self._queue.append(parts)
-        queue_size = self._publication.queue_size or math.inf
-        capacity = min(queue_size, max(1, self._publication.run.node.queue_bytes // size))
-        while len(self._queue) > capacity:
-            self._queue.popleft()
+    def _write(self, parts, size):
+        self._bounded_queue.queue_size = self._publication.queue_size
+        if self._publication.queue_size is None:
+            self._unsent = _Unsent(self._unsent.rest() + parts)
+            while self._unsent.rest():
+                self._send()
+            return
+        if self.is_busy or self._queue or size > MAX_DIRECT:
+            self._bounded_queue.add(parts, size)
+        else:
+            self._unsent = _Unsent(self._unsent.rest() + parts)
+            with contextlib.suppress(BlockingIOError):
+                self._send(socket.MSG_DONTWAIT)
+            if not self._unsent.rest():
+                return
+        if not self.is_busy:
+            self.is_busy = self._wake_thread()
 
     def _wake_thread(self):
+        """Wake or start the thread; return False if the system has no thread left."""
         if self._has_thread:
             self._condition.notify()
         else:
-            self._has_thread = True
-            self._publication.run.start_thread(self._send_queue)
+            self._has_thread = self._publication.run.start_thread(self._send_queue) is not None
+        return self._has_thread
 
-    def _send_rest(self, flags=0):
+    def _send(self, flags=0):
         """Send the bytes that the socket takes, and keep the others."""
-        parts = [*self._rest]
-        sent_bytes = self._connection.socket.sendmsg(parts[:MAX_PARTS], [], flags)
-        self._connection.stat_bytes += sent_bytes
-        while parts and sent_bytes >= len(parts[0]):
-            sent_bytes -= len(parts.pop(0))
-        if parts:
-            parts[0] = memoryview(parts[0])[sent_bytes:]
-        else:
-            self._connection.stat_num_msg += 1
-        self._rest = parts
+        self._unsent = _Unsent(self._unsent.rest())
+        self._unsent.send(self._connection.socket, flags)
+        self._connection.stat_bytes += self._unsent.counts[-1]
+        self._connection.stat_num_msg += not self._unsent.rest()
 
     def _send_queue(self):
         connection = self._connection
         while True:
             with self._condition:
-                if not self._rest and not self._queue:
+                if not self._unsent.rest() and not self._queue:
                     self.is_busy = False
                     self._condition.wait(THREAD_REST)
                 if connection.done or not self.is_busy:
                     self.is_busy = False
                     self._has_thread = False
                     return
-                if not self._rest:
-                    self._rest = self._queue.popleft()
+                if not self._unsent.rest():
+                    self._unsent = _Unsent(self._queue.popleft())
             try:
-                self._send_rest()
+                self._send()
             except CLOSED:
                 connection.close()
 

@@ -2,23 +2,24 @@
 
 :mod:`pharos.private_rospy.patches` sets these methods on each node's own copy of rospy's classes.
 """
+import collections
 import contextlib
+import functools
 import time
 
 import rospy
 
-from pharos.intraprocess.callback_queues import (
-    INFINITE,
-    Inbox,
-    ThreadedCallbackQueue,
-    hand_over,
-)
-from pharos.intraprocess.copier import copier_for, copy_of
+from pharos.intraprocess.callback_queues import CallbackQueue, hand_over
+from pharos.intraprocess.copier import SERIALIZE_ERRORS, copier_for, copy_of
+from pharos.intraprocess.inboxes import Inbox
 from pharos.intraprocess.links import links_of
 from pharos.private_rospy.tcpros import CLOSED, MessageParts, Sender
 
 SOCKET_BYTES = 6 << 20  # bytes that the two sockets of a connection hold, roughly
 FLUSH_PERIOD = 0.001  # seconds between two looks
+#: seconds until the first callback of a subscription: a connection between processes takes so long,
+#: and many constructors subscribe before they have set all that their callback uses
+FIRST_PAUSE = 0.05
 ROSOUT = '/rosout'
 
 
@@ -88,7 +89,7 @@ class PublisherOverlay:
             self.rospy_remove_connection(connection)
 
     def publish(self, message, connection_override=None, channel=None):
-        """Publish to the links, then to the sockets.
+        """Publish to the links, then to memory files and sockets.
 
         If a node has inline delegates, all its waiting jobs run in this thread, after the lock is
         free.
@@ -109,52 +110,50 @@ class PublisherOverlay:
                     # set first: update_inboxes() sets None if the inboxes change meanwhile
                     self.receivers_are_for = self.connections
                     self.receivers = receivers_of(self.connections)
-                inboxes, inline_queues, other_queues, others = self.receivers
+                receivers = self.receivers
                 is_latched = self.is_latch
                 if channel:
                     is_latched = channel.latch
             else:
-                inboxes, inline_queues, other_queues, others = receivers_of([connection_override])
+                receivers = receivers_of([connection_override])
                 is_latched = False
+            inboxes_by_thaw, inline_queues, thread_queues, connections = receivers
             if self.has_header:  # as serialize_message does
                 message.header.seq = self.seq
             # frozen unless sockets alone receive; if nobody does, freeze() checks the fields
-            if inboxes or is_latched or not others:
+            if inboxes_by_thaw or is_latched or not connections:
                 frozen = self.freeze(message)
                 if is_latched:
                     self.latches[channel] = frozen
-                for thaw, receivers in inboxes.items():
+                for thaw, inboxes in inboxes_by_thaw.items():
                     item = frozen, thaw, self.header
-                    for inbox in receivers:
+                    for inbox in inboxes:
                         inbox.put((message, None, None) if inbox.shared else item)
-            if others:
-                self.write(message, others)
+            if connections:
+                self.write(message, connections)
         for callback_queue in inline_queues:
-            callback_queue.run_jobs()
-        if other_queues:
+            callback_queue.run_jobs(waits_for_turn=False)
+        if thread_queues:
             # actionlib stores a goal after publish(): the answer must not come before that
             may_wait = channel is not None
-            self.last_wake = hand_over(other_queues, self.last_wake, may_wait)
+            self.last_wake = hand_over(thread_queues, self.last_wake, may_wait)
 
     def write(self, message, connections):
-        """Write a message to some connections."""
-        try:
-            self._write(message, connections)
-        # a thawed copy has lists or bytes for numpy's arrays; freeze() raises if that is not enough
-        except Exception:
-            self._write(self.thaw(self.freeze(message)), connections)
+        """Serialize a message, and write it to memory files and sockets.
 
-    def _write(self, message, connections):
-        """Serialize a message, and write it to memory files and sockets."""
-        buffer = MessageParts()
+        If a connection fails, it closes, and its subscriber connects anew.
+        """
+        senders = []
         if self.memory:
             senders, connections = self.memory.split(connections)
-        if connections:
-            if self.has_header and message.header.frame_id is None:  # as serialize_message does
-                message.header.frame_id = '0'
-            message.serialize(buffer)
-        if self.memory:  # after serializing for sockets: that may raise, and write() tries again
-            self.memory.write(message, self.seq, senders)
+        try:
+            parts = self._serialize(message, senders, connections)
+        # a thawed copy has lists or bytes for numpy's arrays; freeze() raises if that is not enough
+        except SERIALIZE_ERRORS:
+            parts = self._serialize(self.thaw(self.freeze(message)), senders, connections)
+        parts_in_memory, buffer = parts
+        if senders:
+            self.memory.write(parts_in_memory, senders)
         parts, size = buffer.with_length()
         self.message_data_sent += size
         for connection in connections:
@@ -162,6 +161,18 @@ class PublisherOverlay:
                 connection.write_data(parts, size)
             except CLOSED:
                 connection.close()
+
+    def _serialize(self, message, senders, connections):
+        """Return the parts of a message for memory files, and a MessageParts for sockets."""
+        parts_in_memory = None
+        buffer = MessageParts()
+        if senders:
+            parts_in_memory = self.memory.serialize(message, self.seq)
+        if connections:
+            if self.has_header and message.header.frame_id is None:  # as serialize_message does
+                message.header.frame_id = '0'
+            message.serialize(buffer)
+        return parts_in_memory, buffer
 
     def flush(self, deadline):
         """Wait until the sockets have taken all messages, or until a deadline as monotonic time."""
@@ -189,17 +200,40 @@ class PublisherOverlay:
 class PlainInbox(Inbox):
     """The messages that wait for a subscription's callbacks of plain rospy; all share one Inbox."""
 
-    def __init__(self, subscription):
-        super().__init__(ThreadedCallbackQueue(), subscription.call_plain, subscription.queue_size)
+    def __init__(self, subscription, first_pause):
+        callback_queue = CallbackQueue(subscription.run.callback_order, first_pause)
+        super().__init__(callback_queue, subscription.call_plain, subscription.queue_size)
         self.subscription = subscription
         self.queue_bytes = subscription.run.node.queue_bytes
+        self._paused_connections = collections.deque()
+
+    def receive(self, message, size, connection):
+        """Take a message from a connection.
+
+        Without a queue_size, messages wait in the sockets and in the publisher until the callbacks
+        have ended. The thread that reads a socket of TCPROS runs them.
+        """
+        if self.queue_size is None and connection.transport_type == 'TCPROS':
+            self.put((message, None, None), size)
+            self.callback_queue.run_jobs_here()
+            return
+        if self.queue_size is None:
+            connection.pause()
+            self._paused_connections.append(connection)
+        super().receive(message, size, connection)
+
+    def run_callback(self, job):
+        """Run the callbacks on the message of a job, and have all connections read again."""
+        super().run_callback(job)
+        while self._paused_connections:
+            self._paused_connections.popleft().resume()
 
     def capacity_for(self, size):
         """Return how many messages would wait between processes: in publishers and in sockets."""
         connections = self.subscription.connections
         links = links_of(connections)
         queue_sizes = [link.publisher.queue_size for link in links]
-        if self.queue_size != INFINITE or not links or len(links) < len(connections):
+        if self.queue_size or not links or len(links) < len(connections):
             return super().capacity_for(size)
         if not all(queue_sizes):  # a publisher without a queue_size loses no message
             return super().capacity_for(size)
@@ -243,7 +277,7 @@ class SubscriptionOverlay:
         inboxes = [callback for callback, _ in callbacks if isinstance(callback, Inbox)]
         if len(inboxes) < len(callbacks):
             if not self.plain_inbox:
-                self.plain_inbox = PlainInbox(self)
+                self.plain_inbox = PlainInbox(self, first_pause_for(callbacks))
             inboxes.append(self.plain_inbox)
         self.inboxes[:] = inboxes  # the links have this very list
         links = links_of(self.connections)
@@ -282,7 +316,7 @@ class SubscriptionOverlay:
         copies = [copy_of(message) for _ in inboxes[1:]]
         for own_message, inbox in zip([message, *copies], inboxes):
             own_message._connection_header = connection.header
-            inbox.receive(own_message, size)
+            inbox.receive(own_message, size, connection)
         if connection.is_latched:
             connection.latch = message
 
@@ -290,16 +324,23 @@ class SubscriptionOverlay:
         """Run the callbacks of plain rospy on a message."""
         for callback, args in self.callbacks or ():
             if not isinstance(callback, Inbox):
-                with contextlib.suppress(SystemExit):  # would end the thread of the callbacks
-                    self._invoke_callback(message, callback, args)
+                self._invoke_plain(callback, args, message)
+
+    def _invoke_plain(self, callback, args, message):
+        with contextlib.suppress(SystemExit):  # would end the thread of the callbacks
+            self._invoke_callback(message, callback, args)
 
     def add_callback(self, callback, args):
         self.rospy_add_callback(callback, args)
-        for link in self.update_inboxes():
+        links = self.update_inboxes()
+        inbox = callback  # a channel
+        if not isinstance(callback, Inbox):  # only the new callback gets the latched messages
+            invoke = functools.partial(self._invoke_plain, callback, args)
+            inbox = Inbox(self.plain_inbox.callback_queue, invoke)
+        for link in links:
             for frozen in list(link.publisher.latches.values()):
-                message = link.thaw(frozen)
-                message._connection_header = link.header
-                self._invoke_callback(message, callback, args)
+                inbox.put((frozen, link.thaw, link.header))
+        inbox.callback_queue.request_thread()
         self.run.connect_all(self.resolved_name)
 
     def remove_callback(self, callback, args):
@@ -310,6 +351,15 @@ class SubscriptionOverlay:
         close_topic(self)
         if self.plain_inbox:
             self.plain_inbox.callback_queue.close(0)
+
+
+def first_pause_for(callbacks):
+    """Return how many seconds some callbacks must wait for the constructor that subscribes.
+
+    A function in C, and that of rospy's wait_for_message(), use nothing that a constructor sets.
+    """
+    modules = {getattr(callback, '__module__', '') for callback, _ in callbacks}
+    return 0.0 if modules <= {None, 'rospy.client'} else FIRST_PAUSE
 
 
 def receivers_of(connections):

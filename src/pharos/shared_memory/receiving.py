@@ -4,9 +4,12 @@ rospy asks each protocol of a node for its offer, and a publisher takes the firs
 supports. roscpp and nodes of rospy alone do not know this protocol, and take TCPROS.
 """
 import array
+import contextlib
 import functools
 import mmap
+import operator
 import os
+import select
 import socket
 import struct
 import threading
@@ -19,7 +22,7 @@ from rosgraph.network import (
 from rospy.impl.transport import ProtocolHandler
 
 from pharos.private_rospy.run import UNREACHABLE, ServerProxy
-from pharos.private_rospy.tcpros import check_user, receive_until_end, shutdown_socket
+from pharos.private_rospy.tcpros import check_user, end_connection, shutdown_socket
 from pharos.shared_memory.sending import (
     MAX_PACKET,
     NO_FILE,
@@ -31,10 +34,13 @@ from pharos.shared_memory.sending import (
     is_plain,
 )
 
-PROTOCOL = 'PHAROS-SHM'
+PROTOCOL = 'PHAROS-SHM-2'
 MAX_HEADER = 1 << 17  # bytes of a connection header
 ACCEPT_PAUSE = 1.0  # seconds after an error
 RECEIPT = b'\0'
+MAX_MESSAGES = 100  # that are taken before the first one is delivered
+IDLE_PERIOD = 1.0  # seconds between two looks if a connection is left
+_lock = threading.Lock()  # held while a listener is made, and the reader's thread starts or ends
 _DESCRIPTOR_SIZE = array.array('i').itemsize
 
 
@@ -51,7 +57,6 @@ class SharedMemoryHandler(ProtocolHandler):
     def __init__(self, run):
         self.run = run
         self._listener = None
-        self._lock = threading.Lock()  # held while the socket is made
 
     def supports(self, protocol):
         return protocol == PROTOCOL
@@ -66,27 +71,33 @@ class SharedMemoryHandler(ProtocolHandler):
     # -- publishers
 
     def init_publisher(self, topic, protocol):
-        """Answer with the name of the socket; readers of another host or user get TCPROS."""
-        if protocol[1:] != host_and_user():
+        """Answer with the name of the socket.
+
+        Readers of another host or user get TCPROS, and so do all if the node lacks memory.
+        """
+        if protocol[1:] != host_and_user() or self.run.lacks_memory:
             return self._tcpros_handler.init_publisher(topic, ['TCPROS'])
-        with self._lock:
+        with _lock:
             if not self._listener:
-                self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-                self._listener.bind('')  # the kernel chooses a name that is not in a file system
-                self._listener.listen()
-                self.run.sockets.add(self._listener)
-                self.run.start_thread(self._accept)
+                listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+                listener.bind('')  # the kernel chooses a name that is not in a file system
+                listener.listen()
+                self.run.sockets.add(listener)
+                if not self.run.start_thread(functools.partial(self._accept, listener)):
+                    return self._tcpros_handler.init_publisher(topic, ['TCPROS'])
+                self._listener = listener
         return 1, '', [PROTOCOL, self._listener.getsockname()[1:].decode()]
 
-    def _accept(self):
+    def _accept(self, listener):
         while not self.run.stopping.is_set():
             try:
-                sock, _ = self._listener.accept()
+                sock, _ = listener.accept()
             except OSError:  # the stop has closed it, or no descriptor is left
                 self.run.stopping.wait(ACCEPT_PAUSE)
                 continue
             self.run.sockets.add(sock)
-            self.run.start_thread(functools.partial(self._add_reader, sock))
+            if not self.run.start_thread(functools.partial(self._add_reader, sock)):
+                sock.close()
 
     def _add_reader(self, sock):
         """Shake hands, and add a connection to the publisher."""
@@ -114,13 +125,7 @@ class SharedMemoryHandler(ProtocolHandler):
         with publisher.lock:
             if not publisher.memory:
                 publisher.memory = MessageMemory(self.run)
-            sender = MemorySender(
-                publisher.resolved_name,
-                header['callerid'],
-                sock,
-                publisher.memory,
-                publisher.queue_size,
-            )
+            sender = MemorySender(publisher, header['callerid'], sock)
             publisher.add_connection(sender)
 
     # -- subscriptions
@@ -138,14 +143,14 @@ class SharedMemoryHandler(ProtocolHandler):
             sock.close()
             return self._connect_by_tcpros(topic, uri)
         self.run.sockets.add(sock)
-        connection = MemoryReceiver(topic, uri, sock)
+        connection = MemoryReceiver(topic, uri, sock, subscription, self.run)
         if not subscription.add_connection(connection):
             connection.close()
             return 0, 'the subscription was closed', 0
-        receive = functools.partial(connection.receive, subscription, self.run)
-        self.run.start_thread(
-            functools.partial(receive_until_end, self.run, subscription, connection, uri, receive)
-        )
+        connect = functools.partial(_reader.attempt, connection, connection.connect)
+        if not self.run.start_thread(connect):
+            connection.close()
+            return 0, 'no thread is left', 0
         return 1, '', 0
 
     def _connect_by_tcpros(self, topic, uri):
@@ -159,6 +164,89 @@ class SharedMemoryHandler(ProtocolHandler):
         return self._tcpros_handler.create_transport(topic, uri, answer)
 
 
+class Reader:
+    """The thread that reads all connections of this process by shared memory.
+
+    Each round takes all messages that are there, and delivers them in the order of sending. If a
+    socket has a message, all that was sent before is there, too. The thread waits for no callback.
+    """
+
+    def __init__(self):
+        self._connections = {}  # descriptor -> MemoryReceiver
+        self._thread = None
+        self._last_copy = None, b''  # the key of a message, and its bytes
+
+    def add(self, connection):
+        """Read a connection from now on."""
+        with _lock:
+            self._connections[connection.descriptor] = connection
+            if not self._thread:
+                self._epoll = select.epoll()
+                thread = threading.Thread(target=self._read_all, name='pharos reader', daemon=True)
+                thread.start()
+                self._thread = thread
+            # the connection may be read already, or another thread may have closed it
+            with contextlib.suppress(OSError, ValueError):
+                self._epoll.register(connection.descriptor, select.EPOLLIN)
+            if connection.done:
+                self.remove(connection)
+
+    def remove(self, connection):
+        """Read a connection no more."""
+        if self._connections.get(connection.descriptor) is connection:
+            del self._connections[connection.descriptor]
+            with contextlib.suppress(OSError, ValueError):
+                self._epoll.unregister(connection.descriptor)
+
+    def copy_once(self, key, memory):
+        """Return the bytes of a message in memory; one copy is for all nodes of this process."""
+        if key != self._last_copy[0]:
+            self._last_copy = key, bytes(memory)
+        return self._last_copy[1]
+
+    def _read_all(self):
+        while True:
+            messages = self._take_messages()
+            for _, connection, deliver in sorted(messages, key=operator.itemgetter(0)):
+                self.attempt(connection, deliver)
+            self._last_copy = None, b''
+            with _lock:
+                if not self._connections:
+                    self._epoll.close()
+                    self._thread = None
+                    return
+
+    def _take_messages(self):
+        """Wait for messages, and return them as ``(time of sending, connection, deliver)``."""
+        messages = []
+        timeout = IDLE_PERIOD
+        while len(messages) < MAX_MESSAGES:
+            events = self._epoll.poll(timeout)
+            if not events:
+                break
+            for descriptor, _ in events:
+                connection = self._connections.get(descriptor)
+                if connection:
+                    message = self.attempt(connection, connection.read)
+                    if message:
+                        messages.append(message)
+            timeout = 0
+        return messages
+
+    def attempt(self, connection, function):
+        """Call a function of a connection, and return the value; an error ends the connection."""
+        try:
+            return function()
+        except BlockingIOError:
+            pass
+        except Exception as error:  # such as a message that does not deserialize
+            connection.end(error)
+        return None
+
+
+_reader = Reader()
+
+
 class MemoryReceiver(MemoryTransport):
     """The subscription's end of a connection."""
 
@@ -166,40 +254,66 @@ class MemoryReceiver(MemoryTransport):
     latch = None
     header = None
 
-    def __init__(self, topic, uri, sock):
+    def __init__(self, topic, uri, sock, subscription, run):
         super().__init__('i', topic, uri, sock)
+        self._subscription = subscription
+        self._run = run
+        self.descriptor = sock.fileno()
         self._maps = {}  # position -> map of a file
 
-    def receive(self, subscription, run):
-        """Shake hands, and receive messages until the connection ends."""
-        message_class = subscription.data_class
-        self._shake_hands(message_class, run)
-        subscription.begin_delivery(self)
-        while not self.done:
-            packet, ancillary, flags, _ = self._socket.recvmsg(
-                MAX_PACKET + PACKET.size, socket.CMSG_SPACE(_DESCRIPTOR_SIZE)
-            )
-            if not packet:
-                return
-            if flags & socket.MSG_CTRUNC:
-                raise OSError('this process has no descriptor left for a memory file')
-            position, slot, size, dropped = PACKET.unpack_from(packet)
-            for _, _, descriptor in ancillary:
-                self._map(position, descriptor)
-            data = packet[PACKET.size :]
-            if position == NO_FILE:
-                message = message_class().deserialize(data)
-            else:
-                value = self._maps[position][:size]
-                self._socket.send(RECEIPT)  # fails if the publisher has given this reader up
-                if slot == WHOLE:
-                    message = message_class().deserialize(value)
-                else:
-                    message = message_class().deserialize(data)
-                    setattr(message, message.__slots__[slot], value)
-            for inbox in subscription.inboxes:
-                inbox.dropped += dropped
-            subscription.deliver(message, self, len(data) + size)
+    def connect(self):
+        """Shake hands, and have the reader receive the messages."""
+        self._shake_hands(self._subscription.data_class, self._run)
+        self._subscription.begin_delivery(self)
+        _reader.add(self)
+
+    def read(self):
+        """Return the next message as ``(time of sending, connection, deliver)``.
+
+        :raises EOFError: at the end of the connection
+        """
+        packet, ancillary, flags, _ = self._socket.recvmsg(
+            MAX_PACKET + PACKET.size, socket.CMSG_SPACE(_DESCRIPTOR_SIZE), socket.MSG_DONTWAIT
+        )
+        if not packet:
+            raise EOFError
+        if flags & socket.MSG_CTRUNC:
+            raise OSError('this process has no descriptor left for a memory file')
+        position, slot, size, dropped, send_time = PACKET.unpack_from(packet)
+        for _, _, descriptor in ancillary:
+            self._map(position, descriptor)
+        # either the message, or what is left of it without the large field in the file
+        data = packet[PACKET.size :]
+        value = b''
+        if position != NO_FILE:
+            memory = memoryview(self._maps[position])[:size]
+            value = _reader.copy_once((self.endpoint_id, self.name, send_time), memory)
+            self._socket.send(RECEIPT)  # fails if the publisher has given this reader up
+        return send_time, self, functools.partial(self._deliver, data, slot, value, dropped)
+
+    def _deliver(self, data, slot, value, dropped):
+        message = self._subscription.data_class()
+        if slot == WHOLE:
+            message.deserialize(data or value)
+        else:
+            message.deserialize(data)
+            setattr(message, message.__slots__[slot], value)
+        for inbox in self._subscription.inboxes:
+            inbox.dropped += dropped
+        self._subscription.deliver(message, self, len(data) + len(value))
+
+    def pause(self):
+        """Read no more until resume(): messages wait in the socket, and in the publisher."""
+        _reader.remove(self)
+
+    def resume(self):
+        """Read again."""
+        if not self.done:
+            _reader.add(self)
+
+    def end(self, error):
+        """Close the connection, and connect again, unless the subscription is closed."""
+        end_connection(self._run, self._subscription, self, self.endpoint_id, str(error))
 
     def _shake_hands(self, message_class, run):
         """Exchange the headers of TCPROS.
@@ -229,6 +343,7 @@ class MemoryReceiver(MemoryTransport):
     def close(self):
         if not self.done:
             super().close()
+            _reader.remove(self)
             shutdown_socket(self._socket)
             self._socket.close()
             self._maps.clear()

@@ -7,13 +7,11 @@ the message at once, and says so by a receipt of one byte: then the file is free
 from __future__ import annotations
 
 import array
-import collections
 import copy
 import fcntl
 import functools
 import io
 import itertools
-import math
 import mmap
 import os
 import select
@@ -27,13 +25,16 @@ import genpy
 from rospy.impl.transport import Transport
 from rospy.msg import serialize_message
 
+from pharos.intraprocess.inboxes import BoundedQueue
 from pharos.private_rospy.tcpros import shutdown_socket
+from pharos.waiting import let_others_run
 
 MAX_PACKET = 1 << 16  # bytes of a message, or a part of one, that the socket takes itself
 MAX_FILES = 4  # of a publisher
 POLL_LIMIT = 1000  # milliseconds between two looks if the connection is closed
-#: position of the file, or NO_FILE; slot of the field in it, or WHOLE; its bytes; dropped messages
-PACKET = struct.Struct('<bBQI')
+#: position of the file, or NO_FILE; slot of the field in it, or WHOLE; its bytes; dropped messages;
+#: the time of sending, as of time.monotonic(), which is the same for all processes of a host
+PACKET = struct.Struct('<bBQId')
 NO_FILE = -1
 WHOLE = 255
 _SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
@@ -48,9 +49,13 @@ class MemoryFile:
         self.number = 0  # of the message
         self.readers = set()  # senders that announce it later, or have no receipt yet
         self.descriptor = os.memfd_create('pharos', os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-        os.ftruncate(self.descriptor, self.capacity)
-        fcntl.fcntl(self.descriptor, fcntl.F_ADD_SEALS, _SEALS)
-        self.map = mmap.mmap(self.descriptor, self.capacity)
+        try:
+            os.ftruncate(self.descriptor, self.capacity)
+            fcntl.fcntl(self.descriptor, fcntl.F_ADD_SEALS, _SEALS)
+            self.map = mmap.mmap(self.descriptor, self.capacity)
+        except OSError:
+            os.close(self.descriptor)
+            raise
 
     def close(self):
         self.map.close()
@@ -71,45 +76,63 @@ class MessageMemory:
         senders = [each for each in connections if isinstance(each, MemorySender)]
         return senders, [each for each in connections if each not in senders]
 
-    def write(self, message, seq, senders):
-        """Send a message by the connections that share memory."""
-        if not senders:
-            return
-        slot, value, rest = _split(message, seq)
-        size = len(value)
-        with self.lock:
+    def serialize(self, message, seq):
+        """Return the parts of a message for write()."""
+        return _split(message, seq)
+
+    def write(self, parts, senders):
+        """Send a message by the connections that share memory.
+
+        If that fails half way, the connections close, and the readers connect anew. If no memory
+        file could be had, they get TCPROS.
+        """
+        is_complete = False
+        try:
+            with self.lock:
+                self._put(parts, senders)
+            is_complete = True
+        except OSError as error:
+            self.run.lacks_memory = True
+            name = senders[0].name
+            self.run.troubles.add(f'{name}: sends by TCPROS, since memory lacks a file: {error}')
+        finally:
             for sender in senders:
-                sender.take_receipts()
-            if size > MAX_PACKET:
-                file = self._free_file(size)
-                file.map[:size] = value
-                file.number = next(self._numbers)
-                entry = Entry(file, slot, size, rest)
-            else:
-                entry = Entry(None, WHOLE, 0, value)
-            for sender in senders:
-                sender.put(entry)
-        for sender in senders:
-            sender.close_if_broken()
+                if not is_complete:  # a signal's handler may have raised between any two lines
+                    sender.give_up()
+                sender.close_if_broken()
         if any(sender.is_sending for sender in senders):
-            time.sleep(0)  # or a busy publisher keeps the interpreter for 5 ms
+            let_others_run()
+
+    def _put(self, parts, senders):
+        slot, value, rest = parts
+        size = len(value)
+        for sender in senders:
+            sender.take_receipts()
+        if size > MAX_PACKET:
+            file = self._free_file(size)
+            file.map[:size] = value
+            file.number = next(self._numbers)
+            entry = Entry(file, slot, size, rest, time.monotonic())
+        else:
+            entry = Entry(None, WHOLE, 0, value, time.monotonic())
+        for sender in senders:
+            sender.put(entry)
 
     def _free_file(self, size):
         """Return a file that no reader needs, with room for so many bytes."""
+        if len(self._files) == MAX_FILES and all(file.readers for file in self._files):
+            self._drop_oldest()
         free_files = [file for file in self._files if not file.readers]
         for file in free_files:
             if file.capacity >= size:
                 return file
-        if free_files:  # the message has grown
-            position = free_files[0].position
-            free_files[0].close()
-            self._files[position] = MemoryFile(position, size)
-            return self._files[position]
-        if len(self._files) < MAX_FILES:
+        if not free_files:
             self._files.append(MemoryFile(len(self._files), size))
             return self._files[-1]
-        self._drop_oldest()
-        return self._free_file(size)
+        small_file = free_files[0]  # the message has grown
+        self._files[small_file.position] = MemoryFile(small_file.position, size)
+        small_file.close()
+        return self._files[small_file.position]
 
     def _drop_oldest(self):
         """Drop the oldest message that no reader may be reading; else give up its readers."""
@@ -120,6 +143,7 @@ class MessageMemory:
         oldest = (queued_files or files)[0]
         for sender in list(oldest.readers):
             sender.drop(oldest)
+        oldest.readers.clear()  # a signal may have ended an earlier drop
 
     def close(self):
         """Free the files."""
@@ -136,6 +160,7 @@ class Entry(NamedTuple):
     slot: int  # of the field in the file, or WHOLE
     size: int  # bytes in the file
     data: bytes  # the rest of the message
+    time: float  # of sending
 
 
 class MemoryTransport(Transport):
@@ -153,20 +178,25 @@ class MemoryTransport(Transport):
         return f'{self.transport_type} connection to [{self.endpoint_id}]'
 
 
-class MemorySender(MemoryTransport):
-    """The publisher's end of a connection."""
+class MemorySender(MemoryTransport, BoundedQueue):
+    """The publisher's end of a connection.
+
+    The lock of the MessageMemory guards all attributes: its user holds the lock.
+
+    :ivar dropped: the number of messages that were dropped since the last packet
+    """
 
     is_sending = False  # True while a thread sends the queue
     is_broken = False
     announced = None  # the file that the reader has no receipt for yet
 
-    def __init__(self, topic, reader_name, sock, memory, queue_size):
-        super().__init__('o', topic, reader_name, sock)
-        self._memory = memory
-        self._queue_size = queue_size or math.inf
-        self._queue = collections.deque()
+    def __init__(self, publisher, reader_name, sock):
+        MemoryTransport.__init__(self, 'o', publisher.resolved_name, reader_name, sock)
+        BoundedQueue.__init__(self, publisher.queue_size)
+        self._memory = publisher.memory
+        self._queue = self.messages  # of Entries
+        self.queue_bytes = self._memory.run.node.queue_bytes
         self._known_files = {}  # position -> the file that the reader has mapped
-        self._dropped = 0  # messages since the last packet
 
     def fileno(self):
         """Let rospy find readers that have left; a reader has none, since it reads to the end."""
@@ -184,30 +214,32 @@ class MemorySender(MemoryTransport):
         """Add a message to the queue, and send all that the socket takes; never waits."""
         if self.done or self.is_broken:
             return
-        self._queue.append(entry)
         if entry.file:
             entry.file.readers.add(self)
-        queue_bytes = self._memory.run.node.queue_bytes
-        capacity = min(self._queue_size, max(1, queue_bytes // max(1, len(entry.data))))
-        while len(self._queue) > capacity:
-            self._drop_entry(self._queue[0])
+        self.add(entry, len(entry.data))
         self._send_ready()
         if self._queue and not self.is_sending:
-            self.is_sending = True
-            self._memory.run.start_thread(self._send_queue)
+            self.is_sending = self._memory.run.start_thread(self._send_queue) is not None
 
-    def _drop_entry(self, entry):
-        self._queue.remove(entry)
-        self._dropped += 1
+    def forget(self, entry):
+        """Free the file of a dropped message."""
         if entry.file:
             entry.file.readers.discard(self)
+        return True
 
     def drop(self, file):
         """Drop the message in a file. If the reader may be reading it, give up the reader."""
         if self.announced is file:
             self._break()
         for entry in [each for each in self._queue if each.file is file]:
-            self._drop_entry(entry)
+            self._queue.remove(entry)
+            self.dropped += 1
+            self.forget(entry)
+
+    def give_up(self):
+        """Have the reader connect anew."""
+        with self._memory.lock:
+            self._break()
 
     def _break(self):
         """Have the reader find its socket closed: its receipt fails, and it drops the message."""
@@ -216,8 +248,7 @@ class MemorySender(MemoryTransport):
         if self.announced:
             self.announced.readers.discard(self)
             self.announced = None
-        for entry in list(self._queue):
-            self._drop_entry(entry)
+        self.drop_beyond(0)
 
     def _send_ready(self):
         """Send the messages that the socket takes, one in a file at a time."""
@@ -234,14 +265,14 @@ class MemorySender(MemoryTransport):
                 return
             self._queue.popleft()
             self.announced = entry.file or self.announced
-            self._dropped = 0
+            self.dropped = 0
             self.stat_num_msg += 1
             self.stat_bytes += entry.size + len(entry.data)
 
     def _send(self, entry):
         file = entry.file
         position = file.position if file else NO_FILE
-        head = PACKET.pack(position, entry.slot, entry.size, self._dropped)
+        head = PACKET.pack(position, entry.slot, entry.size, self.dropped, entry.time)
         rights = []
         if file and self._known_files.get(position) is not file:
             descriptors = array.array('i', [file.descriptor])
