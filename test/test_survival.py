@@ -731,12 +731,12 @@ def test_moment_without_threads_is_told(master, peer, monkeypatch):
     channel = mouth.output_channel('/t', STRING)
     until(lambda: len(channel.connections) == 2)
 
-    def fail(*args):
+    def fail(thread):
         raise RuntimeError("can't start new thread")
 
     large = 'x' * (3 << 20)  # a connection needs a thread for this
     with monkeypatch.context() as moment:
-        moment.setattr(threading, '_start_new_thread', fail)
+        moment.setattr(threading.Thread, 'start', fail)
         channel.send(data=large)
     for data in 'one', 'two':
         channel.send(data=data)
@@ -749,15 +749,15 @@ def test_moment_without_threads_is_told(master, peer, monkeypatch):
 def test_subscription_connects_after_lack_of_threads(master, peer, monkeypatch):
     peer.run('publisher = rospy.Publisher("/t", message_class("std_msgs/String"), queue_size=100)')
     ear, mailbox = create(master, '/ear'), Mailbox()
-    start = threading._start_new_thread
+    start = threading.Thread.start
 
-    def fail_in_ear(function, *args):
-        if 'ear' in function.__self__.name or function.__self__.name == '/t':
+    def fail_in_ear(thread):
+        if 'ear' in thread.name or thread.name == '/t':
             raise RuntimeError("can't start new thread")
-        return start(function, *args)
+        start(thread)
 
     with monkeypatch.context() as moment:
-        moment.setattr(threading, '_start_new_thread', fail_in_ear)
+        moment.setattr(threading.Thread, 'start', fail_in_ear)
         ear.ros.Subscriber('/t', std_msgs.msg.String, mailbox)
     until(lambda: peer.value('publisher.get_num_connections()') == 1)
     peer.run('publisher.publish("hello")')
