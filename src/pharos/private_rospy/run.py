@@ -39,6 +39,7 @@ from pharos.private_rospy.loader import PrivateModules, Shim, private_path
 from pharos.private_rospy.tcpros import close_relay, join_relay, shutdown_socket
 from pharos.signals import may_be_signal
 from pharos.transcript import Transcript
+from pharos.waiting import let_others_run
 
 if TYPE_CHECKING:
     from pharos.master import Master
@@ -234,11 +235,11 @@ class Run:
         if self.finished.is_set():
             raise SystemExit  # in a thread that was left behind
         if seconds <= 0:
-            time.sleep(0)
+            let_others_run()
             return
         is_stopping = self.stopping.wait(seconds)
-        if is_stopping:
-            time.sleep(0)  # a loop that sleeps on must let other threads run
+        if is_stopping:  # a loop may sleep on
+            let_others_run()
 
     def checkpoint(self):
         """Do nothing: a run of a script handles its signals here.
