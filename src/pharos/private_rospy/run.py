@@ -459,11 +459,8 @@ class Run:
         reason = ''
         try:
             code, _, _ = self.ros_handler._connect_topic(topic, uri)
-        except (
-            AttributeError,
-            UnboundLocalError,
-        ):  # of rospy: the subscription was closed meanwhile
-            pass
+        except (AttributeError, UnboundLocalError):
+            pass  # rospy raises these if the subscription is closed meanwhile
         except RuntimeError as error:  # no thread is left, but rospy has added the connection
             reason = str(error)
             for connection in subscription.connections:
@@ -592,7 +589,8 @@ class Run:
     def stop(self, timeout):
         """Send messages under way, unregister, free ports and threads; log threads left behind.
 
-        When this has returned, no thread of the node runs, but for those that the log names.
+        When this has returned, no thread of the node runs, unless one has blocked longer than its
+        limit. The log names souls and delegates that have.
 
         :param timeout: seconds for souls, as long for the delegate that runs, and as long for
             messages under way
