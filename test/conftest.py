@@ -98,3 +98,15 @@ def transcript():
     before = pharos.Transcript.on_show(lines.append)
     yield lines
     pharos.Transcript.on_show(before)
+
+
+@pytest.fixture
+def bench(master, tmp_path, monkeypatch):
+    """A Bench; ROS finds it and the package robot."""
+    robot = ROOT / 'test' / 'robot'
+    shutil.copytree(robot, tmp_path / 'robot', ignore=shutil.ignore_patterns('CATKIN_IGNORE'))
+    paths = [str(tmp_path), os.environ.get('ROS_PACKAGE_PATH', ''), '/usr/share']
+    monkeypatch.setenv('ROS_PACKAGE_PATH', os.pathsep.join(paths))
+    monkeypatch.setenv('ROS_HOME', str(tmp_path / 'home'))
+    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
+    return helpers.Bench(tmp_path / 'bench', master)

@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import textwrap
 import threading
 
 import rosmaster.master
@@ -21,6 +22,16 @@ PYTHON = '/usr/bin/python3'
 #: begins a command whose signals do what they do by default, also under nohup
 DEFAULT_SIGNALS = ['env', '--default-signal=INT,TERM,HUP']
 TIMEOUT = 30  # seconds; a test that passes never waits so long
+COMPOSE = ['rosrun', 'pharos', 'compose']
+#: begins each script of a Bench
+HEAD = '''#!/usr/bin/python3
+import asyncio, atexit, inspect, os, pharos, rospy, signal, sys, threading, time
+from std_msgs.msg import String
+SAID = os.path.dirname(__file__) + '/said'
+def say(text):
+    with open(SAID, 'a') as file:
+        print(text, file=file)
+'''
 threading.Thread.isAlive = threading.Thread.is_alive  # the rospy of Debian 11 calls it at its end
 _created = []
 
@@ -272,6 +283,54 @@ def _serve_as_peer():
             pickle.dumps(answer)
         except BaseException as error:
             answer = RuntimeError(f'{type(error).__name__}: {error}')
+
+
+class Bench:
+    """A package of scripts, which tell the test by ``say(text)`` what they do."""
+
+    def __init__(self, folder, master):
+        self.folder, self.master = folder, master
+        self.write('<package><name>bench</name></package>', 'package.xml', '')
+
+    def write(self, text, name='program', head=HEAD):
+        """Write a script, or a file without a head; returns its path."""
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(head + textwrap.dedent(text))
+        path.chmod(0o755)
+        return str(path)
+
+    def load(self, text, **options):
+        """Load a script; the fixture of the master stops it."""
+        return self.master.load(self.write(text), **options)
+
+    @contextlib.contextmanager
+    def program(self, *words):
+        """Run rosrun pharos compose; Ctrl-C ends it."""
+        with Program([*COMPOSE, *words], self.master.url) as running:
+            try:
+                yield running
+            finally:
+                end(running)
+
+    def launch_file(self, xml='', **texts):
+        """Write a launch file, with a node for each of these scripts; returns its path."""
+        for name, text in texts.items():
+            self.write(text.replace("'program'", repr(name)), name)
+            xml += f'<node pkg="bench" type="{name}" name="{name}"/>'
+        return self.write(f'<launch>{xml}</launch>', 'a.launch', '')
+
+    def said(self):
+        """Return the lines that the scripts have said."""
+        file = self.folder / 'said'
+        return file.read_text().splitlines() if file.exists() else []
+
+
+def end(running):
+    """Press Ctrl-C if it runs, and return the exit code."""
+    if running.poll() is None:
+        running.signal(signal.SIGINT)
+    return running.wait()
 
 
 if __name__ == '__main__':

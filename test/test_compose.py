@@ -7,7 +7,6 @@ import shutil
 import signal
 import sys
 import textwrap
-import traceback
 import xmlrpc.client
 from unittest import mock
 
@@ -232,7 +231,7 @@ def test_error_in_script_is_its_failure(load, transcript):
     script = load("rospy.init_node('program')\nrospy.sleep(0)\n1 / 0")
     script.wait(TIMEOUT)
     assert isinstance(script.errors[0], ZeroDivisionError)
-    assert traceback.extract_tb(script.errors[0].__traceback__)[-1].line == '1 / 0'
+    assert '\n1 / 0\n' in script.failures[0].traceback.replace('    ', '')
     assert script.failures[0].error is script.errors[0]
 
 
@@ -573,10 +572,10 @@ def test_respawned_node_starts_again(master, compose):
     until(lambda: master.parameters.get('/ends/starts', 0) >= 3)
 
 
-@pytest.mark.parametrize('apart', [[], ['ends']])
-def test_required_node_ends_all(master, compose, apart):
+@pytest.mark.parametrize('where', [{}, {'apart': ['ends']}, {'groups': [['ends']]}])
+def test_required_node_ends_all(master, compose, where):
     master.parameters['/stay'] = True
-    composition = compose(ending('required="true"') + node('sonar', 'robot'), apart=apart)
+    composition = compose(ending('required="true"') + node('sonar', 'robot'), **where)
     until(lambda: '/ends/starts' in master.parameters)
     assert any(each.is_running for each in composition.nodes)
     master.parameters['/stay'] = False
@@ -635,7 +634,7 @@ def test_commands_control_a_node(master, compose):
     assert sonar.is_running
     first_run = sonar.uri
     assert command('restart') == (0, '')
-    assert sonar.is_running and sonar.uri == first_run
+    assert sonar.is_running and sonar.uri != first_run
     status, output = command('restart', 'nobody')
     assert status == 1 and '/nobody is not a node of a composition' in output
 
@@ -789,31 +788,3 @@ def test_required_node_is_programs_status(program, tmp_path):
     element = ending('required="true"')
     (tmp_path / 'a.launch').write_text(f'<launch>{element}</launch>')
     assert program(tmp_path / 'a.launch').wait() == 1
-
-
-def test_program_is_a_nodelet_manager(master, program):
-    program('__name:=manager', '__ns:=/rig')
-    load = master.wait_for_service('/rig/manager/load_nodelet', TIMEOUT)
-    listed = master.wait_for_service('/rig/manager/list', TIMEOUT)
-    unload = master.wait_for_service('/rig/manager/unload_nodelet', TIMEOUT)
-    master.parameters['/rig/sonar/frame_id'] = 'left'
-    mailbox = Mailbox(create(master, '/ear'), '/left', 'sensor_msgs/Range')
-    remap = {'remap_source_args': ['range'], 'remap_target_args': ['/left']}
-    assert load.call(name='sonar', type='robot/sonar', **remap).success
-    assert mailbox.next().header.frame_id == 'left'
-    assert listed.call().nodelets == ['/rig/sonar']
-    assert unload.call(name='sonar').success
-    assert listed.call().nodelets == []
-    with pytest.raises(pharos.ServiceCallError):
-        load.call(name='x', type='robot/no_such_program')
-
-
-def test_launch_file_of_nodelets_loads_scripts(master, program):
-    composed = program()
-    master.wait_for_service('/compose/load_nodelet', TIMEOUT)
-    mailbox = Mailbox(create(master, '/ear'), '/left/range', 'sensor_msgs/Range')
-    with master.launch('robot', 'nodelets.launch'):
-        assert mailbox.next().header.frame_id == 'left'
-        assert master.wait_for_service('/compose/list').call().nodelets == ['/left_sonar']
-    until(lambda: master.wait_for_service('/compose/list').call().nodelets == [])
-    assert composed.poll() is None

@@ -8,9 +8,7 @@ import subprocess
 import tempfile
 import xml.etree.ElementTree
 
-import numpy
 import pexpect
-import PIL.Image
 import pytest
 
 import helpers
@@ -433,7 +431,7 @@ def test_keys_of_top_restart_a_node(master, tmp_path):
             top.press('x', '/clock: stop done')
             assert not master.call('lookupNode', '/clock')
             top.press('a', '/clock: start done')
-            assert master.node('/clock').uri == uri
+            assert master.node('/clock').uri != uri
         composed.signal(signal.SIGINT)
         composed.wait()
 
@@ -565,22 +563,6 @@ def test_messages_are_shown_in_short(master, transcript):
         assert len(shown) < 5000
 
 
-def test_plot_draws_numbers(master, tmp_path):
-    node = create(master, '/counter')
-    numbers = node.output_channel('/numbers', 'geometry_msgs/Twist')
-
-    def count(me):
-        for number in me.every(0.02):
-            numbers.send(linear={'x': number})
-
-    node.fork(count)
-    plot = master.topic('/numbers').plot('linear.x', 'angular.z', seconds=0.3)
-    plot.savefig(tmp_path / 'plot.png')
-    with PIL.Image.open(tmp_path / 'plot.png') as picture:
-        assert min(picture.size) > 200
-        assert len(picture.convert('RGB').getcolors(1 << 20)) > 2
-
-
 # -- the workspace: one session for all, at a master of its own
 
 
@@ -667,72 +649,7 @@ def test_session_leaves_no_registration(master, tmp_path):
     assert not any(master.system_state())
 
 
-# -- pictures of messages in the workspace, as a notebook shows them, too
-
-SHOW = '''
-formatter = get_ipython().display_formatter
-formatter.active_types = formatter.format_types  # as in a notebook
-for name, (type_, fields) in eval(open('{folder}/messages').read()).items():
-    message = me.send_to('/pictures/' + name, fields, typed_as=type_)
-    data, _ = formatter.format(message)
-    if 'image/png' in data:
-        open('{folder}/' + name + '.png', 'wb').write(data['image/png'])
-    open('{folder}/' + name + '.txt', 'w').write(data['text/plain'])
-print('pictures' + ' drawn')
-'''
-WIDTH, HEIGHT = 48, 32
-
-
-def image_of(encoding, kind, *colours):
-    """The fields of an image whose left half has one colour and the right half another."""
-    pixels = numpy.zeros((HEIGHT, WIDTH, numpy.size(colours[0])), kind)
-    pixels[:, : WIDTH // 2], pixels[:, WIDTH // 2 :] = colours
-    shape = {'height': HEIGHT, 'width': WIDTH, 'step': pixels.strides[0]}
-    return 'sensor_msgs/Image', {**shape, 'encoding': encoding, 'data': pixels.tobytes()}
-
-
-FIELDS = [{'name': 'xyz'[at], 'offset': 4 * at, 'datatype': 7, 'count': 1} for at in range(3)]
-CLOUD = {'height': 1, 'width': 100, 'point_step': 12, 'row_step': 1200, 'is_dense': True}
-POINTS = numpy.linspace(0, 1, 300, dtype='f4')
-RANGES = [1.0 + at / 9 for at in range(50)]
-MAP = {'width': 40, 'height': 30, 'resolution': 0.1}
-POSES = [{'pose': {'position': {'x': at, 'y': at**2}}} for at in range(5)]
-PICTURES = {
-    'mono8': image_of('mono8', 'u1', 0, 255),
-    'rgb8': image_of('rgb8', 'u1', (255, 0, 0), (0, 0, 255)),
-    'bgr8': image_of('bgr8', 'u1', (0, 0, 255), (255, 0, 0)),
-    '16UC1': image_of('16UC1', 'u2', 500, 3000),
-    '32FC1': image_of('32FC1', 'f4', 0.5, 3.0),
-    'scan': ('sensor_msgs/LaserScan', {'angle_increment': 0.1, 'range_max': 9.0, 'ranges': RANGES}),
-    'map': ('nav_msgs/OccupancyGrid', {'info': MAP, 'data': [0, 100, -1] * 400}),
-    'cloud': ('sensor_msgs/PointCloud2', {**CLOUD, 'fields': FIELDS, 'data': POINTS.tobytes()}),
-    'path': ('nav_msgs/Path', {'poses': POSES}),
-}
-
-
-@pytest.fixture(scope='module')
-def pictures(session, tmp_path_factory):
-    """The folder of what the session shows of the messages."""
-    folder = tmp_path_factory.mktemp('pictures')
-    others = {'twist': ('geometry_msgs/Twist', {'linear': {'x': 2.5}})}
-    (folder / 'messages').write_text(repr({**PICTURES, **others}))
-    (folder / 'show.py').write_text(SHOW.format(folder=folder))
-    session.enter(f'exec(open("{folder}/show.py").read())', 'pictures drawn')
-    return folder
-
-
-@pytest.mark.parametrize('name', PICTURES)
-def test_message_has_picture(pictures, name):
-    with PIL.Image.open(pictures / f'{name}.png') as picture:
-        colours = {colour for _, colour in picture.convert('RGB').getcolors(1 << 20)}
-        assert picture.format == 'PNG'
-        assert picture.width >= WIDTH or picture.height >= HEIGHT
-    assert len(colours) > 1
-    if name in ('rgb8', 'bgr8'):
-        assert {(255, 0, 0), (0, 0, 255)} <= colours
-
-
-def test_messages_have_short_text(pictures):
-    assert 'x: 2.5' in (pictures / 'twist.txt').read_text()
-    assert not (pictures / 'twist.png').exists()
-    assert max(len(path.read_text()) for path in pictures.glob('*.txt')) < 5000
+def test_messages_have_short_text(session):
+    session.enter('message_class("sensor_msgs/Image")(width=7, data=bytes(1000000))', 'width: 7')
+    session.enter('print("short", 6 * 7)', 'short 42')
+    assert len(session.text) < 100_000

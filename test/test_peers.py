@@ -12,7 +12,7 @@ import rosbag
 import std_msgs.msg
 from geometry_msgs.msg import PointStamped, TransformStamped
 
-from helpers import PYTHON, ROOT, TIMEOUT, InProcessMaster, Peer, Program, create, stop_nodes
+from helpers import TIMEOUT, InProcessMaster, Peer, Program, create, stop_nodes
 import pharos
 from pharos import Master
 from pharos.testing import Mailbox, until
@@ -368,38 +368,6 @@ def test_service_of_nodelet_manager_is_called(master, node):
         listing = node.wait_for_service('/manager/list', TIMEOUT)
         assert listing.type == 'nodelet/NodeletList'
         assert list(listing.call().nodelets) == []
-
-
-PACKAGE = """<package format="2"><name>small_robot</name><version>0.0.0</version>
-<description>d</description><maintainer email="a@b.org">m</maintainer><license>BSD</license>
-</package>"""
-TALKER = """#!/usr/bin/python3
-import rospy, std_msgs.msg
-rospy.init_node('talker')
-sent = rospy.Publisher('chatter', std_msgs.msg.String, queue_size=1, latch=True)
-sent.publish(rospy.get_param('~text', 'nothing'))
-rospy.spin()
-"""
-
-
-@needs_nodelet
-def test_nodelet_load_starts_program_in_compose(master, node, tmp_path, monkeypatch):
-    """It ends with its loader, as a nodelet does."""
-    program = tmp_path / 'small_robot' / 'scripts' / 'talker'
-    program.parent.mkdir(parents=True)
-    program.write_text(TALKER)
-    program.chmod(0o755)
-    (tmp_path / 'small_robot' / 'package.xml').write_text(PACKAGE)
-    monkeypatch.setenv('ROS_PACKAGE_PATH', f'{tmp_path}:/usr/share')
-    box = Mailbox(node, '/said', STRING)
-    load = 'load', 'small_robot/talker', 'compose', '__name:=talker', 'chatter:=said', '_text:=here'
-    with running(master, PYTHON, str(ROOT / 'scripts' / 'compose')):
-        node.wait_for_service('/compose/list', TIMEOUT)
-        with running(master, NODELET, *load):
-            assert box.next().data == 'here'
-            bond = master.topic('/compose/bond')
-            until(lambda: '/talker' in bond.publishers)  # it handles SIGINT now
-        until(lambda: '/talker' not in [each.name for each in master.nodes()], TIMEOUT)
 
 
 # -- libraries written on rospy

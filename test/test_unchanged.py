@@ -3,8 +3,6 @@ import contextlib
 import io
 import itertools
 import os
-import pathlib
-import shutil
 import signal
 import textwrap
 import threading
@@ -13,20 +11,10 @@ import time
 import pytest
 
 import pharos
-from helpers import PYTHON, TIMEOUT, Program, create
+from helpers import COMPOSE, HEAD, PYTHON, TIMEOUT, Program, create, end
 from pharos.testing import Mailbox, until
 
-ROBOT = pathlib.Path(__file__).parent / 'robot'
-COMPOSE = ['rosrun', 'pharos', 'compose']
 STRING = 'std_msgs/String'
-HEAD = '''#!/usr/bin/python3
-import asyncio, atexit, inspect, os, pharos, rospy, signal, sys, threading, time
-from std_msgs.msg import String
-SAID = os.path.dirname(__file__) + '/said'
-def say(text):
-    with open(SAID, 'a') as file:
-        print(text, file=file)
-'''
 INIT = "rospy.init_node('program')\n"
 SPIN = INIT + "say('ready')\nrospy.spin()\n"
 DRIVE = '''
@@ -153,7 +141,7 @@ SHOWN = [
     '/ticks starts',
     f'bench/early", line {HEAD.count(chr(10)) + 1}, in read',
     "[/early] FileNotFoundError: [Errno 2] No such file or directory: '/no/such.yaml'",
-    '/window runs in a process of its own: it has',
+    '/window runs as a plain process: it has',
     '[/dots] half',
     '[/ends] last words',
     '/dies has ended, with exit code 4',
@@ -183,65 +171,6 @@ say('over')
 '''
 GROUP = '''<group ns="rig"><remap from="words" to="/speech"/><node pkg="bench" type="program"
 name="boss" respawn="true"><param name="gain" value="7"/></node></group>'''
-
-
-class Bench:
-    """A package of scripts, which tell the test by ``say(text)`` what they do."""
-
-    def __init__(self, folder, master):
-        self.folder, self.master = folder, master
-        self.write('<package><name>bench</name></package>', 'package.xml', '')
-
-    def write(self, text, name='program', head=HEAD):
-        """Write a script, or a file without a head; returns its path."""
-        path = self.folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(head + textwrap.dedent(text))
-        path.chmod(0o755)
-        return str(path)
-
-    def load(self, text, **options):
-        """Load a script; the fixture of the master stops it."""
-        return self.master.load(self.write(text), **options)
-
-    @contextlib.contextmanager
-    def program(self, *words):
-        """Run rosrun pharos compose; Ctrl-C ends it."""
-        with Program([*COMPOSE, *words], self.master.url) as running:
-            try:
-                yield running
-            finally:
-                end(running)
-
-    def launch_file(self, xml='', **texts):
-        """Write a launch file, with a node for each of these scripts; returns its path."""
-        for name, text in texts.items():
-            self.write(text.replace("'program'", repr(name)), name)
-            xml += f'<node pkg="bench" type="{name}" name="{name}"/>'
-        return self.write(f'<launch>{xml}</launch>', 'a.launch', '')
-
-    def said(self):
-        """Return the lines that the scripts have said."""
-        file = self.folder / 'said'
-        return file.read_text().splitlines() if file.exists() else []
-
-
-@pytest.fixture
-def bench(master, tmp_path, monkeypatch):
-    """A Bench; ROS finds it and the package robot."""
-    shutil.copytree(ROBOT, tmp_path / 'robot', ignore=shutil.ignore_patterns('CATKIN_IGNORE'))
-    paths = [str(tmp_path), os.environ.get('ROS_PACKAGE_PATH', ''), '/usr/share']
-    monkeypatch.setenv('ROS_PACKAGE_PATH', os.pathsep.join(paths))
-    monkeypatch.setenv('ROS_HOME', str(tmp_path / 'home'))
-    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
-    return Bench(tmp_path / 'bench', master)
-
-
-def end(running):
-    """Press Ctrl-C if it runs, and return the exit code."""
-    if running.poll() is None:
-        running.signal(signal.SIGINT)
-    return running.wait()
 
 
 @pytest.mark.parametrize('way', ['Ctrl-C', 'stop', 'kill'])
@@ -513,7 +442,7 @@ def test_blocking_delegate_holds_nobody_up(master):
 
 def test_terminal_tells_of_each_node(bench):
     bench.write("rospy.init_node('dies')\nsys.exit(4)", 'dies')
-    with bench.program(bench.launch_file(RESPAWNED, **TEXTS)) as composed:
+    with bench.program(bench.launch_file(RESPAWNED, **TEXTS), '--screen') as composed:
         for text in SHOWN:
             composed.expect(text)
         until(lambda: composed.output.count('ValueError: in vain') >= 2)
@@ -567,7 +496,7 @@ def test_launched_program_creates_nodes(master, bench):
     node = create(master, '/ear')
     mailbox, channel = Mailbox(node, '/speech', STRING), node.output_channel('/end', STRING)
     with bench.program(bench.launch_file(GROUP)) as composed:
-        for runs in check_runs(master, bench, mailbox, ['/rig/boss', '/rig/two', '/compose']):
+        for runs in check_runs(master, bench, mailbox, ['/rig/boss', '/rig/two']):
             assert master.node('/rig/boss').pid == composed.pid
             channel.wait_for_subscribers(1, TIMEOUT)
             channel.send(data='') if runs == 1 else end(composed)

@@ -339,12 +339,6 @@ class Topic:
 
         watching.watch(self, count, block)
 
-    def plot(self, *fields: str, seconds: float = 5.0):
-        """Return a matplotlib Figure of fields such as 'linear.x' over some seconds."""
-        from pharos.live import watching
-
-        return watching.plot(self, fields, seconds)
-
     def input_channel(self, node: Node, typed_as=None, **options) -> InputChannel:
         """Hand a node its end to receive at; see :meth:`Node.interested_in`."""
         return node.interested_in(self.name, typed_as, **options)

@@ -86,7 +86,7 @@ class Failure:
 
 
 class Failures(list):
-    """The failures of one run of a node, the newest last; printed as a table. For any thread."""
+    """The failures of one run of a node, the newest last. For any thread."""
 
     total = 0  #: the number of all failures, also of those dropped since
 
@@ -104,17 +104,3 @@ class Failures(list):
             for older in self[:-MAX_WITH_FRAMES]:
                 older.drop_frames()
             del self[:-MAX_FAILURES]
-
-    def __repr__(self):
-        if not self:
-            return '[]'
-        lines = [f'{"raised":60}  {"by":30}  {"on":20}  times  last']
-        for failure in self:
-            error_text = f'{type(failure.error).__name__}: {failure.error}'
-            topic = getattr(failure.channel, 'topic', '')
-            clock_time = time.strftime('%H:%M:%S', time.localtime(failure.time))
-            lines.append(
-                f'{error_text:60.60}  {block_name(failure.block):30.30}  {topic:20.20}'
-                f'  {failure.count:5}  {clock_time}'
-            )
-        return '\n'.join(lines)

@@ -2,30 +2,29 @@
 
   compose PKG FILE.launch [arg:=value ...]     as roslaunch; nodes that are not Python run apart
   compose FILE.launch [arg:=value ...]         the same, by its path
-  compose --script PKG/EXECUTABLE ...          programs, as rosrun finds them
-  compose                                      none at first
+  compose --script PKG/EXECUTABLE ... [_rate:=5 old:=new ...]    programs, as rosrun runs them
+  compose talker.py ...                        the same, by paths
 
-Programs with windows run in processes of their own. It is a node, /compose by default (__name:= names it
-otherwise), with the services of a nodelet manager: `rosrun nodelet nodelet load PKG/EXECUTABLE
-compose __name:=talker` loads one more. It ends when all nodes have ended, or by Ctrl-C.
+Programs with windows, and those with a state that a process has but once, run as plain processes; a line
+says which and why. It ends when all nodes have ended, or by Ctrl-C.
 """
 import argparse
 import contextlib
-import functools
+import faulthandler
 import os
 import sys
 
 import rospkg
-from rosgraph.names import anonymous_name
 
-from pharos import Master, NodeNameInUseError, PharosError, spin
+from pharos import Master, PharosError
 from pharos.compose.composition import SWITCH_INTERVAL, Composition
-from pharos.compose.container import Container
 from pharos.compose.launch_file import LaunchFile
+from pharos.waiting import wait
 
 
 def main(argv=None):
     """Start, wait, and return the exit status."""
+    faulthandler.enable(all_threads=False)  # a crash in C says where in Python it was
     sys.setswitchinterval(SWITCH_INTERVAL)
     options, mappings = _parse(sys.argv[1:] if argv is None else argv)
     with contextlib.ExitStack() as stack:
@@ -46,7 +45,7 @@ def _parse(arguments):
     parser.add_argument('file', nargs='*', help='PKG FILE.launch, or its path alone')
     parser.add_argument('--script', nargs='+', default=[], help='programs to run')
     parser.add_argument('--only', nargs='+', default=[], help='of the file, these nodes alone')
-    parser.add_argument('--apart', nargs='+', default=[], help='these in processes of their own')
+    parser.add_argument('--apart', nargs='+', default=[], help='these as plain processes')
     parser.add_argument(
         '--here', nargs='+', default=[], help='these here, though they show windows'
     )
@@ -56,10 +55,26 @@ def _parse(arguments):
     parser.add_argument(
         '--share-connections', action='store_true', help='one connection to each other publisher'
     )
+    roslaunch_options = parser.add_argument_group('as for roslaunch')
+    roslaunch_options.add_argument('--wait', action='store_true', help='wait for the master')
+    roslaunch_options.add_argument('-v', action='store_true', help='no effect: all is said anyway')
+    for output in 'screen', 'log':
+        roslaunch_options.add_argument(
+            f'--{output}',
+            action='store_const',
+            const=output,
+            dest='output',
+            help=f"all nodes have output='{output}'",
+        )
     options = parser.parse_args([each for each in arguments if ':=' not in each])
     mappings = [each for each in arguments if ':=' in each]
-    needs_file = options.file or options.only or options.apart or options.group
-    if needs_file and (options.script or len(options.file) not in (1, 2)):
+    if options.file and options.file[0].endswith('.py'):
+        options.script = options.file
+        options.file = []
+    if not (options.file or options.script):
+        parser.error('give a launch file, or programs')
+    names_nodes = options.only or options.apart or options.group
+    if options.script and (options.file or names_nodes) or len(options.file) > 2:
         parser.error('give one launch file, by package and name or by its path, first; or --script')
     return options, mappings
 
@@ -67,29 +82,18 @@ def _parse(arguments):
 def _run(stack, options, mappings):
     """Run as the options say, and return the exit status; the stack ends all."""
     master = Master(share_connections=options.share_connections)
+    if options.wait:
+        wait(master.is_reachable)
     if not master.is_reachable():
         port = int(master.url.rstrip('/').rpartition(':')[2])
         print(f'no ROS master at {master.url}: it is started here', file=sys.stderr)
         os.environ['ROS_MASTER_URI'] = stack.enter_context(Master.embedded(port)).url
-    composition = Composition(master)
-    ros_arguments = [each for each in mappings if each.startswith('_') or not options.file]
-    create = functools.partial(
-        master.create, Container, argv=ros_arguments, composition=composition
-    )
-    try:
-        container = create(named='compose')
-    except NodeNameInUseError:
-        container = create(named=anonymous_name('compose'))
-    stack.enter_context(container)
-    stack.enter_context(composition)
+    composition = stack.enter_context(Composition(master, owns_process=True))
     if options.file:
         composition.launch(_read_launch_file(master.url, options, mappings))
-        return composition.wait()
-    if options.script:
-        composition.run_scripts(options.script, options.here)
-        return composition.wait()
-    spin()
-    return 0
+    else:
+        composition.run_scripts(options.script, mappings, options.here)
+    return composition.wait()
 
 
 def _read_launch_file(url, options, mappings):
@@ -97,7 +101,7 @@ def _read_launch_file(url, options, mappings):
     args = dict(each.split(':=', 1) for each in mappings if not each.startswith('_'))
     package = options.file[0] if len(options.file) == 2 else None
     names = options.only, options.apart, options.here, options.group
-    launch_file = LaunchFile(url, package, options.file[-1], args, *names)
+    launch_file = LaunchFile(url, package, options.file[-1], args, *names, options.output)
     home = rospkg.get_ros_home()
     os.makedirs(home, exist_ok=True)
     os.chdir(home)

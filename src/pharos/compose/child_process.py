@@ -31,9 +31,10 @@ class RosProcess(subprocess.Popen):
     program.
 
     :param on_line: ``on_line(text)`` is called for each printed line, in another thread
+    :param pass_fds: descriptors that the program gets, too
     """
 
-    def __init__(self, command, master_url, on_line=None):
+    def __init__(self, command, master_url, on_line=None, pass_fds=()):
         self._lines = collections.deque(maxlen=MAX_LINES)
         self._on_line = on_line
         terminal, child_terminal = os.openpty()
@@ -44,6 +45,7 @@ class RosProcess(subprocess.Popen):
             super().__init__(
                 command,
                 env=environ,
+                pass_fds=pass_fds,
                 start_new_session=True,
                 stdin=child_terminal,
                 stdout=child_terminal,
@@ -98,9 +100,7 @@ class RosProcess(subprocess.Popen):
         :returns: the program's exit code
         """
         atexit.unregister(self.terminate)
-        descendants = []
-        if self.poll() is None:
-            descendants = psutil.Process(self.pid).children(recursive=True)
+        descendants = descendants_of(self)
         # to the group: the program's children may live on without the program
         for number in signal.SIGINT, signal.SIGTERM, signal.SIGKILL:
             with contextlib.suppress(ProcessLookupError, subprocess.TimeoutExpired):
@@ -113,6 +113,22 @@ class RosProcess(subprocess.Popen):
 
     def __exit__(self, *error):
         self.terminate()
+
+
+def descendants_of(process):
+    """Return the children of a subprocess.Popen, and their children, as psutil's processes."""
+    if process.poll() is not None:
+        return []
+    return psutil.Process(process.pid).children(recursive=True)
+
+
+def interrupt(process):
+    """Send SIGINT to a subprocess.Popen and its descendants, as Ctrl-C in a terminal does."""
+    descendants = descendants_of(process)
+    process.send_signal(signal.SIGINT)
+    for child in descendants:
+        with contextlib.suppress(psutil.Error):
+            child.send_signal(signal.SIGINT)
 
 
 def find_program(package, executable):

@@ -5,29 +5,38 @@ import collections
 import contextlib
 import os
 import pickle
+import signal
 import socket
 import sys
-import tempfile
 import threading
 import time
 
 import roslaunch.core
 import rospkg
+from rosgraph.names import get_ros_namespace, load_mappings, ns_join
 
 from pharos import signals
-from pharos.compose.child_process import RosProcess, find_program
 from pharos.compose import control, roslaunch_parent
-from pharos.compose.launch_file import Group
-from pharos.compose.script import ScriptNode, wait_for_end
-from pharos.compose.sources import compile_program, needs_main_thread
+from pharos.compose.child_process import RosProcess, find_program
+from pharos.compose.launch_file import Entry, Group
+from pharos.compose.script import ScriptNode, name_of_file, wait_for_end
+from pharos.compose.sources import (
+    compile_program,
+    needs_process,
+    source_of,
+    why_not_this_python,
+    why_own_group,
+)
 from pharos.errors import PharosError
-from pharos.private_rospy.run import Lifecycle, Settings
+from pharos.external_node import ExternalNode
+from pharos.private_rospy.run import Lifecycle, Settings, join
 from pharos.private_rospy.tcpros import shutdown_socket
 from pharos.transcript import Transcript
 from pharos.waiting import wait
 
 #: seconds until the next node starts side by side with one that has not registered yet
 HEAD_START = 0.1
+SLOW_END = 2.0  # seconds; the Transcript names what takes longer to end
 INIT_LIMIT = 2.0  # seconds that a launch waits until all nodes have registered
 TERMINATE_LIMIT = 40.0  # seconds: 20 after the SIGINT, since roslaunch gives its nodes 17
 POLL_PERIOD = 0.02  # seconds between two looks at the nodes that have ended
@@ -40,28 +49,29 @@ class Composition:
 
     :meth:`Master.compose` makes a composition. The end of its ``with`` block ends the composition.
 
+    :param owns_process: True: nothing but the composition runs in this process
     :ivar nodes: the ScriptNodes of this process, in the order of the launch file
-    :ivar process: the RosProcess in which roslaunch runs the others, or None
+    :ivar stopping: an Event, set when the end has begun
     """
 
-    def __init__(self, master):
+    def __init__(self, master, owns_process=False):
         self.master = master
-        self.process: RosProcess | None = None
+        self.owns_process = owns_process
         self.nodes: list[ScriptNode] = []
-        self._processes: list[RosProcess] = []  # of groups, and of scripts that need one each
-        self._required_processes: list[RosProcess] = []  # those with a required node
+        self.stopping = threading.Event()
+        self._parts: list[_Part] = []  # processes of groups, of roslaunch, and of single programs
+        self._roslaunch_part: _Part | None = None
         self._end_times: dict[ScriptNode, float] = {}  # as of time.monotonic()
         self._stopped_nodes: set[ScriptNode] = set()  # by control(); they do not respawn
-        self._stopping = threading.Event()
         self._listener: socket.socket | None = None  # of control()
         self._watcher = threading.Thread(target=self._watch, name='composition', daemon=True)
         self._has_started = False  # True if one node was started
-        self._has_lost_required = False
+        self._has_failed = False  # True if a required node has ended, or a process by a signal
 
     def launch(self, launch_file):
         """Set the parameters of a launch file, and start its nodes.
 
-        The Transcript shows why a node does not start, or runs in a process of its own.
+        The Transcript shows why a node does not start, or runs in another process.
 
         :param launch_file: the :class:`LaunchFile`
         :raises PharosError: if the master does not answer, or refuses a parameter
@@ -71,90 +81,100 @@ class Composition:
         for text in launch_file.config.config_errors:
             Transcript.show(text)
         for name, reason in launch_file.reasons.items():
-            Transcript.show(f'{name} runs in a process of its own: {reason}')
-        if launch_file.nodes_apart:
-            self._start_roslaunch(launch_file)
+            Transcript.show(f'{name} runs as a plain process: {reason}')
+        if launch_file.entries_apart:
+            command = [sys.executable, roslaunch_parent.__file__]
+            self._roslaunch_part = self._start_part(
+                launch_file.entries_apart, command, launch_file.config_of
+            )
         log_folder = os.path.join(rospkg.get_log_dir(), run_id)
-        groups = collections.defaultdict(list)
+        os.makedirs(log_folder, exist_ok=True)
+        entries = []
         for number, entry in enumerate(launch_file.entries, 1):
             log_name = f'{entry.name[1:].replace("/", "-")}-{number}.log'  # as roslaunch names logs
             arguments = [*entry.args, f'__log:={log_folder}/{log_name}']
-            groups[entry.group].append(entry._replace(args=arguments))
-            if entry.group not in ('', entry.name):
-                Transcript.show(f'{entry.name} runs in the group {entry.group}')
-        own_entries = groups.pop('', [])
-        for entries in groups.values():
-            self._start_group(entries)
-        self.start_entries(own_entries)
+            entries.append(entry._replace(args=arguments))
+        self._start_groups(entries)
 
-    def start_entries(self, entries):
-        """Start the nodes of this process, in the order of the launch file."""
-        for entry in entries:
-            with self._show_failure(entry.name):
-                self.start(entry.name, entry.path, entry.args, entry.roslaunch_node)
-        self._begin_watch()
-        wait(lambda: all(map(_has_begun, self.nodes)), INIT_LIMIT)
-
-    def _begin_watch(self):
-        self._listener = control.listen(self)
-        self._watcher.start()
-
-    def _start_group(self, entries):
-        """Start nodes in a process of this package."""
-        master = self.master
-        group = Group(entries, master.url, master.share_connections, master.shared_memory)
-        search_path = os.pathsep.join(folder for folder in sys.path if folder)
-        module = 'pharos.compose.group'
-        command = ['env', f'PYTHONPATH={search_path}', sys.executable, '-m', module]
-        process = self._start_process(command, group)
-        self._processes.append(process)
-        if any(entry.roslaunch_node.required for entry in entries):
-            self._required_processes.append(process)
-
-    def _start_process(self, command, data):
-        """Start a program of this package; it gets a file with pickled data, and our number."""
-        with tempfile.NamedTemporaryFile('wb', delete=False) as file:
-            pickle.dump(data, file)
-        self._has_started = True
-        command = [*command, file.name, str(os.getpid())]
-        return RosProcess(command, self.master.url, Transcript.show)
-
-    def _start_roslaunch(self, launch_file):
-        """Start the nodes apart in a process of roslaunch."""
-        command = [sys.executable, roslaunch_parent.__file__]
-        process = self._start_process(command, launch_file.config_apart())
-        self.process = process
-        if any(node.required for node in launch_file.nodes_apart):
-            self._required_processes.append(process)
-
-    def run_scripts(self, programs, programs_here):
+    def run_scripts(self, programs, arguments, programs_here):
         """Run programs without a launch file; the Transcript shows why a program does not start.
 
         :param programs: texts: PACKAGE/EXECUTABLE, or a path
+        :param arguments: for each program, such as '_rate:=5'
         :param programs_here: those of them that run in this process even if they show windows
         """
+        entries = []
         for text in programs:
             with self._show_failure(text):
-                self._run_script(text, text in programs_here)
-        self._begin_watch()
+                entries += self._script_entries(text, arguments, text in programs_here)
+        self._start_groups(entries)
 
-    def _run_script(self, text, may_show_windows):
+    def _script_entries(self, text, arguments, is_here):
+        """Return a list with the entry of a program; start a plain process if it needs one."""
         path = text
         if not os.path.isfile(text):
             package, _, executable = text.partition('/')
             if not executable:
                 raise PharosError(f'there is no file {text} here: give a path, or PACKAGE/PROGRAM')
             path = find_program(package, executable)
-        reason = '' if may_show_windows else needs_main_thread(path)
+        path = os.path.abspath(path)
+        name = ns_join(get_ros_namespace(argv=arguments), name_of_file(path))
+        entry = Entry(name, source_of(path), arguments, None, is_here=is_here)
+        command = [path]
+        with open(path, errors='replace') as file:
+            has_first_line = file.read(2) == '#!'
+        reason = has_first_line and why_not_this_python(path)
+        if not reason and not is_here:
+            reason = needs_process(path)
+            command = [sys.executable, path]
         if reason:
-            Transcript.show(f'{text} runs in a process of its own: {reason}')
-            self._has_started = True
-            command = [sys.executable, os.path.abspath(path)]
-            self._processes.append(RosProcess(command, self.master.url, Transcript.show))
-        else:
-            Transcript.show(f'{text} starts')
-            self.nodes.append(self.master.load(path, here=True))
-            self._has_started = True
+            Transcript.show(f'{text} runs as a plain process: {reason}')
+            self._start_part([entry], [*command, *arguments])
+            return []
+        return [entry]
+
+    def _start_groups(self, entries):
+        """Start the groups, then the nodes of this process.
+
+        A node that needs the environment of a process is a group, unless it is the only one here.
+        """
+        groups = collections.defaultdict(list)
+        is_alone = self.owns_process and len(entries) == 1
+        for entry in entries:
+            group = entry.group
+            reason = ''
+            if not (group or entry.is_here or is_alone):
+                environ = entry.roslaunch_node.env_args if entry.roslaunch_node else ()
+                reason = why_own_group(entry.path, environ)
+            if reason:
+                group = entry.name
+            if group:
+                Transcript.show(f'{entry.name} runs in {reason or group}')
+            groups[group].append(entry)
+        own_entries = groups.pop('', [])
+        for group_entries in groups.values():
+            self._start_part(group_entries, _group_command(), self._group_of)
+        self.start_entries(own_entries)
+
+    def start_entries(self, entries):
+        """Start nodes in this process, side by side, in the order of the launch file."""
+        for entry in entries:
+            with self._show_failure(entry.name):
+                self._start(entry, self.owns_process and len(entries) == 1)
+        self._listener = control.listen(self)
+        self._watcher.start()
+        wait(lambda: all(map(_has_begun, self.nodes)), INIT_LIMIT)
+
+    def _start_part(self, *arguments):
+        part = _Part(self.master, *arguments)
+        part.start()
+        self._has_started = True
+        self._parts.append(part)
+        return part
+
+    def _group_of(self, entries):
+        master = self.master
+        return Group(entries, master.url, master.share_connections, master.shared_memory)
 
     @contextlib.contextmanager
     def _show_failure(self, name):
@@ -164,26 +184,31 @@ class Composition:
         except PharosError as error:
             Transcript.show(f'{name} is not started: {error}')
 
-    def start(self, name, path, arguments, roslaunch_node=None, init_timeout=HEAD_START):
-        """Start a program as the node of that name, and return the node.
+    def _start(self, entry, owns_process):
+        """Start a program as a node of this process.
 
-        :param path: the file of the program
-        :param arguments: the arguments of the program, with ROS's
-        :param roslaunch_node: roslaunch's Node, if the program comes from a launch file
         :raises PharosError: if the program failed before ``init_node``
         """
         node = ScriptNode.__new__(ScriptNode)
-        node._configure(Settings(name, self.master, None, (0, 0), ()), None, None)
-        ScriptNode.__init__(
-            node, path, arguments, None, roslaunch_node.env_args if roslaunch_node else ()
-        )
-        node.init_timeout = init_timeout
+        node._configure(Settings(entry.name, self.master, None, (0, 0), ()), None, None)
+        roslaunch_node = entry.roslaunch_node
+        environ = roslaunch_node.env_args if roslaunch_node else ()
+        ScriptNode.__init__(node, entry.path, entry.args, None, environ)
+        node.init_timeout = HEAD_START
+        node.owns_process = owns_process
         node.roslaunch_node = roslaunch_node
+        if roslaunch_node and roslaunch_node.output != 'screen':
+            log = load_mappings(entry.args)['__log']
+            node.output_file = log.replace('.log', '-stdout.log')  # as roslaunch names it
         self.nodes.append(node)
-        Transcript.show(f'{name} starts')
-        node._start_held()
+        Transcript.show(f'{entry.name} starts')
         self._has_started = True
-        return node
+        node._start_held()
+
+    @property
+    def process(self) -> RosProcess | None:
+        """The process in which roslaunch runs the other nodes, or None."""
+        return self._roslaunch_part.process if self._roslaunch_part else None
 
     @property
     def is_over(self) -> bool:
@@ -194,15 +219,12 @@ class Composition:
             respawns = node.roslaunch_node and node.roslaunch_node.respawn
             if respawns or node.lifecycle is not Lifecycle.STOPPED:
                 return False
-        return all(process.poll() is not None for process in self._all_processes())
-
-    def _all_processes(self):
-        return [*self._processes, self.process] if self.process else self._processes
+        return all(part.is_over for part in self._parts)
 
     def _watch(self):
         """Show ends, start again nodes that respawn, and end all if a required node has ended."""
         while not self.is_over:
-            is_stopping = self._stopping.wait(POLL_PERIOD)
+            is_stopping = self.stopping.wait(POLL_PERIOD)
             if is_stopping:
                 break
             self._look()
@@ -210,13 +232,37 @@ class Composition:
 
     def _look(self):
         for node in self.nodes:
-            if self._stopping.is_set():
+            if self.stopping.is_set():
                 return
             if node.lifecycle is Lifecycle.STOPPED and node not in self._stopped_nodes:
                 self._look_at_ended(node)
-        for process in self._required_processes:
-            if process.poll() is not None:  # roslaunch or a group ends with its required node
-                self._end('a node in another process')
+        for part in self._parts:
+            if not self.stopping.is_set():
+                self._look_at_part(part)
+
+    def _look_at_part(self, part):
+        """Tell of a process that a signal has ended, and start again its nodes that respawn.
+
+        roslaunch and groups end with a required node.
+        """
+        code = part.process.poll()
+        if code is None:
+            return
+        if part.is_due:
+            Transcript.show(f'{part.names}: back in a new process')
+            part.start()
+            if self.stopping.is_set():  # stop() may have looked before the start
+                part.process.terminate(TERMINATE_LIMIT)
+        elif not part.is_told:
+            names = part.names
+            has_required = part.has_required
+            if code < 0:
+                self._has_failed = True
+                Transcript.show(f'{names}: {signal.Signals(-code).name} has ended their process')
+                part.forget_nodes()
+            part.is_told = True
+            if has_required:
+                self._end(f'one of {names}')
 
     def _look_at_ended(self, node):
         name = node._settings.name
@@ -238,7 +284,7 @@ class Composition:
             Transcript.show(f'{name} comes back')
             del self._end_times[node]
             node._start_held()
-        if self._stopping.is_set():  # stop() may have looked before the start
+        if self.stopping.is_set():  # stop() may have looked before the start
             node._stop_safely()
 
     def control(self, node, action):
@@ -259,38 +305,56 @@ class Composition:
             self._stopped_nodes.discard(node)
 
     def _end(self, name):
-        if not self._stopping.is_set():
+        if not self.stopping.is_set():
             Transcript.show(f'{name}, which is required, has ended: all others end')
-            self._has_lost_required = True
+            self._has_failed = True
             self.stop()
 
     def wait(self, timeout: float | None = None) -> int:
         """Wait until all nodes have ended, or Ctrl-C, and stop the composition.
 
         :param timeout: seconds, None: without limit
-        :returns: 0; or 1 if a required node has ended, or no node has started
+        :returns: 0; 1 if a required node has ended, a signal has ended a process, or no node has
+            started; the status of the program if there is but one, without a launch file
         :raises TimeoutError: if not all nodes have ended in time
         """
         wait_for_end(self._must_end, timeout, 'the composition')
-        if self.is_over:
+        is_over = self.is_over
+        if is_over:
             self._watcher.join()  # the watcher shows all ends before this returns
         self.stop()
-        return 1 if self._has_lost_required or not self._has_started else 0
+        if self._has_failed or not self._has_started:
+            return 1
+        only_code = None
+        if is_over and len(self.nodes) == 1 and not self.nodes[0].roslaunch_node:
+            only_code = self.nodes[0].exit_code
+        return only_code or 0
 
     def _must_end(self):
-        return self.is_over or self._stopping.is_set() or signals.is_ending()
+        return self.is_over or self.stopping.is_set() or signals.is_ending()
 
     def stop(self) -> None:
-        """End all nodes, also those in processes of their own, and wait for their ends."""
-        self._stopping.set()
+        """End all nodes, also those in processes of their own, and wait for their ends.
+
+        The Transcript names what does not end within SLOW_END.
+        """
+        is_first = not self.stopping.is_set()
+        self.stopping.set()
         if self._listener:
             shutdown_socket(self._listener)
-        threads = [threading.Thread(target=node._stop_safely) for node in self.nodes]
-        for process in self._all_processes():
-            threads.append(threading.Thread(target=process.terminate, args=[TERMINATE_LIMIT]))
+        threads = {}
+        for node in self.nodes:
+            threads[threading.Thread(target=node._stop_safely)] = node._settings.name
+        for part in self._parts:
+            terminate = part.process.terminate
+            threads[threading.Thread(target=terminate, args=[TERMINATE_LIMIT])] = part.names
         for thread in threads:
             thread.start()
-        for thread in threads:
+        late_threads = join(threads, SLOW_END)
+        if late_threads and is_first:
+            names = ', '.join(threads[thread] for thread in late_threads)
+            Transcript.show(f'the end waits for {names}; a further Ctrl-C ends all at once')
+        for thread in late_threads:
             thread.join()
 
     def __enter__(self) -> Composition:
@@ -298,6 +362,104 @@ class Composition:
 
     def __exit__(self, *error):
         self.stop()
+
+
+class _Part:
+    """A process of a composition, with the nodes that it runs.
+
+    :param entries: an :class:`Entry` for each node
+    :param command: the command of the process
+    :param data_of: ``data_of(entries)`` is pickled for a program of this package, which gets the
+        file with that, and the number of this process
+    :ivar is_told: True if the end of the process has been looked at
+    """
+
+    def __init__(self, master, entries, command, data_of=None):
+        self.entries = entries
+        self._master = master
+        self._command = command
+        self._data_of = data_of
+        self._comeback_time: float | None = None  # as of time.monotonic()
+
+    def start(self):
+        """Start the process with the nodes in ``entries``."""
+        self.is_told = False
+        self._comeback_time = None
+        url = self._master.url
+        if not self._data_of:
+            self.process = RosProcess(self._command, url, Transcript.show)
+            return
+        with open(os.memfd_create('pharos'), 'wb') as file, _blocked_interrupts():
+            pickle.dump(self._data_of(self.entries), file)
+            file.flush()
+            command = [*self._command, f'/proc/self/fd/{file.fileno()}', str(os.getpid())]
+            self.process = RosProcess(command, url, Transcript.show, pass_fds=[file.fileno()])
+
+    @property
+    def names(self):
+        """The names of the nodes, as text."""
+        return ', '.join(entry.name for entry in self.entries)
+
+    @property
+    def has_required(self):
+        """True if the process has a required node."""
+        return any(entry.roslaunch_node.required for entry in self.entries if entry.roslaunch_node)
+
+    @property
+    def is_over(self):
+        """True if the process has ended, that was told, and no node respawns."""
+        return self.is_told and self._comeback_time is None
+
+    @property
+    def is_due(self):
+        """True if the nodes that respawn must start now."""
+        return self._comeback_time is not None and time.monotonic() >= self._comeback_time
+
+    def forget_nodes(self):
+        """Unregister the nodes after a crash of the process; keep the entries that respawn.
+
+        The nodes of roslaunch go on without it: end them.
+        """
+        for entry in self.entries:
+            with contextlib.suppress(PharosError):
+                ExternalNode(self._master, entry.name).shutdown()
+            with contextlib.suppress(PharosError):
+                _unregister(self._master, entry.name)
+        nodes = [entry.roslaunch_node for entry in self.entries]
+        if any(node and node.respawn for node in nodes):
+            self.entries = [each for each in self.entries if each.roslaunch_node.respawn]
+            delays = [float(entry.roslaunch_node.respawn_delay) for entry in self.entries]
+            self._comeback_time = time.monotonic() + max(delays)
+
+
+@contextlib.contextmanager
+def _blocked_interrupts():
+    """Have a new process take no SIGINT until it says so: an import may lose the signal."""
+    former_mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, former_mask)
+
+
+def _group_command():
+    """Return the command of a process of this package that runs a group."""
+    search_path = os.pathsep.join(folder for folder in sys.path if folder)
+    return ['env', f'PYTHONPATH={search_path}', sys.executable, '-m', 'pharos.compose.group']
+
+
+def _unregister(master, name):
+    """Unregister a node that is dead, as ``rosnode cleanup`` does."""
+    uri = master.call('lookupNode', name)
+    publishers, subscribers, services = master.call('getSystemState')
+    for method, users in ('unregisterPublisher', publishers), ('unregisterSubscriber', subscribers):
+        for topic, nodes in users:
+            if name in nodes:
+                master.call(method, topic, uri, caller_id=name)
+    for service, nodes in services:
+        if name in nodes:
+            address = master.call('lookupService', service)
+            master.call('unregisterService', service, address, caller_id=name)
 
 
 def _has_begun(node):

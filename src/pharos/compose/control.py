@@ -14,6 +14,7 @@ from pharos.private_rospy.tcpros import check_user
 
 ANSWER_LIMIT = 60.0  # seconds
 MAX_TEXT = 4096  # bytes
+ACCEPT_PAUSE = 0.5  # seconds until the next attempt
 _PREFIX = 'pharos-compose-'
 DONE = 'done'
 
@@ -30,16 +31,24 @@ def listen(composition):
 
 def _serve(listener, composition):
     with listener:
-        while True:
+        while not composition.stopping.is_set():
             try:
                 client, _ = listener.accept()
-            except OSError:  # the composition has stopped
-                return
-            with client, contextlib.suppress(OSError, ValueError):  # it has gone, or sends nonsense
-                check_user(client)
-                action, name, url = client.recv(MAX_TEXT).decode().split()
-                if url == composition.master.url:
-                    client.send(_answer(composition, action, name).encode())
+                thread = threading.Thread(target=_serve_client, args=[client, composition])
+                thread.daemon = True
+                thread.start()
+            # the composition ends, or the system has no descriptor or thread left
+            except (OSError, RuntimeError):
+                composition.stopping.wait(ACCEPT_PAUSE)
+
+
+def _serve_client(client, composition):
+    client.settimeout(ANSWER_LIMIT)
+    with client, contextlib.suppress(OSError, ValueError):  # it has gone, or sends nonsense
+        check_user(client)
+        action, name, url = client.recv(MAX_TEXT).decode().split()
+        if url == composition.master.url:
+            client.send(_answer(composition, action, name).encode())
 
 
 def _answer(composition, action, name):

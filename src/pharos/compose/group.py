@@ -3,25 +3,25 @@
 A composition starts this program for each of its groups. FILE has a pickled Group. The program ends
 when its programs have ended, when a required one has, and when the process PARENT has ended.
 """
-import os
-import pickle
+import faulthandler
+import signal
 import sys
 
 from pharos.compose.composition import SWITCH_INTERVAL, Composition
-from pharos.compose.roslaunch_parent import end_with
+from pharos.compose.roslaunch_parent import end_with, read_parcel
 from pharos.master import Master
 
 
 def main(path: str, parent: int) -> int:
-    """Run the group in a file, which is removed, and return the exit status of its composition."""
+    """Run the group in a file, and return the exit status of its composition."""
+    faulthandler.enable(all_threads=False)
     sys.setswitchinterval(SWITCH_INTERVAL)
-    with open(path, 'rb') as file:
-        group = pickle.load(file)
-    os.unlink(path)
+    group = read_parcel(path)
     end_with(parent)
     try:
         master = Master(group.url, group.share_connections, group.shared_memory)
-        with Composition(master) as composition:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])  # the parent has blocked it
+        with Composition(master, owns_process=True) as composition:
             composition.start_entries(group.entries)
             return composition.wait()
     except KeyboardInterrupt:

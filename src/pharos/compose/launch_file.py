@@ -21,23 +21,26 @@ from pharos.transcript import Transcript
 
 #: a node with this private parameter belongs to the group of that name
 GROUP_PARAMETER = 'pharos_group'
+APART_PARAMETER = 'pharos_apart'  # a node with this private parameter True is a plain process
 
 
 class Entry(NamedTuple):
-    """A node of a launch file that runs in this process, or in the process of a group.
+    """A node of a launch file, or a program, that a composition starts.
 
     :ivar name: the full name
     :ivar path: the file of the program
     :ivar args: the arguments of the program, with ROS's
     :ivar roslaunch_node: roslaunch's Node
-    :ivar group: the name of the group; '' for this process
+    :ivar group: the name of the group; '' for the composition's own process
+    :ivar is_here: True: in the composition's own process, whatever the program has
     """
 
     name: str
     path: str
     args: list[str]
     roslaunch_node: Any
-    group: str
+    group: str = ''
+    is_here: bool = False
 
 
 class Group(NamedTuple):
@@ -59,23 +62,26 @@ class LaunchFile:
     :param package: None: ``file`` is a path
     :param args: names of the launch file's arguments -> values
     :param only: the names of the nodes that run; none: all
-    :param apart: the names of nodes that run in processes of their own
+    :param apart: the names of nodes that are plain processes
     :param here: the names of nodes that run in this process even if they show windows
     :param groups: lists of names of nodes that run in one process each
+    :param output: 'screen' or 'log' for all nodes; default: what the file says
     :ivar config: roslaunch's configuration
     :ivar entries: an :class:`Entry` for each node of this process and of groups
-    :ivar nodes_apart: roslaunch's nodes for its own processes
-    :ivar reasons: the names of nodes apart -> texts that say why they run apart
+    :ivar entries_apart: one for each plain process, without its program
+    :ivar reasons: the names of nodes apart -> texts that say why they are
     :raises UnknownNodeError: if there is no such package, file, argument or node
     :raises PharosError: if roslaunch cannot read the file
     """
 
-    def __init__(self, url, package, file, args, only=(), apart=(), here=(), groups=()):
+    def __init__(
+        self, url, package, file, args, only=(), apart=(), here=(), groups=(), output=None
+    ):
         self.path = find_launch_file(package, file)
         self._read(args)
         self.config.master.uri = url
         self.entries: list[Entry] = []
-        self.nodes_apart: list[Any] = []
+        self.entries_apart: list[Entry] = []
         self.reasons: dict[str, str] = {}
         nodes = {
             rosgraph.names.ns_join(node.namespace, node.name): node for node in self.config.nodes
@@ -85,10 +91,12 @@ class LaunchFile:
         given_names = [*only, *apart, *here, *(name for group in groups for name in group)]
         self._check(given_names, set().union(*short_names.values()), 'node')
         for name, node in nodes.items():
+            node.output = output or node.output
             if not only or short_names[name] & set(only):
-                group = self._group_of(name, short_names[name], apart, groups)
+                is_apart = not short_names[name].isdisjoint(apart)
                 is_here = not short_names[name].isdisjoint(here)
-                self._sort(name, node, group, is_here)
+                group = self._group_of(name, short_names[name], groups)
+                self._sort(name, node, is_apart, is_here, group)
 
     def _read(self, args):
         loader = roslaunch.xmlloader.XmlLoader()
@@ -107,20 +115,25 @@ class LaunchFile:
                 known_text = ', '.join(sorted(known_names)) or 'none'
                 raise UnknownNodeError(f'{self.path} has no {role} {name!r}; it has {known_text}')
 
-    def _group_of(self, name, short_names, apart, groups):
-        """Return the name of the group of a node; '' if the node runs in this process."""
-        if not short_names.isdisjoint(apart):
-            return name
+    def _group_of(self, name, short_names, groups):
+        """Return the name of the group of a node; '' if there is none."""
         for number, group in enumerate(groups, 1):
             if not short_names.isdisjoint(group):
-                return str(number)
-        parameter = self.config.params.get(f'{name}/{GROUP_PARAMETER}')
-        return str(parameter.value) if parameter else ''
+                return f'--group {number}'
+        group_name = self._private_parameter(name, GROUP_PARAMETER)
+        return group_name and f'the group {group_name}' or ''
 
-    def _sort(self, name, node, group, is_here):
-        """Put a node into the entries, or among the nodes apart."""
-        try:
+    def _private_parameter(self, name, parameter_name):
+        parameter = self.config.params.get(f'{name}/{parameter_name}')
+        return parameter and parameter.value
+
+    def _sort(self, name, node, is_apart, is_here, group):
+        """Put a node into the entries, or among those apart."""
+        if is_apart or self._private_parameter(name, APART_PARAMETER):
+            reason = 'as --apart or pharos_apart says'
+        else:
             reason = self._why_apart(node)
+        try:
             if not reason:
                 command = roslaunch.node_args.create_local_process_args(
                     node, node.machine, env=os.environ
@@ -131,11 +144,9 @@ class LaunchFile:
             return
         if reason:
             self.reasons[name] = reason
-            self.nodes_apart.append(node)
+            self.entries_apart.append(Entry(name, '', [], node))
             return
-        if group == name:
-            self.reasons[name] = 'as --apart says'
-        self.entries.append(Entry(name, source_of(command[0]), command[1:], node, group))
+        self.entries.append(Entry(name, source_of(command[0]), command[1:], node, group, is_here))
 
     def _why_apart(self, node):
         """Return why the launch file wants a process for a node, as text; else ''."""
@@ -162,10 +173,10 @@ class LaunchFile:
         except roslaunch.core.RLException as error:
             raise PharosError(f'{self.path}: {error}') from error
 
-    def config_apart(self):
-        """Return a configuration with nothing but the nodes apart, for a process of roslaunch."""
+    def config_of(self, entries):
+        """Return a configuration with nothing but some nodes, for a process of roslaunch."""
         config = copy.copy(self.config)
-        config.nodes = self.nodes_apart
+        config.nodes = [entry.roslaunch_node for entry in entries]
         config.nodes_core = []
         config.tests = []
         config.executables = []

@@ -10,10 +10,6 @@ import sys
 import threading
 import time
 
-import roslaunch
-import roslaunch.parent
-import roslaunch.rlutil
-
 
 PARENT_PERIOD = 1.0  # seconds between two looks at the parent
 
@@ -29,26 +25,45 @@ def end_with(parent):
     threading.Thread(target=watch, daemon=True).start()
 
 
+def read_parcel(path):
+    """Return what is pickled in a file that the parent has passed on, and close the file."""
+    with open(path, 'rb') as file:
+        parcel = pickle.load(file)
+    os.close(int(os.path.basename(path)))  # else the nodes would inherit the descriptor
+    return parcel
+
+
 def main(path, parent):
     """Run the nodes, and return the exit status.
 
-    :param path: the file with the pickled configuration; this removes the file
+    :param path: the file with the pickled configuration
     :param parent: the number of the parent process
     """
-    with open(path, 'rb') as file:
-        config = pickle.load(file)
-    os.unlink(path)
+    interrupts = []
+    signal.signal(signal.SIGINT, lambda *_: interrupts.append(True))
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])  # the parent has blocked it
+    import roslaunch.parent
+    import roslaunch.rlutil
+
+    config = read_parcel(path)
     end_with(parent)
     run_id = roslaunch.rlutil.get_or_generate_uuid(None, False)
     roslaunch.configure_logging(run_id)
     launch = roslaunch.parent.ROSLaunchParent(run_id, [], show_summary=False)
     launch.config = config
+    # roslaunch's own handler waits 20 s for a lock that the start may hold
+    roslaunch.pmon._sig_initialized = True
     try:
-        launch.start()
-        launch.spin()
+        if not interrupts:
+            launch.start()
+        signal.signal(signal.SIGINT, roslaunch.pmon.rl_signal)
+        if not interrupts:
+            launch.spin()
     except roslaunch.RLException as error:
         print(f'roslaunch: {error}', file=sys.stderr)
         return 1
+    finally:
+        launch.shutdown()
     return 0
 
 

@@ -10,7 +10,7 @@ from rosgraph.names import ns_join
 from pharos import signals
 from pharos.compose.child_process import find_program
 from pharos.compose.script_run import ScriptRun
-from pharos.compose.sources import needs_main_thread, source_of
+from pharos.compose.sources import needs_process, source_of
 from pharos.errors import PharosError, UnknownNodeError
 from pharos.node import Node
 from pharos.private_rospy.run import Lifecycle
@@ -36,8 +36,10 @@ class ScriptNode(Node):
     #: seconds that :meth:`stop` waits for the program, as long as roslaunch waits after its SIGINT
     stop_timeout = 15.0
     exit_code: int | None = None
-    roslaunch_node: Any = None  # roslaunch's Node, if the program comes from a launch file
+    owns_process = False  # True: the process's environment is the program's
+    output_file = ''  # what the program prints goes there; '': to the terminal
     _run_class = ScriptRun
+    roslaunch_node: Any = None  # roslaunch's Node, if the program comes from a launch file
     _has_own_start = True  # the program itself opens its endpoints at each start
 
     def __init__(self, path: str, args: list[str], params: dict | None = None, env: Any = ()):
@@ -74,18 +76,23 @@ def load(master, package, executable, arguments, name, namespace, params, here):
     path = os.path.abspath(package) if executable is None else find_program(package, executable)
     if not os.path.isfile(path):
         raise UnknownNodeError(f'there is no file {path}: give a path, or a package and a program')
-    reason = '' if here else needs_main_thread(path)
+    reason = '' if here else needs_process(path)
     if reason:
         raise PharosError(
-            f'{path} needs a process of its own, since {reason}: start it by master.run(),'
-            ' or load(..., here=True)'
+            f'{path} needs a process of its own: {reason}. Start it by master.run(), or'
+            ' load(..., here=True)'
         )
     if name:
         node_name = name
         arguments = [*arguments, f'__name:={name.rpartition("/")[2]}']
-    else:  # the node has its file's name until the program calls init_node
-        file_name = re.sub(r'\.py$', '', os.path.basename(path))
-        node_name = re.sub(r'\W|^(?=[^A-Za-z])', 'x', file_name)
+    else:
+        node_name = name_of_file(path)
     if namespace:
         node_name = ns_join(namespace, node_name)
     return master.create(ScriptNode, node_name, path=source_of(path), args=arguments, params=params)
+
+
+def name_of_file(path):
+    """Return the name of a program's node until the program calls ``rospy.init_node``."""
+    file_name = re.sub(r'\.py$', '', os.path.basename(path))
+    return re.sub(r'\W|^(?=[^A-Za-z])', 'x', file_name)

@@ -7,35 +7,49 @@ import collections
 import contextlib
 import ctypes
 import functools
+import gc
 import os
 import signal
+import socket
 import sys
 import threading
 import time
 import traceback
 import types
+from threading import ExceptHookArgs
 
+from rosgraph import get_master_uri
 from rosgraph.names import anonymous_name, get_ros_namespace, load_mappings, ns_join
 
 import pharos
 from pharos import signals
+from pharos.blocks import block_name
+from pharos.compose.child_process import interrupt
 from pharos.compose.sources import compile_program
 from pharos.errors import PharosError
 from pharos.master import Master
+from pharos.private_rospy import loader
 from pharos.private_rospy.loader import Shim
 from pharos.private_rospy.patches import patch
-from pharos.private_rospy.run import STOP_LIMIT, Run, join
+from pharos.private_rospy.run import STOP_LIMIT, Lifecycle, Run, join
+from pharos.transcript import Transcript
 from pharos.waiting import current, wait
 
 SIGNAL_LIMIT = 0.2  # seconds that a signal waits for the main thread
 JOIN_PERIOD = 0.02  # seconds between two looks for a signal
 SPIN_PERIOD = 0.01  # seconds
+#: files whose frames tracebacks do not show
+_HIDDEN = '<frozen importlib', loader.__file__, __file__
 
 
 @patch('subprocess', 'Popen.__init__')
 def start_child(original, run, self, *args, env=None, **kwargs):
-    """Python gives a child the environment of this process. This passes on the program's."""
+    """Python gives a child the environment of this process. This passes on the program's.
+
+    The end of the program interrupts the child, as roslaunch and a terminal do.
+    """
     original(self, *args, env=run.environ if env is None else env, **kwargs)
+    run.children = [*filter(is_alive, run.children), self]
 
 
 class ScriptRun(Run):
@@ -63,6 +77,8 @@ class ScriptRun(Run):
     main_has_ended = True  # there is no main thread yet; False from start() on
 
     def __init__(self, node, settings):
+        self.process_id = os.getpid()  # os.fork() makes another one
+        self.children = []  # processes, as subprocess.Popen
         self.exit_functions = []  # of atexit
         self.thread_exit_functions = []  # of threading._register_atexit, which run before
         self.threads_to_join = []  # those that are not daemons
@@ -86,6 +102,10 @@ class ScriptRun(Run):
 
     def substitutes(self):
         """Return the stand-ins that the program imports for some modules of Python."""
+        self.process_environ = dict(os.environ)
+        if self.node.owns_process:  # code in C and shared modules see the program's variables
+            os.environ.update(self.environ)
+            self.environ = os.environ
         stand_ins = super().substitutes()
         run = self
 
@@ -101,7 +121,6 @@ class ScriptRun(Run):
             def start(self):
                 if not self.daemon:
                     run.threads_to_join.append(self)
-                self.run = functools.partial(run.run_thread, self.run)
                 super().start()
 
         stand_ins['threading'] = Shim(
@@ -109,6 +128,7 @@ class ScriptRun(Run):
             Thread=Thread,
             Timer=type('Timer', (Thread, threading.Timer), {}),
             main_thread=lambda: self.main,
+            excepthook=self._print_thread_error,
             _register_atexit=self.thread_exit_functions.append,
         )
         stand_ins['signal'] = Shim(signal, signal=self._set_handler, getsignal=self._handler_of)
@@ -120,8 +140,11 @@ class ScriptRun(Run):
         stand_ins['pharos'] = _Pharos(self)
         self.stdout = NamedLines(sys.__stdout__, self)
         self.stderr = NamedLines(sys.__stderr__, self)
+        if self.node.output_file:
+            self.stdout = open(self.node.output_file, 'a', buffering=1)
         stand_ins['sys'].stdout = self.stdout
         stand_ins['sys'].stderr = self.stderr
+        stand_ins['sys'].excepthook = self.print_error
         # without ${node}: NamedLines puts the node's name in front
         self.environ['ROSCONSOLE_FORMAT'] = os.environ.get(
             'ROSCONSOLE_FORMAT', '[${severity}] [${time}]: ${message}'
@@ -145,11 +168,25 @@ class ScriptRun(Run):
         """Stand in for ``print``: write to the program's own sys.stdout, not to the process's."""
         print(*values, file=file or self.modules.modules['sys'].stdout, **options)
 
-    def print_error(self, error, title=''):
-        """Print a traceback, as Python does at the end of a program or thread."""
-        self.stderr.write(
-            title + ''.join(traceback.format_exception(type(error), error, error.__traceback__))
-        )
+    def print_error(self, error_class, error, trace, title=''):
+        """Stand in for ``sys.excepthook``: print a traceback, without the frames of pharos."""
+        summary = traceback.TracebackException(error_class, error, trace)
+        cause = summary
+        while cause:
+            cause.stack[:] = [each for each in cause.stack if not each.filename.startswith(_HIDDEN)]
+            cause = cause.__cause__ or cause.__context__
+        self.stderr.write(title + ''.join(summary.format()))
+
+    def _print_thread_error(self, args):
+        """Stand in for ``threading.excepthook``."""
+        self.print_error(*args[:3], f'Exception in thread {args.thread.name}:\n')
+
+    def show_error(self, error, show):
+        """Call ``show(class, error, traceback)``, a hook that the program may have set."""
+        try:
+            show(type(error), error, error.__traceback__)
+        except Exception as new_error:
+            self.show_error(new_error, self.print_error)
 
     # -- start
 
@@ -170,11 +207,11 @@ class ScriptRun(Run):
         self.main.start()
         wait(lambda: self.is_known or not self.main.is_alive(), node.init_timeout, node)
         self.is_starting = False
-        if self.error:
-            is_ours = isinstance(self.error, PharosError)
-            error_class = type(self.error) if is_ours else PharosError
-            text = f'{node.path} ended before it was a node: {self.error!r}'
-            raise error_class(text) from self.error
+        error, self.error = self.error, None
+        if error:
+            error_class = type(error) if isinstance(error, PharosError) else PharosError
+            text = f'{node.path} ended before it was a node: {error!r}'
+            raise error_class(text) from error
 
     @property
     def is_known(self):
@@ -193,15 +230,15 @@ class ScriptRun(Run):
         if anonymous:
             name = anonymous_name(name)
         settings = self.settings
+        url = get_master_uri(self.environ, self.argv)
+        master = Master(url, self.master.share_connections, self.master.shared_memory)
+        if master != self.master:
+            self.master = settings.master = self.node.master = master
         self.base_name = load_mappings(self.argv).get('__name', name)
         self.name = ns_join(get_ros_namespace(self.environ, self.argv), self.base_name)
         settings.name = self.name
         self.node.name = self.name
-        tcp_port, xmlrpc_port = settings.ports
-        settings.ports = (
-            options.pop('tcpros_port', 0) or tcp_port,
-            options.pop('xmlrpc_port', 0) or xmlrpc_port,
-        )
+        settings.ports = options.pop('tcpros_port', 0), options.pop('xmlrpc_port', 0)
         for parameter_name, value in self.node.params.items():
             self.master.parameters[f'{self.name}/{parameter_name}'] = value
         super().start(disable_signals=disable_signals, **options)
@@ -209,16 +246,18 @@ class ScriptRun(Run):
 
     # -- the program
 
-    def run_thread(self, target):
-        """Run the target of a thread of the program; print and keep its exception."""
+    def run_thread(self, thread, target):
+        """Run the target of a thread; show and keep its exception."""
         try:
-            target()
+            super().run_thread(thread, target)
         except SystemExit:  # ends the thread, not the program
             pass
         except Exception as error:
-            name = target.__self__.name
-            self.print_error(error, f'Exception in thread {name}:\n')
-            self.keep_failure(error, name)
+            if self.lifecycle is Lifecycle.STOPPED:
+                return  # the hook is gone with the program
+            hook = self.modules.modules['threading'].excepthook
+            self.show_error(error, lambda *facts: hook(ExceptHookArgs([*facts, thread])))
+            self.keep_failure(error, thread.name)
 
     def run_main(self):
         """Run the program to its end, with its threads and exit functions; stop the node."""
@@ -251,21 +290,15 @@ class ScriptRun(Run):
             return 0
         except SystemExit as error:
             return self._status_of(error)
-        except KeyboardInterrupt as error:
-            self._print_main_error(error)
-            return -signal.SIGINT
         except BaseException as error:
-            self._print_main_error(error)
+            self.show_error(error, self.modules.modules['sys'].excepthook)
+            if isinstance(error, KeyboardInterrupt):
+                return -signal.SIGINT
             if self.is_starting and not self.is_known:
                 self.error = error
             else:
                 self.keep_failure(error, self.node.path)
             return 1
-
-    def _print_main_error(self, error):
-        # without the frame of _run_code()
-        error.__traceback__ = error.__traceback__.tb_next
-        self.print_error(error)
 
     def _run_all(self, functions):
         while functions:
@@ -273,12 +306,22 @@ class ScriptRun(Run):
             try:
                 function()
             except (Exception, SystemExit, KeyboardInterrupt) as error:
-                self.print_error(error)
-                self.keep_failure(error, function)
+                self.show_error(error, self.print_error)
+                self.keep_failure(error, block_name(function.func))
 
     def exit_now(self, status):
-        """Stand in for ``os._exit``: end the program, not the process."""
+        """Stand in for ``os._exit``: end the program, not the process, without hooks."""
+        if os.getpid() != self.process_id:
+            os._exit(status)  # a child by os.fork()
         self.exit_request = SystemExit(status)
+        hooks = self.core._client_shutdown_hooks
+        for functions in (
+            hooks,
+            self.exit_functions,
+            self.thread_exit_functions,
+            self.threads_to_join,
+        ):
+            functions.clear()
         self.request_stop()
         raise self.exit_request
 
@@ -336,6 +379,8 @@ class ScriptRun(Run):
                     self.stop_created_nodes()
                 if callable(handler):
                     handler(number, None)
+                elif handler is signal.SIG_DFL:  # the system ends a process at once
+                    self.exit_now(-number)
 
     def _signal_numbers(self):
         """Return [SIGINT], and SIGTERM if the program has a handler of its own for that alone."""
@@ -371,9 +416,7 @@ class ScriptRun(Run):
         if isinstance(error, SystemExit):
             self.exit_request = error
         if self.main.is_alive() and not self.main_has_ended:
-            thread_id = ctypes.c_ulong(self.main.ident)
-            error_class = ctypes.py_object(type(error))
-            ctypes.pythonapi.PyThreadState_SetAsyncExc(thread_id, error_class)
+            raise_in(self.main, type(error))
 
     # -- stop
 
@@ -385,16 +428,15 @@ class ScriptRun(Run):
         if self.has_run_hooks:
             return
         self.has_run_hooks = True
-        hooks = self.core._client_shutdown_hooks[:]
-        self.core._client_shutdown_hooks.clear()
-        for hook in hooks:
+        hooks = self.core._client_shutdown_hooks
+        while hooks:
+            hook = hooks.pop(0)
             try:
                 hook()
             except (Exception, SystemExit) as error:
-                if error is self.exit_request:  # os._exit() runs no more hooks
-                    break
-                self.print_error(error)
-                self.keep_failure(error, hook)
+                if error is not self.exit_request:  # of os._exit()
+                    self.show_error(error, self.print_error)
+                    self.keep_failure(error, block_name(hook))
         self.close_rospy(STOP_LIMIT)
 
     def stop_created_nodes(self):
@@ -415,6 +457,8 @@ class ScriptRun(Run):
         :param timeout: seconds for the main thread, which then gets a SystemExit
         """
         self.is_end_requested = True
+        for child in filter(is_alive, self.children):
+            interrupt(child)
         if not self.main_has_ended:
             self.has_signal = True
             self.pending_signal.set()
@@ -425,11 +469,68 @@ class ScriptRun(Run):
             if join(threads, timeout):
                 self.ros.logwarn(f'left behind, since it did not end in time: {self.node.path}')
                 self.raise_in_main(SystemExit())
+                end_reads(self.main)
                 self.souls.pop(self.main)
                 self.threads.discard(self.main)
         self.signal_shutdown('stop')
         self.stop_created_nodes()
-        self.finished.set()  # threads left behind end at their next sleep
+        self.finished.set()
+        thread_class = self.modules.modules['threading'].Thread
+        own_threads = [thread for thread in self.threads.copy() if isinstance(thread, thread_class)]
+        for thread in join(own_threads, 0):
+            raise_in(thread, SystemExit)  # at its next line
+        for thread in join(own_threads, SIGNAL_LIMIT):
+            end_reads(thread)
+
+    def stop(self, timeout):
+        """Stop the node, and drop what the program has opened, as the end of a process does.
+
+        These are ports, files, locks. The Transcript names threads that keep some.
+        """
+        super().stop(timeout)
+        left_threads = join(self.threads.copy(), 0)
+        for thread in left_threads:
+            raise_in(thread, SystemExit)
+        left_threads = join(left_threads, SIGNAL_LIMIT)
+        if left_threads:
+            names = ', '.join(thread.name for thread in left_threads)
+            Transcript.show(f'{self.name} leaves threads that block, with what they use: {names}')
+        self.exit_request = None
+        self.handlers.clear()
+        self.created_nodes.clear()
+        for failure in self.failures:
+            failure.drop_frames()
+        self.modules.modules.clear()
+        if self.node.owns_process:
+            os.environ.clear()
+            os.environ.update(self.process_environ)
+        if not signals.is_ending():
+            gc.collect()
+
+
+def is_alive(process):
+    """True if a subprocess.Popen goes on."""
+    return process.poll() is None
+
+
+def end_reads(thread):
+    """End the wait of a thread that reads a socket, or a port of pyserial, without a limit."""
+    frame = sys._current_frames().get(thread.ident)
+    while frame:
+        values = frame.f_locals
+        for value in [*values.values(), *getattr(values.get('self'), '__dict__', {}).values()]:
+            with contextlib.suppress(Exception):  # it is closed already
+                if isinstance(value, socket.socket):
+                    value.shutdown(socket.SHUT_RD)
+                elif hasattr(value, 'cancel_read'):
+                    value.cancel_read()
+        frame = frame.f_back
+
+
+def raise_in(thread, error_class):
+    """Raise an exception of a class in a thread, at its next line of Python."""
+    thread_id = ctypes.c_ulong(thread.ident)
+    ctypes.pythonapi.PyThreadState_SetAsyncExc(thread_id, ctypes.py_object(error_class))
 
 
 class NamedLines:

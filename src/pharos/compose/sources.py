@@ -1,23 +1,33 @@
 """Read the sources of programs, to find out which ones need a process of their own."""
 import ast
+import os
 import pathlib
 import re
+import sys
 import tokenize
 
 from pharos.errors import PharosError
 from pharos.private_rospy.loader import source_places
 
-_PYTHON = re.compile(r'#!.*\bpython(3(\.\d+)?)?\b')
+_PYTHON = re.compile(r'#!\s*(\S*/)?(env\s.*\b)?python(3(?:\.\d+)?)?\b')
+_VERSIONS = None, '3', f'3.{sys.version_info.minor}'  # that a first line may name
+_PYTHON_FOLDERS = None, '/usr/bin/', '/bin/', os.path.dirname(sys.executable) + '/'
 #: catkin's stand-in for a script in a devel space, which names and runs the script's file
 _WRAPPER = re.compile(r'^python_script = (.+?)$.*exec\(compile\(', re.MULTILINE | re.DOTALL)
 _WRAPPER_LENGTH = 4000  # characters
-#: code that shows windows or takes signals, and so needs the main thread of a process
-_NEEDS_MAIN = re.compile(
+#: code that shows windows, takes signals, or has one state for the whole process
+_NEEDS_PROCESS = re.compile(
     r'^[ \t]*(?:import|from)[ \t]+(?:tkinter|PyQt\d|PySide\d|python_qt_binding'
-    r'|rqt_\w+|qt_gui|gtk|wx|pygame|turtle)\b'
-    r'|\bgi\.require_version\(.Gtk|\bcv2\.(?:imshow|namedWindow)\(|\b(?:plt|pyplot)\.(?:show|pause)\('
+    r'|rqt_\w+|qt_gui|gtk|wx|pygame|turtle|pylab|matplotlib\.pyplot)\b'
+    r'|^[ \t]*from[ \t]+matplotlib[ \t]+import[^\n]*\bpyplot\b'
+    r'|\bgi\.require_version\(.Gtk|\bcv2\.(?:imshow|namedWindow)\(|\breactor\.run\('
     r'|\.add_signal_handler\(|\bsignal\.(?:alarm|setitimer|pause)\(',
     re.MULTILINE,
+)
+#: code that sets environment variables other than ROS's
+_SETS_ENVIRONMENT = re.compile(
+    r'\benviron\[\s*[\'"](?!ROS)[^]\n]*\]\s*=(?!=)'
+    r'|\benviron\.(?:update\(|setdefault\(\s*[\'"](?!ROS))|\bos\.putenv\('
 )
 _IMPORT = re.compile(
     r'^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t(]+([\w, ]+)|import[ \t]+([\w.]+))', re.MULTILINE
@@ -48,33 +58,58 @@ def compile_program(path):
 
 
 def why_apart(path, may_show_windows=False):
-    """Return why a program of a launch file cannot run in this process, as text; else ''.
+    """Return why a program of a launch file needs a plain process, as text; else ''.
 
     :param path: the program, whose first line must name Python 3
-    :param may_show_windows: True: do not ask if the program needs the main thread
+    :param may_show_windows: True: ask the first line alone
     """
+    return why_not_this_python(path) or ('' if may_show_windows else needs_process(path))
+
+
+def why_not_this_python(path):
+    """Return why this Python cannot run a program, by its first line, as text; else ''."""
     with open(path, errors='replace') as file:
         first_line = file.readline(256)
-    if not _PYTHON.match(first_line):
+    python = _PYTHON.match(first_line)
+    if not python:
         return 'it is not a program of Python 3'
-    if may_show_windows:
-        return ''
-    return needs_main_thread(path)
+    folder, _, version = python.groups()
+    if folder not in _PYTHON_FOLDERS or version not in _VERSIONS:
+        return f'its first line names {python[0][2:].strip()}'
+    return ''
 
 
-def needs_main_thread(path):
-    """Return why a Python program needs the main thread of a process, as text; else ''.
+def needs_process(path):
+    """Return why a Python program needs a plain process, as text; else ''."""
+    match = _search(path, _NEEDS_PROCESS)
+    return match and f'it has {match!r}, which needs one; --here overrides this'
+
+
+def why_own_group(path, env=()):
+    """Return why a Python program needs the environment of a process, as text; else ''.
+
+    In a process with other programs, code in C and shared modules do not see its variables.
+
+    :param env: pairs: environment variables that its launch file sets
+    """
+    names = [name for name, _ in env if not name.startswith('ROS')]
+    if names:
+        return f'a group of its own: its environment has {", ".join(names)}'
+    code = _search(path, _SETS_ENVIRONMENT)
+    return code and f'a group of its own: it has {code!r}'
+
+
+def _search(path, pattern):
+    """Return the first text of a program that a pattern matches, or ''.
 
     This also reads the program's modules that lie beside the program or in a package of the user.
     """
     files = [pathlib.Path(source_of(path))]
     for file in files:  # the list grows meanwhile
         text = re.sub('#.*', '', file.read_text(errors='replace'))
-        match = _NEEDS_MAIN.search(text)
+        match = pattern.search(text)
         if match:
-            return (
-                f'it has {match[0].strip()!r}, which needs the main thread; --here overrides this'
-            )
+            return match[0].strip()
         for name in _imported_names(text):
             imported_file = _user_file(name, file.parent)
             if imported_file and imported_file not in files:

@@ -38,16 +38,16 @@ class Link(Transport):
     latch = None  # rospy would send a latched message again; the overlay has its own latches
     header = property(lambda self: self.publisher.header)
     callerid_pub = property(peer_of)  # actionlib reads this
+    transport_type = property(lambda self: self.publisher.transport_type)
     # the publisher counts for all links: to touch ten links takes as long as to run ten delegates
     # rospy sets the count to 0 at first
     stat_num_msg = property(lambda self: self.publisher.seq, lambda self, zero: None)
 
-    def __init__(self, direction, publisher, run, endpoint_id, transport_type, thaw):
+    def __init__(self, direction, publisher, run, endpoint_id, thaw):
         super().__init__(direction, publisher.name)
         self.publisher = publisher
         self.run = run
         self.endpoint_id = endpoint_id
-        self.transport_type = transport_type
         self.thaw = thaw
 
     def get_transport_info(self):
@@ -85,10 +85,10 @@ def link_topic(sender, receiver, topic):
         )
         return
     publisher.make_header()
-    link(publisher, sender.uri, subscription, receiver, 'INTRAPROCESS')
+    link(publisher, sender.uri, subscription, receiver)
 
 
-def link(publisher, uri, subscription, receiver, transport_type):
+def link(publisher, uri, subscription, receiver):
     """Link a publisher and a subscription, and hand over the latched messages.
 
     Do nothing if one of them is closed, or if they are connected already.
@@ -97,12 +97,11 @@ def link(publisher, uri, subscription, receiver, transport_type):
     :param uri: the URI of the publisher's node
     :param subscription: rospy's _SubscriberImpl
     :param receiver: the run of the subscription's node
-    :param transport_type: shown by tools of ROS: 'INTRAPROCESS', or 'TCPROS' for a relay
     """
     thaw = thaw_function(publisher.data_class, subscription.data_class)
     with publisher.lock:
-        sender_end = Link('o', publisher, receiver, receiver.name, transport_type, thaw)
-        receiver_end = Link('i', publisher, receiver, uri, transport_type, thaw)
+        sender_end = Link('o', publisher, receiver, receiver.name, thaw)
+        receiver_end = Link('i', publisher, receiver, uri, thaw)
         sender_end.other_end = receiver_end
         receiver_end.other_end = sender_end
         sender_end.inboxes = subscription.inboxes

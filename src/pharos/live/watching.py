@@ -3,11 +3,10 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import operator
 import queue
 import statistics
 import time
-from typing import Any, Iterator, NamedTuple, Sequence
+from typing import Any, Iterator, NamedTuple
 
 import rosgraph.names
 import rospy
@@ -126,20 +125,3 @@ def watch(topic: Topic, count: int | None, block: Block | None) -> None:
 
 def _show_message(message):
     Transcript.show(f'{message_text(message)}\n---')
-
-
-def plot(topic: Topic, fields: Sequence[str], seconds: float) -> Any:
-    """Return the matplotlib Figure of :meth:`Topic.plot`."""
-    from matplotlib.figure import Figure  # loaded only for plots
-
-    with arrival_queue(topic) as arrivals:
-        arrival_list = _collect_arrivals(arrivals, seconds)
-    figure = Figure(figsize=(8, 4), constrained_layout=True)
-    axes = figure.add_subplot(title=topic.name, xlabel='seconds')
-    times = [arrival.time - arrival_list[0].time for arrival in arrival_list]
-    for field in fields:
-        read_field = operator.attrgetter(field)
-        values = [read_field(arrival.message) for arrival in arrival_list]
-        axes.plot(times, values, label=field)
-    axes.legend()
-    return figure

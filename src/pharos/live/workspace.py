@@ -17,7 +17,6 @@ from genpy import Message
 import pharos
 from pharos import signals
 from pharos.errors import PharosError
-from pharos.live.pictures import figure_png, message_png
 from pharos.live.text_format import message_text
 from pharos.master import Master
 from pharos.node import BlockNode
@@ -121,7 +120,5 @@ def load_ipython_extension(shell: Any, names: dict[str, Any] | None = None) -> N
     shell._atexit_once = stop_nodes
     shell.set_hook('complete_command', complete, re_key='.*')
     formatters = shell.display_formatter.formatters
-    formatters['image/png'].for_type(Message, message_png)
-    formatters['image/png'].for_type_by_name('matplotlib.figure', 'Figure', figure_png)
     formatters['text/plain'].for_type(Message, print_message)
     print(BANNER.format(pharos=pharos, count=len(master.nodes()), **names))

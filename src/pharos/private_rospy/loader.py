@@ -15,10 +15,8 @@ import pathlib
 import re
 import sys
 import threading
-import weakref
-from contextlib import suppress
 from functools import lru_cache
-from importlib.machinery import PathFinder
+from importlib.machinery import PathFinder, SourceFileLoader
 from importlib.util import module_from_spec, resolve_name
 from types import ModuleType
 
@@ -33,7 +31,8 @@ COMMON = STANDARD_MODULES.union(
 )
 #: logging: rospy takes its handlers away; smach: its classes keep the container under construction;
 #: the others use sys.argv, sys.path, os.environ or threads
-PRIVATE = 'logging argparse optparse subprocess concurrent pkgutil smach'.split()
+PRIVATE = 'logging argparse optparse subprocess concurrent pkgutil runpy smach'.split()
+_IMPORTERS = 'importlib', 'imp', '_frozen_importlib', '_frozen_importlib_external'
 MAX_FILES = 300  # of a package that could be written on rospy
 
 
@@ -89,6 +88,16 @@ def _find(name, path):
     if os.path.isfile(spec.origin):
         change_time = os.stat(spec.origin).st_mtime_ns
     return spec, _code_of(spec.loader, name, change_time)
+
+
+def _import_shared(name):
+    """Import a module that all nodes share: one at a time, or circular imports as scipy's fail."""
+    module = sys.modules.get(name)
+    spec = getattr(module, '__spec__', None)
+    if spec and not getattr(spec, '_initializing', False):
+        return module
+    with _process_lock:
+        return importlib._bootstrap._gcd_import(name)
 
 
 def source_places(top_name):
@@ -149,24 +158,28 @@ def _is_generated(name):
     return rest[:1] in (['msg'], ['srv']) and top_name not in ('rospy', 'rosgraph')
 
 
-_dataclass_lock = threading.Lock()
-
-#: class of a private module -> its PrivateModules, as a weak reference
-_owners = weakref.WeakKeyDictionary()
+#: held while a module that all nodes share is imported, or sys.modules shows a private one
+_process_lock = threading.RLock()
 
 
 def _private_module(thing):
-    """Return the private module of a class, function, method or frame, or None."""
+    """Return the private module of a class, function, method or frame, or None.
+
+    That of a class is one of the node whose code has called.
+    """
     owner = None
     if inspect.isclass(thing):
         name = thing.__module__
-        with suppress(TypeError):  # its metaclass has no hash
-            owner = _owners.get(thing, lambda: None)()
+        frame = sys._getframe()
+        while frame and not owner:
+            owner = _owner_of_builtins(frame.f_globals.get('__builtins__'))
+            frame = frame.f_back
     else:
         variables = getattr(thing, 'f_globals', None) or getattr(thing, '__globals__', None) or {}
         name = variables.get('__name__')
         owner = _owner_of_builtins(variables.get('__builtins__'))
-    return owner.modules.get(name) if owner else None
+    module = owner.modules.get(name) if owner else None
+    return module if type(module) is ModuleType else None  # not a stand-in
 
 
 def _owner_of_builtins(module_builtins):
@@ -204,7 +217,7 @@ def _process_class(cls, *args, original=dataclasses._process_class, **kwargs):
     if module is None:
         return original(cls, *args, **kwargs)
     name = cls.__module__
-    with _dataclass_lock:
+    with _process_lock:
         shown_module = sys.modules.get(name)
         sys.modules[name] = module
         try:
@@ -216,6 +229,18 @@ def _process_class(cls, *args, original=dataclasses._process_class, **kwargs):
                 del sys.modules[name]
 
 
+def _exec_module(loader, module, original=SourceFileLoader.exec_module):
+    """Give the node's rospy to a module that a private one loads from a file, by importlib or imp."""
+    frame = sys._getframe(1)
+    while frame.f_globals.get('__name__', '').partition('.')[0] in _IMPORTERS:
+        frame = frame.f_back
+    owner = _owner_of_builtins(frame.f_globals.get('__builtins__'))
+    if owner:
+        vars(module)['__builtins__'] = owner.builtins
+    original(loader, module)
+
+
+SourceFileLoader.exec_module = _exec_module
 dataclasses._process_class = _process_class
 inspect.getmodule = _getmodule
 inspect.getfile = _getfile
@@ -247,7 +272,6 @@ class PrivateModules:
         self.builtins = {
             **vars(builtins),
             '__import__': self._import,
-            '__build_class__': self._build_class,
         }
 
     @property
@@ -299,7 +323,7 @@ class PrivateModules:
         """
         parent, _, leaf = name.rpartition('.')
         if name not in self.modules and not self._is_private(name):
-            module = importlib.import_module(name)
+            module = _import_shared(name)
             if parent and self._is_private(parent):  # a package with code and messages
                 setattr(self.load(parent), leaf, module)
             return module
@@ -327,14 +351,6 @@ class PrivateModules:
             del self.modules[name]
             raise
         self._patch(module)
-
-    def _build_class(self, function, name, *bases, **options):
-        cls = builtins.__build_class__(function, name, *bases, **options)
-        is_rospy = str(function.__module__).startswith('rospy')
-        if not is_rospy:  # sys.modules has the same files of rospy
-            with suppress(TypeError):  # its metaclass has no hash
-                _owners[cls] = weakref.ref(self)
-        return cls
 
     def _import_module(self, name, package=None):
         return self.load(resolve_name(name, package))

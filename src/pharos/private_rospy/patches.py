@@ -5,7 +5,6 @@ target. ``original`` is the former function, and ``run`` the Run that owns the p
 ``def f(original, run)``, ``@replace(module, target)`` puts the returned object in the target's
 place. Each docstring names first the behaviour of rospy, then that of the patch ("this").
 """
-import functools
 import socket
 import threading
 from urllib.parse import urlsplit
@@ -24,16 +23,8 @@ POLL_INTERVAL = 60  # seconds between two looks for a stop; the stop itself wake
 TABLE = {}
 
 
-class _CurrentClient(threading.local):
-    """The client that this thread answers.
-
-    :ivar address: ``(host, port)``
-    """
-
-    address = ()
-
-
-_current_client = _CurrentClient()
+#: the client that this thread answers; its address is ``(host, port)``
+_current_client = threading.local()
 
 
 def replace(module, target):
@@ -122,7 +113,8 @@ def accept(original, run, self, sock, address):
 @patch('rospy.impl.tcpros_base', 'logwarn')
 def name_client(original, run, text, *args):
     """rospy logs a refusal without the client. This names the client's address."""
-    original(f'{":".join(map(str, _current_client.address))}: {text}', *args)
+    address = getattr(_current_client, 'address', ())
+    original(f'{":".join(map(str, address))}: {text}', *args)
 
 
 @patch('rospy.impl.tcpros_base', 'rospyerr')
@@ -328,9 +320,7 @@ def receive_and_retry(original, run, connection, address, port, uri, callback, t
 
     A publisher of another type is a failure of the node, and is not tried again.
     """
-    subscription = callback.__self__
-    receive = functools.partial(tcpros.receive, connection, address, port, uri, subscription, run)
-    tcpros.receive_until_end(run, subscription, connection, uri, receive)
+    tcpros.receive_until_end(connection, address, port, uri, callback.__self__, run)
 
 
 @patch('rospy.impl.registration', 'RegManager.reg_added')

@@ -188,14 +188,8 @@ class Run:
             def start(self):
                 self.daemon = True
                 run.threads.add(self)  # before its start: a stop waits for it
+                self.run = functools.partial(run.run_thread, self, self.run)
                 super().start()
-
-            def run(self):
-                try:
-                    super().run()
-                finally:
-                    run.ended_cpu_seconds += time.thread_time()
-                    run.threads.discard(self)
 
         self.Thread = Thread
         client = Shim(xmlrpc.client, ServerProxy=ServerProxy)
@@ -209,6 +203,14 @@ class Run:
             'xmlrpc': Shim(xmlrpc, client=client),
             'xmlrpc.client': client,
         }
+
+    def run_thread(self, thread, target):
+        """Run the target of a thread of the node, in this thread."""
+        try:
+            target()
+        finally:
+            self.ended_cpu_seconds += time.thread_time()
+            self.threads.discard(thread)
 
     def start_thread(self, target):
         """Start a thread of the node, and return the thread.
@@ -370,10 +372,15 @@ class Run:
         uri = self.master.call('lookupNode', self.name)
         if not uri:
             return
+        name = None
         with suppress(*UNREACHABLE):
-            ServerProxy(uri, NAME_LIMIT).getPid('/pharos')
+            proxy = ServerProxy(uri, NAME_LIMIT)
+            proxy.getPid('/pharos')  # raises if the URI is dead
+            name = self.name
+            name = proxy.getName('/pharos')[2]  # another node may have the URI; roscpp raises
+        if name == self.name:
             raise NodeNameInUseError(
-                f'{self.name} is running already, at {uri}: choose another name, or end that one'
+                f'{name} is running already, at {uri}: choose another name, or end that one'
             )
 
     def make_findable(self, handler, uri):
@@ -653,6 +660,7 @@ def _watch_runs():
         look_count += 1
         for run in list(runs.values()):
             run.check_peers()
+        run = None  # else a stopped run would live until the next look
         if look_count % LOOKS_PER_MASTER == 0:
             _ask_masters()
 

@@ -46,11 +46,18 @@ def check_user(sock):
 # -- receiving
 
 
-def receive_until_end(run, subscription, connection, uri, receive_messages):
-    """Receive messages until the connection ends, then connect again, or report a refusal."""
+def receive_until_end(connection, address, port, uri, subscription, run):
+    """Receive from a publisher until the connection ends; then connect again, or report a refusal.
+
+    This runs in rospy's thread of the connection.
+
+    :param connection: rospy's TCPROSTransport
+    :param uri: the URI of the publisher's node
+    """
     reason = ''
     try:
-        receive_messages()
+        connection.connect(address, port, uri, timeout=CONNECT_LIMIT)
+        _receive(connection, subscription, run)
     except Exception as error:
         reason = str(error)
     end_connection(run, subscription, connection, uri, reason)
@@ -70,17 +77,14 @@ def end_connection(run, subscription, connection, uri, reason):
         run.connect_later(topic, uri, reason)
 
 
-def receive(connection, address, port, uri, subscription, run):
-    """Connect to a publisher and receive its messages until the connection ends.
+def _receive(connection, subscription, run):
+    """Receive the messages of a connection until its end.
 
     Each message goes to the relay of the connection, if there is one, and to all inboxes of the
-    subscription. This runs in rospy's thread of the connection.
+    subscription.
 
-    :param connection: rospy's TCPROSTransport
-    :param uri: the URI of the publisher's node
-    :raises Exception: if the connection cannot be made or breaks, or a message cannot be read
+    :raises Exception: if the connection breaks, or a message cannot be read
     """
-    connection.connect(address, port, uri, timeout=CONNECT_LIMIT)
     sock = connection.socket
     keep_alive(sock)
     run.sockets.add(sock)
@@ -127,7 +131,7 @@ def join_relay(run, topic, uri, subscription):
         for other in runs.values():
             if key in other.relays:
                 relay = other.relays[key]
-                link(relay, uri, subscription, run, relay.transport_type)
+                link(relay, uri, subscription, run)
                 return True
         relay = run.modules.load('rospy.topics')._PublisherImpl(topic, subscription.data_class)
         relay.transport_type = 'TCPROS'  # until begin_delivery() knows the connection's

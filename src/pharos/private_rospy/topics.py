@@ -38,6 +38,7 @@ class PublisherOverlay:
     def __init__(self, name, data_class):
         self.rospy___init__(name, data_class)
         self.lock = self.publock  # rospy's close() sets publock to None
+        self.transport_type = 'INTRAPROCESS'  # of its links; that of its connection for a relay
         self.latches = {}  # channel, or None for all Publishers of plain rospy -> frozen message
         self.last_wake = 0.0
         self.freeze, self.thaw = copier_for(data_class)
@@ -118,10 +119,12 @@ class PublisherOverlay:
                 receivers = receivers_of([connection_override])
                 is_latched = False
             inboxes_by_thaw, inline_queues, thread_queues, connections = receivers
-            if self.has_header:  # as serialize_message does
+            if self.has_header and message._has_header:  # as serialize_message does; not AnyMsg
                 message.header.seq = self.seq
-            # frozen unless sockets alone receive; if nobody does, freeze() checks the fields
-            if inboxes_by_thaw or is_latched or not connections:
+                if message.header.frame_id is None:
+                    message.header.frame_id = '0'
+            # frozen unless sockets alone receive; if nobody does, a channel has the fields checked
+            if inboxes_by_thaw or is_latched or channel and not connections:
                 frozen = self.freeze(message)
                 if is_latched:
                     self.latches[channel] = frozen
@@ -145,7 +148,7 @@ class PublisherOverlay:
         """
         senders = []
         if self.memory:
-            senders, connections = self.memory.split(connections)
+            senders, connections = self.memory.sort(connections)
         try:
             parts = self._serialize(message, senders, connections)
         # a thawed copy has lists or bytes for numpy's arrays; freeze() raises if that is not enough
@@ -167,10 +170,8 @@ class PublisherOverlay:
         parts_in_memory = None
         buffer = MessageParts()
         if senders:
-            parts_in_memory = self.memory.serialize(message, self.seq)
+            parts_in_memory = self.memory.split(message)
         if connections:
-            if self.has_header and message.header.frame_id is None:  # as serialize_message does
-                message.header.frame_id = '0'
             message.serialize(buffer)
         return parts_in_memory, buffer
 
@@ -295,9 +296,6 @@ class SubscriptionOverlay:
             relay.header = connection.header
             relay.is_latch = connection.is_latched
             relay.transport_type = connection.transport_type
-            for end in relay.connections:  # nodes that have joined before
-                end.transport_type = connection.transport_type
-                end.other_end.transport_type = connection.transport_type
 
     def deliver(self, message, connection, size):
         """Count a message that came by a connection, and give each inbox a message of its own.

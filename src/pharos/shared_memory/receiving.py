@@ -5,6 +5,7 @@ supports. roscpp and nodes of rospy alone do not know this protocol, and take TC
 """
 import array
 import contextlib
+import fcntl
 import functools
 import mmap
 import operator
@@ -336,6 +337,8 @@ class MemoryReceiver(MemoryTransport):
         """Map a file that came with a packet."""
         number = array.array('i', descriptor)[0]
         try:
+            if not fcntl.fcntl(number, fcntl.F_GET_SEALS) & fcntl.F_SEAL_SHRINK:
+                raise PermissionError('a memory file without a seal could end this process')
             self._maps[position] = mmap.mmap(number, 0, prot=mmap.PROT_READ)
         finally:
             os.close(number)

@@ -10,7 +10,6 @@ import array
 import copy
 import fcntl
 import functools
-import io
 import itertools
 import mmap
 import os
@@ -23,14 +22,15 @@ from typing import NamedTuple
 
 import genpy
 from rospy.impl.transport import Transport
-from rospy.msg import serialize_message
 
+from pharos.intraprocess.copier import serialize
 from pharos.intraprocess.inboxes import BoundedQueue
 from pharos.private_rospy.tcpros import shutdown_socket
 from pharos.waiting import let_others_run
 
 MAX_PACKET = 1 << 16  # bytes of a message, or a part of one, that the socket takes itself
 MAX_FILES = 4  # of a publisher
+MAX_EXCESS = 10  # a file so many times as large as its message is given back
 POLL_LIMIT = 1000  # milliseconds between two looks if the connection is closed
 #: position of the file, or NO_FILE; slot of the field in it, or WHOLE; its bytes; dropped messages;
 #: the time of sending, as of time.monotonic(), which is the same for all processes of a host
@@ -71,14 +71,23 @@ class MessageMemory:
         self._files = []
         self._numbers = itertools.count(1)
 
-    def split(self, connections):
+    def sort(self, connections):
         """Return the connections that share memory, and the others."""
         senders = [each for each in connections if isinstance(each, MemorySender)]
         return senders, [each for each in connections if each not in senders]
 
-    def serialize(self, message, seq):
-        """Return the parts of a message for write()."""
-        return _split(message, seq)
+    def split(self, message):
+        """Return the slot of a large field and its bytes, or WHOLE and the message, and the rest."""
+        for slot in _byte_fields(type(message)):
+            name = message.__slots__[slot]
+            value = _view(getattr(message, name))
+            if len(value) > MAX_PACKET:
+                others = copy.copy(message)
+                setattr(others, name, b'')
+                rest = serialize(others)
+                if len(rest) <= MAX_PACKET:
+                    return slot, value, rest
+        return WHOLE, serialize(message), b''
 
     def write(self, parts, senders):
         """Send a message by the connections that share memory.
@@ -124,15 +133,15 @@ class MessageMemory:
             self._drop_oldest()
         free_files = [file for file in self._files if not file.readers]
         for file in free_files:
-            if file.capacity >= size:
+            if size <= file.capacity <= MAX_EXCESS * size:
                 return file
         if not free_files:
             self._files.append(MemoryFile(len(self._files), size))
             return self._files[-1]
-        small_file = free_files[0]  # the message has grown
-        self._files[small_file.position] = MemoryFile(small_file.position, size)
-        small_file.close()
-        return self._files[small_file.position]
+        unfit_file = free_files[0]
+        self._files[unfit_file.position] = MemoryFile(unfit_file.position, size)
+        unfit_file.close()
+        return self._files[unfit_file.position]
 
     def _drop_oldest(self):
         """Drop the oldest message that no reader may be reading; else give up its readers."""
@@ -334,20 +343,6 @@ def _byte_fields(message_class):
     return [slot for slot, name in enumerate(message_class._slot_types) if name == 'uint8[]']
 
 
-def _split(message, seq):
-    """Return the slot of a large field and its bytes, or WHOLE and the message, and the rest."""
-    for slot in _byte_fields(type(message)):
-        name = message.__slots__[slot]
-        value = _view(getattr(message, name))
-        if len(value) > MAX_PACKET:
-            others = copy.copy(message)
-            setattr(others, name, b'')
-            rest = _serialize(others, seq)
-            if len(rest) <= MAX_PACKET:
-                return slot, value, rest
-    return WHOLE, _serialize(message, seq), b''
-
-
 def _view(value):
     """Return the bytes of a field without copying them, b'' if that cannot be."""
     if isinstance(value, bytes):
@@ -355,9 +350,3 @@ def _view(value):
     if getattr(value, 'dtype', None) == 'uint8' and value.flags.c_contiguous:
         return memoryview(value).cast('B')
     return b''
-
-
-def _serialize(message, seq):
-    buffer = io.BytesIO()
-    serialize_message(buffer, seq, message)
-    return buffer.getvalue()[4:]  # without the length

@@ -1,0 +1,549 @@
+"""Programs in one process get devices, children, environments and hooks as in their own."""
+import os
+import pty
+import signal
+import socket
+import sys
+import time
+import tty
+
+import psutil
+import pytest
+
+import pharos
+from helpers import COMPOSE, TIMEOUT, Program, create, end
+from pharos.compose.control import control
+from pharos.compose.sources import why_apart, why_own_group
+from pharos.testing import Mailbox, until
+
+STRING = 'std_msgs/String'
+INIT = "rospy.init_node('program')\n"
+SPIN = INIT + "say('ready')\nrospy.spin()\n"
+
+# -- drivers come back
+
+READERS = {
+    'nobody': '',
+    'loop': 'def read(device):\n    while True: time.sleep(0.01)\n',
+    'socket': 'def read(device):\n    device.recv(10)\n',
+}
+DRIVER = '''
+import socket
+{reader}
+class Driver:
+    def __init__(self):
+        self.device = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.device.bind(('127.0.0.1', {port}))
+        self.subscriber = rospy.Subscriber('/wheels', String, self.drive)
+        self.timer = rospy.Timer(rospy.Duration(0.01), self.look)
+        if {has_reader}:
+            threading.Thread(target=read, args=[self.device], daemon=True).start()
+    def drive(self, message): pass
+    def look(self, event): pass
+rospy.init_node('program')
+driver = Driver()
+say('opened')
+{rest}
+'''
+ENDS = {'exit': 'sys.exit(1)', 'exception': "raise RuntimeError('USB has gone')"}
+
+
+def driver(port, reader='nobody', rest='rospy.spin()'):
+    text = READERS[reader]
+    return DRIVER.format(port=port, reader=text, has_reader=bool(text), rest=rest)
+
+
+@pytest.fixture
+def port():
+    """A free port for UDP."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(('127.0.0.1', 0))
+        return sock.getsockname()[1]
+
+
+@pytest.mark.parametrize('reader', READERS)
+@pytest.mark.parametrize('rest', ENDS.values(), ids=ENDS)
+def test_driver_respawns_and_opens_its_device_again(bench, port, reader, rest):
+    bench.write(driver(port, reader, rest))
+    launch = bench.launch_file('<node pkg="bench" type="program" name="program" respawn="true"/>')
+    with bench.program(launch):
+        until(lambda: bench.said().count('opened') >= 3)
+
+
+@pytest.mark.parametrize('reader', READERS)
+def test_stop_gives_the_device_back(bench, port, reader):
+    script = bench.load(driver(port, reader))
+    until(lambda: bench.said() == ['opened'])
+    script.stop()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(('127.0.0.1', port))
+
+
+def test_serial_driver_restarts_while_its_thread_reads(bench):
+    pytest.importorskip('serial')
+    device, program_end = pty.openpty()
+    tty.setraw(program_end)
+    text = f'''
+        import serial
+        def read(port):
+            while True: port.read(1)
+        rospy.init_node('program')
+        port = serial.Serial({os.ttyname(program_end)!r}, exclusive=True)  # waits for ever
+        threading.Thread(target=read, args=[port], daemon=True).start()
+        say('opened')
+        rospy.spin()
+        '''
+    script = bench.load(text)
+    for count in 1, 2, 3:
+        until(lambda count=count: bench.said().count('opened') == count)
+        script.restart()
+    os.close(device)
+    os.close(program_end)
+
+
+def test_thread_that_blocks_for_ever_is_told(bench, transcript):
+    reading_end, writing_end = os.pipe()
+    text = f'''
+        rospy.init_node('program')
+        threading.Thread(target=os.read, args=[{reading_end}, 1], name='blocked', daemon=True).start()
+        rospy.spin()
+        '''
+    bench.load(text).stop()
+    os.close(writing_end)
+    os.close(reading_end)
+    (line,) = [line for line in transcript if 'leaves threads' in line]
+    assert line.endswith('with what they use: blocked')
+
+
+def test_restarted_script_needs_not_its_former_ports(master, bench):
+    script = bench.load(SPIN)
+    script.stop()
+    with socket.create_server(('127.0.0.1', script.tcp_port)):
+        script.start()
+    assert script.is_running
+
+
+@pytest.mark.parametrize('rest', ['rospy.spin()', 'rospy.sleep(0.5)'])
+def test_child_is_interrupted_at_the_end(bench, rest):
+    text = f'''
+                rospy.init_node('program')
+        child = subprocess.Popen(['sh', '-c', 'trap "exit 3" INT; sleep 60 & wait'])
+        say(child.pid)
+        {rest}
+        '''
+    script = bench.load(text)
+    until(bench.said)
+    child = psutil.Process(int(bench.said()[0]))
+    if 'spin' in rest:
+        script.stop()
+    script.wait(TIMEOUT)
+    until(lambda: not child.is_running() or child.status() == psutil.STATUS_ZOMBIE)
+
+
+# -- plain processes, and groups of one
+
+
+@pytest.mark.parametrize(
+    'first_line, reason',
+    [
+        ('#!/usr/bin/python3', ''),
+        ('#!/usr/bin/env python3', ''),
+        ('#!/usr/bin/env -S python3 -u', ''),
+        (f'#!/usr/bin/python3.{sys.version_info.minor}', ''),
+        ('#!/usr/bin/python3.2', 'names /usr/bin/python3.2'),
+        ('#!/usr/bin/env python2', 'not a program of Python 3'),
+        ('#!/home/me/venv/bin/python', 'names /home/me/venv/bin/python'),
+        ('#!/bin/sh', 'not a program of Python 3'),
+    ],
+)
+def test_first_line_may_name_another_python(tmp_path, first_line, reason):
+    (tmp_path / 'program').write_text(f'{first_line}\nimport rospy\n')
+    assert reason in why_apart(str(tmp_path / 'program')) and bool(reason) == bool(
+        why_apart(str(tmp_path / 'program'))
+    )
+
+
+@pytest.mark.parametrize(
+    'line, reason',
+    [
+        ('from twisted.internet import reactor\nreactor.run()', 'reactor.run('),
+        ('import matplotlib.pyplot as plotter', 'matplotlib.pyplot'),
+        ('from matplotlib import cm, pyplot as p', 'pyplot'),
+        ('import pylab', 'pylab'),
+        ('import matplotlib.figure', ''),
+        ('self.reactor.running()', ''),
+    ],
+)
+def test_program_may_need_a_plain_process(tmp_path, line, reason):
+    (tmp_path / 'program').write_text(f'#!/usr/bin/python3\n{line}\n')
+    found = why_apart(str(tmp_path / 'program'))
+    assert reason in found and bool(reason) == bool(found)
+
+
+@pytest.mark.parametrize(
+    'line, is_found',
+    [
+        ("os.environ['CUDA_VISIBLE_DEVICES'] = '1'", True),
+        ("os.environ.setdefault('OMP_NUM_THREADS', '1')", True),
+        ("os.environ.update(TZ='UTC')", True),
+        ("os.putenv('TZ', 'UTC')", True),
+        ("os.environ['ROS_NAMESPACE'] = 'left'", False),
+        ("os.environ['TZ'] == 'UTC'", False),
+        ("print(os.environ['TZ'])", False),
+    ],
+)
+def test_program_may_need_an_environment(tmp_path, line, is_found):
+    (tmp_path / 'program').write_text(f'#!/usr/bin/python3\nimport os\n{line}\n')
+    assert bool(why_own_group(str(tmp_path / 'program'))) == is_found
+
+
+APART = '<node pkg="bench" type="program" name="program">{}</node>'
+SAYS_PROCESS = INIT + "say(f'{os.getppid()} {sys.argv[0]}')\nrospy.spin()\n"
+
+
+@pytest.mark.parametrize('how', ['option', 'parameter'])
+def test_node_apart_is_a_plain_process(master, bench, how):
+    path = bench.write(SAYS_PROCESS)
+    inside = '<param name="pharos_apart" value="true"/>' if how == 'parameter' else ''
+    apart = ['--apart', 'program'] if how == 'option' else []
+    with bench.program(bench.launch_file(APART.format(inside)), *apart) as composed:
+        until(bench.said)
+        parent, program = bench.said()[0].split()
+        assert program == path
+        assert 'roslaunch_parent.py' in ' '.join(psutil.Process(int(parent)).cmdline())
+        process = psutil.Process(master.node('/program').pid)
+        assert not any('pharos' in each.path for each in process.memory_maps())
+        assert process.cmdline()[1] == path
+    assert '/program runs as a plain process: as --apart or pharos_apart says' in composed.output
+
+
+SAYS_GPU = '''
+import ctypes
+rospy.init_node('program')
+getenv = ctypes.CDLL(None).getenv
+getenv.restype = ctypes.c_char_p
+os.system('echo shell $GPU >> ' + SAID)
+say(f'C {getenv(b"GPU")}')
+rospy.spin()
+'''
+ENVIRONMENTS = {
+    'launch file': ('<env name="GPU" value="1"/>', '', 'its environment has GPU'),
+    'program': ('', "os.environ['GPU'] = '1'\n", 'it has "environ[\'GPU\'] ="'),
+}
+
+
+@pytest.mark.parametrize('xml, first, reason', ENVIRONMENTS.values(), ids=ENVIRONMENTS)
+def test_environment_reaches_c_code_and_shells(master, bench, xml, first, reason):
+    bench.write(first + SAYS_GPU)
+    with bench.program(bench.launch_file(APART.format(xml), other=SPIN)) as composed:
+        until(lambda: {'shell 1', "C b'1'"} <= set(bench.said()))
+        assert master.wait_for_node('/program', TIMEOUT).pid != composed.pid
+        assert master.wait_for_node('/other', TIMEOUT).pid == composed.pid
+    assert f'/program runs in a group of its own: {reason}' in composed.output
+
+
+def test_only_program_has_the_environment_of_the_process(master, bench):
+    path = bench.write("os.environ['GPU'] = '1'\n" + SAYS_GPU)
+    with bench.program('--script', path) as composed:
+        until(lambda: {'shell 1', "C b'1'"} <= set(bench.said()))
+        assert master.node('/program').pid == composed.pid
+
+
+# -- crashes are told
+
+CRASH = '''
+import ctypes
+rospy.init_node('program')
+say(os.getpid())
+while not rospy.get_param('/crash', False): time.sleep(0.01)
+rospy.delete_param('/crash')
+ctypes.string_at(0)
+'''
+GROUP = '<param name="pharos_group" value="g"/>'
+
+
+@pytest.mark.parametrize('ending', ['SIGSEGV', 'SIGKILL'])
+def test_crash_of_a_group_is_told_and_its_node_respawns(master, bench, ending):
+    bench.write(CRASH)
+    bench.write(SPIN.replace("'program'", "'beside'"), 'beside')
+    xml = f'<node pkg="bench" type="program" name="program" respawn="true">{GROUP}</node>'
+    xml += f'<node pkg="bench" type="beside" name="beside">{GROUP}</node>'
+    with bench.program(bench.launch_file(xml)) as composed:
+        for count in 1, 2:
+            until(
+                lambda count=count: len(bench.said()) >= count and master.wait_for_node('/program')
+            )
+            (pid,) = [line for line in bench.said() if line.isdigit()][count - 1 :]
+            if ending == 'SIGKILL':
+                os.kill(int(pid), signal.SIGKILL)
+            else:
+                master.parameters['/crash'] = True
+            until(lambda count=count: len([x for x in bench.said() if x.isdigit()]) == count + 1)
+            until(lambda: '/beside' not in [each.name for each in master.nodes()])
+        assert end(composed) == 1
+    assert f'/program: {ending} has ended their process' in composed.output
+    assert '/program: back in a new process' in composed.output
+    if ending == 'SIGSEGV':
+        assert 'bench/program", line' in composed.output
+
+
+def test_crash_of_a_group_with_a_required_node_ends_all(master, bench):
+    bench.write(CRASH)
+    xml = f'<node pkg="bench" type="program" name="program" required="true">{GROUP}</node>'
+    with bench.program(bench.launch_file(xml, other=SPIN)) as composed:
+        until(lambda: 'ready' in bench.said() and len(bench.said()) == 2)
+        master.parameters['/crash'] = True
+        assert composed.wait() == 1
+    assert not any(master.system_state())
+
+
+def test_nodes_of_a_killed_roslaunch_end_or_respawn(master, bench):
+    bench.write(INIT + "say(os.getpid())\nrospy.spin()\n")
+    xml = ''.join(
+        f'<node pkg="bench" type="program" name="{name}" respawn="{respawn}"/>'
+        for name, respawn in [('one', 'true'), ('two', 'false')]
+    )
+    with bench.program(bench.launch_file(xml), '--apart', 'one', 'two') as composed:
+        until(lambda: len(bench.said()) == 2)
+        for name in 'one', 'two':
+            master.wait_for_node(f'/{name}', TIMEOUT)
+        two = master.node('/two')
+        os.kill(psutil.Process(two.pid).ppid(), signal.SIGKILL)
+        until(lambda: len(bench.said()) == 3)
+        assert master.wait_for_node('/one', TIMEOUT).is_alive()
+        until(lambda: '/two' not in [each.name for each in master.nodes()])
+        assert end(composed) == 1
+    until(lambda: not any(psutil.pid_exists(int(pid)) for pid in bench.said()))
+
+
+def test_interrupt_while_roslaunch_starts_ends_its_nodes(master, bench):
+    bench.write(INIT + "say(os.getpid())\nrospy.spin()\n")
+    names = [f'node{number}' for number in range(6)]
+    xml = ''.join(f'<node pkg="bench" type="program" name="{name}"/>' for name in names)
+    with bench.program(bench.launch_file(xml), '--apart', *names) as composed:
+        until(lambda: 'process[node0' in composed.output)
+        begin = time.monotonic()
+        end(composed)
+        assert time.monotonic() - begin < 10
+    assert not any(psutil.pid_exists(int(pid)) for pid in bench.said())
+
+
+def test_slow_end_is_told(bench):
+    text = "rospy.init_node('program')\nrospy.on_shutdown(lambda: time.sleep(2.5))\n" + SPIN
+    with bench.program('--script', bench.write(text)) as composed:
+        until(lambda: 'ready' in bench.said())
+        end(composed)
+    assert 'the end waits for /program; a further Ctrl-C ends all at once' in composed.output
+
+
+# -- as rospy, and as Python
+
+
+def test_frame_id_none_is_sent_as_in_rospy(master, bench):
+    text = '''
+        from sensor_msgs.msg import Imu
+        rospy.init_node('program')
+        imu = rospy.Publisher('/imu', Imu, queue_size=1)
+        message = Imu()
+        message.header.frame_id = None
+        imu.publish(message)
+        say(message.header.frame_id)
+        imu.publish(None)
+        say('none')
+        '''
+    assert bench.load(text).wait(TIMEOUT) == 1
+    assert bench.said() == ['0']
+
+
+def test_wrong_message_passes_while_nobody_hears_it(master, bench):
+    text = '''
+        from std_msgs.msg import Int32
+        rospy.init_node('program')
+        numbers = rospy.Publisher('/numbers', Int32, queue_size=1)
+        numbers.publish('seven')
+        say('passed')
+        while not numbers.get_num_connections(): time.sleep(0.01)
+        try: numbers.publish('seven')
+        except rospy.ROSSerializationException: say('refused')
+        '''
+    script = bench.load(text)
+    Mailbox(create(master, '/ear'), '/numbers', 'std_msgs/Int32')
+    assert script.wait(TIMEOUT) == 0
+    assert bench.said() == ['passed', 'refused']
+
+
+def test_relay_of_any_message_passes_headers(master, bench):
+    text = '''
+        import roslib.message
+        def relay(message):
+            if not outputs:
+                type_ = roslib.message.get_message_class(message._connection_header['type'])
+                outputs.append(rospy.Publisher('/out', type_, queue_size=10, latch=True))
+            outputs[0].publish(message)
+        outputs = []
+        rospy.init_node('program')
+        rospy.Subscriber('/in', rospy.AnyMsg, relay)
+        rospy.spin()
+        '''
+    bench.load(text)
+    node = create(master, '/mouth')
+    node.send_to('/in', typed_as='std_msgs/Header', frame_id='map')
+    assert Mailbox(node, '/out', 'std_msgs/Header').next().frame_id == 'map'
+    node.send_to('/scan', typed_as='sensor_msgs/LaserScan')
+
+
+def test_program_chooses_its_master(master, bench):
+    with pharos.Master.embedded() as other:
+        script = bench.load(f"os.environ['ROS_MASTER_URI'] = '{other.url}'\n" + SPIN)
+        assert script.master == other
+        assert '/program' in [each.name for each in other.nodes()]
+        assert not any(master.system_state())
+        script.stop()
+
+
+def test_system_default_of_sigint_ends_at_once(bench):
+    text = '''
+        rospy.init_node('program')
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        rospy.on_shutdown(lambda: say('hook'))
+        atexit.register(lambda: say('atexit'))
+        say('ready')
+        while True: time.sleep(0.01)
+        '''
+    script = bench.load(text)
+    until(lambda: bench.said() == ['ready'])
+    script.stop()
+    assert bench.said() == ['ready']
+    assert script.exit_code == -signal.SIGINT
+
+
+def test_hooks_for_exceptions_are_called(bench):
+    text = '''
+        sys.excepthook = lambda kind, error, trace: say(f'main {kind.__name__}')
+        threading.excepthook = lambda args: say(f'{args.thread.name} {args.exc_type.__name__}')
+        rospy.init_node('program')
+        thread = threading.Thread(target=lambda: 1 / 0, name='worker')
+        thread.start()
+        thread.join()
+        raise RuntimeError
+        '''
+    assert bench.load(text).wait(TIMEOUT) == 1
+    assert bench.said() == ['worker ZeroDivisionError', 'main RuntimeError']
+
+
+LOADERS = {
+    'spec': "spec = importlib.util.spec_from_file_location('plug', path)\n"
+    'm = importlib.util.module_from_spec(spec)\nspec.loader.exec_module(m)',
+    'loader': "m = importlib.machinery.SourceFileLoader('plug', path).load_module()",
+    'imp': "import warnings; warnings.simplefilter('ignore')\n"
+    "import imp; m = imp.load_source('plug', path)",
+    'runpy': 'import runpy, types; m = types.SimpleNamespace(**runpy.run_path(path))',
+}
+PLUG = "import rospy\ndef name(): return rospy.get_name()\n"
+
+
+@pytest.mark.parametrize('how', LOADERS)
+def test_loaded_plugin_has_the_rospy_of_its_node(bench, how):
+    if how == 'imp' and sys.version_info >= (3, 12):
+        pytest.skip('Python has no imp any more')
+    path = bench.write(PLUG, 'plugins/plug.py', '')
+    head = f'import importlib.machinery, importlib.util\npath = {path!r}\n'
+    assert bench.load(f'{INIT}{head}{LOADERS[how]}\nsay(m.name())').wait(TIMEOUT) == 0
+    assert bench.said() == ['/program']
+
+
+def test_shared_module_is_imported_by_one_thread_at_a_time(bench, tmp_path, monkeypatch):
+    """Two modules that import each other fail if two threads begin with one each, as in Python."""
+    for one, other in ('a', 'b'), ('b', 'a'):
+        text = f'import time\ntime.sleep(0.3)\nimport circle_{other}\ncircle_{other}.__file__, 1\n'
+        (tmp_path / f'circle_{one}.py').write_text(text + f'value = "{one}"\n')
+    monkeypatch.setenv('PYTHONPATH', f'{tmp_path}:{os.environ["PYTHONPATH"]}')
+    begin = 'from circle_{0} import value\nrospy.init_node("{0}")\nsay(value)\n'
+    launch = bench.launch_file(**{name: begin.format(name) for name in 'ab'})
+    with bench.program(launch) as composed:
+        assert composed.wait() == 0
+    assert sorted(bench.said()) == ['a', 'b']
+
+
+def test_forked_child_ends_nothing_of_its_parents(master, bench):
+    text = '''
+        rospy.init_node('program')
+        pid = os.fork()
+        if not pid: os._exit(5)
+        say(os.waitpid(pid, 0)[1] >> 8)
+        rospy.spin()
+        '''
+    script = bench.load(text)
+    until(lambda: bench.said() == ['5'])
+    assert script.is_running and '/program' in [each.name for each in master.nodes()]
+
+
+def test_traceback_has_the_frames_of_the_program(bench, capfd):
+    with pytest.raises(pharos.PharosError):
+        bench.load('def read():\n    import no_such_module\nread()')
+    lines = [line for line in capfd.readouterr().err.splitlines() if 'File "' in line]
+    assert len(lines) == 2 and all('bench/program' in line for line in lines)
+
+
+# -- on the command line
+
+
+def test_scripts_start_side_by_side_with_arguments(master, bench):
+    slow = bench.write(
+        f"while not rospy.core.is_initialized() and not os.path.exists(SAID): time.sleep(0.01)\n{INIT}",
+        'slow',
+    )
+    quick = bench.write(
+        "rospy.init_node('quick')\nsay(rospy.get_param('~rate'))\nrospy.spin()", 'quick'
+    )
+    with bench.program('--script', slow, quick, '_rate:=5', '__ns:=/left') as composed:
+        until(lambda: bench.said() == ['5'])
+        assert master.wait_for_node('/left/program', TIMEOUT)
+        assert master.node('/left/quick').pid == composed.pid
+
+
+@pytest.mark.parametrize('text, status', [('sys.exit(3)', 3), ('1 / 0', 1), ('', 0)])
+def test_status_is_that_of_the_only_program(bench, text, status):
+    with bench.program(bench.write(INIT + text, 'program.py')) as composed:
+        assert composed.wait() == status
+
+
+def test_without_arguments_its_usage_is_shown(master):
+    with Program(COMPOSE, master.url) as composed:
+        assert composed.wait() == 2
+    assert 'usage: compose' in composed.output
+
+
+@pytest.mark.parametrize(
+    'output, option, is_shown',
+    [('', '', False), ('output="screen"', '', True), ('', '--screen', True)],
+)
+def test_output_is_as_with_roslaunch(bench, output, option, is_shown):
+    bench.write(INIT + "print('printed')\nrospy.loginfo('logged')\nrospy.logwarn('warned')")
+    xml = f'<node pkg="bench" type="program" name="program" {output}/>'
+    with bench.program(bench.launch_file(xml), *filter(None, [option])) as composed:
+        composed.wait()
+    assert 'warned' in composed.output
+    files = (bench.folder.parent / 'log').rglob('program-1-stdout.log')
+    text = composed.output if is_shown else next(files).read_text()
+    assert 'printed' in text and 'logged' in text
+    assert ('printed' in composed.output) == ('logged' in composed.output) == is_shown
+
+
+# -- control
+
+
+def test_silent_client_keeps_no_other_out(master, bench):
+    bench.write(SPIN)
+    launch = bench.launch_file('<node pkg="bench" type="program" name="program"/>')
+    with master.compose(None, launch) as composition:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as silent:
+            silent.connect(f'\0pharos-compose-{os.getpid()}')
+            control('restart', '/program', master)
+        assert composition.nodes[0].is_running
+
+
+def test_name_is_free_if_another_node_has_its_uri(master):
+    other = create(master, '/other')
+    master.call('registerPublisher', '/talker', '/words', STRING, other.uri)
+    assert create(master, '/talker').is_running
