@@ -289,7 +289,6 @@ def test_program_names_missing_master(command):
 
 COMMANDS = {
     'graph': 'graph',
-    'graph json': 'graph --json',
     'everything': 'graph --all --services',
     'less': 'graph --hide tf --rates 0.5',
     'top': 'top --once',
@@ -368,13 +367,6 @@ def test_program_prints_what_is_asked(scene, command, there, left_out):
     printed = scene.output[command]
     assert [text for text in there if text.format(**scene.pids) not in printed] == []
     assert [text for text in left_out if text in printed] == []
-
-
-def test_graph_program_prints_json(scene):
-    found = json.loads(scene.output['graph json'])
-    assert {'/sender', '/hearer', '/peer'} <= set(found['nodes'])
-    assert '/traffic' in found['topics']
-    assert {'start', 'end', 'transports'} <= set(found['edges'][0])
 
 
 def test_graph_program_saves_picture(scene):

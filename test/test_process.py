@@ -28,12 +28,14 @@ READERS = {
     'socket': 'def read(device):\n    device.recv(10)\n',
 }
 DRIVER = '''
-import socket
+import fcntl, socket
 {reader}
 class Driver:
     def __init__(self):
         self.device = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.device.bind(('127.0.0.1', {port}))
+        self.lock = os.open(SAID, os.O_RDWR)
+        fcntl.flock(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self.subscriber = rospy.Subscriber('/wheels', String, self.drive)
         self.timer = rospy.Timer(rospy.Duration(0.01), self.look)
         if {has_reader}:
@@ -41,6 +43,7 @@ class Driver:
     def drive(self, message): pass
     def look(self, event): pass
 rospy.init_node('program')
+say('begins')
 driver = Driver()
 say('opened')
 {rest}
@@ -73,7 +76,7 @@ def test_driver_respawns_and_opens_its_device_again(bench, port, reader, rest):
 @pytest.mark.parametrize('reader', READERS)
 def test_stop_gives_the_device_back(bench, port, reader):
     script = bench.load(driver(port, reader))
-    until(lambda: bench.said() == ['opened'])
+    until(lambda: bench.said() == ['begins', 'opened'])
     script.stop()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind(('127.0.0.1', port))
@@ -126,7 +129,8 @@ def test_restarted_script_needs_not_its_former_ports(master, bench):
 @pytest.mark.parametrize('rest', ['rospy.spin()', 'rospy.sleep(0.5)'])
 def test_child_is_interrupted_at_the_end(bench, rest):
     text = f'''
-                rospy.init_node('program')
+        import subprocess
+        rospy.init_node('program')
         child = subprocess.Popen(['sh', '-c', 'trap "exit 3" INT; sleep 60 & wait'])
         say(child.pid)
         {rest}
@@ -187,6 +191,12 @@ def test_program_may_need_a_plain_process(tmp_path, line, reason):
         ("os.environ.setdefault('OMP_NUM_THREADS', '1')", True),
         ("os.environ.update(TZ='UTC')", True),
         ("os.putenv('TZ', 'UTC')", True),
+        ('os.environ[name] = value', True),
+        ("os.environ |= {'TZ': 'UTC'}", True),
+        ("os.environ.pop('TZ')", True),
+        ("del os.environ['TZ']", True),
+        ('env = os.environ', True),
+        ('subprocess.run(command, env=os.environ)', False),
         ("os.environ['ROS_NAMESPACE'] = 'left'", False),
         ("os.environ['TZ'] == 'UTC'", False),
         ("print(os.environ['TZ'])", False),
@@ -328,8 +338,45 @@ def test_interrupt_while_roslaunch_starts_ends_its_nodes(master, bench):
     assert not any(psutil.pid_exists(int(pid)) for pid in bench.said())
 
 
+def test_end_waits_for_no_thread_that_blocks(bench):
+    text = '''
+        import queue
+        rospy.init_node('program')
+        threading.Thread(target=queue.Queue().get, daemon=True).start()
+        rospy.loginfo('begins')
+        say('ready')
+        rospy.spin()
+        '''
+    with bench.program('--script', bench.write(text)) as composed:
+        until(lambda: 'ready' in bench.said())
+        begin = time.monotonic()
+        end(composed)
+        assert time.monotonic() - begin < 2
+    (line,) = [line for line in composed.output.splitlines() if 'begins' in line]
+    assert line.count('program') == 1 and 'leaves' not in composed.output
+
+
+def test_end_waits_for_no_thread_of_a_library(bench):
+    text = '''
+        import socket, socketserver
+        class Handler(socketserver.BaseRequestHandler):
+            def handle(self): self.request.recv(100)
+        rospy.init_node('program')
+        server = socketserver.ThreadingTCPServer(('127.0.0.1', 0), Handler)
+        rospy.on_shutdown(server.shutdown)
+        client = socket.create_connection(server.server_address)
+        threading.Thread(target=lambda: [time.sleep(0.1), say('ready')], daemon=True).start()
+        server.serve_forever()
+        '''
+    with bench.program('--script', bench.write(text)) as composed:
+        until(lambda: 'ready' in bench.said())
+        begin = time.monotonic()
+        end(composed)
+        assert time.monotonic() - begin < 5
+
+
 def test_slow_end_is_told(bench):
-    text = "rospy.init_node('program')\nrospy.on_shutdown(lambda: time.sleep(2.5))\n" + SPIN
+    text = "rospy.init_node('program')\nrospy.on_shutdown(lambda: time.sleep(4))\n" + SPIN
     with bench.program('--script', bench.write(text)) as composed:
         until(lambda: 'ready' in bench.said())
         end(composed)

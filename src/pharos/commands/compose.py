@@ -17,7 +17,7 @@ import sys
 import rospkg
 
 from pharos import Master, PharosError
-from pharos.compose.composition import SWITCH_INTERVAL, Composition
+from pharos.compose.composition import SWITCH_INTERVAL, Composition, leave
 from pharos.compose.launch_file import LaunchFile
 from pharos.waiting import wait
 
@@ -27,14 +27,16 @@ def main(argv=None):
     faulthandler.enable(all_threads=False)  # a crash in C says where in Python it was
     sys.setswitchinterval(SWITCH_INTERVAL)
     options, mappings = _parse(sys.argv[1:] if argv is None else argv)
+    status = 0
     with contextlib.ExitStack() as stack:
         try:
-            return _run(stack, options, mappings)
+            status = _run(stack, options, mappings)
         except (PharosError, ValueError) as error:
             print(f'compose: {error}', file=sys.stderr)
-            return 1
+            status = 1
         except KeyboardInterrupt:
-            return 0
+            pass
+    return leave(status)
 
 
 def _parse(arguments):

@@ -1,8 +1,6 @@
 """The command graph."""
 from __future__ import annotations
 
-import json
-
 from pharos.commands import argument_parser
 from pharos.live.graph import NO_NAME, graph_of
 from pharos.master import Master
@@ -18,7 +16,6 @@ def graph(arguments: list[str]) -> None:
     """
     parser = argument_parser(graph)
     parser.add_argument('-o', '--output', metavar='FILE', help='save a picture')
-    parser.add_argument('--json', action='store_true', help='print JSON')
     parser.add_argument('--all', action='store_true', help='show names of every node, too: /rosout')
     parser.add_argument('--services', action='store_true', help='show services, too')
     parser.add_argument('--only', default='', metavar='REGEX', help='show only names that match')
@@ -37,7 +34,5 @@ def graph(arguments: list[str]) -> None:
     )
     if options.output:
         ros_graph.save(options.output)
-    elif options.json:
-        print(json.dumps(ros_graph.as_dict()))
     else:
         print(ros_graph.text())

@@ -462,6 +462,18 @@ def _unregister(master, name):
             master.call('unregisterService', service, address, caller_id=name)
 
 
+def leave(status):
+    """Return an exit status; end this process at once if a thread goes on that is not a daemon.
+
+    Such a thread of a library, as of socketserver, would go on for ever.
+    """
+    threads = [each for each in threading.enumerate() if not each.daemon]
+    if len(threads) > 1:
+        sys.stdout.flush()
+        os._exit(status)
+    return status
+
+
 def _has_begun(node):
     """True if a program has registered its node, or has ended."""
     return not node.is_running or node._current_run.is_known

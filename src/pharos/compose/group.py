@@ -7,7 +7,7 @@ import faulthandler
 import signal
 import sys
 
-from pharos.compose.composition import SWITCH_INTERVAL, Composition
+from pharos.compose.composition import SWITCH_INTERVAL, Composition, leave
 from pharos.compose.roslaunch_parent import end_with, read_parcel
 from pharos.master import Master
 
@@ -29,4 +29,4 @@ def main(path: str, parent: int) -> int:
 
 
 if __name__ == '__main__':
-    sys.exit(main(sys.argv[1], int(sys.argv[2])))
+    sys.exit(leave(main(sys.argv[1], int(sys.argv[2]))))

@@ -74,11 +74,13 @@ class ScriptRun(Run):
     is_end_requested = False
     has_signal = False
     has_run_hooks = False
+    left_threads = ()  # of the program, which do not end at their next line
     main_has_ended = True  # there is no main thread yet; False from start() on
 
     def __init__(self, node, settings):
         self.process_id = os.getpid()  # os.fork() makes another one
         self.children = []  # processes, as subprocess.Popen
+        self.descriptors = {}  # of os.open() -> the status of the file
         self.exit_functions = []  # of atexit
         self.thread_exit_functions = []  # of threading._register_atexit, which run before
         self.threads_to_join = []  # those that are not daemons
@@ -136,6 +138,7 @@ class ScriptRun(Run):
         stand_ins['atexit'].unregister = lambda function: None
         stand_ins['os'].getenv = self.environ.get
         stand_ins['os']._exit = self.exit_now
+        stand_ins['os'].open = self.open_descriptor
         stand_ins['asyncio'] = _Asyncio(self)
         stand_ins['pharos'] = _Pharos(self)
         self.stdout = NamedLines(sys.__stdout__, self)
@@ -146,7 +149,7 @@ class ScriptRun(Run):
         stand_ins['sys'].stderr = self.stderr
         stand_ins['sys'].excepthook = self.print_error
         # without ${node}: NamedLines puts the node's name in front
-        self.environ['ROSCONSOLE_FORMAT'] = os.environ.get(
+        self.environ['ROSCONSOLE_FORMAT'] = self.process_environ.get(
             'ROSCONSOLE_FORMAT', '[${severity}] [${time}]: ${message}'
         )
         return stand_ins
@@ -154,6 +157,18 @@ class ScriptRun(Run):
     def _register_at_exit(self, function, *args, **kwargs):
         self.exit_functions.append(functools.partial(function, *args, **kwargs))
         return function
+
+    def open_descriptor(self, *args, **kwargs):
+        """Stand in for ``os.open``: the end of the program closes the descriptor."""
+        descriptor = os.open(*args, **kwargs)
+        self.descriptors[descriptor] = os.fstat(descriptor)
+        return descriptor
+
+    def _close_descriptors(self):
+        for descriptor, status in self.descriptors.items():
+            with contextlib.suppress(OSError):  # it is closed
+                if os.path.samestat(status, os.fstat(descriptor)):
+                    os.close(descriptor)
 
     def _handler_of(self, number):
         default = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
@@ -479,7 +494,9 @@ class ScriptRun(Run):
         own_threads = [thread for thread in self.threads.copy() if isinstance(thread, thread_class)]
         for thread in join(own_threads, 0):
             raise_in(thread, SystemExit)  # at its next line
-        for thread in join(own_threads, SIGNAL_LIMIT):
+        self.left_threads = join(own_threads, SIGNAL_LIMIT)
+        self.threads.difference_update(self.left_threads)  # stop() does not wait for them
+        for thread in self.left_threads:
             end_reads(thread)
 
     def stop(self, timeout):
@@ -488,11 +505,11 @@ class ScriptRun(Run):
         These are ports, files, locks. The Transcript names threads that keep some.
         """
         super().stop(timeout)
-        left_threads = join(self.threads.copy(), 0)
+        left_threads = join({*self.threads, *self.left_threads}, 0)
         for thread in left_threads:
             raise_in(thread, SystemExit)
         left_threads = join(left_threads, SIGNAL_LIMIT)
-        if left_threads:
+        if left_threads and not signals.is_ending():
             names = ', '.join(thread.name for thread in left_threads)
             Transcript.show(f'{self.name} leaves threads that block, with what they use: {names}')
         self.exit_request = None
@@ -506,6 +523,7 @@ class ScriptRun(Run):
             os.environ.update(self.process_environ)
         if not signals.is_ending():
             gc.collect()
+        self._close_descriptors()
 
 
 def is_alive(process):

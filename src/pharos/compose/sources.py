@@ -26,8 +26,10 @@ _NEEDS_PROCESS = re.compile(
 )
 #: code that sets environment variables other than ROS's
 _SETS_ENVIRONMENT = re.compile(
-    r'\benviron\[\s*[\'"](?!ROS)[^]\n]*\]\s*=(?!=)'
-    r'|\benviron\.(?:update\(|setdefault\(\s*[\'"](?!ROS))|\bos\.putenv\('
+    r'\benviron\[\s*(?![\'"]ROS)[^]\n]*\]\s*=(?!=)|\bdel\s+os\.environ\b|\benviron\s*\|='
+    r'|\benviron\.(?:update\(|(?:setdefault|pop)\(\s*(?![\'"]ROS))|\bos\.putenv\('
+    r'|^[ \t]*\w+[ \t]*=[ \t]*os\.environ[ \t]*$',
+    re.MULTILINE,
 )
 _IMPORT = re.compile(
     r'^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t(]+([\w, ]+)|import[ \t]+([\w.]+))', re.MULTILINE

@@ -257,16 +257,16 @@ def _generate(cls, depth=0):
     source = _Source(cls, depth)
     class_name = source.name_for(cls)
     variables = ''.join(f'{variable}, ' for variable in source.variables)
-    freeze_lines = source.freeze_lines
+    freeze_lines = [*source.freeze_lines, f'return ({variables})']
     if depth == 0:  # an element of an array may be of a similar class
         freeze_lines = [
             f'if m.__class__ is not {class_name}: return serialize(m)',
             'try:',
-            *(f'    {line}' for line in freeze_lines or ['pass']),
-            # the serializer's exception names the error
-            'except refused: return serialize(m)',
+            *(f'    {line}' for line in freeze_lines),
+            'except refused: pass',
+            'return serialize(m)',  # whose exception names the error
         ]
-    freeze = ['def freeze(m):', *freeze_lines, f'return ({variables})']
+    freeze = ['def freeze(m):', *freeze_lines]
     thaw = [
         'def thaw(frozen):',
         f'if type(frozen) is bytes: return {class_name}().deserialize(frozen)',

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import collections
-import dataclasses
 import os
 import pathlib
 import re
@@ -238,14 +237,6 @@ class Graph:
 
     def _repr_svg_(self):
         return self._draw('svg').decode()
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the graph as plain values, for JSON."""
-        nodes = {name: dataclasses.asdict(node) for name, node in self.nodes.items()}
-        for node in nodes.values():
-            del node['links']  # JSON has no keys for them; the edges tell the same
-        edges = [edge._asdict() for edge in self.edges]
-        return {'nodes': nodes, 'topics': self.topics, 'edges': edges, 'rates': self.rates}
 
     def __repr__(self):
         return f'<Graph of {len(self.nodes)} nodes: see text() and save()>'

@@ -33,6 +33,10 @@ COMMON = STANDARD_MODULES.union(
 #: the others use sys.argv, sys.path, os.environ or threads
 PRIVATE = 'logging argparse optparse subprocess concurrent pkgutil runpy smach'.split()
 _IMPORTERS = 'importlib', 'imp', '_frozen_importlib', '_frozen_importlib_external'
+#: not the words from and import in a docstring
+_IMPORT = re.compile(
+    r'^\s*(?:from (\w+)[\w.]* import\b|import (\w+)[\w.]*\s*(?:$|[,;#]|as ))', re.M
+)
 MAX_FILES = 300  # of a package that could be written on rospy
 
 
@@ -131,7 +135,8 @@ def _imports_of(top_name):
     if len(contents) > MAX_FILES:
         return set()
     text = b'\n'.join([file.read_bytes(), *contents])
-    names = set(re.findall(r'^\s*(?:from|import) (\w+)', text.decode(errors='replace'), re.M))
+    imports = _IMPORT.findall(text.decode(errors='replace'))
+    names = {name for pair in imports for name in pair if name}
     if b'rospy' in text:
         names.add('rospy')
     return names
