@@ -421,7 +421,7 @@ def test_closed_output_refuses_to_send(node, end):
         channel.send(data='late')
 
 
-@pytest.mark.parametrize('message', [Int32(7), 'hello', None, {'data': 'hello'}], ids=repr)
+@pytest.mark.parametrize('message', [Int32(7), {'data': 'hello'}], ids=repr)
 def test_publish_takes_its_type_alone(node, message):
     with pytest.raises(MessageTypeError):
         node.output_channel('/chatter', STRING).publish(message)

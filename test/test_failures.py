@@ -1,14 +1,16 @@
 """Exceptions of blocks, which end nothing else; and the errors of the package."""
 import contextlib
+import signal
 import threading
 import time
 
 import pexpect
 import pytest
 import rospy
+from geometry_msgs.msg import Point32
 
 import pharos
-from helpers import PYTHON, TIMEOUT, create, free_port, registrations
+from helpers import COMPOSE, PYTHON, TIMEOUT, Program, create, free_port, registrations
 from pharos import BlockNode, Transcript
 from pharos.testing import Mailbox, until
 
@@ -405,3 +407,130 @@ def test_error_says_what_to_do(master, node, use, error, words):
     assert [word for word in words if word not in text] == []
     with contextlib.suppress(pharos.PharosError):
         assert registrations(master, '/n') == [[], [], []]
+
+
+# -- no silence for those who write nodes
+
+
+PLAIN = '''
+import rospy, sys, threading
+from pharos import Master, Node, spin
+from std_msgs.msg import String
+class Habit(Node):
+    def start(self):
+        super().start()
+        rospy.loginfo('in vain')
+        rospy.get_param('~gain', 1)
+        rospy.Subscriber('words', String, print)
+        rospy.Subscriber('more_words', String, print)
+        self.fork(Habit.loop)
+    def loop(self):
+        while not rospy.is_shutdown(): self.sleep(0.01)
+        print('the loop ends', flush=True)
+Master().create(Habit, named='habit', argv=sys.argv)
+print('up', flush=True)
+spin()
+'''
+
+
+@pytest.mark.parametrize('command', [[PYTHON], [*COMPOSE, '--script']], ids=['process', 'composed'])
+def test_plain_rospy_says_what_to_write(master, tmp_path, command):
+    (tmp_path / 'program').write_text(PLAIN)
+    with Program([*command, str(tmp_path / 'program')], master.url) as program:
+        program.expect('up')
+        program.signal(signal.SIGINT)
+        program.wait()
+    for name in 'loginfo', 'get_param', 'Subscriber':
+        assert program.output.count(f'write node.ros.{name}') == 1
+    assert 'left behind' not in program.output
+
+
+def test_library_of_plain_rospy_is_named(master, tmp_path):
+    text = '\nimport tf2_ros\nMaster().create(Node, named="n")\ntf2_ros.Buffer()\n'
+    (tmp_path / 'program').write_text('from pharos import Master, Node' + text)
+    with Program([PYTHON, str(tmp_path / 'program')], master.url) as program:
+        program.wait()
+    assert "write node.ros_import('tf2_ros')" in program.output
+
+
+@pytest.mark.parametrize('end', ['1 / 0', 'return'])
+def test_required_soul_ends_its_program(master, tmp_path, end):
+    text = 'from pharos import *\nnode = Master().create(BlockNode, named="/driver")\n'
+    text += f'def work(me):\n    me.sleep(0.01)\n    {end}\n'
+    (tmp_path / 'program').write_text(text + 'node.fork(work, required=True)\nspin()\n')
+    for command in [PYTHON], [*COMPOSE, '--script']:
+        with Program([*command, str(tmp_path / 'program')], master.url) as program:
+            assert program.wait() == 1
+
+
+def test_required_soul_may_end_with_its_node(master):
+    node = create(master)
+    node.fork(lambda me: me.sleep(60), required=True)
+    node.restart()
+    assert node.is_running
+    node.stop()
+    assert node not in pharos.signals.lost_nodes
+
+
+def test_delegate_that_hangs_is_seen(master):
+    ear, free = create(master, '/ear'), threading.Event()
+    ear.interested_in('/words', STRING, delegate=lambda message: free.wait(TIMEOUT))
+    mouth = create(master, '/mouth').output_channel('/words', STRING)
+    for _ in range(3):
+        mouth.send(data='')
+    until(lambda: ear.health().callback_seconds > 0.1)
+    assert ear.health().waiting == 2
+    free.set()
+    until(lambda: ear.health().callback_seconds == 0 == ear.health().waiting)
+
+
+def test_missing_parameter_names_near_ones(master, node, other):
+    master.parameters['/node/gain'] = 1
+    log = Mailbox(other, '/rosout', 'rosgraph_msgs/Log')
+    node.parameter('~gian')
+    log.wait_for(lambda line: "near names: ['/node/gain']" in line.msg)
+
+
+def test_clock_that_stands_still_is_told(master, capfd):
+    master.parameters['/use_sim_time'] = True
+    create(master)
+    until(lambda: 'time stands still' in capfd.readouterr().err)
+
+
+def test_failure_stands_once_with_the_name_on_each_line(master, tmp_path):
+    text = 'from pharos import *\nnode = Master().create(BlockNode, named="/driver")\n'
+    text += 'node.soul = lambda me: 1 / 0\nnode.execute()\n'
+    (tmp_path / 'program').write_text(text)
+    with Program([PYTHON, str(tmp_path / 'program')], master.url) as program:
+        program.wait()
+    lines = [line for line in program.output.splitlines() if line]
+    assert all('/driver' in line for line in lines)
+    assert sum('raised ZeroDivisionError' in line for line in lines) == 1
+
+
+def test_health_before_the_start_is_an_error(master):
+    class Early(pharos.Node):
+        def __init__(self):
+            for method in self.health, self.restart:
+                with pytest.raises(pharos.NodeStoppedError):
+                    method()
+
+    create(master, node_class=Early)
+
+
+def test_values_fill_the_fields(master, node):
+    box = Mailbox(create(master, '/ear'), '/words', STRING)
+    words = node.output_channel('/words', STRING)
+    words.publish('one')
+    words.publish(data='two')
+    words.send('three')
+    node.send_to('/words', 'four')
+    assert [box.next().data for _ in range(4)] == ['one', 'two', 'three', 'four']
+    points = node.output_channel('/points', 'geometry_msgs/Point')
+    with pytest.raises(pharos.MessageTypeError):
+        points.publish(1.0)
+    points.publish(1.0, 2.0, 3.0)
+    polygon = node.send_to(
+        '/polygon', typed_as='geometry_msgs/Polygon', points=[Point32(), {'y': 2.0}]
+    )
+    assert [point.y for point in polygon.points] == [0.0, 2.0]

@@ -117,8 +117,8 @@ def look():
 
 for number in signal.SIGINT, signal.SIGTERM, signal.SIGHUP:
     signal.signal(number, lambda number, frame: None)
-before = look()
 import pharos
+before = look()
 with pharos.Master().create(pharos.BlockNode, named='/node') as node:
     node.send_to('/t', typed_as='std_msgs/String', data='x')
     node.ros_import('actionlib')

@@ -376,7 +376,8 @@ def test_end_waits_for_no_thread_of_a_library(bench):
 
 
 def test_slow_end_is_told(bench):
-    text = "rospy.init_node('program')\nrospy.on_shutdown(lambda: time.sleep(4))\n" + SPIN
+    text = "rospy.init_node('program')\nrospy.on_shutdown(lambda: time.sleep(4))\n"
+    text += "rospy.sleep(0.5)\n" + SPIN
     with bench.program('--script', bench.write(text)) as composed:
         until(lambda: 'ready' in bench.said())
         end(composed)
@@ -594,3 +595,33 @@ def test_name_is_free_if_another_node_has_its_uri(master):
     other = create(master, '/other')
     master.call('registerPublisher', '/talker', '/words', STRING, other.uri)
     assert create(master, '/talker').is_running
+
+
+def test_program_is_controlled_by_the_names_of_its_nodes(master, bench):
+    bench.write(
+        """
+        master = pharos.Master()
+        for name in 'arm', 'hand': master.create(pharos.BlockNode, name)
+        say('ready')
+        pharos.spin()
+        """
+    )
+    launch = bench.launch_file('<node pkg="bench" type="program" name="program"/>')
+    with master.compose(None, launch) as composition:
+        until(lambda: bench.said() == ['ready'])
+        assert control('stop', '/hand', master) == '/program'
+        assert not composition.nodes[0].is_running
+        assert control('start', '/arm', master) == '/program'
+        until(lambda: bench.said() == ['ready'] * 2)
+
+
+def test_restart_keeps_a_node_if_a_module_cannot_be_read(master, bench):
+    bench.write('import rospy\n', 'helper.py', '')
+    bench.write('import helper\n' + SPIN)
+    launch = bench.launch_file('<node pkg="bench" type="program" name="program"/>')
+    with master.compose(None, launch) as composition:
+        until(lambda: bench.said() == ['ready'])
+        bench.write('import rospy\nx = = 1\n', 'helper.py', '')
+        with pytest.raises(pharos.PharosError, match=r'helper\.py:2: '):
+            composition.control(composition.nodes[0], 'restart')
+        assert composition.nodes[0].is_running

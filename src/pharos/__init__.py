@@ -36,7 +36,9 @@ from pharos.messages import define_message, define_service, message_class, servi
 from pharos.node import BlockNode, Node
 from pharos.parameter import Parameter
 from pharos.private_rospy.run import Lifecycle
+from pharos.private_rospy.plain import guide as _guide
 from pharos.service import Service
+from pharos.signals import live_nodes as _live_nodes
 from pharos.signals import spin
 from pharos.transcript import Transcript
 
@@ -83,6 +85,7 @@ __all__ = [
     'ServiceCallError',
     'NodeStoppedError',
 ]
+_guide(_rospy, _live_nodes)
 _EXTRA_MODULES = {
     'Composition': 'compose.composition',
     'Graph': 'live.graph',

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from genpy import Message
 from rospy import ROSException
+from rospy.msg import args_kwds_to_message
 
 from pharos import messages
 from pharos.blocks import Block, DelegateHolder
@@ -201,16 +202,25 @@ class OutputChannel(Channel):
                 'warning',
             )
 
-    def publish(self, message: Message, connection=None) -> None:
-        """Send a message.
+    def publish(self, *values: Any, **fields) -> None:
+        """Send a message, or one with these values of all its fields, or with these fields.
 
         Inline delegates of nodes of this process run before this returns. This never waits for the
         subscribers.
 
-        :param connection: send to that connection alone; None: to all
         :raises MessageTypeError: if the message is of another type, or cannot be serialized
         :raises NodeStoppedError: if the channel is closed
         """
+        message = values[0] if len(values) == 1 and not fields else None
+        if not isinstance(message, Message):
+            try:
+                message = args_kwds_to_message(self.message_class, values, fields)
+            except (TypeError, ROSException) as error:
+                raise MessageTypeError(f'{self.topic} carries {self.type}: {error}') from error
+        self._publish(message)
+
+    def _publish(self, message, connection=None):
+        """Send a message, to all or to one connection."""
         if type(message) is not self.message_class:
             self._check_type(message)
         if self.closed:
@@ -243,7 +253,7 @@ class OutputChannel(Channel):
         """
         message = messages.build(self.message_class, block, fields)
         connection = self._connection_to(to) if to else None
-        self.publish(message, connection)
+        self._publish(message, connection)
         return message
 
     def _connection_to(self, node):

@@ -1,19 +1,13 @@
 """Message and service types: find or make their classes, and fill messages by name."""
 from __future__ import annotations
 
-import functools
 import pathlib
 import re
-import threading
 from contextlib import suppress
 from typing import Any, Callable
 
-import genmsg
 import rospkg
 from catkin_pkg.package import InvalidPackage
-from genmsg.msg_loader import load_depends, load_msg_from_string, load_srv_from_string
-from genmsg.msgs import bare_msg_type, is_builtin
-from genpy.dynamic import generate_dynamic
 from genpy.message import Message, get_message_class, get_service_class
 from rospy.impl.tcpros_service import convert_return_to_response
 
@@ -72,12 +66,11 @@ float32 angular
 
 '''
 #: (suffix, type) -> definition; the suffix is msg or srv
-_shipped_definitions = {
+shipped_definitions = {
     (suffix, type_name): text
     for suffix, type_name, text in re.findall(r'(\w+) (\S+)\n(.*?\n)\n', _TURTLESIM, re.S)
 }
-_given_definitions = {}
-_lock = threading.RLock()  # genpy's generator is not thread-safe
+given_definitions: dict[tuple[str, str], str] = {}  #: as shipped_definitions
 
 
 def message_class(type_: str | type, ask: Callable | None = None) -> type[Message]:
@@ -92,10 +85,12 @@ def message_class(type_: str | type, ask: Callable | None = None) -> type[Messag
     """
     if isinstance(type_, type) and issubclass(type_, Message):
         return type_
-    installed_class = _installed_class('msg', type_)
+    installed_class = class_of_package('msg', type_)
     if installed_class:
         return installed_class
-    return _make_message(type_, _find_definition('msg', type_, ask))
+    from pharos.definitions import make_message
+
+    return make_message(type_, find_definition('msg', type_, ask))
 
 
 def service_class(type_: Any) -> Any:
@@ -105,10 +100,12 @@ def service_class(type_: Any) -> Any:
     """
     if hasattr(type_, '_request_class'):
         return type_
-    installed_class = _installed_class('srv', type_)
+    installed_class = class_of_package('srv', type_)
     if installed_class:
         return installed_class
-    return _make_service(type_, _find_definition('srv', type_))
+    from pharos.definitions import make_service
+
+    return make_service(type_, find_definition('srv', type_))
 
 
 def define_message(type_: str, text: str) -> type[Message]:
@@ -119,32 +116,19 @@ def define_message(type_: str, text: str) -> type[Message]:
     :raises MessageTypeError: if the type is known already, with other fields
     :raises UnknownTypeError: if the text cannot be read, or a nested type is not found
     """
-    return _define('msg', type_, text, message_class, _make_message)
+    from pharos.definitions import define, make_message
+
+    return define('msg', type_, text, message_class, make_message)
 
 
 def define_service(type_: str, text: str) -> Any:
     """Define a service type by the text of a ``.srv`` file, as :func:`define_message` does."""
-    return _define('srv', type_, text, service_class, _make_service)
+    from pharos.definitions import define, make_service
+
+    return define('srv', type_, text, service_class, make_service)
 
 
-def _define(suffix, type_name, text, find_class, make_class):
-    new_class = make_class(type_name, text)
-    key = suffix, type_name
-    with suppress(UnknownTypeError):
-        known_class = find_class(type_name)
-        is_shipped = key in _shipped_definitions  # a real turtlesim may have other fields
-        if _checksums(known_class) != _checksums(new_class) and not is_shipped:
-            raise MessageTypeError(f'{type_name} is known with other fields: define another type')
-    _given_definitions.setdefault(key, text)
-    return find_class(type_name)
-
-
-def _checksums(cls):
-    """Return the md5sums of a class, and of a service's request: equal for equal fields."""
-    return cls._md5sum, getattr(cls, '_request_class', cls)._md5sum
-
-
-def _installed_class(suffix, type_name):
+def class_of_package(suffix, type_name):
     """Return the class of a type that an installed Python package has, or None."""
     if not (isinstance(type_name, str) and _TYPE.fullmatch(type_name)):
         raise UnknownTypeError(
@@ -157,7 +141,7 @@ def _installed_class(suffix, type_name):
         return None
 
 
-def _find_definition(suffix, type_name, ask=None):
+def find_definition(suffix, type_name, ask=None):
     """Return the definition of a type that has no generated class, or raise UnknownTypeError."""
     package, name = type_name.split('/')
     # there may be no file, or the package.xml of another package cannot be parsed
@@ -165,11 +149,11 @@ def _find_definition(suffix, type_name, ask=None):
         folder = pathlib.Path(rospkg.RosPack().get_path(package), suffix)
         return (folder / f'{name}.{suffix}').read_text('utf-8', 'replace')
     key = suffix, type_name
-    if ask and key not in _shipped_definitions:
+    if ask and key not in shipped_definitions:
         definition = ask(type_name)
         if isinstance(definition, str):
             return definition
-    for definitions in _given_definitions, _shipped_definitions:
+    for definitions in given_definitions, shipped_definitions:
         if key in definitions:
             return definitions[key]
     function_name = 'define_message' if suffix == 'msg' else 'define_service'
@@ -180,107 +164,6 @@ def _find_definition(suffix, type_name, ask=None):
         f' Debian python3-{package.replace("_", "-")}), source its workspace, or call'
         f' {function_name}(type, text)'
     )
-
-
-class _Definition:
-    """A definition as genmsg reads it, with the definitions of all nested types.
-
-    :ivar context: genmsg's context, with all types
-    :ivar text: the text of the type alone
-    :ivar nested_texts: names of nested types -> their texts
-    """
-
-    def __init__(self, type_name, text):
-        self.context = genmsg.MsgContext.create_default()
-        self.nested_texts = {}
-        own_text, *parts = re.split(r'\n=+[ \t]*\nMSG: *', f'\n{text}')
-        self.text = own_text[1:]
-        self._given_texts = {}
-        for part in parts:
-            name, _, nested_text = part.partition('\n')
-            self._given_texts[name.strip()] = nested_text
-        for part in re.split(r'^---.*$', own_text, flags=re.M):  # a service has two parts
-            self._add_nested(type_name, part)
-
-    def _add_nested(self, type_name, text):
-        """Read the text of a type, and add the types of its fields, and those nested in them."""
-        spec = load_msg_from_string(self.context, text, type_name)
-        for field_type in map(bare_msg_type, spec.types):
-            name = 'std_msgs/Header' if field_type == 'Header' else field_type
-            if is_builtin(name) or name in self.nested_texts:
-                continue
-            nested_text = self._given_texts.get(name)
-            if nested_text is None:
-                nested_text = _nested_definition(name)
-            self.nested_texts[name] = nested_text
-            # other types may nest this one without its definition
-            _given_definitions.setdefault(('msg', name), nested_text)
-            self._add_nested(name, nested_text)
-
-    @property
-    def nested_part(self):
-        """The texts of the nested types, as they follow in a full definition."""
-        texts = self.nested_texts.items()
-        return ''.join(f'\n{"=" * 80}\nMSG: {name}\n{text}' for name, text in texts)
-
-
-def _nested_definition(type_name):
-    """Return the definition of a nested type, without the texts of further nested types."""
-    installed_class = _installed_class('msg', type_name)
-    if installed_class:
-        text = installed_class._full_text
-    else:
-        text = _find_definition('msg', type_name)
-    return re.split(r'\n=+[ \t]*\n', text)[0]
-
-
-def _once(make_class):
-    """Return a function that runs once for the same arguments, in one thread at a time.
-
-    Each exception becomes an UnknownTypeError.
-    """
-    cached_function = functools.lru_cache(None)(make_class)
-
-    def make_once(type_name, text):
-        try:
-            with _lock:
-                return cached_function(type_name, text)
-        except Exception as error:
-            raise UnknownTypeError(f'{type_name}: no class can be made of it: {error}') from error
-
-    return make_once
-
-
-@_once
-def _make_message(type_name, text):
-    definition = _Definition(type_name, text)
-    full_text = definition.text + definition.nested_part
-    classes = generate_dynamic(type_name, f'{full_text}\n')
-    cls = classes[type_name]
-    cls._full_text = full_text
-    cls._classes = classes  # for the copier
-    for name in definition.nested_texts:  # genpy has made classes of these, too
-        known_class = message_class(name)
-        if known_class._md5sum == classes[name]._md5sum:
-            classes[name] = known_class
-            # genpy's deserialize() makes nested messages of this name
-            cls.serialize.__globals__['_' + name.replace('/', '__')] = known_class
-    return cls
-
-
-@_once
-def _make_service(type_name, text):
-    definition = _Definition(type_name, text)
-    spec = load_srv_from_string(definition.context, definition.text, type_name)
-    load_depends(definition.context, spec, {})
-    nested_part = definition.nested_part
-    attributes = {
-        '_type': type_name,
-        '_md5sum': genmsg.compute_md5(definition.context, spec),
-        '_request_class': _make_message(f'{type_name}Request', spec.request.text + nested_part),
-        '_response_class': _make_message(f'{type_name}Response', spec.response.text + nested_part),
-    }
-    return type(spec.short_name, (), attributes)
 
 
 # -- filling
@@ -300,7 +183,7 @@ def build(cls, block, fields):
 
     :param cls: the message class
     :param block: ``block(message)`` fills the message or returns another one; or a dict of fields;
-        or a ready message; or None
+        or a ready message; or the value of the only field; or None
     :param fields: a dict of fields, which are set last
     :raises MessageTypeError: for a field that does not exist, or another kind of block
     """
@@ -313,6 +196,8 @@ def build(cls, block, fields):
         returned_value = block(message)
         if isinstance(returned_value, Message):
             message = returned_value
+    elif block is not None and len(cls.__slots__) == 1:
+        fields = {cls.__slots__[0]: block, **fields}
     elif block is not None:
         raise MessageTypeError(
             f'{cls._type} is filled by a block, a dict or keywords, or is a message; not {block!r}'
@@ -358,8 +243,9 @@ def _fill(message, fields):
         base_type = types[name].partition('[')[0]
         if type(value) is dict:
             value = _fill(_class_of_field(base_type, cls)(), value)
-        elif type(value) is list and value and type(value[0]) is dict:
-            value = [_fill(_class_of_field(base_type, cls)(), item) for item in value]
+        elif type(value) is list and dict in map(type, value):
+            item_class = _class_of_field(base_type, cls)
+            value = [_fill(item_class(), each) if type(each) is dict else each for each in value]
         setattr(message, name, value)
     return message
 

@@ -216,10 +216,12 @@ class Node(DelegateHolder):
 
         :raises MasterUnreachableError: if the master does not answer; the node runs on
         """
+        if not self._current_run:
+            self._check_active()  # raises
         with self._life_lock:
             self._settings.master.call('getPid')  # raises if the master does not answer
             souls = self._current_run.souls.items()
-            live_souls = [(thread.name, block) for thread, block in souls if thread.is_alive()]
+            live_souls = [(thread.name, *soul) for thread, soul in souls if thread.is_alive()]
             signals.restarting_nodes.append(self)  # or spin() would return
             try:
                 self.stop()
@@ -227,8 +229,8 @@ class Node(DelegateHolder):
             finally:
                 signals.restarting_nodes.remove(self)
             if not self._has_own_start:
-                for name, block in live_souls:
-                    Node.fork(self, block, name)  # the class may have a fork() of its own
+                for name, block, required in live_souls:
+                    Node.fork(self, block, name, required)  # the class may have another fork()
 
     def become(self, node_class: type[Node]) -> None:
         """Change the node's class; its name, ports, connections and attributes stay.
@@ -302,8 +304,11 @@ class Node(DelegateHolder):
             is silent), ``kind`` (the class's name), ``connections`` ({transport: number}),
             ``dropped`` (number of messages), ``errors`` (how often blocks failed), ``threads``
             (number), ``cpu_seconds``, ``souls`` (number of those that run in threads),
-            ``ended_souls`` (names)
+            ``ended_souls`` (names), ``callback_seconds`` (since the callback has begun that runs
+            now), ``waiting`` (number of messages)
         """
+        if not self._current_run:
+            self._check_active()  # raises
         registered = None
         with suppress(MasterUnreachableError):
             uri = self._settings.master.call('lookupNode', self._settings.name)
@@ -328,7 +333,9 @@ class Node(DelegateHolder):
         """
         return self._run_soul(self._check_soul(self.soul))
 
-    def fork(self, block: Block | None = None, name: str | None = None) -> threading.Thread:
+    def fork(
+        self, block: Block | None = None, name: str | None = None, required: bool = False
+    ) -> threading.Thread:
         """Run the soul, or ``block(node)``, in a thread of its own, and return the thread.
 
         The report (listing 3.8): ``[node execute] fork``. :meth:`stop` ends the soul at its next
@@ -336,11 +343,15 @@ class Node(DelegateHolder):
         but for a rospy.ROSException after a stop has begun.
 
         :param name: the thread's name; default: the block's
+        :param required: True: when the soul ends, the node stops, and ``spin()`` ends the program
+            with status 1, so that a launch file's ``respawn`` and ``required`` see it
         """
         soul = self._check_soul(block or self.soul)
         run = self._current_run
-        thread = run.Thread(target=self._run_soul, args=[soul], name=name or block_name(soul))
-        run.souls[thread] = block  # None: a restart runs the soul that the node has then
+        name = name or block_name(soul)
+        thread = run.Thread(target=self._run_soul, args=[soul, required], name=name)
+        # None: a restart runs the soul that the node has then
+        run.souls[thread] = block, required
         thread.start()
         return thread
 
@@ -351,7 +362,7 @@ class Node(DelegateHolder):
             raise PharosError(f'{self._settings.name} has no soul: give it one, node.soul = block')
         return block
 
-    def _run_soul(self, block):
+    def _run_soul(self, block, required=False):
         former_node = current.node
         current.node = self
         is_node_soul = block is self.soul
@@ -367,6 +378,9 @@ class Node(DelegateHolder):
                 self._current_run.report_failure(error, block, 'soul', retry=retry)
         finally:
             current.node = former_node
+            if required and not self._current_run.stopping.is_set():
+                signals.lost_nodes.append(self)
+                self._current_run.request_stop()
         return None
 
     def sleep(self, seconds: float) -> None:

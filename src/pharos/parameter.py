@@ -1,5 +1,6 @@
 """Parameters of the parameter server, bound both ways."""
 import collections
+import difflib
 import functools
 import threading
 from copy import deepcopy
@@ -23,6 +24,9 @@ class Parameter(Endpoint):
         self._changes = collections.deque()  # the values that the blocks have not got yet
         self._blocks_lock = threading.Lock()  # held by the thread that runs the blocks
         self.open()
+        if self._value is None:
+            near = difflib.get_close_matches(name, node.master.parameters)
+            node.log(f'the server has no parameter {name}; near names: {near}', 'warning')
 
     def subscribe(self):
         """Have the master report changes; set the node's value if the server has none."""

@@ -18,6 +18,8 @@ _SPIN_PERIOD = 0.01  # seconds
 
 #: the nodes of this process that have started
 started_nodes = []
+#: the nodes that a required soul has ended
+lost_nodes = []
 #: the nodes between the stop and the start of a restart()
 restarting_nodes = []
 
@@ -30,6 +32,11 @@ def own_nodes():
     """Return the nodes of this process that start, run, stop or restart."""
     between = [node for node in restarting_nodes if node not in started_nodes]
     return [*started_nodes, *between]
+
+
+def live_nodes():
+    """Return the nodes of this process that start or run."""
+    return [node for node in started_nodes if not node._current_run.stopping.is_set()]
 
 
 @contextlib.contextmanager
@@ -53,13 +60,18 @@ def stop_all():
 
 
 def spin() -> None:
-    """Wait until every node of this process has stopped. Ctrl-C, SIGTERM and SIGHUP stop them."""
+    """Wait until every node of this process has stopped. Ctrl-C, SIGTERM and SIGHUP stop them.
+
+    :raises SystemExit: with status 1, if a required soul has ended
+    """
     handle_signals()
     with contextlib.suppress(KeyboardInterrupt), quiet_wait():
         # a program may have called rospy.init_node(): then a signal is rospy's
         while own_nodes() and not rospy.is_shutdown():
             time.sleep(_SPIN_PERIOD)
     stop_all()
+    if lost_nodes:
+        sys.exit(1)
 
 
 def handle_signals():

@@ -19,6 +19,11 @@ class _Transcript:
         else:
             print(f'{line}\n', end='', flush=True)  # in one piece: other threads print, too
 
+    @property
+    def has_receiver(self) -> bool:
+        """True if a receiver takes the lines, and not standard output."""
+        return self._receiver is not None
+
     def on_show(self, receiver: Block | None) -> Block | None:
         """Have ``receiver(line)`` take the lines, and return the former receiver.
 

@@ -24,4 +24,7 @@ def start(arguments: list[str]) -> None:
 def _control(command, arguments):
     parser = argument_parser(command)
     parser.add_argument('node', metavar='NODE', help='the full name of the node')
-    control(command.__name__, parser.parse_args(arguments).node, Master())
+    name = '/' + parser.parse_args(arguments).node.lstrip('/')
+    program = control(command.__name__, name, Master())
+    if program != name:
+        print(f'{name} is a node of the program {program}: {command.__name__} of all its nodes')

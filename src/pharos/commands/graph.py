@@ -17,7 +17,6 @@ def graph(arguments: list[str]) -> None:
     parser = argument_parser(graph)
     parser.add_argument('-o', '--output', metavar='FILE', help='save a picture')
     parser.add_argument('--all', action='store_true', help='show names of every node, too: /rosout')
-    parser.add_argument('--services', action='store_true', help='show services, too')
     parser.add_argument('--only', default='', metavar='REGEX', help='show only names that match')
     parser.add_argument('--hide', default=NO_NAME, metavar='REGEX', help='hide names that match')
     parser.add_argument(
@@ -28,7 +27,6 @@ def graph(arguments: list[str]) -> None:
         Master(),
         options.rates,
         show_all=options.all,
-        show_services=options.services,
         only=options.only,
         hide=options.hide,
     )

@@ -15,12 +15,14 @@ FILE_WIDTH = 10000  # columns of a table that is not for a terminal, so that not
 
 
 def top(arguments: list[str]) -> None:
-    """Show the nodes, processes and topics of the ROS master in a live table.
+    """Show the nodes and processes of the ROS master in a live table.
 
     The columns are messages and bytes a second, transports, dropped messages, failures, CPU and
     memory. The command subscribes to nothing.
 
-      top NAME ...        only nodes and topics that have a NAME in their names
+      top NAME ...        only nodes that have a NAME in their names
+
+    Other commands: compose, graph, workspace, restart, stop, start, create_package.
     """
     parser = argument_parser(top)
     parser.add_argument('names', nargs='*', metavar='NAME', help='a part of a name')

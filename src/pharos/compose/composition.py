@@ -11,7 +11,9 @@ import sys
 import threading
 import time
 
+import rosgraph
 import roslaunch.core
+import rosnode
 import rospkg
 from rosgraph.names import get_ros_namespace, load_mappings, ns_join
 
@@ -21,7 +23,6 @@ from pharos.compose.child_process import RosProcess, find_program
 from pharos.compose.launch_file import Entry, Group
 from pharos.compose.script import ScriptNode, name_of_file, wait_for_end
 from pharos.compose.sources import (
-    compile_program,
     needs_process,
     source_of,
     why_not_this_python,
@@ -293,7 +294,7 @@ class Composition:
         :raises PharosError: if the node does not start
         """
         if action == 'restart':
-            compile_program(node.path)  # the node runs on if its new program cannot be read
+            node._current_run.check_readable()  # else the node runs on
         Transcript.show(f'{node._settings.name}: {action}')
         self._stopped_nodes.add(node)
         if action != 'start':
@@ -325,10 +326,9 @@ class Composition:
         self.stop()
         if self._has_failed or not self._has_started:
             return 1
-        only_code = None
         if is_over and len(self.nodes) == 1 and not self.nodes[0].roslaunch_node:
-            only_code = self.nodes[0].exit_code
-        return only_code or 0
+            return self.nodes[0].exit_code or 0
+        return 0
 
     def _must_end(self):
         return self.is_over or self.stopping.is_set() or signals.is_ending()
@@ -423,8 +423,9 @@ class _Part:
         for entry in self.entries:
             with contextlib.suppress(PharosError):
                 ExternalNode(self._master, entry.name).shutdown()
-            with contextlib.suppress(PharosError):
-                _unregister(self._master, entry.name)
+        names = [entry.name for entry in self.entries]
+        with contextlib.suppress(OSError, rosgraph.MasterException):
+            rosnode.cleanup_master_blacklist(rosgraph.Master('/pharos', self._master.url), names)
         nodes = [entry.roslaunch_node for entry in self.entries]
         if any(node and node.respawn for node in nodes):
             self.entries = [each for each in self.entries if each.roslaunch_node.respawn]
@@ -446,20 +447,6 @@ def _group_command():
     """Return the command of a process of this package that runs a group."""
     search_path = os.pathsep.join(folder for folder in sys.path if folder)
     return ['env', f'PYTHONPATH={search_path}', sys.executable, '-m', 'pharos.compose.group']
-
-
-def _unregister(master, name):
-    """Unregister a node that is dead, as ``rosnode cleanup`` does."""
-    uri = master.call('lookupNode', name)
-    publishers, subscribers, services = master.call('getSystemState')
-    for method, users in ('unregisterPublisher', publishers), ('unregisterSubscriber', subscribers):
-        for topic, nodes in users:
-            if name in nodes:
-                master.call(method, topic, uri, caller_id=name)
-    for service, nodes in services:
-        if name in nodes:
-            address = master.call('lookupService', service)
-            master.call('unregisterService', service, address, caller_id=name)
 
 
 def leave(status):

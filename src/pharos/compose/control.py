@@ -16,7 +16,7 @@ ANSWER_LIMIT = 60.0  # seconds
 MAX_TEXT = 4096  # bytes
 ACCEPT_PAUSE = 0.5  # seconds until the next attempt
 _PREFIX = 'pharos-compose-'
-DONE = 'done'
+DONE = 'done: '
 
 
 def listen(composition):
@@ -54,19 +54,20 @@ def _serve_client(client, composition):
 def _answer(composition, action, name):
     """Do what a client wants, and return the text for it; '' if the node is not of this composition."""
     for node in composition.nodes:
-        if node._settings.name == name:
+        if name in (node._settings.name, *node._current_run.created_names):
             try:
                 composition.control(node, action)
             except PharosError as error:
                 return str(error)
-            return DONE
+            return f'{DONE}{node._settings.name}'
     return ''
 
 
-def control(action: str, name: str, master: Master) -> None:
+def control(action: str, name: str, master: Master) -> str:
     """Restart, stop or start a node of any composition of this user on this host, at a master.
 
     :param action: 'restart', 'stop' or 'start'
+    :returns: the name of the node of the program, which may have created the node with pharos
     :raises UnknownNodeError: if no such composition has the node
     :raises PharosError: if the node does not start
     """
@@ -83,8 +84,8 @@ def control(action: str, name: str, master: Master) -> None:
                 answer = sock.recv(MAX_TEXT).decode()
             except OSError:  # it belongs to another user, or ends
                 continue
-        if answer == DONE:
-            return
+        if answer.startswith(DONE):
+            return answer[len(DONE) :]
         if answer:
             raise PharosError(answer)
     raise UnknownNodeError(

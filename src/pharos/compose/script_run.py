@@ -25,12 +25,13 @@ import pharos
 from pharos import signals
 from pharos.blocks import block_name
 from pharos.compose.child_process import interrupt
-from pharos.compose.sources import compile_program
+from pharos.compose.sources import SYSTEM_FOLDERS, compile_program
 from pharos.errors import PharosError
 from pharos.master import Master
 from pharos.private_rospy import loader
 from pharos.private_rospy.loader import Shim
 from pharos.private_rospy.patches import patch
+from pharos.private_rospy.plain import guide
 from pharos.private_rospy.run import STOP_LIMIT, Lifecycle, Run, join
 from pharos.transcript import Transcript
 from pharos.waiting import current, wait
@@ -86,6 +87,7 @@ class ScriptRun(Run):
         self.threads_to_join = []  # those that are not daemons
         self.handlers = {}  # number of a signal -> the program's handler
         self.created_nodes = []  # the nodes that the program has created with pharos
+        self.created_names = []  # their names, also after a stop
         self.pending_signal = threading.Event()
         self.signal_accepted = threading.Event()
         self.handler_lock = threading.RLock()  # held while a signal is handled
@@ -217,7 +219,7 @@ class ScriptRun(Run):
         node.exit_code = 1  # stays if the program cannot be read
         self.code = compile_program(node.path)
         node.exit_code = None
-        self.souls[self.main] = None
+        self.souls[self.main] = None, False
         self.main_has_ended = False
         self.main.start()
         wait(lambda: self.is_known or not self.main.is_alive(), node.init_timeout, node)
@@ -435,6 +437,17 @@ class ScriptRun(Run):
 
     # -- stop
 
+    def check_readable(self):
+        """Compile the program, and its modules that lie outside of the system's folders.
+
+        :raises PharosError: if one cannot be read as Python 3
+        """
+        compile_program(self.node.path)
+        for module in list(self.modules.modules.values()):
+            path = getattr(module, '__file__', None) or '/usr/'
+            if path.endswith('.py') and not path.startswith(SYSTEM_FOLDERS):
+                compile_program(path)
+
     def signal_shutdown(self, reason):
         """Stand in for ``rospy.signal_shutdown``: run the program's hooks, and close rospy.
 
@@ -465,6 +478,8 @@ class ScriptRun(Run):
             while any(node in signals.own_nodes() for node in self.created_nodes):
                 self.sleep(SPIN_PERIOD)
         self.stop_created_nodes()
+        if any(node in signals.lost_nodes for node in self.created_nodes):
+            sys.exit(1)
 
     def end_program(self, timeout):
         """End the program as Ctrl-C does: handlers and hooks, main thread, then created nodes.
@@ -562,7 +577,6 @@ class NamedLines:
         self._stream = stream
         self._run = run
         self._partial_line = ''  # the text after the last line end, not written yet
-        self._is_within_line = False  # True if a part of the line is written
 
     def __getattr__(self, name):
         return getattr(self._stream, name)
@@ -570,26 +584,21 @@ class NamedLines:
     def write(self, text):
         """Write the complete lines, keep the rest, and return the number of characters."""
         *lines, self._partial_line = (self._partial_line + text).split('\n')
-        if lines:
-            self._write('\n'.join(lines) + '\n')
+        self._write(lines)
         return len(text)
 
     def flush(self):
-        """Write the rest of the text, which is not a complete line yet."""
+        """Write the rest of the text as a line."""
         if self._partial_line:
-            self._write(self._partial_line)
+            self._write([self._partial_line])
             self._partial_line = ''
 
-    def _write(self, text):
-        prefix = f'[{self._run.name}] '
-        named_text = ''.join(f'{prefix}{line}' for line in text.splitlines(keepends=True))
-        if self._is_within_line:
-            named_text = named_text[len(prefix) :]
+    def _write(self, lines):
+        text = ''.join(f'[{self._run.name}] {line}\n' for line in lines)
         # the reader of a pipe may have gone: the program must go on, and stop its motors
         with contextlib.suppress(OSError, ValueError):
-            self._stream.write(named_text)
+            self._stream.write(text)
             self._stream.flush()
-        self._is_within_line = not text.endswith('\n')
 
 
 class _Asyncio(Shim):
@@ -621,11 +630,12 @@ class _Pharos(Shim):
             _environ = run.environ
             _first_nodes: dict = {}
 
-            def __init__(self, url=None, share_connections=None, shared_memory=None):
-                if share_connections is None:
-                    share_connections = run.master.share_connections
-                if shared_memory is None:
-                    shared_memory = run.master.shared_memory
+            def __init__(
+                self,
+                url=None,
+                share_connections=run.master.share_connections,
+                shared_memory=run.master.shared_memory,
+            ):
                 super().__init__(url or run.master.url, share_connections, shared_memory)
 
             def _remapped_name(self, node, name, mappings):
@@ -634,9 +644,16 @@ class _Pharos(Shim):
                     self.parameters[f'{full_name}/{parameter_name}'] = value
                 return full_name
 
+            def _live_nodes(self):
+                nodes = signals.live_nodes()
+                return [node for node in nodes if type(node._settings.master) is type(self)]
+
             def create(self, *args, **kwargs):
+                if not run.created_nodes:
+                    guide(run.ros, self._live_nodes)
                 node = super().create(*args, **kwargs)
                 run.created_nodes.append(node)
+                run.created_names.append(node._settings.name)
                 return node
 
         transcript = type(pharos.Transcript)()

@@ -34,7 +34,7 @@ _SETS_ENVIRONMENT = re.compile(
 _IMPORT = re.compile(
     r'^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t(]+([\w, ]+)|import[ \t]+([\w.]+))', re.MULTILINE
 )
-_SYSTEM_FOLDERS = '/usr/', '/opt/ros/'
+SYSTEM_FOLDERS = '/usr/', '/opt/ros/'
 
 
 def source_of(path):
@@ -56,7 +56,8 @@ def compile_program(path):
         with tokenize.open(path) as file:
             return compile(file.read(), path, 'exec', dont_inherit=True)
     except (SyntaxError, ValueError, OSError) as error:
-        raise PharosError(f'{path} cannot be read as Python 3: {error}') from error
+        line = getattr(error, 'lineno', None) or 1
+        raise PharosError(f'{path}:{line}: cannot be read as Python 3: {error}') from error
 
 
 def why_apart(path, may_show_windows=False):
@@ -136,6 +137,6 @@ def _user_file(module, folder):
     for place in [folder / top_name, *map(pathlib.Path, folders)]:
         base = place.joinpath(*rest)
         for file in base.with_suffix('.py'), base / '__init__.py':
-            if file.is_file() and not str(file).startswith(_SYSTEM_FOLDERS):
+            if file.is_file() and not str(file).startswith(SYSTEM_FOLDERS):
                 return file
     return None

@@ -175,21 +175,23 @@ class CallbackQueue:
             job = self.jobs.popleft()
         except IndexError:  # a publisher has dropped the last one
             return
+        self.begin_time = perf_counter()
         job[1].run_callback(job)
+        self.begin_time = None
 
     def _run_in_order(self, waits_for_turn):
         """Run the next job in the queue's turn, and say so to the other queues of the node."""
         if waits_for_turn:
             self._wait_for_turn()
         self._current_number = self.next_number()
-        self.begin_time = perf_counter()
+        begin_time = self.begin_time = perf_counter()
         if self._is_slow:  # the next callbacks need not wait for this one
             self.order.pass_turn()
         try:
             if self.may_begin:  # else a stop has begun
                 self._run_next()
         finally:
-            self._is_slow = perf_counter() - self.begin_time > SLOW
+            self._is_slow = perf_counter() - begin_time > SLOW
             self.begin_time = None
             self.order.pass_turn()
 

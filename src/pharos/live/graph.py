@@ -37,7 +37,6 @@ LEGEND = (
 NODE_STYLE = 'shape=box, style="rounded,filled", fillcolor="#D9EAF7"'
 DEAD_NODE_STYLE = 'shape=box, style="rounded,filled", fillcolor="#EEEEEE"'
 TOPIC_STYLE = 'shape=box, style=filled, fillcolor="#FFF6D5"'
-SERVICE_STYLE = 'shape=cds, style=filled, fillcolor="#DDF3E8"'
 FRAME_STYLE = 'style="rounded,filled"; color="#9AA5B1"; fillcolor="#F5F7F9"'
 NO_NAME = '(?!)'  # a regular expression that matches nothing
 
@@ -75,7 +74,6 @@ class Graph:
         snapshot: Snapshot,
         rates: dict[str, float],
         show_all: bool = False,
-        show_services: bool = False,
         only: str = '',
         hide: str = NO_NAME,
     ):
@@ -90,14 +88,11 @@ class Graph:
         self.rates = rates
         self.nodes = {name: node for name, node in snapshot.nodes.items() if is_visible(name)}
         self.edges: list[Edge] = []
-        self.services: dict[str, str] = {}  # name -> node
         for name, node in self.nodes.items():
             for topic in filter(is_visible, node.publishes):
                 self.edges.append(Edge(name, topic, False, self._transports(name, topic, False)))
             for topic in filter(is_visible, node.subscribes):
                 self.edges.append(Edge(topic, name, True, self._transports(name, topic, True)))
-            if show_services:
-                self.services.update((service, name) for service in filter(is_visible, node.offers))
         edge_topics = {edge.topic for edge in self.edges}
         self.topics = {name: snapshot.topics[name] for name in sorted(edge_topics)}
 
@@ -130,7 +125,7 @@ class Graph:
     # -- as text
 
     def text(self) -> str:
-        """Return the graph for a terminal: each node with its topics, peers and services."""
+        """Return the graph for a terminal: each node with its topics and peers."""
         return '\n'.join(self._text_lines())
 
     def _text_lines(self):
@@ -142,9 +137,6 @@ class Graph:
                 for edge in self.edges:
                     if edge.node == name:
                         yield self._edge_text(edge)
-                for service, node_name in self.services.items():
-                    if node_name == name:
-                        yield f'    offers {service}'
 
     def _edge_text(self, edge):
         links = self.snapshot.links_of(edge.node, edge.topic, edge.is_incoming)
@@ -198,9 +190,6 @@ class Graph:
         for topic in self.topics:
             box = _dot_box('t', topic, self._topic_label(topic), TOPIC_STYLE)
             boxes[self._topic_process(topic)].append(box)
-        for service, name in self.services.items():
-            boxes[self._process_of(name)].append(_dot_box('s', service, '', SERVICE_STYLE))
-            boxes[None].append(f'{_dot_id("n", name)} -> {_dot_id("s", service)} [arrowhead=none]')
         return boxes
 
     def _topic_process(self, topic):
@@ -243,12 +232,12 @@ class Graph:
 
 
 def _dot_id(prefix, name):
-    """Return an id for graphviz; the prefix tells nodes, topics and services of one name apart."""
+    """Return an id for graphviz; the prefix tells a node from a topic of its name."""
     return f'"{prefix} {name}"'
 
 
 def _dot_box(prefix, name, caption, style):
-    """Return the box of a node, topic or service, with a caption in small letters."""
+    """Return the box of a node or topic, with a caption in small letters."""
     label = escape(name)
     if prefix == 'n':
         label = f'<b>{label}</b>'

@@ -186,6 +186,8 @@ def topic_rates(link_rates: dict[Link, Traffic], unit: str) -> dict[str, float]:
 def health_facts(run: Run) -> dict[str, Any]:
     """Return the facts of :meth:`Node.health` that the master is not asked for."""
     connections = run.topic_manager.get_pub_sub_info()
+    queues = list(run.callback_order.queues)
+    begin_times = [queue.begin_time for queue in queues if queue.begin_time]
     ended_souls = [soul.name for soul in run.souls if not soul.is_alive()]
     return {
         'kind': type(run.node).__name__,
@@ -196,4 +198,6 @@ def health_facts(run: Run) -> dict[str, Any]:
         'cpu_seconds': round(run.cpu_seconds(), 3),
         'souls': len(run.souls) - len(ended_souls),
         'ended_souls': ended_souls,
+        'callback_seconds': time.perf_counter() - min(begin_times) if begin_times else 0.0,
+        'waiting': sum(len(queue.jobs) for queue in queues),
     }

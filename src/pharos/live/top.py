@@ -1,4 +1,4 @@
-"""Measure the nodes, processes and topics of a master, and show them as tables in a terminal.
+"""Measure the nodes and processes of a master, and show them as tables in a terminal.
 
 Nodes count their messages anyway. Two snapshots give rates, so top subscribes to nothing.
 """
@@ -18,16 +18,17 @@ from rich.live import Live
 from rich.table import Table
 
 from pharos.errors import MasterUnreachableError, PharosError
-from pharos.live.snapshot import LOCAL_HOST, publisher_rates, take_snapshot, topic_rates
+from pharos.live.snapshot import LOCAL_HOST, publisher_rates, take_snapshot
 from pharos.live.text_format import short_number
 from pharos.master import Master
 
-VIEWS = {'n': 'nodes', 'p': 'processes', 't': 'topics'}  # key -> view
-KEY_HELP = 'n nodes  p processes  t topics  s sort by the next column  q quit'
+VIEWS = {'n': 'nodes', 'p': 'processes'}  # key -> view
+KEY_HELP = 'n nodes  p processes  q quit'
 CONTROL_HELP = 'j k choose a node of a composition  r restart  x stop  a start'
 ACTIONS = {'r': 'restart', 'x': 'stop', 'a': 'start'}  # key -> action
-WIDE_COLUMNS = 'NODE', 'TOPIC', 'PID'  # are never cut, however narrow the terminal is
+WIDE_COLUMNS = 'NODE', 'PID'  # are never cut, however narrow the terminal is
 ALARM_COLUMNS = 'DROP', 'FAIL', 'PROBLEM'  # are red unless the value is 0 or empty
+HANG = 3.0  # seconds of a callback that are a problem
 BUSY_PROCESS = 90  # percent of a core
 BUSY_NODE = 20  # percent of a core
 SUM_COLUMNS = 'IN/S', 'OUT/S', 'IN B/S', 'OUT B/S', 'DROP', 'FAIL'
@@ -36,7 +37,7 @@ SUM_COLUMNS = 'IN/S', 'OUT/S', 'IN B/S', 'OUT B/S', 'DROP', 'FAIL'
 class Meter:
     """Measures a master: each measurement tells the rates since the one before.
 
-    :param names: parts of names; only nodes and topics that have one of them are measured
+    :param names: parts of names; only nodes that have one of them are measured
     :raises MasterUnreachableError: if the master does not answer
     """
 
@@ -55,17 +56,14 @@ class Meter:
         start = self._snapshot
         self._snapshot = take_snapshot(self.master)
         link_rates = self._snapshot.rates_since(start)
-        node_rows = self._select(_node_rows(self._snapshot, start, link_rates), 'NODE')
-        topic_rows = self._select(_topic_rows(self._snapshot, link_rates), 'TOPIC')
+        node_rows = list(_node_rows(self._snapshot, start, link_rates))
+        if self._names:
+            node_rows = [
+                row for row in node_rows if any(name in row['NODE'] for name in self._names)
+            ]
         process_rows = list(self._process_rows(node_rows))
         self.advice = '\n'.join(_advice(node_rows, process_rows))
-        return {'nodes': node_rows, 'processes': process_rows, 'topics': topic_rows}
-
-    def _select(self, rows, column):
-        """Return the rows that have one of the names in a column."""
-        if not self._names:
-            return list(rows)
-        return [row for row in rows if any(name in row[column] for name in self._names)]
+        return {'nodes': node_rows, 'processes': process_rows}
 
     def _process_rows(self, node_rows):
         """Yield the sums of each process's nodes, with the load of processes of this host."""
@@ -143,59 +141,30 @@ def _node_rows(snapshot, start, link_rates):
             'TCP': transports.count('TCPROS'),
             'DROP': node.health.get('dropped'),
             'FAIL': node.health.get('errors'),
-            'PROBLEM': node.problem,
+            'PROBLEM': node.problem or _hang(node.health),
         }
 
 
-def _topic_rows(snapshot, link_rates):
-    message_rates = topic_rates(link_rates, 'messages')
-    byte_rates = topic_rates(link_rates, 'bytes')
-    nodes = snapshot.nodes.values()
-    for name, topic_type in snapshot.topics.items():
-        transports = [link.transport for link in snapshot.links if link.topic == name]
-        yield {
-            'TOPIC': name,
-            'TYPE': topic_type,
-            'HZ': message_rates.get(name),
-            'B/S': byte_rates.get(name),
-            'PUB': sum(name in node.publishes for node in nodes),
-            'SUB': sum(name in node.subscribes for node in nodes),
-            'LOCAL': transports.count('INTRAPROCESS'),
-            'SHM': transports.count('SHARED_MEMORY'),
-            'TCP': transports.count('TCPROS'),
-        }
+def _hang(health):
+    """Return a text if a callback of a node of pharos has run for long, else ''."""
+    seconds = health.get('callback_seconds', 0)
+    if seconds < HANG:
+        return ''
+    return f'delegate for {seconds:.0f} s, {health["waiting"]} wait'
 
 
-def sorted_rows(rows: list[dict[str, Any]], sort_column: int) -> list[dict[str, Any]]:
-    """Return the rows sorted by a column: texts by the alphabet, numbers from the largest."""
-    if not rows:
-        return []
-    sort_title = list(rows[0])[sort_column % len(rows[0])]
+def table(rows: list[dict[str, Any]], chosen_node: str = '') -> Table:
+    """Return a table of rows.
 
-    def sort_key(row):
-        value = row[sort_title]
-        if isinstance(value, str):
-            return value, 0
-        return '', 0 if value is None else -value
-
-    return sorted(rows, key=sort_key)
-
-
-def table(rows: list[dict[str, Any]], sort_column: int = 0, chosen_node: str = '') -> Table:
-    """Return a table of rows, sorted by a column.
-
-    :param sort_column: the index of the column; after the last one comes the first again
     :param chosen_node: the row of this node is marked
     """
     columns = list(rows[0]) if rows else ['nothing there']
-    sort_title = columns[sort_column % len(columns)]
     rich_table = Table(box=None, padding=(0, 1, 0, 0))
     for column in columns:
         has_text = any(isinstance(row[column], str) for row in rows)
-        title = f'[reverse]{column}[/]' if column == sort_title else column
         justify: Any = 'left' if has_text else 'right'
-        rich_table.add_column(title, justify=justify, no_wrap=column in WIDE_COLUMNS)
-    for row in sorted_rows(rows, sort_column):
+        rich_table.add_column(column, justify=justify, no_wrap=column in WIDE_COLUMNS)
+    for row in rows:
         style = 'reverse' if row.get('NODE') == chosen_node else None
         cells = [_cell_text(column, value) for column, value in row.items()]
         rich_table.add_row(*cells, style=style)
@@ -231,7 +200,6 @@ def show(meter: Meter, interval: float) -> None:
 
 def _show_views(screen, meter, interval, keyboard):
     view = 'nodes'
-    sort_column = 0
     chosen_node = ''
     tables = meter.measure()
     line = meter.advice
@@ -240,7 +208,7 @@ def _show_views(screen, meter, interval, keyboard):
         rows = tables[view]
         help_text = f'{KEY_HELP}\n{CONTROL_HELP}'
         page = Table.grid()
-        for part in help_text, line, table(rows, sort_column, chosen_node):
+        for part in help_text, line, table(rows, chosen_node):
             page.add_row(part)
         screen.update(page, refresh=True)
         timeout = max(0, deadline - time.monotonic())
@@ -248,14 +216,11 @@ def _show_views(screen, meter, interval, keyboard):
             key = os.read(keyboard, 1).decode('latin-1')
             if key == 'q':
                 return
-            if key == 's':
-                sort_column += 1
-            elif key in VIEWS:
+            if key in VIEWS:
                 view = VIEWS[key]
-                sort_column = 0
             elif key in 'jk' and view == 'nodes':
                 step = 1 if key == 'j' else -1
-                chosen_node = _next_node(sorted_rows(rows, sort_column), chosen_node, step)
+                chosen_node = _next_node(rows, chosen_node, step)
             elif key in ACTIONS and chosen_node:
                 line = _control(ACTIONS[key], chosen_node, meter.master)
         else:
@@ -280,7 +245,7 @@ def _control(action, name, master):
     from pharos.compose.control import control
 
     try:
-        control(action, name, master)
+        program = control(action, name, master)
     except PharosError as error:
         return str(error)
-    return f'{name}: {action} done'
+    return f'{program}: {action} done'

@@ -4,7 +4,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import queue
-import statistics
 import time
 from typing import Any, Iterator, NamedTuple
 
@@ -31,14 +30,10 @@ class Rate(NamedTuple):
     rate: float  # messages in one second
     bandwidth: float  # bytes in one second
     window: int  # messages that were counted
-    min: float  # seconds from one message to the next
-    max: float
-    std_dev: float
 
     def __repr__(self):
-        gaps = f'{self.min:.3g} to {self.max:.3g} s apart, std dev {self.std_dev:.3g} s'
         bandwidth = f'{short_number(self.bandwidth)}B/s'
-        return f'{self.rate:.4g} Hz ({gaps}), {bandwidth}, {self.window} messages'
+        return f'{self.rate:.4g} Hz, {bandwidth}, {self.window} messages'
 
 
 class Arrival(NamedTuple):
@@ -88,17 +83,7 @@ def measure(topic: Topic, seconds: float) -> Rate:
     gaps = [later.time - earlier.time for earlier, later in zip(arrival_list, arrival_list[1:])]
     byte_count = sum(len(arrival.message._buff) for arrival in arrival_list)
     rate = len(gaps) / sum(gaps) if gaps else 0.0
-    if not gaps:
-        gaps = [0.0]
-    return Rate(
-        topic.name,
-        rate=rate,
-        bandwidth=byte_count / seconds,
-        window=len(arrival_list),
-        min=min(gaps),
-        max=max(gaps),
-        std_dev=statistics.pstdev(gaps),
-    )
+    return Rate(topic.name, rate, byte_count / seconds, len(arrival_list))
 
 
 def last(topic: Topic) -> Message:

@@ -6,17 +6,13 @@ from __future__ import annotations
 
 import atexit
 import os
-import pathlib
-import re
 from typing import Any, Sequence
 
 import rosgraph.names
-import rospkg
 from genpy import Message
 
 import pharos
 from pharos import signals
-from pharos.errors import PharosError
 from pharos.live.text_format import message_text
 from pharos.master import Master
 from pharos.node import BlockNode
@@ -25,10 +21,6 @@ BANNER = """PhaROS {pharos.__version__}: {count} nodes are at the ROS master {ma
 master is that master, me the node {me.name} of this session; all of pharos is imported.
 Tab completes, x? explains x, Ctrl-C ends a line, Ctrl-D the session and its nodes.
 """
-#: matches a line that ends inside a string
-STRING_PATTERN = re.compile(r'.*[\'"]([\w/~]*)$', re.DOTALL)
-#: matches a line that ends inside send_to('TOPIC', ... FIELD
-FIELD_PATTERN = re.compile(r'.*send_to\(\s*[\'"]([\w/]+)[\'"].*,\s*(\w*)$', re.DOTALL)
 
 
 def namespace(argv: Sequence[str] | None = None) -> dict[str, Any]:
@@ -52,48 +44,6 @@ def namespace(argv: Sequence[str] | None = None) -> dict[str, Any]:
     return names
 
 
-def completions(line: str, master: Master) -> list[str]:
-    """Return the words that the last word of a line can become.
-
-    In a string: names of the graph and types of messages. In a call of send_to: fields.
-    """
-    string = STRING_PATTERN.fullmatch(line)
-    field = FIELD_PATTERN.fullmatch(line)
-    try:
-        if string:
-            prefix = string[1]
-            words = _graph_names(master) if prefix.startswith('/') else _type_names(prefix)
-        elif field:
-            prefix = field[2]
-            message_class = pharos.message_class(master.topic(field[1]).type or '')
-            words = [f'{name}=' for name in message_class.__slots__]
-        else:
-            return []
-    except (PharosError, LookupError, rospkg.ResourceNotFound):
-        return []  # Tab must not raise if the master, topic or package is missing
-    return sorted({word for word in words if word.startswith(prefix)})
-
-
-def _graph_names(master):
-    """Return the names of topics, services, nodes and parameters."""
-    names = list(master.parameters)
-    for registrations in master.system_state():
-        names += registrations
-        for node_names in registrations.values():
-            names += node_names
-    return names
-
-
-def _type_names(prefix):
-    """Return the types of the package that the prefix names, or else the names of packages."""
-    packages = rospkg.RosPack()
-    package, slash, _ = prefix.partition('/')
-    if not slash:
-        return packages.list()
-    files = pathlib.Path(packages.get_path(package)).glob('[ms][sr][gv]/*')
-    return [f'{package}/{file.stem}' for file in files]
-
-
 def load_ipython_extension(shell: Any, names: dict[str, Any] | None = None) -> None:
     """Make a session of IPython a workspace; ``%load_ext`` calls this.
 
@@ -111,14 +61,10 @@ def load_ipython_extension(shell: Any, names: dict[str, Any] | None = None) -> N
         signals.stop_all()
         end_session()  # clears the names, so that the nodes stop before
 
-    def complete(shell, event):
-        return completions(event.text_until_cursor, master)
-
     def print_message(message, printer, is_cycle):
         printer.text(message_text(message))
 
     shell._atexit_once = stop_nodes
-    shell.set_hook('complete_command', complete, re_key='.*')
     formatters = shell.display_formatter.formatters
     formatters['text/plain'].for_type(Message, print_message)
     print(BANNER.format(pharos=pharos, count=len(master.nodes()), **names))

@@ -9,6 +9,7 @@ import dataclasses
 import enum
 import errno
 import functools
+import math
 import os
 import socket
 import sys
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
 MASTER_LIMIT = 5.0  # seconds for each question to a master or node
 NAME_LIMIT = 1.0  # seconds for the question whether another node has the name
 STOP_LIMIT = 2.0  # seconds that a stop waits for threads of rospy
+CLOCK_LIMIT = 3.0  # seconds until a clock that stands still is told
 HOLD_LIMIT = 2.0  # seconds that delegates wait for the end of start(); start() may wait for them
 RETRY_DELAY = 1.0  # seconds until the next attempt to connect
 WATCH_PERIOD = 0.5  # seconds between two looks of the watcher
@@ -138,7 +140,7 @@ class Run:
         self.name = settings.name
         self.master = settings.master
         self.failures = Failures()
-        self.souls = {}  # thread -> its block, None for the node's soul
+        self.souls = {}  # thread -> its block, None for the node's soul, and True if it is required
         self.endpoints = []  # also those that the stop has closed, for the next start
         self.stopping = threading.Event()  # set when a stop begins: sleeps and waits end
         self.finished = threading.Event()  # set at the end of a stop: threads left behind end
@@ -159,6 +161,7 @@ class Run:
         if node._holds_delegates:  # else a user calls start(): there is no release after its end
             self.hold_deadline += HOLD_LIMIT
         namespace, _, self.base_name = self.name.rpartition('/')
+        self.clock_deadline = monotonic() + CLOCK_LIMIT  # when a clock that stands is told
         self.environ = {
             'ROSCONSOLE_FORMAT': '[${severity}] [${time}]: ${node}: ${message}',
             **os.environ,
@@ -314,10 +317,12 @@ class Run:
             text += f' raised {type(error).__name__}: {error}'
             if failure.count > 1:
                 text += f' ({failure.count} times)'
+            log_text = f'{text}\n{failure.traceback}'.rstrip()
             try:
-                self.ros.logerr('%s\n%s', text, failure.traceback)
+                self.ros.logerr('%s', log_text.replace('\n', f'\n{self.name}: '))
             finally:
-                Transcript.show(text)
+                if Transcript.has_receiver:  # else it would stand on the terminal twice
+                    Transcript.show(text)
 
     def keep_failure(self, error, block, message=None, channel=None, retry=None):
         """Keep an exception of a block, without a log line, and return the Failure."""
@@ -554,6 +559,11 @@ class Run:
         now = monotonic()
         if now > self.hold_deadline:
             self.callback_queue.release()
+        if now > self.clock_deadline:
+            self.clock_deadline = math.inf
+            rostime = self.ros.rostime
+            if not (rostime.is_wallclock() or rostime.get_time()):
+                self.troubles.add('time stands still: /use_sim_time is set, and no /clock comes')
         for sock, deadline in list(self.deadlines.items()):
             if now > deadline:
                 self.deadlines.pop(sock, None)

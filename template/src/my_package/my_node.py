@@ -11,7 +11,7 @@ class MyNode(Node):
         self.count = 0
         self.period = self.parameter('~period', initialized=1.0)
         self.interested_in('~input', typed_as='std_msgs/String', delegate=self.hear)
-        self.fork(MyNode.speak)
+        self.fork(MyNode.speak, required=True)
 
     def hear(self, message):
         """Run for each message on ~input, one at a time."""
