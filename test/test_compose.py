@@ -788,3 +788,17 @@ def test_required_node_is_programs_status(program, tmp_path):
     element = ending('required="true"')
     (tmp_path / 'a.launch').write_text(f'<launch>{element}</launch>')
     assert program(tmp_path / 'a.launch').wait() == 1
+
+
+def test_stopped_node_does_not_respawn(master, compose):
+    again = '<node pkg="robot" type="ends" name="again" args="told" respawn="true"/>'
+    master.parameters['/stay'] = True
+    composition = compose(ending('respawn="true"') + again)
+    ends, _ = composition.nodes
+    until(lambda: master.parameters.get('/ends/starts') and master.parameters.get('/again/starts'))
+    composition.control(ends, 'stop')
+    master.parameters['/stay'] = False
+    until(lambda: master.parameters['/again/starts'] >= 3, TIMEOUT)
+    assert not ends.is_running and master.parameters['/ends/starts'] == 1
+    composition.control(ends, 'start')
+    until(lambda: master.parameters['/ends/starts'] >= 3, TIMEOUT)  # it respawns again
