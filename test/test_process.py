@@ -537,10 +537,8 @@ def test_traceback_has_the_frames_of_the_program(bench, capfd):
 
 
 def test_scripts_start_side_by_side_with_arguments(master, bench):
-    slow = bench.write(
-        f"while not rospy.core.is_initialized() and not os.path.exists(SAID): time.sleep(0.01)\n{INIT}",
-        'slow',
-    )
+    waits = 'while not os.path.exists(SAID): time.sleep(0.01)\n'
+    slow = bench.write(f'{waits}{INIT}rospy.spin()', 'slow')
     quick = bench.write(
         "rospy.init_node('quick')\nsay(rospy.get_param('~rate'))\nrospy.spin()", 'quick'
     )
