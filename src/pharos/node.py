@@ -379,6 +379,7 @@ class Node(DelegateHolder):
         finally:
             current.node = former_node
             if required and not self._current_run.stopping.is_set():
+                self.log(f'stops: {block_name(block)}, which is required, has ended', 'error')
                 signals.lost_nodes.append(self)
                 self._current_run.request_stop()
         return None

@@ -54,7 +54,7 @@ def _serve_client(client, composition):
 def _answer(composition, action, name):
     """Do what a client wants, and return the text for it; '' if the node is not of this composition."""
     for node in composition.nodes:
-        if name in (node._settings.name, *node._current_run.created_names):
+        if name in (node._settings.name, *node.created_names):
             try:
                 composition.control(node, action)
             except PharosError as error:

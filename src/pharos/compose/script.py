@@ -47,6 +47,7 @@ class ScriptNode(Node):
         self.args = args
         self.params = params or {}
         self.env = dict(env)
+        self.created_names = set()  # of nodes that the program has created with pharos
         self._settings.remappings = args
 
     def wait(self, timeout: float | None = None) -> int | None:

@@ -87,7 +87,6 @@ class ScriptRun(Run):
         self.threads_to_join = []  # those that are not daemons
         self.handlers = {}  # number of a signal -> the program's handler
         self.created_nodes = []  # the nodes that the program has created with pharos
-        self.created_names = []  # their names, also after a stop
         self.pending_signal = threading.Event()
         self.signal_accepted = threading.Event()
         self.handler_lock = threading.RLock()  # held while a signal is handled
@@ -653,7 +652,7 @@ class _Pharos(Shim):
                     guide(run.ros, self._live_nodes)
                 node = super().create(*args, **kwargs)
                 run.created_nodes.append(node)
-                run.created_names.append(node._settings.name)
+                run.node.created_names.add(node._settings.name)
                 return node
 
         transcript = type(pharos.Transcript)()

@@ -1,5 +1,4 @@
 """Plain rospy in a program whose nodes are made with pharos: it says what to write instead."""
-import functools
 import sys
 
 FUNCTIONS = (
@@ -22,7 +21,6 @@ def guide(rospy, nodes):
     def watch(owner, attribute):
         original = getattr(owner, attribute)
 
-        @functools.wraps(original)
         def call(*args, **kwargs):
             if nodes() and not rospy.core.is_initialized():
                 _tell(type(args[0]).__name__ if attribute == '__init__' else attribute, told)
@@ -47,7 +45,9 @@ def guide(rospy, nodes):
 def _tell(name, told):
     """Print what to write instead of a call of rospy, once for each name."""
     frame = sys._getframe(2)
-    while frame.f_globals.get('__name__', '').startswith('rospy'):
+    if name in FUNCTIONS and frame.f_globals['__name__'].startswith('rospy'):
+        return  # a class of rospy has called, and has been told of
+    while frame.f_globals.get('__name__', '').startswith(('rospy', 'pharos')):
         frame = frame.f_back
     advice = f'node.ros.{name}'
     if frame.f_code.co_filename.startswith(_SYSTEM_FOLDERS):  # a library on rospy

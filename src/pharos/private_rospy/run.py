@@ -9,7 +9,6 @@ import dataclasses
 import enum
 import errno
 import functools
-import math
 import os
 import socket
 import sys
@@ -48,6 +47,7 @@ if TYPE_CHECKING:
 MASTER_LIMIT = 5.0  # seconds for each question to a master or node
 NAME_LIMIT = 1.0  # seconds for the question whether another node has the name
 STOP_LIMIT = 2.0  # seconds that a stop waits for threads of rospy
+FOR_EVER = 1e9  # seconds
 CLOCK_LIMIT = 3.0  # seconds until a clock that stands still is told
 HOLD_LIMIT = 2.0  # seconds that delegates wait for the end of start(); start() may wait for them
 RETRY_DELAY = 1.0  # seconds until the next attempt to connect
@@ -317,11 +317,11 @@ class Run:
             text += f' raised {type(error).__name__}: {error}'
             if failure.count > 1:
                 text += f' ({failure.count} times)'
-            log_text = f'{text}\n{failure.traceback}'.rstrip()
+            log_text = f'{text}\n{failure.traceback[:-1]}'
             try:
                 self.ros.logerr('%s', log_text.replace('\n', f'\n{self.name}: '))
             finally:
-                if Transcript.has_receiver:  # else it would stand on the terminal twice
+                if Transcript.receiver:  # else it would stand on the terminal twice
                     Transcript.show(text)
 
     def keep_failure(self, error, block, message=None, channel=None, retry=None):
@@ -560,7 +560,7 @@ class Run:
         if now > self.hold_deadline:
             self.callback_queue.release()
         if now > self.clock_deadline:
-            self.clock_deadline = math.inf
+            self.clock_deadline += FOR_EVER
             rostime = self.ros.rostime
             if not (rostime.is_wallclock() or rostime.get_time()):
                 self.troubles.add('time stands still: /use_sim_time is set, and no /clock comes')
