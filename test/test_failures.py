@@ -475,7 +475,7 @@ def test_required_soul_may_end_with_its_node(master):
     node.restart()
     assert node.is_running
     node.stop()
-    assert node not in pharos.signals.lost_nodes
+    assert not pharos.signals.lost_names
 
 
 def test_delegate_that_hangs_is_seen(master):

@@ -469,3 +469,22 @@ def test_killed_publisher_is_replaced(master, node):
             while not box.empty():
                 data = box.next().data
                 assert (data == data[:4] * (LARGE // 4)) is True
+
+
+def test_file_that_could_shrink_is_refused(master, node, listener, topic, monkeypatch):
+    monkeypatch.setattr('pharos.shared_memory.sending._SEALS', 0)
+    log = Mailbox(create(master, '/ear'), '/rosout', 'rosgraph_msgs/Log')
+    listener.listen(topic)
+    out = node.output_channel(topic, IMAGE)
+    until(lambda: out.connections)
+    out.send(data=bytes(LARGE))
+    log.wait_for(lambda line: 'without a seal' in line.msg)
+
+
+def test_file_of_one_large_message_is_given_back(node, listener, topic):
+    listener.listen(topic)
+    datas = map(bytes, (LARGE, 100_000, 100_000))
+    send_and_wait(node.output_channel(topic, IMAGE), topic, datas, listener)
+    paths = [f'/proc/self/fd/{number}' for number in os.listdir('/proc/self/fd')]
+    files = [path for path in paths if os.path.realpath(path).startswith('/memfd:pharos')]
+    assert files and all(os.stat(path).st_size < LARGE for path in files)

@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 from typing import TYPE_CHECKING, Any, Callable, Sequence, TypeVar
+from weakref import WeakValueDictionary
 from xmlrpc.client import dumps, loads
 
 from rosgraph.names import get_ros_namespace, is_legal_remap, load_mappings, ns_join
@@ -90,7 +91,7 @@ class Master:
     """
 
     _environ = os.environ  # for ROS_NAMESPACE; a script's Master has its own
-    _first_nodes: dict = {}  # argv -> the first node that was created with it
+    _first_nodes: Any = WeakValueDictionary()  # argv -> the first node that was created with it
 
     def __init__(
         self,

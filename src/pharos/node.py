@@ -380,7 +380,7 @@ class Node(DelegateHolder):
             current.node = former_node
             if required and not self._current_run.stopping.is_set():
                 self.log(f'stops: {block_name(block)}, which is required, has ended', 'error')
-                signals.lost_nodes.append(self)
+                signals.lost_names.add(self._settings.name)
                 self._current_run.request_stop()
         return None
 

@@ -18,8 +18,8 @@ _SPIN_PERIOD = 0.01  # seconds
 
 #: the nodes of this process that have started
 started_nodes = []
-#: the nodes that a required soul has ended
-lost_nodes = []
+#: the names of nodes that a required soul has ended
+lost_names = set()
 #: the nodes between the stop and the start of a restart()
 restarting_nodes = []
 
@@ -62,15 +62,15 @@ def stop_all():
 def spin() -> None:
     """Wait until every node of this process has stopped. Ctrl-C, SIGTERM and SIGHUP stop them.
 
-    :raises SystemExit: with status 1, if a required soul has ended
+    :raises SystemExit: with status 1, as soon as a required soul has ended
     """
     handle_signals()
     with contextlib.suppress(KeyboardInterrupt), quiet_wait():
         # a program may have called rospy.init_node(): then a signal is rospy's
-        while own_nodes() and not rospy.is_shutdown():
+        while own_nodes() and not (lost_names or rospy.core.is_shutdown_requested()):
             time.sleep(_SPIN_PERIOD)
     stop_all()
-    if lost_nodes:
+    if lost_names:
         sys.exit(1)
 
 

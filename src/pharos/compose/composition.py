@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import collections
 import contextlib
+import math
 import os
 import pickle
 import signal
@@ -122,9 +123,7 @@ class Composition:
         name = ns_join(get_ros_namespace(argv=arguments), name_of_file(path))
         entry = Entry(name, source_of(path), arguments, None, is_here=is_here)
         command = [path]
-        with open(path, errors='replace') as file:
-            has_first_line = file.read(2) == '#!'
-        reason = has_first_line and why_not_this_python(path)
+        reason = why_not_this_python(path, needs_first_line=False)
         if not reason and not is_here:
             reason = needs_process(path)
             command = [sys.executable, path]
@@ -153,8 +152,10 @@ class Composition:
                 Transcript.show(f'{entry.name} runs in {reason or group}')
             groups[group].append(entry)
         own_entries = groups.pop('', [])
+        search_path = os.pathsep.join(folder for folder in sys.path if folder)
+        command = ['env', f'PYTHONPATH={search_path}', sys.executable, '-m', 'pharos.compose.group']
         for group_entries in groups.values():
-            self._start_part(group_entries, _group_command(), self._group_of)
+            self._start_part(group_entries, command, self._group_of)
         self.start_entries(own_entries)
 
     def start_entries(self, entries):
@@ -379,12 +380,11 @@ class _Part:
         self._master = master
         self._command = command
         self._data_of = data_of
-        self._comeback_time: float | None = None  # as of time.monotonic()
 
     def start(self):
         """Start the process with the nodes in ``entries``."""
         self.is_told = False
-        self._comeback_time = None
+        self._comeback_time = math.inf  # as of time.monotonic(); infinity: nobody respawns
         url = self._master.url
         if not self._data_of:
             self.process = RosProcess(self._command, url, Transcript.show)
@@ -408,12 +408,12 @@ class _Part:
     @property
     def is_over(self):
         """True if the process has ended, that was told, and no node respawns."""
-        return self.is_told and self._comeback_time is None
+        return self.is_told and self._comeback_time == math.inf
 
     @property
     def is_due(self):
         """True if the nodes that respawn must start now."""
-        return self._comeback_time is not None and time.monotonic() >= self._comeback_time
+        return time.monotonic() >= self._comeback_time
 
     def forget_nodes(self):
         """Unregister the nodes after a crash of the process; keep the entries that respawn.
@@ -443,19 +443,12 @@ def _blocked_interrupts():
         signal.pthread_sigmask(signal.SIG_SETMASK, former_mask)
 
 
-def _group_command():
-    """Return the command of a process of this package that runs a group."""
-    search_path = os.pathsep.join(folder for folder in sys.path if folder)
-    return ['env', f'PYTHONPATH={search_path}', sys.executable, '-m', 'pharos.compose.group']
-
-
 def leave(status):
     """Return an exit status; end this process at once if a thread goes on that is not a daemon.
 
     Such a thread of a library, as of socketserver, would go on for ever.
     """
-    threads = [each for each in threading.enumerate() if not each.daemon]
-    if len(threads) > 1:
+    if sum(not thread.daemon for thread in threading.enumerate()) > 1:
         sys.stdout.flush()
         os._exit(status)
     return status

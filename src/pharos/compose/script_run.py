@@ -17,6 +17,7 @@ import time
 import traceback
 import types
 from threading import ExceptHookArgs
+from weakref import WeakValueDictionary
 
 from rosgraph import get_master_uri
 from rosgraph.names import anonymous_name, get_ros_namespace, load_mappings, ns_join
@@ -145,7 +146,8 @@ class ScriptRun(Run):
         self.stdout = NamedLines(sys.__stdout__, self)
         self.stderr = NamedLines(sys.__stderr__, self)
         if self.node.output_file:
-            self.stdout = open(self.node.output_file, 'a', buffering=1)
+            with contextlib.suppress(OSError):  # the terminal has it, if the folder is gone
+                self.stdout = open(self.node.output_file, 'a', buffering=1)
         stand_ins['sys'].stdout = self.stdout
         stand_ins['sys'].stderr = self.stderr
         stand_ins['sys'].excepthook = self.print_error
@@ -475,9 +477,13 @@ class ScriptRun(Run):
         """Stand in for ``pharos.spin``: wait until the nodes of the program have stopped."""
         with contextlib.suppress(KeyboardInterrupt):
             while any(node in signals.own_nodes() for node in self.created_nodes):
+                if signals.lost_names & self.node.created_names:
+                    break
                 self.sleep(SPIN_PERIOD)
         self.stop_created_nodes()
-        if any(node in signals.lost_nodes for node in self.created_nodes):
+        lost_names = signals.lost_names & self.node.created_names
+        signals.lost_names -= lost_names  # a respawn begins anew
+        if lost_names:
             sys.exit(1)
 
     def end_program(self, timeout):
@@ -506,11 +512,10 @@ class ScriptRun(Run):
         self.finished.set()
         thread_class = self.modules.modules['threading'].Thread
         own_threads = [thread for thread in self.threads.copy() if isinstance(thread, thread_class)]
-        for thread in join(own_threads, 0):
-            raise_in(thread, SystemExit)  # at its next line
-        self.left_threads = join(own_threads, SIGNAL_LIMIT)
+        self.left_threads = join(own_threads, SIGNAL_LIMIT)  # others have slept, and ended
         self.threads.difference_update(self.left_threads)  # stop() does not wait for them
         for thread in self.left_threads:
+            raise_in(thread, SystemExit)  # at its next line
             end_reads(thread)
 
     def stop(self, timeout):
@@ -627,7 +632,7 @@ class _Pharos(Shim):
             """A master that gives nodes the name, the namespace and the remappings of the entry."""
 
             _environ = run.environ
-            _first_nodes: dict = {}
+            _first_nodes = WeakValueDictionary()
 
             def __init__(
                 self,

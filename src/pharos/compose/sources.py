@@ -69,11 +69,16 @@ def why_apart(path, may_show_windows=False):
     return why_not_this_python(path) or ('' if may_show_windows else needs_process(path))
 
 
-def why_not_this_python(path):
-    """Return why this Python cannot run a program, by its first line, as text; else ''."""
+def why_not_this_python(path, needs_first_line=True):
+    """Return why this Python cannot run a program, by its first line, as text; else ''.
+
+    :param needs_first_line: False: a program without a first line for the system is one of Python
+    """
     with open(path, errors='replace') as file:
         first_line = file.readline(256)
     python = _PYTHON.match(first_line)
+    if not (needs_first_line or first_line.startswith('#!')):
+        return ''
     if not python:
         return 'it is not a program of Python 3'
     folder, _, version = python.groups()

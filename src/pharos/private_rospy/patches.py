@@ -188,11 +188,8 @@ def process_request(original, run, self, request, address):
 
 
 @patch('rosgraph.xmlrpc', 'SilenceableXMLRPCRequestHandler.do_POST')
-def limit_request(original, run, self):
-    """rospy reads requests of any size. This refuses large ones."""
-    if int(self.headers.get('content-length', 0)) > MAX_REQUEST:
-        self.send_error(413)
-        return
+def wait_for_next(original, run, self):
+    """rospy waits for ever for the next request. This has a limit."""
     original(self)
     run.limit_silence(self.connection)
 

@@ -2,8 +2,8 @@
 import sys
 
 FUNCTIONS = (
-    'loginfo logwarn logerr logdebug logfatal get_param set_param has_param search_param get_name'
-    ' on_shutdown'
+    'loginfo logwarn logerr logdebug logfatal loginfo_once logwarn_once logerr_once get_param'
+    ' set_param has_param search_param get_name get_namespace on_shutdown wait_for_message'
 ).split()
 _SYSTEM_FOLDERS = '/usr/', '/opt/ros/'
 
@@ -22,7 +22,9 @@ def guide(rospy, nodes):
         original = getattr(owner, attribute)
 
         def call(*args, **kwargs):
-            if nodes() and not rospy.core.is_initialized():
+            if rospy.core.is_initialized():
+                setattr(owner, attribute, original)  # or the log would name this file
+            elif nodes():
                 _tell(type(args[0]).__name__ if attribute == '__init__' else attribute, told)
             return original(*args, **kwargs)
 
