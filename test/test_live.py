@@ -603,9 +603,3 @@ def test_session_leaves_no_registration(master, tmp_path):
         session.press('exit\r')
         assert session.end() == 0
     assert not any(master.system_state())
-
-
-def test_messages_have_short_text(session):
-    session.enter('message_class("sensor_msgs/Image")(width=7, data=bytes(1000000))', 'width: 7')
-    session.enter('print("short", 6 * 7)', 'short 42')
-    assert len(session.text) < 100_000

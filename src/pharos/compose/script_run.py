@@ -503,8 +503,8 @@ class ScriptRun(Run):
                 threads += self._start_handling()
             if join(threads, timeout):
                 self.ros.logwarn(f'left behind, since it did not end in time: {self.node.path}')
-                self.raise_in_main(SystemExit())
                 end_reads(self.main)
+                self.raise_in_main(SystemExit())
                 self.souls.pop(self.main)
                 self.threads.discard(self.main)
         self.signal_shutdown('stop')
@@ -515,8 +515,10 @@ class ScriptRun(Run):
         self.left_threads = join(own_threads, SIGNAL_LIMIT)  # others have slept, and ended
         self.threads.difference_update(self.left_threads)  # stop() does not wait for them
         for thread in self.left_threads:
-            raise_in(thread, SystemExit)  # at its next line
             end_reads(thread)
+            # if traced, Python 3.11 stands still while an exception waits for a blocked thread
+            if not sys.gettrace():
+                raise_in(thread, SystemExit)  # at its next line
 
     def stop(self, timeout):
         """Stop the node, and drop what the program has opened, as the end of a process does.
@@ -524,10 +526,7 @@ class ScriptRun(Run):
         These are ports, files, locks. The Transcript names threads that keep some.
         """
         super().stop(timeout)
-        left_threads = join({*self.threads, *self.left_threads}, 0)
-        for thread in left_threads:
-            raise_in(thread, SystemExit)
-        left_threads = join(left_threads, SIGNAL_LIMIT)
+        left_threads = join({*self.threads, *self.left_threads}, SIGNAL_LIMIT)
         if left_threads and not signals.is_ending():
             names = ', '.join(thread.name for thread in left_threads)
             Transcript.show(f'{self.name} leaves threads that block, with what they use: {names}')
