@@ -152,7 +152,8 @@ WINDOWS = [
     ('from tkinter import Tk', '', 'tkinter'),
     ('loop.add_signal_handler(2, end)', '', 'add_signal_handler'),
     ('pass  # cv2.imshow("x", image)', '', ''),
-    ('import helper', 'def show(x):\n    cv2.imshow("x", x)\n', 'imshow'),
+    ('import os, helper', 'def show(x):\n    cv2.imshow("x", x)\n', 'imshow'),
+    ('from helper import (\n    show,\n)', 'def show(x):\n    cv2.imshow("x", x)\n', 'imshow'),
     ('import helper', '# cv2.imshow("x", x)\n', ''),
 ]
 OWN = '''

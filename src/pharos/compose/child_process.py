@@ -31,10 +31,10 @@ class RosProcess(subprocess.Popen):
     program.
 
     :param on_line: ``on_line(text)`` is called for each printed line, in another thread
-    :param pass_fds: descriptors that the program gets, too
+    :param options: of ``subprocess.Popen``; ``stdin=None``: the keyboard of this process
     """
 
-    def __init__(self, command, master_url, on_line=None, pass_fds=()):
+    def __init__(self, command, master_url, on_line=None, **options):
         self._lines = collections.deque(maxlen=MAX_LINES)
         self._on_line = on_line
         terminal, child_terminal = os.openpty()
@@ -45,11 +45,10 @@ class RosProcess(subprocess.Popen):
             super().__init__(
                 command,
                 env=environ,
-                pass_fds=pass_fds,
                 start_new_session=True,
-                stdin=child_terminal,
                 stdout=child_terminal,
                 stderr=child_terminal,
+                **{'stdin': child_terminal, **options},
             )
         finally:
             os.close(child_terminal)

@@ -204,8 +204,8 @@ class Composition:
             node.output_file = log.replace('.log', '-stdout.log')  # as roslaunch names it
         self.nodes.append(node)
         Transcript.show(f'{entry.name} starts')
-        self._has_started = True
         node._start_held()
+        self._has_started = True
 
     @property
     def process(self) -> RosProcess | None:
@@ -387,13 +387,15 @@ class _Part:
         self._comeback_time = math.inf  # as of time.monotonic(); infinity: nobody respawns
         url = self._master.url
         if not self._data_of:
-            self.process = RosProcess(self._command, url, Transcript.show)
+            self.process = RosProcess(self._command, url, Transcript.show, stdin=None)
             return
         with open(os.memfd_create('pharos'), 'wb') as file, _blocked_interrupts():
             pickle.dump(self._data_of(self.entries), file)
             file.flush()
             command = [*self._command, f'/proc/self/fd/{file.fileno()}', str(os.getpid())]
-            self.process = RosProcess(command, url, Transcript.show, pass_fds=[file.fileno()])
+            self.process = RosProcess(
+                command, url, Transcript.show, stdin=None, pass_fds=[file.fileno()]
+            )
 
     @property
     def names(self):

@@ -34,15 +34,13 @@ def _serve(listener, composition):
         while not composition.stopping.is_set():
             try:
                 client, _ = listener.accept()
-                thread = threading.Thread(target=_serve_client, args=[client, composition])
-                thread.daemon = True
-                thread.start()
+                threading.Thread(target=_obey, args=[client, composition], daemon=True).start()
             # the composition ends, or the system has no descriptor or thread left
             except (OSError, RuntimeError):
                 composition.stopping.wait(ACCEPT_PAUSE)
 
 
-def _serve_client(client, composition):
+def _obey(client, composition):
     client.settimeout(ANSWER_LIMIT)
     with client, contextlib.suppress(OSError, ValueError):  # it has gone, or sends nonsense
         check_user(client)

@@ -503,8 +503,8 @@ class ScriptRun(Run):
                 threads += self._start_handling()
             if join(threads, timeout):
                 self.ros.logwarn(f'left behind, since it did not end in time: {self.node.path}')
-                end_reads(self.main)
                 self.raise_in_main(SystemExit())
+                end_reads(self.main)
                 self.souls.pop(self.main)
                 self.threads.discard(self.main)
         self.signal_shutdown('stop')
@@ -515,10 +515,10 @@ class ScriptRun(Run):
         self.left_threads = join(own_threads, SIGNAL_LIMIT)  # others have slept, and ended
         self.threads.difference_update(self.left_threads)  # stop() does not wait for them
         for thread in self.left_threads:
-            end_reads(thread)
             # if traced, Python 3.11 stands still while an exception waits for a blocked thread
             if not sys.gettrace():
                 raise_in(thread, SystemExit)  # at its next line
+            end_reads(thread)  # after that: a thread that has woken would read again
 
     def stop(self, timeout):
         """Stop the node, and drop what the program has opened, as the end of a process does.

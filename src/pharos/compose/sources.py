@@ -32,7 +32,8 @@ _SETS_ENVIRONMENT = re.compile(
     re.MULTILINE,
 )
 _IMPORT = re.compile(
-    r'^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t(]+([\w, ]+)|import[ \t]+([\w.]+))', re.MULTILINE
+    r'^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]*(\([^)]*\)|[^\n(]+)|import[ \t]+([\w., \t]+))',
+    re.MULTILINE,
 )
 SYSTEM_FOLDERS = '/usr/', '/opt/ros/'
 
@@ -127,10 +128,11 @@ def _search(path, pattern):
 
 def _imported_names(text):
     """Yield the names that could be modules in the imports of a text."""
-    for package, names, module in _IMPORT.findall(text):
-        yield module or package
-        for name in names.split(','):
-            yield f'{package}.{name.strip()}'
+    for package, names, modules in _IMPORT.findall(text):
+        yield package
+        yield from re.findall(r'[\w.]+', modules)
+        for name in re.findall(r'\w+', names):
+            yield f'{package}.{name}'
 
 
 def _user_file(module, folder):

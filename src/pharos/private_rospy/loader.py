@@ -237,9 +237,10 @@ def _process_class(cls, *args, original=dataclasses._process_class, **kwargs):
 def _exec_module(loader, module, original=SourceFileLoader.exec_module):
     """Give the node's rospy to a module that a private one loads from a file, by importlib or imp."""
     frame = sys._getframe(1)
-    while frame.f_globals.get('__name__', '').partition('.')[0] in _IMPORTERS:
+    # code in C may import in a thread without another frame
+    while frame and frame.f_globals.get('__name__', '').partition('.')[0] in _IMPORTERS:
         frame = frame.f_back
-    owner = _owner_of_builtins(frame.f_globals.get('__builtins__'))
+    owner = frame and _owner_of_builtins(frame.f_globals.get('__builtins__'))
     if owner:
         vars(module)['__builtins__'] = owner.builtins
     original(loader, module)

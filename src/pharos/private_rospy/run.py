@@ -47,7 +47,6 @@ if TYPE_CHECKING:
 MASTER_LIMIT = 5.0  # seconds for each question to a master or node
 NAME_LIMIT = 1.0  # seconds for the question whether another node has the name
 STOP_LIMIT = 2.0  # seconds that a stop waits for threads of rospy
-FOR_EVER = 1e9  # seconds
 CLOCK_LIMIT = 3.0  # seconds until a clock that stands still is told
 HOLD_LIMIT = 2.0  # seconds that delegates wait for the end of start(); start() may wait for them
 RETRY_DELAY = 1.0  # seconds until the next attempt to connect
@@ -560,7 +559,7 @@ class Run:
         if now > self.hold_deadline:
             self.callback_queue.release()
         if now > self.clock_deadline:
-            self.clock_deadline += FOR_EVER
+            self.clock_deadline += 1e9  # it is told once
             rostime = self.ros.rostime
             if not (rostime.is_wallclock() or rostime.get_time()):
                 self.troubles.add('time stands still: /use_sim_time is set, and no /clock comes')
