@@ -42,7 +42,7 @@ class RosProcess(subprocess.Popen):
         self._terminal = open(terminal, errors='replace')
         environ = {**os.environ, 'ROS_MASTER_URI': master_url, 'TERM': 'dumb'}
         try:
-            super().__init__(
+            super().__init__(  # type: ignore[call-overload]
                 command,
                 env=environ,
                 start_new_session=True,
