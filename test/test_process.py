@@ -20,8 +20,6 @@ STRING = 'std_msgs/String'
 INIT = "rospy.init_node('program')\n"
 SPIN = INIT + "say('ready')\nrospy.spin()\n"
 
-untraced = pytest.mark.skipif(bool(sys.gettrace()), reason='no SystemExit in threads if traced')
-
 # -- drivers come back
 
 READERS = {
@@ -50,7 +48,7 @@ driver = Driver()
 say('opened')
 {rest}
 '''
-DEVICE_READERS = 'nobody', 'loop', pytest.param('socket', marks=untraced)
+DEVICE_READERS = 'nobody', 'loop', 'socket'
 ENDS = {'exit': 'sys.exit(1)', 'exception': "raise RuntimeError('USB has gone')"}
 
 
@@ -85,7 +83,6 @@ def test_stop_gives_the_device_back(bench, port, reader):
         sock.bind(('127.0.0.1', port))
 
 
-@untraced
 def test_serial_driver_restarts_while_its_thread_reads(bench):
     pytest.importorskip('serial')
     device, program_end = pty.openpty()
@@ -108,7 +105,6 @@ def test_serial_driver_restarts_while_its_thread_reads(bench):
     os.close(program_end)
 
 
-@untraced
 def test_thread_that_blocks_for_ever_is_told(bench, transcript):
     reading_end, writing_end = os.pipe()
     text = f'''
