@@ -140,7 +140,7 @@ class Pharos(Player):
         import pharos
 
         super().__init__(name, options)
-        master = pharos.Master(share_connections='sharing' in options)
+        master = pharos.Master()
         self._node = lambda each: master.create(
             pharos.BlockNode, named=f'{name}/{each}{options.get("one", "")}', domain='127.0.0.1'
         )
@@ -165,7 +165,7 @@ class Pharos(Player):
         if not self.sends:
             return None
         channel = self._publisher.output_channel(topic, ros_type, queue_size=queue_size)
-        if not channel.wait_for_subscribers(1 if 'sharing' in options else receivers, PATIENCE):
+        if not channel.wait_for_subscribers(receivers, PATIENCE):
             raise SystemExit(f'not connected: {channel!r}')
         send_to, names = self._publisher.send_to, ros_type.__slots__
         if 'send_to' in options:

@@ -29,7 +29,6 @@ ROWS = {
     NODELETS: ['nodelets'],
     'rospy, 1 process': ['rospy'],
     'pharos, 2 processes': ['pharos', 'two'],
-    'pharos, 2 pr., sharing': ['pharos', 'sharing', 'two'],
     'rospy, 2 processes': ['rospy', 'two'],
     'rospy, 2 proc., tuned': ['rospy', 'tuned', 'two'],
 }

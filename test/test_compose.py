@@ -681,26 +681,6 @@ def test_composition_ends_with_its_block(compose):
     assert not any(each.is_running for each in composition.nodes)
 
 
-def test_composed_nodes_share_connections(peer, compose, write):
-    write(
-        '''
-        rospy.init_node('hearer')
-        rospy.Subscriber('/words', String, lambda m: rospy.set_param('~heard', m.data))
-        rospy.spin()
-        ''',
-        'hearer',
-    )
-    peer.run("String = message_class('std_msgs/String')")
-    peer.run("publisher = rospy.Publisher('/words', String, queue_size=1, latch=True)")
-    peer.run("publisher.publish('hello')")
-    names = 'left', 'right', 'middle'
-    xml = ''.join(f'<node pkg="bench" type="hearer" name="{name}"/>' for name in names)
-    composition = compose(xml, share_connections=True)
-    parameters = composition.nodes[0].master.parameters
-    until(lambda: all(f'/{name}/heard' in parameters for name in names))
-    assert peer.value('publisher.get_num_connections()') == 1
-
-
 # -- rosrun pharos compose
 
 

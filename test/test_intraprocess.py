@@ -312,24 +312,3 @@ def test_ten_receivers_get_all(master, sender):
         sender.send_to('/a', data=number)
     for box in boxes:
         assert [box.next().data for _ in range(200)] == list(range(200))
-
-
-# -- one connection for several nodes
-
-
-def test_nodes_share_an_external_connection(master, peer):
-    sharing = pharos.Master(master.url, share_connections=True)
-    nodes = [create(sharing, f'/hearer{n}') for n in range(3)]
-    boxes = [Mailbox(node, '/a', STRING) for node in nodes]
-    peer.run("out = rospy.Publisher('/a', message_class('std_msgs/String'), queue_size=10)")
-    until(lambda: peer.value('out.get_num_connections()') == 1)
-    until(lambda: all(box.channel.connections for box in boxes))
-    peer.run("out.publish('one')")
-    assert [box.next().data for box in boxes] == ['one'] * 3
-    assert peer.value('out.get_num_connections()') == 1
-    nodes[0].stop()
-    left = boxes[1:]
-    until(lambda: (peer.run("out.publish('more')"), all(len(box.all()) > 1 for box in left))[1])
-    peer.run('out.unregister()')
-    peer.run("out = rospy.Publisher('/a', message_class('std_msgs/String'), queue_size=10)")
-    until(lambda: (peer.run("out.publish('!')"), all(b.all()[-1].data == '!' for b in left))[1])

@@ -147,7 +147,7 @@ Early = type('Early', (Node,), {'start': lambda self: self.interested_in('/t', S
 MISTAKES = {
     'call': (lambda m: Bare(), PharosError, r"create\(Bare, named='bare'\)"),
     'argument': (lambda m: Bare('bare'), PharosError, r"create\(Bare, named='bare'\)"),
-    'name': (lambda m: create(m, '/n', Named), PharosError, r"'named'.*named=.*super"),
+    'name': (lambda m: create(m, '/n', Named), PharosError, r"create\(Named, named=.*super"),
     'anonymous': (lambda m: create(m, '/n', Bare, anonymous=True), PharosError, 'named='),
     'keyword': (lambda m: create(m, '/n', Wheeled, anonymous=True), TypeError, 'named=anonymous'),
     'no super': (lambda m: create(m, '/n', Superless), PharosError, 'super'),

@@ -382,22 +382,6 @@ def test_from_and_to_select(master, node, listener, topic):
         assert {note[3] for note in listener.notes(topic)} == {'/node'}
 
 
-def test_nodes_of_process_share_connection(node, listener, topic):
-    listener.run(
-        'sharing = pharos.Master(share_connections=True)\n'
-        "pair = [sharing.create(pharos.BlockNode, f'/pair{n}') for n in range(2)]\n"
-        'came = [[], []]\n'
-        f'for each, box in zip(pair, came): each.interested_in({topic!r}, {IMAGE!r}, box.append)'
-    )
-    out = node.output_channel(topic, IMAGE)
-    data = os.urandom(300_000)
-    until(lambda: out.send(data=data) and listener.value('all(came)'), TIMEOUT)
-    assert [kind for _, kind in out.connections] == [SHARED]
-    datas = listener.value('[box[0].data for box in came]')
-    listener.run('for each in pair: each.stop()')
-    assert datas == [data] * 2
-
-
 # -- readers that do not read, and ends without a word
 
 

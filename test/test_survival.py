@@ -764,37 +764,6 @@ def test_subscription_connects_after_lack_of_threads(master, peer, monkeypatch):
     assert mailbox.next().data == 'hello'
 
 
-@pytest.mark.parametrize('queue_size', [None, 10])
-def test_handler_that_raises_in_publish(master, peer, queue_size):
-    """The next publish() sends the rest of a message that a signal has cut, and then its own."""
-    mouth = create(master, '/mouth')
-    peer.hear('/t', STRING)
-    publisher = mouth.ros.Publisher('/t', std_msgs.msg.String, queue_size=queue_size)
-    until(publisher.get_num_connections)
-
-    class Alarm(Exception):
-        pass
-
-    def handle(number, frame):
-        raise Alarm
-
-    former_handler = signal.signal(signal.SIGALRM, handle)
-    try:
-        os.kill(peer.pid, signal.SIGSTOP)
-        with pytest.raises(Alarm):
-            signal.setitimer(signal.ITIMER_REAL, 0.2)
-            while True:
-                publisher.publish('x' * 100_000)
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, former_handler)
-        os.kill(peer.pid, signal.SIGCONT)
-
-    publisher.publish('whole')
-    until(lambda: peer.value('heard["/t"] and heard["/t"][-1].data') == 'whole')
-    assert set(peer.value('{message.data for message in heard["/t"]}')) == {'whole', 'x' * 100_000}
-
-
 # -- for a while
 
 

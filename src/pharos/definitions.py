@@ -7,6 +7,7 @@ import threading
 from contextlib import suppress
 
 import genmsg
+from genmsg.gentools import compute_full_text, compute_md5
 from genmsg.msg_loader import load_depends, load_msg_from_string, load_srv_from_string
 from genmsg.msgs import bare_msg_type, is_builtin
 from genpy.dynamic import generate_dynamic
@@ -29,8 +30,8 @@ def define(suffix, type_name, text, find_class, make_class):
     key = suffix, type_name
     with suppress(UnknownTypeError):
         known_class = find_class(type_name)
-        is_shipped = key in shipped_definitions  # a real turtlesim may have other fields
-        if _checksums(known_class) != _checksums(new_class) and not is_shipped:
+        is_other = _checksums(known_class) != _checksums(new_class)
+        if is_other and key not in shipped_definitions:  # a real turtlesim may have other fields
             raise MessageTypeError(f'{type_name} is known with other fields: define another type')
     given_definitions.setdefault(key, text)
     return find_class(type_name)
@@ -41,46 +42,38 @@ def _checksums(cls):
     return cls._md5sum, getattr(cls, '_request_class', cls)._md5sum
 
 
-class _Definition:
-    """A definition as genmsg reads it, with the definitions of all nested types.
+def _read(load, type_name, text):
+    """Return genmsg's context, which has all nested types, and the specification of a type.
 
-    :ivar context: genmsg's context, with all types
-    :ivar text: the text of the type alone
-    :ivar nested_texts: names of nested types -> their texts
+    :param load: genmsg's function for the text of a message or of a service
     """
+    context = genmsg.MsgContext.create_default()
+    own_text, *parts = re.split(r'\n=+[ \t]*\nMSG: *', f'\n{text}')
+    given_texts = {}
+    for part in parts:
+        name, _, nested_text = part.partition('\n')
+        given_texts[name.strip()] = nested_text
+    spec = load(context, own_text[1:], type_name)
+    for part in getattr(spec, 'request', spec), getattr(spec, 'response', spec):
+        _register_nested(context, part, given_texts)
+    load_depends(context, spec, {})
+    return context, spec
 
-    def __init__(self, type_name, text):
-        self.context = genmsg.MsgContext.create_default()
-        self.nested_texts = {}
-        own_text, *parts = re.split(r'\n=+[ \t]*\nMSG: *', f'\n{text}')
-        self.text = own_text[1:]
-        self._given_texts = {}
-        for part in parts:
-            name, _, nested_text = part.partition('\n')
-            self._given_texts[name.strip()] = nested_text
-        for part in re.split(r'^---.*$', own_text, flags=re.M):  # a service has two parts
-            self._add_nested(type_name, part)
 
-    def _add_nested(self, type_name, text):
-        """Read the text of a type, and add the types of its fields, and those nested in them."""
-        spec = load_msg_from_string(self.context, text, type_name)
-        for field_type in map(bare_msg_type, spec.types):
-            name = 'std_msgs/Header' if field_type == 'Header' else field_type
-            if is_builtin(name) or name in self.nested_texts:
-                continue
-            nested_text = self._given_texts.get(name)
-            if nested_text is None:
-                nested_text = _nested_definition(name)
-            self.nested_texts[name] = nested_text
-            # other types may nest this one without its definition
-            given_definitions.setdefault(('msg', name), nested_text)
-            self._add_nested(name, nested_text)
-
-    @property
-    def nested_part(self):
-        """The texts of the nested types, as they follow in a full definition."""
-        texts = self.nested_texts.items()
-        return ''.join(f'\n{"=" * 80}\nMSG: {name}\n{text}' for name, text in texts)
+def _register_nested(context, spec, given_texts):
+    """Register the types of the fields of a type, and those nested in them."""
+    for field_type in map(bare_msg_type, spec.types):
+        name = 'std_msgs/Header' if field_type == 'Header' else field_type
+        if is_builtin(name) or context.is_registered(name):
+            continue
+        text = given_texts.get(name)
+        if text is None:
+            text = _nested_definition(name)
+        # other types may nest this one without its definition
+        given_definitions.setdefault(('msg', name), text)
+        nested_spec = load_msg_from_string(context, text, name)
+        context.register(name, nested_spec)
+        _register_nested(context, nested_spec, given_texts)
 
 
 def _nested_definition(type_name):
@@ -100,7 +93,6 @@ def _once(make_class):
     """
     cached_function = functools.lru_cache(None)(make_class)
 
-    @functools.wraps(make_class)
     def make_once(type_name, text):
         try:
             with _lock:
@@ -117,17 +109,14 @@ def make_message(type_name, text):
 
     :raises UnknownTypeError: if no class can be made
     """
-    definition = _Definition(type_name, text)
-    full_text = definition.text + definition.nested_part
+    full_text = compute_full_text(*_read(load_msg_from_string, type_name, text))
     classes = generate_dynamic(type_name, f'{full_text}\n')
     cls = classes[type_name]
     cls._full_text = full_text
-    cls._classes = classes  # for the copier
-    for name in definition.nested_texts:  # genpy has made classes of these, too
+    for name in classes.keys() - {type_name}:  # genpy has made classes of these, too
         known_class = message_class(name)
         if known_class._md5sum == classes[name]._md5sum:
-            classes[name] = known_class
-            # genpy's deserialize() makes nested messages of this name
+            # genpy's deserialize() makes nested messages of this name, and nested_class() reads it
             cls.serialize.__globals__['_' + name.replace('/', '__')] = known_class
     return cls
 
@@ -135,14 +124,15 @@ def make_message(type_name, text):
 @_once
 def make_service(type_name, text):
     """Return the class of a service type, as make_message() does."""
-    definition = _Definition(type_name, text)
-    spec = load_srv_from_string(definition.context, definition.text, type_name)
-    load_depends(definition.context, spec, {})
-    nested_part = definition.nested_part
+    context, spec = _read(load_srv_from_string, type_name, text)
     attributes = {
         '_type': type_name,
-        '_md5sum': genmsg.compute_md5(definition.context, spec),
-        '_request_class': make_message(f'{type_name}Request', spec.request.text + nested_part),
-        '_response_class': make_message(f'{type_name}Response', spec.response.text + nested_part),
+        '_md5sum': compute_md5(context, spec),
+        '_request_class': _make_part(context, spec.request),
+        '_response_class': _make_part(context, spec.response),
     }
     return type(spec.short_name, (), attributes)
+
+
+def _make_part(context, spec):
+    return make_message(spec.full_name, compute_full_text(context, spec))

@@ -83,8 +83,6 @@ class Master:
     that ask the master raise MasterUnreachableError if the master does not answer.
 
     :param url: default: ROS_MASTER_URI, or else http://localhost:11311/
-    :param share_connections: nodes of this process that receive from one external publisher on one
-        topic share a connection
     :param shared_memory: False: nodes use TCPROS between processes of this package on one host, too;
         default: what PHAROS_SHARED_MEMORY says, 0 or 1, else True
     :raises ValueError: if the URL is malformed
@@ -93,12 +91,7 @@ class Master:
     _environ = os.environ  # for ROS_NAMESPACE; a script's Master has its own
     _first_nodes: Any = WeakValueDictionary()  # argv -> the first node that was created with it
 
-    def __init__(
-        self,
-        url: str | None = None,
-        share_connections: bool = False,
-        shared_memory: bool | None = None,
-    ):
+    def __init__(self, url: str | None = None, shared_memory: bool | None = None):
         url = url or os.environ.get('ROS_MASTER_URI') or 'http://localhost:11311/'
         parts = _URL.fullmatch(str(url).lower())
         if not parts:
@@ -107,7 +100,6 @@ class Master:
             )
         host = parts[1].replace('localhost', '127.0.0.1')
         self.url = f'http://{host}:{parts[2]}/'
-        self.share_connections = share_connections
         if shared_memory is None:
             shared_memory = os.environ.get('PHAROS_SHARED_MEMORY') != '0'
         self.shared_memory = shared_memory and hasattr(os, 'memfd_create')
@@ -444,7 +436,6 @@ class Master:
         apart: Sequence[str] = (),
         here: Sequence[str] = (),
         groups: Sequence[Sequence[str]] = (),
-        share_connections: bool = False,
         **args,
     ) -> Composition:
         """Run the Python nodes of a launch file in this process.
@@ -457,7 +448,6 @@ class Master:
         :param apart: the names of nodes that run in processes of their own
         :param here: the names of nodes that run in this process even if they show windows
         :param groups: lists of names; the nodes of each list run in one process
-        :param share_connections: as for :class:`Master`; True here or there is enough
         :param args: the arguments of the launch file
         :raises UnknownNodeError: if there is no such file, argument or node
         :raises PharosError: if roslaunch cannot read the file
@@ -466,8 +456,7 @@ class Master:
         from pharos.compose.launch_file import LaunchFile
 
         launch_file = LaunchFile(self.url, package, file, args, only, apart, here, groups)
-        master = Master(self.url, share_connections or self.share_connections, self.shared_memory)
-        composition = Composition(master)
+        composition = Composition(Master(self.url, self.shared_memory))
         composition.launch(launch_file)
         return composition
 

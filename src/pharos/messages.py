@@ -242,18 +242,12 @@ def _fill(message, fields):
             raise MessageTypeError(f'{cls._type} has no field {name!r}; it has {fields_text(cls)}')
         base_type = types[name].partition('[')[0]
         if type(value) is dict:
-            value = _fill(_class_of_field(base_type, cls)(), value)
+            value = _fill(nested_class(base_type, cls)(), value)
         elif type(value) is list and dict in map(type, value):
-            item_class = _class_of_field(base_type, cls)
+            item_class = nested_class(base_type, cls)
             value = [_fill(item_class(), each) if type(each) is dict else each for each in value]
         setattr(message, name, value)
     return message
-
-
-def _class_of_field(base_type, cls):
-    """Return the class of a nested field; genpy.dynamic has these classes in one module."""
-    made_class = cls.serialize.__globals__.get('_' + base_type.replace('/', '__'))
-    return made_class or nested_class(base_type, cls)
 
 
 def explain(message, error):

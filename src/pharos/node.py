@@ -92,14 +92,10 @@ class Node(DelegateHolder):
         """
         if self._settings and not args and not kwargs:
             return
-        class_name = type(self).__name__
-        mistake = class_name
-        if args or kwargs:
-            arguments = ', '.join([*map(repr, args), *kwargs])
-            mistake = f'{class_name} takes no {arguments}'
+        name = type(self).__name__
         raise PharosError(
-            f"{mistake}: write Master().create({class_name}, named='{class_name.lower()}'), and"
-            ' super().__init__() without a name'
+            f"{name}: write Master().create({name}, named='{name.lower()}'), and super().__init__()"
+            ' without a name'
         )
 
     def _configure(self, settings, soul, delegate):
@@ -519,7 +515,6 @@ class Node(DelegateHolder):
         self,
         topic: str,
         block=None,
-        fill: Block | None = None,
         *,
         typed_as: str | type | None = None,
         to=None,
@@ -531,21 +526,19 @@ class Node(DelegateHolder):
         The report: ``self sendTo: '/cmd_vel' a: [:msg | msg linear: 2.0]``::
 
             node.send_to('/cmd_vel', typed_as='turtlesim/Velocity', linear=2.0)
-            node.send_to('/cmd_vel', Velocity, linear=2.0)
             node.send_to('/cmd_vel', lambda msg: setattr(msg, 'linear', 2.0))
 
-        :param block: ``block(message)`` fills a new message; or a ready message, a dict of fields,
-            or a message class, which is the type
-        :param fill: if ``block`` is a message class, a block, ready message or dict of fields
+        :param block: ``block(message)`` fills a new message; or a ready message, or a dict of
+            fields, or the value of the only field; or a message class, which is the type
         :param typed_as: as for :meth:`interested_in`, with the same errors
         :param to: the node that alone gets the message: a name, Node or ExternalNode
         :param fields: fill the message by name
         :raises MessageTypeError: if the message does not fit the topic, or has no such field
         :raises UnknownNodeError: if the node ``to`` is not connected
         """
-        if isinstance(block, type) and issubclass(block, Message):
+        if isinstance(block, type):
             typed_as = block
-            block = fill
+            block = None
         channel = self._send_channels.get((topic, typed_as))
         if channel and not channel.closed:
             return channel.send(block, to=to, **fields)

@@ -54,9 +54,6 @@ def _parse(arguments):
     parser.add_argument(
         '--group', nargs='+', action='append', default=[], help='these in one other process'
     )
-    parser.add_argument(
-        '--share-connections', action='store_true', help='one connection to each other publisher'
-    )
     roslaunch_options = parser.add_argument_group('as for roslaunch')
     roslaunch_options.add_argument('--wait', action='store_true', help='wait for the master')
     roslaunch_options.add_argument('-v', action='store_true', help='no effect: all is said anyway')
@@ -83,7 +80,7 @@ def _parse(arguments):
 
 def _run(stack, options, mappings):
     """Run as the options say, and return the exit status; the stack ends all."""
-    master = Master(share_connections=options.share_connections)
+    master = Master()
     if options.wait:
         wait(master.is_reachable)
     if not master.is_reachable():

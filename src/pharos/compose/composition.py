@@ -176,7 +176,7 @@ class Composition:
 
     def _group_of(self, entries):
         master = self.master
-        return Group(entries, master.url, master.share_connections, master.shared_memory)
+        return Group(entries, master.url, master.shared_memory)
 
     @contextlib.contextmanager
     def _show_failure(self, name):

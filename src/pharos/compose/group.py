@@ -19,7 +19,7 @@ def main(path: str, parent: int) -> int:
     group = read_parcel(path)
     end_with(parent)
     try:
-        master = Master(group.url, group.share_connections, group.shared_memory)
+        master = Master(group.url, group.shared_memory)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])  # the parent has blocked it
         with Composition(master, owns_process=True) as composition:
             composition.start_entries(group.entries)

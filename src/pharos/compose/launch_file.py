@@ -48,7 +48,6 @@ class Group(NamedTuple):
 
     entries: list[Entry]
     url: str
-    share_connections: bool
     shared_memory: bool
 
 

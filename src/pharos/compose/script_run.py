@@ -249,7 +249,7 @@ class ScriptRun(Run):
             name = anonymous_name(name)
         settings = self.settings
         url = get_master_uri(self.environ, self.argv)
-        master = Master(url, self.master.share_connections, self.master.shared_memory)
+        master = Master(url, self.master.shared_memory)
         if master != self.master:
             self.master = settings.master = self.node.master = master
         self.base_name = load_mappings(self.argv).get('__name', name)
@@ -515,9 +515,7 @@ class ScriptRun(Run):
         self.left_threads = join(own_threads, SIGNAL_LIMIT)  # others have slept, and ended
         self.threads.difference_update(self.left_threads)  # stop() does not wait for them
         for thread in self.left_threads:
-            # if traced, Python 3.11 stands still while an exception waits for a blocked thread
-            if not sys.gettrace():
-                raise_in(thread, SystemExit)  # at its next line
+            raise_in(thread, SystemExit)  # at its next line
             end_reads(thread)  # after that: a thread that has woken would read again
 
     def stop(self, timeout):
@@ -565,6 +563,8 @@ def end_reads(thread):
 
 def raise_in(thread, error_class):
     """Raise an exception of a class in a thread, at its next line of Python."""
+    if sys.version_info[:2] == (3, 11) and sys.gettrace():
+        return  # traced threads would stand still until the thread has come to that line
     thread_id = ctypes.c_ulong(thread.ident)
     ctypes.pythonapi.PyThreadState_SetAsyncExc(thread_id, ctypes.py_object(error_class))
 
@@ -633,13 +633,8 @@ class _Pharos(Shim):
             _environ = run.environ
             _first_nodes = WeakValueDictionary()
 
-            def __init__(
-                self,
-                url=None,
-                share_connections=run.master.share_connections,
-                shared_memory=run.master.shared_memory,
-            ):
-                super().__init__(url or run.master.url, share_connections, shared_memory)
+            def __init__(self, url=None, shared_memory=run.master.shared_memory):
+                super().__init__(url or run.master.url, shared_memory)
 
             def _remapped_name(self, node, name, mappings):
                 full_name = super()._remapped_name(node, name, mappings)

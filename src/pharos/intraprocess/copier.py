@@ -92,7 +92,7 @@ def size_of(frozen):
 
 def _sequence(value):
     if type(value) not in (list, tuple):
-        if not hasattr(value, 'ravel'):  # an array of numpy
+        if not getattr(value, 'ndim', 0):  # no array of numpy
             raise _UnusualError
         value = value.ravel().tolist()
     return tuple(value)
@@ -243,12 +243,14 @@ def nested_class(base, cls):
     """Return the class of a nested field.
 
     :param base: the type's name, such as 'std_msgs/Header' or 'time'
-    :param cls: the message class with the field; one made at run time brings its nested classes
+    :param cls: the message class with the field
     """
     if base in _TIMES:
         return _TIMES[base]
     base = 'std_msgs/Header' if base == 'Header' else base
-    return getattr(cls, '_classes', {}).get(base) or genpy.message.get_message_class(base)
+    # genpy makes a class of a definition in a module with the classes of all its fields
+    made_class = cls.serialize.__globals__.get('_' + base.replace('/', '__'))
+    return made_class or genpy.message.get_message_class(base)
 
 
 @functools.lru_cache(None)

@@ -12,7 +12,7 @@ from pharos.intraprocess.copier import thaw_function
 
 #: the runs of this process by the URI of their node
 runs = {}
-runs_lock = threading.Lock()  # of runs and their relays
+runs_lock = threading.Lock()
 
 
 def peer_of(connection):
@@ -38,7 +38,7 @@ class Link(Transport):
     latch = None  # rospy would send a latched message again; the overlay has its own latches
     header = property(lambda self: self.publisher.header)
     callerid_pub = property(peer_of)  # actionlib reads this
-    transport_type = property(lambda self: self.publisher.transport_type)
+    transport_type = 'INTRAPROCESS'
     # the publisher counts for all links: to touch ten links takes as long as to run ten delegates
     # rospy sets the count to 0 at first
     stat_num_msg = property(lambda self: self.publisher.seq, lambda self, zero: None)
@@ -67,7 +67,8 @@ class Link(Transport):
 def link_topic(sender, receiver, topic):
     """Link two runs of this process on a topic, if one publishes and the other subscribes.
 
-    A publisher of another type is reported as a failure of the receiver.
+    Hand over the latched messages. A publisher of another type is reported as a failure of the
+    receiver. Do nothing if the two are connected already.
 
     :param sender: the run of the publishing node
     :param receiver: the run of the receiving node
@@ -85,23 +86,10 @@ def link_topic(sender, receiver, topic):
         )
         return
     publisher.make_header()
-    link(publisher, sender.uri, subscription, receiver)
-
-
-def link(publisher, uri, subscription, receiver):
-    """Link a publisher and a subscription, and hand over the latched messages.
-
-    Do nothing if one of them is closed, or if they are connected already.
-
-    :param publisher: rospy's _PublisherImpl
-    :param uri: the URI of the publisher's node
-    :param subscription: rospy's _SubscriberImpl
-    :param receiver: the run of the subscription's node
-    """
-    thaw = thaw_function(publisher.data_class, subscription.data_class)
+    thaw = thaw_function(sent_class, wanted_class)
     with publisher.lock:
         sender_end = Link('o', publisher, receiver, receiver.name, thaw)
-        receiver_end = Link('i', publisher, receiver, uri, thaw)
+        receiver_end = Link('i', publisher, receiver, sender.uri, thaw)
         sender_end.other_end = receiver_end
         receiver_end.other_end = sender_end
         sender_end.inboxes = subscription.inboxes

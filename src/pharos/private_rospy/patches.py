@@ -317,7 +317,7 @@ def receive_and_retry(original, run, connection, address, port, uri, callback, t
 
     A publisher of another type is a failure of the node, and is not tried again.
     """
-    tcpros.receive_until_end(connection, address, port, uri, callback.__self__, run)
+    tcpros.receive_until_end(connection, address, port, uri, callback.__self__)
 
 
 @patch('rospy.impl.registration', 'RegManager.reg_added')

@@ -5,6 +5,7 @@ FUNCTIONS = (
     'loginfo logwarn logerr logdebug logfatal loginfo_once logwarn_once logerr_once get_param'
     ' set_param has_param search_param get_name get_namespace on_shutdown wait_for_message'
 ).split()
+CLASSES = 'Publisher Subscriber Service ServiceProxy'.split()
 _SYSTEM_FOLDERS = '/usr/', '/opt/ros/'
 
 
@@ -16,47 +17,47 @@ def guide(rospy, nodes):
     :param rospy: the process's own rospy, or that of a composed program
     :param nodes: ``nodes()`` returns the nodes of pharos that start or run
     """
-    told = set()  # what to write, and '' when there have been nodes
+    advices = set()  # that have been given
+    had_nodes = False
 
-    def watch(owner, attribute):
+    def watch(owner, attribute, name):
         original = getattr(owner, attribute)
 
         def call(*args, **kwargs):
             if rospy.core.is_initialized():
                 setattr(owner, attribute, original)  # or the log would name this file
             elif nodes():
-                _tell(type(args[0]).__name__ if attribute == '__init__' else attribute, told)
+                _advise(name, advices)
             return original(*args, **kwargs)
 
         setattr(owner, attribute, call)
 
     def is_shutdown(original=rospy.is_shutdown):
+        nonlocal had_nodes
         if nodes():
-            told.add('')
-        elif told and not rospy.core.is_initialized():
+            had_nodes = True
+        elif had_nodes and not rospy.core.is_initialized():
             return True
         return original()
 
     rospy.is_shutdown = rospy.core.is_shutdown = is_shutdown
     for name in FUNCTIONS:
-        watch(rospy, name)
-    for cls in rospy.topics.Topic, rospy.Service, rospy.ServiceProxy:
-        watch(cls, '__init__')
+        watch(rospy, name, name)
+    for name in CLASSES:
+        watch(getattr(rospy, name), '__init__', name)
 
 
-def _tell(name, told):
-    """Print what to write instead of a call of rospy, once for each name."""
-    frame = sys._getframe(2)
-    if name in FUNCTIONS and frame.f_globals['__name__'].startswith('rospy'):
-        return  # a class of rospy has called, and has been told of
-    while frame.f_globals.get('__name__', '').startswith(('rospy', 'pharos')):
-        frame = frame.f_back
+def _advise(name, advices):
+    """Print what to write instead of a call of rospy, unless that has been printed."""
+    caller = sys._getframe(2)
+    module = caller.f_globals['__name__'].partition('.')[0]
+    if module == 'rospy':  # it was called itself, and has been told of
+        return
     advice = f'node.ros.{name}'
-    if frame.f_code.co_filename.startswith(_SYSTEM_FOLDERS):  # a library on rospy
-        library = frame.f_globals['__name__'].partition('.')[0]
-        advice = f"node.ros_import('{library}')"
-    if advice not in told:
-        told.add(advice)
+    if caller.f_code.co_filename.startswith(_SYSTEM_FOLDERS):  # a library on rospy
+        advice = f"node.ros_import('{module}')"
+    if advice not in advices:
+        advices.add(advice)
         print(
             f'rospy.{name} has no node, since nobody calls rospy.init_node(): write {advice}',
             file=sys.stderr,

@@ -36,7 +36,7 @@ from pharos.intraprocess.callback_queues import CallbackOrder, CallbackQueue
 from pharos.intraprocess.links import link_topic, runs, runs_lock
 from pharos.private_rospy import patches
 from pharos.private_rospy.loader import PrivateModules, Shim, private_path
-from pharos.private_rospy.tcpros import close_relay, join_relay, shutdown_socket
+from pharos.private_rospy.tcpros import shutdown_socket
 from pharos.signals import may_be_signal
 from pharos.transcript import Transcript
 from pharos.waiting import let_others_run
@@ -152,7 +152,6 @@ class Run:
         self.publisher_uris = {}  # topic -> URIs, the last list of the master
         self.retries = {}  # (topic, URI) -> the time to connect again, and the last error
         self.connecting = set()  # (topic, URI, id of the subscription) of attempts that go on
-        self.relays = {}  # (topic, URI, class) -> publisher to the nodes that share a connection
         self.callback_order = CallbackOrder(self.start_thread)
         self.callback_queue = CallbackQueue(self.callback_order)
         self.callback_queue.hold()  # until the node's start() has returned
@@ -440,7 +439,7 @@ class Run:
                 self.start_connecting(topic, uri)
 
     def connect(self, topic, uri):
-        """Connect the subscription of a topic to a publisher, by a link, a relay or a socket.
+        """Connect the subscription of a topic to a publisher, by a link or a socket.
 
         Do nothing if they are connected, or if another thread connects them already.
 
@@ -457,10 +456,8 @@ class Run:
             publisher_run = runs.get(uri)
             if publisher_run:
                 link_topic(publisher_run, self, topic)
-                return
-            if self.master.share_connections and join_relay(self, topic, uri, subscription):
-                return
-            self._negotiate(topic, uri, subscription)
+            else:
+                self._negotiate(topic, uri, subscription)
         finally:
             self.connecting.discard(attempt)
 
@@ -478,10 +475,7 @@ class Run:
                 if connection.endpoint_id == uri:
                     connection.close()
             code = 0
-        if code == 1:
-            return
-        close_relay(self, topic, uri, subscription)
-        if code is not None:
+        if code not in (1, None):
             self.connect_later(topic, uri, reason)
 
     def connect_later(self, topic, uri, reason=''):

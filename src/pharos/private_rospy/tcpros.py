@@ -1,4 +1,4 @@
-"""Send to sockets and receive from them, and share a connection among the nodes of a process."""
+"""Send messages to sockets, and receive messages from sockets."""
 import contextlib
 import os
 import socket
@@ -6,7 +6,6 @@ import struct
 import threading
 
 from pharos.intraprocess.inboxes import BoundedQueue
-from pharos.intraprocess.links import link, runs, runs_lock
 from pharos.waiting import let_others_run
 
 MAX_MESSAGE = 1_000_000_000  # bytes, as in roscpp
@@ -46,7 +45,7 @@ def check_user(sock):
 # -- receiving
 
 
-def receive_until_end(connection, address, port, uri, subscription, run):
+def receive_until_end(connection, address, port, uri, subscription):
     """Receive from a publisher until the connection ends; then connect again, or report a refusal.
 
     This runs in rospy's thread of the connection.
@@ -57,40 +56,35 @@ def receive_until_end(connection, address, port, uri, subscription, run):
     reason = ''
     try:
         connection.connect(address, port, uri, timeout=CONNECT_LIMIT)
-        _receive(connection, subscription, run)
+        _receive(connection, subscription)
     except Exception as error:
         reason = str(error)
-    end_connection(run, subscription, connection, uri, reason)
+    end_connection(subscription, connection, uri, reason)
 
 
-def end_connection(run, subscription, connection, uri, reason):
+def end_connection(subscription, connection, uri, reason):
     """Close a connection; connect again later, or report a refusal.
 
     :param reason: the text of the error that has ended the connection, or ''
     """
     topic = subscription.resolved_name
     connection.close()
-    close_relay(run, topic, uri, subscription)
     if 'md5sum' in reason or 'do not match' in reason:  # rospy compares the names of types, too
-        run.report_refusal(topic, reason)
+        subscription.run.report_refusal(topic, reason)
     elif not subscription.closed:
-        run.connect_later(topic, uri, reason)
+        subscription.run.connect_later(topic, uri, reason)
 
 
-def _receive(connection, subscription, run):
+def _receive(connection, subscription):
     """Receive the messages of a connection until its end.
-
-    Each message goes to the relay of the connection, if there is one, and to all inboxes of the
-    subscription.
 
     :raises Exception: if the connection breaks, or a message cannot be read
     """
     sock = connection.socket
     keep_alive(sock)
-    run.sockets.add(sock)
+    subscription.run.sockets.add(sock)
     sock.settimeout(None)
     message_class = subscription.data_class
-    subscription.begin_delivery(connection)
     with sock.makefile('rb', _READ_BUFFER) as stream:
         while not connection.done:
             data = _read_message(stream)
@@ -112,44 +106,6 @@ def _read_message(stream):
     if len(data) < size:
         return None
     return data
-
-
-# -- sharing
-
-
-def join_relay(run, topic, uri, subscription):
-    """Link a subscription to the relay of a node of this process with a connection to a publisher.
-
-    If no node of this process has such a connection, make a relay for this node. The caller then
-    connects.
-
-    :param uri: the URI of the publisher's node
-    :returns: True if the subscription is linked, False if the caller must connect
-    """
-    key = topic, uri, subscription.data_class
-    with runs_lock:
-        for other in runs.values():
-            if key in other.relays:
-                relay = other.relays[key]
-                link(relay, uri, subscription, run)
-                return True
-        relay = run.modules.load('rospy.topics')._PublisherImpl(topic, subscription.data_class)
-        relay.transport_type = 'TCPROS'  # until begin_delivery() knows the connection's
-        relay.has_header = False  # messages keep the publisher's header.seq
-        run.relays[key] = relay
-    return False
-
-
-def close_relay(run, topic, uri, subscription):
-    """Close the relay of a connection that has ended or failed; the linked nodes connect anew."""
-    with runs_lock:
-        relay = run.relays.pop((topic, uri, subscription.data_class), None)
-        if not relay:
-            return
-        links = [*relay.connections]
-        relay.close()
-    for end in links:
-        end.run.start_connecting(topic, uri)
 
 
 # -- sending
@@ -175,35 +131,6 @@ class MessageParts(list):
         return parts, size + _LENGTH.size
 
 
-class _Unsent:
-    """The parts of a message, and the numbers of bytes that the socket has taken of them.
-
-    The handler of a signal may raise an exception in publish(), between any two lines of Python.
-    The next publish() then sends the rest.
-    """
-
-    def __init__(self, parts):
-        self._parts = parts
-        self.counts = []
-
-    def send(self, sock, flags):
-        """Have the socket take bytes, and keep their number.
-
-        extend() does both in C: no handler of a signal can come between.
-        """
-        self.counts.extend(map(sock.sendmsg, [self._parts[:MAX_PARTS]], [[]], [flags]))
-
-    def rest(self):
-        """Return the parts that the socket has not taken yet."""
-        parts = [*self._parts]
-        sent_bytes = sum(self.counts)
-        while parts and sent_bytes >= len(parts[0]):
-            sent_bytes -= len(parts.pop(0))
-        if parts:
-            parts[0] = memoryview(parts[0])[sent_bytes:]
-        return parts
-
-
 class Sender:
     """A connection to a subscriber, with a bounded queue for messages that must wait.
 
@@ -225,7 +152,7 @@ class Sender:
         self._bounded_queue = BoundedQueue()
         self._bounded_queue.queue_bytes = publication.run.node.queue_bytes
         self._queue = self._bounded_queue.messages  # lists of parts
-        self._unsent = _Unsent([])
+        self._unsent = []  # the parts of a message that the socket has not taken yet
         self._condition = threading.Condition()  # notified to wake the thread
 
     def __getattr__(self, name):
@@ -246,17 +173,17 @@ class Sender:
     def _write(self, parts, size):
         self._bounded_queue.queue_size = self._publication.queue_size
         if self._publication.queue_size is None:
-            self._unsent = _Unsent(self._unsent.rest() + parts)
-            while self._unsent.rest():
+            self._unsent += parts
+            while self._unsent:
                 self._send()
             return
         if self.is_busy or self._queue or size > MAX_DIRECT:
             self._bounded_queue.add(parts, size)
         else:
-            self._unsent = _Unsent(self._unsent.rest() + parts)
+            self._unsent += parts
             with contextlib.suppress(BlockingIOError):
                 self._send(socket.MSG_DONTWAIT)
-            if not self._unsent.rest():
+            if not self._unsent:
                 return
         if not self.is_busy:
             self.is_busy = self._wake_thread()
@@ -271,24 +198,29 @@ class Sender:
 
     def _send(self, flags=0):
         """Send the bytes that the socket takes, and keep the others."""
-        self._unsent = _Unsent(self._unsent.rest())
-        self._unsent.send(self._connection.socket, flags)
-        self._connection.stat_bytes += self._unsent.counts[-1]
-        self._connection.stat_num_msg += not self._unsent.rest()
+        parts = self._unsent
+        sent_bytes = self._connection.socket.sendmsg(parts[:MAX_PARTS], [], flags)
+        self._connection.stat_bytes += sent_bytes
+        while parts and sent_bytes >= len(parts[0]):
+            sent_bytes -= len(parts.pop(0))
+        if parts:
+            parts[0] = memoryview(parts[0])[sent_bytes:]
+        else:
+            self._connection.stat_num_msg += 1
 
     def _send_queue(self):
         connection = self._connection
         while True:
             with self._condition:
-                if not self._unsent.rest() and not self._queue:
+                if not self._unsent and not self._queue:
                     self.is_busy = False
                     self._condition.wait(THREAD_REST)
                 if connection.done or not self.is_busy:
                     self.is_busy = False
                     self._has_thread = False
                     return
-                if not self._unsent.rest():
-                    self._unsent = _Unsent(self._queue.popleft())
+                if not self._unsent:
+                    self._unsent += self._queue.popleft()
             try:
                 self._send()
             except CLOSED:

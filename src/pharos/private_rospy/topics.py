@@ -38,7 +38,6 @@ class PublisherOverlay:
     def __init__(self, name, data_class):
         self.rospy___init__(name, data_class)
         self.lock = self.publock  # rospy's close() sets publock to None
-        self.transport_type = 'INTRAPROCESS'  # of its links; that of its connection for a relay
         self.latches = {}  # channel, or None for all Publishers of plain rospy -> frozen message
         self.last_wake = 0.0
         self.freeze, self.thaw = copier_for(data_class)
@@ -286,17 +285,6 @@ class SubscriptionOverlay:
             link.publisher.receivers_are_for = None
         return links
 
-    def _relay_of(self, connection):
-        return self.run.relays.get((self.resolved_name, connection.endpoint_id, self.data_class))
-
-    def begin_delivery(self, connection):
-        """Pass facts of a connection that has shaken hands to its relay, if there is one."""
-        relay = self._relay_of(connection)
-        if relay:
-            relay.header = connection.header
-            relay.is_latch = connection.is_latched
-            relay.transport_type = connection.transport_type
-
     def deliver(self, message, connection, size):
         """Count a message that came by a connection, and give each inbox a message of its own.
 
@@ -306,9 +294,6 @@ class SubscriptionOverlay:
         connection.stat_num_msg += 1
         if self.statistics_logger:
             self.statistics_logger.callback(message, connection.callerid_pub, connection.stat_bytes)
-        relay = self._relay_of(connection)
-        if relay:
-            relay.publish(message)
         inboxes = [*self.inboxes]
         # copied before the first callback may change the message
         copies = [copy_of(message) for _ in inboxes[1:]]

@@ -116,10 +116,9 @@ class SharedMemoryHandler(ProtocolHandler):
                 publisher.make_header()
                 answer = publisher.header
             sock.send(encode_ros_handshake_header(answer))
+            if 'error' in answer:
+                raise ConnectionError
         except (OSError, LookupError, struct.error, ROSHandshakeException):
-            sock.close()
-            return
-        if 'error' in answer:
             sock.close()
             return
         sock.settimeout(None)
@@ -144,7 +143,7 @@ class SharedMemoryHandler(ProtocolHandler):
             sock.close()
             return self._connect_by_tcpros(topic, uri)
         self.run.sockets.add(sock)
-        connection = MemoryReceiver(topic, uri, sock, subscription, self.run)
+        connection = MemoryReceiver(topic, uri, sock, subscription)
         if not subscription.add_connection(connection):
             connection.close()
             return 0, 'the subscription was closed', 0
@@ -255,17 +254,15 @@ class MemoryReceiver(MemoryTransport):
     latch = None
     header = None
 
-    def __init__(self, topic, uri, sock, subscription, run):
+    def __init__(self, topic, uri, sock, subscription):
         super().__init__('i', topic, uri, sock)
         self._subscription = subscription
-        self._run = run
         self.descriptor = sock.fileno()
         self._maps = {}  # position -> map of a file
 
     def connect(self):
         """Shake hands, and have the reader receive the messages."""
-        self._shake_hands(self._subscription.data_class, self._run)
-        self._subscription.begin_delivery(self)
+        self._shake_hands(self._subscription.data_class, self._subscription.run)
         _reader.add(self)
 
     def read(self):
@@ -314,7 +311,7 @@ class MemoryReceiver(MemoryTransport):
 
     def end(self, error):
         """Close the connection, and connect again, unless the subscription is closed."""
-        end_connection(self._run, self._subscription, self, self.endpoint_id, str(error))
+        end_connection(self._subscription, self, self.endpoint_id, str(error))
 
     def _shake_hands(self, message_class, run):
         """Exchange the headers of TCPROS.

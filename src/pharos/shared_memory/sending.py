@@ -92,23 +92,19 @@ class MessageMemory:
     def write(self, parts, senders):
         """Send a message by the connections that share memory.
 
-        If that fails half way, the connections close, and the readers connect anew. If no memory
-        file could be had, they get TCPROS.
+        If no memory file can be had, the connections close, and the readers get TCPROS.
         """
-        is_complete = False
         try:
             with self.lock:
                 self._put(parts, senders)
-            is_complete = True
         except OSError as error:
             self.run.lacks_memory = True
             name = senders[0].name
             self.run.troubles.add(f'{name}: sends by TCPROS, since memory lacks a file: {error}')
-        finally:
             for sender in senders:
-                if not is_complete:  # a signal's handler may have raised between any two lines
-                    sender.give_up()
-                sender.close_if_broken()
+                sender.give_up()
+        for sender in senders:
+            sender.close_if_broken()
         if any(sender.is_sending for sender in senders):
             let_others_run()
 
@@ -152,7 +148,6 @@ class MessageMemory:
         oldest = (queued_files or files)[0]
         for sender in list(oldest.readers):
             sender.drop(oldest)
-        oldest.readers.clear()  # a signal may have ended an earlier drop
 
     def close(self):
         """Free the files."""
