@@ -14,7 +14,8 @@ except ModuleNotFoundError as _error:
         name='rospy',
     ) from None
 
-from pharos.channels import InputChannel, OutputChannel, Topic
+from pharos.channels import InputChannel, OutputChannel
+from pharos.definitions import define_message, define_service, message_class, service_class
 from pharos.errors import (
     MasterUnreachableError,
     MessageTypeError,
@@ -32,7 +33,6 @@ from pharos.errors import (
 from pharos.external_node import ExternalNode
 from pharos.failures import Failure
 from pharos.master import Master
-from pharos.messages import define_message, define_service, message_class, service_class
 from pharos.node import BlockNode, Node
 from pharos.parameter import Parameter
 from pharos.private_rospy.run import Lifecycle
@@ -40,6 +40,7 @@ from pharos.private_rospy.plain import guide as _guide
 from pharos.service import Service
 from pharos.signals import live_nodes as _live_nodes
 from pharos.signals import spin
+from pharos.topic import Topic
 from pharos.transcript import Transcript
 
 if TYPE_CHECKING:

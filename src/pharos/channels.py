@@ -1,16 +1,21 @@
-"""Channels, the ends of a topic at which a node receives and sends; topics, which hand them out."""
+"""Channels: the ends of a topic at which a node receives and sends."""
 from __future__ import annotations
 
-import dataclasses
+import functools
 from typing import TYPE_CHECKING, Any
 
 from genpy import Message
 from rospy import ROSException
 from rospy.msg import args_kwds_to_message
 
-from pharos import messages
-from pharos.blocks import Block, DelegateHolder
-from pharos.errors import MessageTypeError, NodeStoppedError, UnknownNodeError
+from pharos import definitions, messages
+from pharos.blocks import DelegateHolder
+from pharos.errors import (
+    MessageTypeError,
+    NodeStoppedError,
+    UnknownNodeError,
+    UnknownTopicError,
+)
 from pharos.intraprocess.copier import SERIALIZE_ERRORS
 from pharos.intraprocess.inboxes import Inbox
 from pharos.intraprocess.links import peer_of
@@ -18,7 +23,6 @@ from pharos.private_rospy.topics import connections_of
 from pharos.waiting import wait
 
 if TYPE_CHECKING:
-    from pharos.master import Master
     from pharos.node import Node
 
 QUEUE_SIZE = 1000
@@ -164,7 +168,7 @@ class OutputChannel(Channel):
     def open(self):
         """Advertise, and wait for the subscribers that the master knows."""
         # asked before: later subscribers learn of this publisher from the master
-        subscribers = set(Topic(self._run.master, self.topic).subscribers)
+        subscribers = set(self._run.master.system_state()[1].get(self.topic, []))
         latched = None
         if self.ros_object:  # the node was stopped, and starts again: its latched message stays
             latched = self._publisher.latches.get(self)
@@ -287,72 +291,66 @@ class OutputChannel(Channel):
         return wait(lambda: len(self.connections) >= count, timeout, self.node)
 
 
-@dataclasses.dataclass(frozen=True)
-class Topic:
-    """A topic of a master: the named bus, which hands nodes their channels.
+# -- the class of a topic
 
-    :ivar name: the topic's full name
+
+def find_to_send(node, topic, typed_as):
+    """Return an OutputChannel of a node for a topic, and True if the channel is a new one."""
+    message_class = class_of(node, topic, typed_as)
+    for channel in node.channels:
+        if channel.topic == topic and isinstance(channel, OutputChannel):
+            return channel, False
+    return OutputChannel(node, topic, message_class), True
+
+
+def class_of(node, topic, typed_as):
+    """Return the message class of a topic for a node.
+
+    :param typed_as: type name or message class; None: the type known to the node or the master
+    :raises UnknownTopicError, UnknownTypeError: if the type is not known
+    :raises MessageTypeError: if the node has the topic open with another type
     """
+    known = [channel.message_class for channel in node.channels if channel.topic == topic]
+    if known and typed_as is None:
+        return known[0]
+    type_name = typed_as or node._settings.master.topic_type(topic)
+    if type_name is None or type_name == '*':
+        raise UnknownTopicError(
+            f'the master knows no type of {topic}: give typed_as=, such as "std_msgs/String"'
+        )
+    message_class = definitions.message_class(
+        type_name, functools.partial(_ask_definition, node, topic)
+    )
+    if known and known[0]._md5sum != message_class._md5sum:
+        raise MessageTypeError(
+            f'{node._settings.name} has {topic} open as {known[0]._type}, not as'
+            f' {message_class._type}'
+        )
+    return message_class
 
-    master: Master
-    name: str
 
-    @property
-    def type(self) -> str | None:
-        """The name of the topic's message type, None if the master knows none."""
-        return self.master.topic_type(self.name)
+def _ask_definition(node, topic, type_name):
+    """Return the type's definition from the header of a publisher's connection, or None."""
+    if not node._settings.master.topic(topic).publishers:
+        return None
 
-    @property
-    def publishers(self) -> list[str]:
-        """The names of the nodes that publish on the topic."""
-        return self.master.system_state()[0].get(self.name, [])
+    def definitions_of(subscriber):
+        headers = [connection.header or {} for connection in subscriber.impl.connections]
+        return [
+            header['message_definition'] for header in headers if header.get('type') == type_name
+        ]
 
-    @property
-    def subscribers(self) -> list[str]:
-        """The names of the nodes that receive from the topic."""
-        return self.master.system_state()[1].get(self.name, [])
+    found = wait_subscribed(
+        node, definitions_of, node.connect_timeout, topic, node._current_run.ros.AnyMsg
+    )
+    return found[0] if found else None
 
-    @property
-    def channels(self) -> list[Channel]:
-        """The open channels of this topic in nodes of this process."""
-        channels = [channel for node in self.master.own_nodes() for channel in node.channels]
-        return [channel for channel in channels if channel.topic == self.name]
 
-    def hz(self, seconds: float = 1.0):
-        """Measure the rate and the size of messages for some seconds; ``bw`` is the same method.
-
-        :raises UnknownTopicError: if nobody publishes on the topic
-        """
-        from pharos.live import watching
-
-        return watching.measure(self, seconds)
-
-    bw = hz
-
-    @property
-    def last(self) -> Message:
-        """The latched message, or else the next one.
-
-        :raises UnknownTopicError: if nobody publishes on the topic
-        :raises TimeoutError: if no message comes within 3 s
-        """
-        from pharos.live import watching
-
-        return watching.last(self)
-
-    def watch(self, count: int | None = None, block: Block | None = None) -> None:
-        """Show the next messages, or run ``block(message)`` on them.
-
-        :param count: the number of messages, None: until Ctrl-C
-        """
-        from pharos.live import watching
-
-        watching.watch(self, count, block)
-
-    def input_channel(self, node: Node, typed_as=None, **options) -> InputChannel:
-        """Hand a node its end to receive at; see :meth:`Node.interested_in`."""
-        return node.interested_in(self.name, typed_as, **options)
-
-    def output_channel(self, node: Node, typed_as=None, **options) -> OutputChannel:
-        """Hand a node its end to send at; see :meth:`Node.output_channel`."""
-        return node.output_channel(self.name, typed_as, **options)
+def wait_subscribed(node, predicate, timeout, *arguments):
+    """Return the first true ``predicate(subscriber)`` of a new rospy.Subscriber."""
+    # a channel would not do: the delegate that calls this holds up the node's callback queue
+    subscriber = node._current_run.ros.Subscriber(*arguments)
+    try:
+        return wait(lambda: predicate(subscriber), timeout, node)
+    finally:
+        subscriber.unregister()

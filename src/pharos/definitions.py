@@ -1,45 +1,183 @@
-"""Make message and service classes of definitions, for types that no installed package has."""
+"""Message and service types: find their classes, or make them of definitions."""
 from __future__ import annotations
 
 import functools
+import pathlib
 import re
 import threading
 from contextlib import suppress
+from typing import Any, Callable
 
 import genmsg
+import rospkg
+from catkin_pkg.package import InvalidPackage
 from genmsg.gentools import compute_full_text, compute_md5
 from genmsg.msg_loader import load_depends, load_msg_from_string, load_srv_from_string
 from genmsg.msgs import bare_msg_type, is_builtin
 from genpy.dynamic import generate_dynamic
+from genpy.message import Message, get_message_class, get_service_class
 
 from pharos.errors import MessageTypeError, UnknownTypeError
-from pharos.messages import (
-    class_of_package,
-    find_definition,
-    given_definitions,
-    message_class,
-    shipped_definitions,
-)
 
 _lock = threading.RLock()  # genpy's generator is not thread-safe
+_TYPE = re.compile(r'[A-Za-z][A-Za-z0-9_]{0,127}/[A-Za-z][A-Za-z0-9_]{0,127}')
+#: turtlesim's types as in ROS Fuerte, which the report uses; Debian has none
+_TURTLESIM = '''
+msg turtlesim/Color
+uint8 r
+uint8 g
+uint8 b
+
+msg turtlesim/Pose
+float32 x
+float32 y
+float32 theta
+float32 linear_velocity
+float32 angular_velocity
+
+msg turtlesim/Velocity
+float32 linear
+float32 angular
+
+srv turtlesim/Kill
+string name
+---
+
+srv turtlesim/SetPen
+uint8 r
+uint8 g
+uint8 b
+uint8 width
+uint8 off
+---
+
+srv turtlesim/Spawn
+float32 x
+float32 y
+float32 theta
+string name
+---
+string name
+
+srv turtlesim/TeleportAbsolute
+float32 x
+float32 y
+float32 theta
+---
+
+srv turtlesim/TeleportRelative
+float32 linear
+float32 angular
+---
+
+'''
+#: (suffix, type) -> definition; the suffix is msg or srv
+_shipped_definitions = {
+    (suffix, type_name): text
+    for suffix, type_name, text in re.findall(r'(\w+) (\S+)\n(.*?\n)\n', _TURTLESIM, re.S)
+}
+_given_definitions: dict[tuple[str, str], str] = {}  #: as _shipped_definitions
 
 
-def define(suffix, type_name, text, find_class, make_class):
+def message_class(type_: str | type, ask: Callable | None = None) -> type[Message]:
+    """Return the class of a message type, such as ``'geometry_msgs/Twist'``.
+
+    A type is sought in installed Python packages, then in ``.msg`` files on ROS_PACKAGE_PATH, then
+    by ``ask``. The last places are the types given to :func:`define_message`, and turtlesim's.
+
+    :param type_: the name of the type; or a message class, which is returned
+    :param ask: ``ask(type_)`` returns the definition that a publisher sends, or None
+    :raises UnknownTypeError: if the type is not found, or its definition cannot be read
+    """
+    if isinstance(type_, type) and issubclass(type_, Message):
+        return type_
+    installed_class = _class_of_package('msg', type_)
+    if installed_class:
+        return installed_class
+    return _make_message(type_, _find_definition('msg', type_, ask))
+
+
+def service_class(type_: Any) -> Any:
+    """Return the class of a service type such as ``'std_srvs/Empty'``; see :func:`message_class`.
+
+    :raises UnknownTypeError: if the type is not found, or its definition cannot be read
+    """
+    if hasattr(type_, '_request_class'):
+        return type_
+    installed_class = _class_of_package('srv', type_)
+    if installed_class:
+        return installed_class
+    return _make_service(type_, _find_definition('srv', type_))
+
+
+def define_message(type_: str, text: str) -> type[Message]:
+    """Define a message type by the text of a ``.msg`` file, and return its class.
+
+    Texts of unknown nested types follow, each after a line of ``=`` and ``MSG: package/Type``.
+
+    :raises MessageTypeError: if the type is known already, with other fields
+    :raises UnknownTypeError: if the text cannot be read, or a nested type is not found
+    """
+    return _define('msg', type_, text, message_class, _make_message)
+
+
+def define_service(type_: str, text: str) -> Any:
+    """Define a service type by the text of a ``.srv`` file, as :func:`define_message` does."""
+    return _define('srv', type_, text, service_class, _make_service)
+
+
+def _class_of_package(suffix, type_name):
+    """Return the class of a type that an installed Python package has, or None."""
+    if not (isinstance(type_name, str) and _TYPE.fullmatch(type_name)):
+        raise UnknownTypeError(
+            f"malformed type {type_name!r}: give 'package/Type', such as 'std_msgs/String', or a class"
+        )
+    get_class = get_message_class if suffix == 'msg' else get_service_class
+    try:
+        return get_class(type_name)
+    except InvalidPackage:  # genpy cannot read package.xml; the package may still have a .msg file
+        return None
+
+
+def _find_definition(suffix, type_name, ask=None):
+    """Return the definition of a type that has no generated class, or raise UnknownTypeError."""
+    package, name = type_name.split('/')
+    # there may be no file, or the package.xml of another package cannot be parsed
+    with suppress(Exception):
+        folder = pathlib.Path(rospkg.RosPack().get_path(package), suffix)
+        return (folder / f'{name}.{suffix}').read_text('utf-8', 'replace')
+    key = suffix, type_name
+    if ask and key not in _shipped_definitions:
+        definition = ask(type_name)
+        if isinstance(definition, str):
+            return definition
+    for definitions in _given_definitions, _shipped_definitions:
+        if key in definitions:
+            return definitions[key]
+    function_name = 'define_message' if suffix == 'msg' else 'define_service'
+    raise UnknownTypeError(
+        f'unknown type {type_name!r}: Python has no {package}.{suffix}.{name}, there is no'
+        f' {package}/{suffix}/{name}.{suffix} on ROS_PACKAGE_PATH'
+        f' ({":".join(rospkg.get_ros_paths())}), and no definition was given; install {package} (on'
+        f' Debian python3-{package.replace("_", "-")}), source its workspace, or call'
+        f' {function_name}(type, text)'
+    )
+
+
+# -- making
+
+
+def _define(suffix, type_name, text, find_class, make_class):
     """Do the work of :func:`pharos.define_message` and :func:`pharos.define_service`."""
     new_class = make_class(type_name, text)
     key = suffix, type_name
     with suppress(UnknownTypeError):
         known_class = find_class(type_name)
-        is_other = _checksums(known_class) != _checksums(new_class)
-        if is_other and key not in shipped_definitions:  # a real turtlesim may have other fields
+        is_other = known_class._md5sum != new_class._md5sum
+        if is_other and key not in _shipped_definitions:  # a real turtlesim may have other fields
             raise MessageTypeError(f'{type_name} is known with other fields: define another type')
-    given_definitions.setdefault(key, text)
+    _given_definitions.setdefault(key, text)
     return find_class(type_name)
-
-
-def _checksums(cls):
-    """Return the md5sums of a class, and of a service's request: equal for equal fields."""
-    return cls._md5sum, getattr(cls, '_request_class', cls)._md5sum
 
 
 def _read(load, type_name, text):
@@ -70,7 +208,7 @@ def _register_nested(context, spec, given_texts):
         if text is None:
             text = _nested_definition(name)
         # other types may nest this one without its definition
-        given_definitions.setdefault(('msg', name), text)
+        _given_definitions.setdefault(('msg', name), text)
         nested_spec = load_msg_from_string(context, text, name)
         context.register(name, nested_spec)
         _register_nested(context, nested_spec, given_texts)
@@ -78,11 +216,11 @@ def _register_nested(context, spec, given_texts):
 
 def _nested_definition(type_name):
     """Return the definition of a nested type, without the texts of further nested types."""
-    installed_class = class_of_package('msg', type_name)
+    installed_class = _class_of_package('msg', type_name)
     if installed_class:
         text = installed_class._full_text
     else:
-        text = find_definition('msg', type_name)
+        text = _find_definition('msg', type_name)
     return re.split(r'\n=+[ \t]*\n', text)[0]
 
 
@@ -104,7 +242,7 @@ def _once(make_class):
 
 
 @_once
-def make_message(type_name, text):
+def _make_message(type_name, text):
     """Return the class of a message type; equal arguments give the same class.
 
     :raises UnknownTypeError: if no class can be made
@@ -122,8 +260,8 @@ def make_message(type_name, text):
 
 
 @_once
-def make_service(type_name, text):
-    """Return the class of a service type, as make_message() does."""
+def _make_service(type_name, text):
+    """Return the class of a service type, as _make_message() does."""
     context, spec = _read(load_srv_from_string, type_name, text)
     attributes = {
         '_type': type_name,
@@ -135,4 +273,4 @@ def make_service(type_name, text):
 
 
 def _make_part(context, spec):
-    return make_message(spec.full_name, compute_full_text(context, spec))
+    return _make_message(spec.full_name, compute_full_text(context, spec))

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from pharos.errors import UnknownNodeError
-from pharos.private_rospy.run import UNREACHABLE, ServerProxy
+from pharos.private_rospy.xmlrpc import CALLER_ID, UNREACHABLE, ServerProxy
 
 if TYPE_CHECKING:
     from pharos.master import Master
@@ -45,7 +45,7 @@ class ExternalNode:
 
     def _call(self, method, *args):
         try:
-            return getattr(ServerProxy(self.uri), method)('/pharos', *args)[2]
+            return getattr(ServerProxy(self.uri), method)(CALLER_ID, *args)[2]
         except (*UNREACHABLE, TypeError, LookupError) as error:
             raise UnknownNodeError(
                 f'{self.name} does not answer: {error}; rosnode cleanup removes the dead'

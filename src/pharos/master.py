@@ -6,8 +6,6 @@ import contextlib
 import inspect
 import os
 import re
-import subprocess
-import sys
 from typing import TYPE_CHECKING, Any, Callable, Sequence, TypeVar
 from weakref import WeakValueDictionary
 from xmlrpc.client import dumps, loads
@@ -16,13 +14,14 @@ from rosgraph.names import get_ros_namespace, is_legal_remap, load_mappings, ns_
 
 from pharos import signals
 from pharos.blocks import Block
-from pharos.channels import Topic
-from pharos.errors import MasterUnreachableError, PortInUseError
+from pharos.errors import MasterUnreachableError
 from pharos.external_node import ExternalNode
 from pharos.names import full_name, node_name
 from pharos.node import Node, check_node_class
-from pharos.private_rospy.run import UNREACHABLE, ServerProxy, Settings
+from pharos.private_rospy.run import Settings
+from pharos.private_rospy.xmlrpc import CALLER_ID, UNREACHABLE, ServerProxy
 from pharos.service import Service
+from pharos.topic import Topic
 from pharos.waiting import wait_for
 
 if TYPE_CHECKING:
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
     from pharos.compose.script import ScriptNode
     from pharos.live.graph import Graph
 
-CALLER_ID = '/pharos'
 LIFE_LIMIT = 0.5  # seconds that a node has to show that the node lives
 _URL = re.compile(r'http://(\[[\w:]+\]|[\w.-]+):([1-6]?\d{1,4})/?')
 
@@ -119,20 +117,9 @@ class Master:
         :param port: 0: any free port
         :raises PortInUseError: if the port is taken
         """
-        environ = dict(os.environ)
-        environ['PYTHONPATH'] = os.pathsep.join(folder for folder in sys.path if folder)
-        # rospy prefers ROS_HOSTNAME to ROS_IP
-        address = environ.pop('ROS_IP', '127.0.0.1')
-        environ.setdefault('ROS_HOSTNAME', address)
-        pipes = {'stdin': subprocess.PIPE, 'stdout': subprocess.PIPE, 'text': True}
-        command = [sys.executable, '-m', 'pharos.commands.embedded_master', str(port)]
-        process = subprocess.Popen(command, env=environ, start_new_session=True, **pipes)  # type: ignore
-        url = process.stdout.readline().strip()
-        if not url:
-            process.communicate()
-            raise PortInUseError(
-                f'no master starts at port {port}: choose another one, or 0 for any free one'
-            )
+        from pharos.compose.child_process import start_master
+
+        url, process = start_master(port)
         master = cls(url)
         master._process = process
         return master
@@ -378,10 +365,9 @@ class Master:
         :param on_line: ``on_line(text)`` is called for each printed line, in another thread
         :raises UnknownNodeError: if there is no such program
         """
-        from pharos.compose.child_process import RosProcess, find_program
+        from pharos.compose.child_process import run_program
 
-        path = find_program(package, executable)
-        return RosProcess([path, *map(str, args)], self.url, on_line)
+        return run_program(self.url, package, executable, args, on_line)
 
     def launch(self, package: str | None, file: str, **args) -> RosProcess:
         """Run a launch file in a process of roslaunch, at this master.
@@ -390,11 +376,9 @@ class Master:
         :param args: the arguments of the launch file
         :raises UnknownNodeError: if there is no such file
         """
-        from pharos.compose.child_process import RosProcess, find_launch_file
+        from pharos.compose.child_process import run_launch_file
 
-        path = find_launch_file(package, file)
-        arguments = [f'{name}:={value}' for name, value in args.items()]
-        return RosProcess(['roslaunch', '--skip-log-check', path, *arguments], self.url)
+        return run_launch_file(self.url, package, file, args)
 
     def load(
         self,
@@ -423,9 +407,7 @@ class Master:
         """
         from pharos.compose.script import load
 
-        arguments = [*map(str, args)]
-        arguments += [f'{old_name}:={new_name}' for old_name, new_name in (remap or {}).items()]
-        return load(self, package, executable, arguments, name, namespace, params, here)
+        return load(self, package, executable, args, name, namespace, remap or {}, params, here)
 
     def compose(
         self,
@@ -452,13 +434,9 @@ class Master:
         :raises UnknownNodeError: if there is no such file, argument or node
         :raises PharosError: if roslaunch cannot read the file
         """
-        from pharos.compose.composition import Composition
-        from pharos.compose.launch_file import LaunchFile
+        from pharos.compose.composition import compose
 
-        launch_file = LaunchFile(self.url, package, file, args, only, apart, here, groups)
-        composition = Composition(Master(self.url, self.shared_memory))
-        composition.launch(launch_file)
-        return composition
+        return compose(self, package, file, args, only, apart, here, groups)
 
     def graph(self, seconds: float = 0) -> Graph:
         """Return the :class:`Graph` of all nodes and topics.

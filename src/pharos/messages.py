@@ -1,172 +1,11 @@
-"""Message and service types: find or make their classes, and fill messages by name."""
+"""Fill messages by name, and say why one cannot be sent."""
 from __future__ import annotations
 
-import pathlib
-import re
-from contextlib import suppress
-from typing import Any, Callable
+from genmsg.msgs import parse_type
+from genpy.message import Message, check_type
 
-import rospkg
-from catkin_pkg.package import InvalidPackage
-from genpy.message import Message, get_message_class, get_service_class
-from rospy.impl.tcpros_service import convert_return_to_response
-
-from pharos.errors import MessageTypeError, UnknownTypeError
+from pharos.errors import MessageTypeError
 from pharos.intraprocess.copier import copy_of, nested_class
-
-_TYPE = re.compile(r'[A-Za-z][A-Za-z0-9_]{0,127}/[A-Za-z][A-Za-z0-9_]{0,127}')
-#: turtlesim's types as in ROS Fuerte, which the report uses; Debian has none
-_TURTLESIM = '''
-msg turtlesim/Color
-uint8 r
-uint8 g
-uint8 b
-
-msg turtlesim/Pose
-float32 x
-float32 y
-float32 theta
-float32 linear_velocity
-float32 angular_velocity
-
-msg turtlesim/Velocity
-float32 linear
-float32 angular
-
-srv turtlesim/Kill
-string name
----
-
-srv turtlesim/SetPen
-uint8 r
-uint8 g
-uint8 b
-uint8 width
-uint8 off
----
-
-srv turtlesim/Spawn
-float32 x
-float32 y
-float32 theta
-string name
----
-string name
-
-srv turtlesim/TeleportAbsolute
-float32 x
-float32 y
-float32 theta
----
-
-srv turtlesim/TeleportRelative
-float32 linear
-float32 angular
----
-
-'''
-#: (suffix, type) -> definition; the suffix is msg or srv
-shipped_definitions = {
-    (suffix, type_name): text
-    for suffix, type_name, text in re.findall(r'(\w+) (\S+)\n(.*?\n)\n', _TURTLESIM, re.S)
-}
-given_definitions: dict[tuple[str, str], str] = {}  #: as shipped_definitions
-
-
-def message_class(type_: str | type, ask: Callable | None = None) -> type[Message]:
-    """Return the class of a message type, such as ``'geometry_msgs/Twist'``.
-
-    A type is sought in installed Python packages, then in ``.msg`` files on ROS_PACKAGE_PATH, then
-    by ``ask``. The last places are the types given to :func:`define_message`, and turtlesim's.
-
-    :param type_: the name of the type; or a message class, which is returned
-    :param ask: ``ask(type_)`` returns the definition that a publisher sends, or None
-    :raises UnknownTypeError: if the type is not found, or its definition cannot be read
-    """
-    if isinstance(type_, type) and issubclass(type_, Message):
-        return type_
-    installed_class = class_of_package('msg', type_)
-    if installed_class:
-        return installed_class
-    from pharos.definitions import make_message
-
-    return make_message(type_, find_definition('msg', type_, ask))
-
-
-def service_class(type_: Any) -> Any:
-    """Return the class of a service type such as ``'std_srvs/Empty'``; see :func:`message_class`.
-
-    :raises UnknownTypeError: if the type is not found, or its definition cannot be read
-    """
-    if hasattr(type_, '_request_class'):
-        return type_
-    installed_class = class_of_package('srv', type_)
-    if installed_class:
-        return installed_class
-    from pharos.definitions import make_service
-
-    return make_service(type_, find_definition('srv', type_))
-
-
-def define_message(type_: str, text: str) -> type[Message]:
-    """Define a message type by the text of a ``.msg`` file, and return its class.
-
-    Texts of unknown nested types follow, each after a line of ``=`` and ``MSG: package/Type``.
-
-    :raises MessageTypeError: if the type is known already, with other fields
-    :raises UnknownTypeError: if the text cannot be read, or a nested type is not found
-    """
-    from pharos.definitions import define, make_message
-
-    return define('msg', type_, text, message_class, make_message)
-
-
-def define_service(type_: str, text: str) -> Any:
-    """Define a service type by the text of a ``.srv`` file, as :func:`define_message` does."""
-    from pharos.definitions import define, make_service
-
-    return define('srv', type_, text, service_class, make_service)
-
-
-def class_of_package(suffix, type_name):
-    """Return the class of a type that an installed Python package has, or None."""
-    if not (isinstance(type_name, str) and _TYPE.fullmatch(type_name)):
-        raise UnknownTypeError(
-            f"malformed type {type_name!r}: give 'package/Type', such as 'std_msgs/String', or a class"
-        )
-    get_class = get_message_class if suffix == 'msg' else get_service_class
-    try:
-        return get_class(type_name)
-    except InvalidPackage:  # genpy cannot read package.xml; the package may still have a .msg file
-        return None
-
-
-def find_definition(suffix, type_name, ask=None):
-    """Return the definition of a type that has no generated class, or raise UnknownTypeError."""
-    package, name = type_name.split('/')
-    # there may be no file, or the package.xml of another package cannot be parsed
-    with suppress(Exception):
-        folder = pathlib.Path(rospkg.RosPack().get_path(package), suffix)
-        return (folder / f'{name}.{suffix}').read_text('utf-8', 'replace')
-    key = suffix, type_name
-    if ask and key not in shipped_definitions:
-        definition = ask(type_name)
-        if isinstance(definition, str):
-            return definition
-    for definitions in given_definitions, shipped_definitions:
-        if key in definitions:
-            return definitions[key]
-    function_name = 'define_message' if suffix == 'msg' else 'define_service'
-    raise UnknownTypeError(
-        f'unknown type {type_name!r}: Python has no {package}.{suffix}.{name}, there is no'
-        f' {package}/{suffix}/{name}.{suffix} on ROS_PACKAGE_PATH'
-        f' ({":".join(rospkg.get_ros_paths())}), and no definition was given; install {package} (on'
-        f' Debian python3-{package.replace("_", "-")}), source its workspace, or call'
-        f' {function_name}(type, text)'
-    )
-
-
-# -- filling
 
 
 def fields_text(cls):
@@ -214,16 +53,19 @@ def response(cls, value):
     :param cls: the class of the response
     :raises MessageTypeError: if the response cannot be sent
     """
-    names = cls.__slots__
-    if value is None and not names:
-        value = {}
-    elif len(names) == 1 and type(value) is list and cls._slot_types[0].endswith(']'):
-        has_fields = value and type(value[0]) is list  # a list of fields, or the only field
-        if not has_fields:
-            value = {names[0]: value}
-    if type(value) is dict:
-        return checked_copy(_fill(cls(), value))
-    return checked_copy(convert_return_to_response(value, cls))
+    message = value
+    has_only_list = len(cls.__slots__) == 1 and cls._slot_types[0].endswith(']')
+    if value is None and not cls.__slots__:
+        message = cls()
+    elif type(value) is dict:
+        message = _fill(cls(), value)
+    elif has_only_list and type(value) is list and not (value and type(value[0]) is list):
+        message = cls(value)  # the only field, and not a list of the fields
+    elif type(value) in (list, tuple):
+        message = cls(*value)
+    elif not isinstance(value, cls):
+        message = cls(value)
+    return checked_copy(message)
 
 
 def checked_copy(message):
@@ -251,9 +93,22 @@ def _fill(message, fields):
 
 
 def explain(message, error):
-    """Return a MessageTypeError for an exception of serializing; genpy's check names the field."""
+    """Return a MessageTypeError for an exception of serializing; it names the field."""
     try:
+        for name, type_name in zip(message.__slots__, message._slot_types):
+            _check_list(name, type_name, getattr(message, name))
         message._check_types()
     except Exception as type_error:
         error = type_error
     return MessageTypeError(f'{message._type} cannot be sent: {error}: {str(message)[:200]!r}')
+
+
+def _check_list(name, type_name, value):
+    """Raise an exception if a list has the wrong length or a wrong item: genpy names neither."""
+    base, is_array, length = parse_type(type_name)
+    if not is_array or type(value) not in (list, tuple):
+        return
+    if length not in (None, len(value)):
+        raise MessageTypeError(f'{name} takes {length} values, not {len(value)}')
+    for index, item in enumerate(value):
+        check_type(f'{name}[{index}]', base, item)

@@ -1,7 +1,6 @@
 """Nodes: real ROS nodes of this process, written with blocks."""
 from __future__ import annotations
 
-import functools
 import re
 import threading
 import types
@@ -12,15 +11,21 @@ from genpy import Message
 import rosgraph.names
 import rospy
 
-from pharos import messages, signals
+from pharos import definitions, signals
 from pharos.blocks import Block, DelegateHolder, block_name, rebind, with_arguments
-from pharos.channels import QUEUE_SIZE, Channel, InputChannel, OutputChannel
+from pharos.channels import (
+    QUEUE_SIZE,
+    Channel,
+    InputChannel,
+    OutputChannel,
+    class_of,
+    find_to_send,
+    wait_subscribed,
+)
 from pharos.errors import (
     MasterUnreachableError,
-    MessageTypeError,
     NodeStoppedError,
     PharosError,
-    UnknownTopicError,
 )
 from pharos.external_node import ExternalNode
 from pharos.failures import Failures
@@ -141,6 +146,7 @@ class Node(DelegateHolder):
                 if not self._has_own_start:
                     for endpoint in endpoints:
                         endpoint.open()
+                if not self._holds_delegates:
                     run.callback_queue.release()
             except BaseException:
                 self._stop_run()
@@ -155,8 +161,7 @@ class Node(DelegateHolder):
     def _start_held(self):
         """Start, and let delegates run when the start() of the node's class has returned.
 
-        Node.start() itself lets delegates run, if the class has no start(). If a user calls the
-        start() of a class, the watcher lets delegates run.
+        If a user calls start(), Node.start() itself lets delegates run.
         """
         self._holds_delegates = True
         try:
@@ -488,7 +493,7 @@ class Node(DelegateHolder):
                 f'{topic}: give shared or from_, not both: a shared message does not name its sender'
             )
         peer_name = self._peer_name(from_) if from_ else None
-        message_class = self._class_to_receive(topic, typed_as)
+        message_class = class_of(self, topic, typed_as)
         return InputChannel(
             self, topic, message_class, delegate, queue_size, inline, shared, peer_name
         )
@@ -509,7 +514,7 @@ class Node(DelegateHolder):
         :param queue_size: messages that wait for each subscriber in another process at most
         """
         topic = self._resolve(topic)
-        return OutputChannel(self, topic, self._class_of(topic, typed_as), latch, queue_size)
+        return OutputChannel(self, topic, class_of(self, topic, typed_as), latch, queue_size)
 
     def send_to(
         self,
@@ -543,7 +548,8 @@ class Node(DelegateHolder):
         if channel and not channel.closed:
             return channel.send(block, to=to, **fields)
         with self._send_lock:  # two threads that send first open one channel
-            channel, is_new = self._find_send_channel(topic, typed_as, block)
+            message_class = type(block) if isinstance(block, Message) else None
+            channel, is_new = find_to_send(self, self._resolve(topic), typed_as or message_class)
             self._send_channels[topic, typed_as] = channel
         try:
             return channel.send(block, to=to, **fields)
@@ -551,65 +557,6 @@ class Node(DelegateHolder):
             if is_new:
                 channel.close()
             raise
-
-    def _find_send_channel(self, topic, typed_as, block):
-        """Return an OutputChannel for send_to(), and True if the channel is a new one."""
-        name = self._resolve(topic)
-        if isinstance(block, Message):
-            typed_as = typed_as or type(block)
-        message_class = self._class_of(name, typed_as)
-        for channel in self._current_run.open_endpoints(OutputChannel):
-            if channel.topic == name:
-                return channel, False
-        return OutputChannel(self, name, message_class), True
-
-    def _class_to_receive(self, topic, typed_as):
-        """Return the message class for a receiving channel; a publisher may send the definition."""
-        ask_publisher = functools.partial(self._ask_definition, topic)
-        return self._class_of(topic, typed_as, ask_publisher)
-
-    def _class_of(self, topic, typed_as, ask_publisher=None):
-        known = [channel.message_class for channel in self.channels if channel.topic == topic]
-        if known and typed_as is None:
-            return known[0]
-        type_name = typed_as or self._settings.master.topic_type(topic)
-        if type_name is None or type_name == '*':
-            raise UnknownTopicError(
-                f'the master knows no type of {topic}: give typed_as=, such as "std_msgs/String"'
-            )
-        message_class = messages.message_class(type_name, ask_publisher)
-        if known and known[0]._md5sum != message_class._md5sum:
-            raise MessageTypeError(
-                f'{self._settings.name} has {topic} open as {known[0]._type},'
-                f' not as {message_class._type}'
-            )
-        return message_class
-
-    def _ask_definition(self, topic, type_name):
-        """Return the type's definition from the header of a publisher's connection, or None."""
-        if not self._settings.master.topic(topic).publishers:
-            return None
-
-        def definitions(subscriber):
-            headers = [connection.header or {} for connection in subscriber.impl.connections]
-            return [
-                header['message_definition']
-                for header in headers
-                if header.get('type') == type_name
-            ]
-
-        any_message = self._current_run.ros.AnyMsg
-        found = self._wait_subscribed(definitions, self.connect_timeout, topic, any_message)
-        return found[0] if found else None
-
-    def _wait_subscribed(self, predicate, timeout, *arguments):
-        """Return the first true ``predicate(subscriber)`` of a new rospy.Subscriber."""
-        # a channel would not do: the delegate that calls this holds up the node's callback queue
-        subscriber = self._current_run.ros.Subscriber(*arguments)
-        try:
-            return wait(lambda: predicate(subscriber), timeout, self)
-        finally:
-            subscriber.unregister()
 
     def wait_for_message(
         self,
@@ -640,8 +587,8 @@ class Node(DelegateHolder):
         master.call('getPid')  # raises if the master does not answer
         if timeout and not typed_as:
             typed_as = wait(lambda: master.topic_type(topic), timeout, self)
-        message_class = self._class_to_receive(topic, typed_as)
-        if self._wait_subscribed(find_wanted, timeout, topic, message_class, received.append):
+        message_class = class_of(self, topic, typed_as)
+        if wait_subscribed(self, find_wanted, timeout, topic, message_class, received.append):
             return received[0]
         if not self._current_run.stopping.is_set():
             raise TimeoutError(f'no message on {topic} came within {timeout:g} s: is it published?')
@@ -660,7 +607,7 @@ class Node(DelegateHolder):
         :raises PharosError: if the node offers the service already
         :raises UnknownTypeError: if the type is not known
         """
-        return OfferedService(self, self._resolve(name), messages.service_class(typed_as), block)
+        return OfferedService(self, self._resolve(name), definitions.service_class(typed_as), block)
 
     def lookup_service(self, name: str) -> Service:
         """Return the service of a name that the node resolves, or raise UnknownServiceError."""

@@ -5,7 +5,6 @@ import io
 import socket
 import struct
 from contextlib import suppress
-from time import monotonic
 from typing import Any
 
 from rosgraph.network import (
@@ -16,7 +15,7 @@ from rosgraph.network import (
 from rospy import ServiceException
 from rospy.core import parse_rosrpc_uri
 
-from pharos import messages
+from pharos import definitions, messages
 from pharos.blocks import Block, with_arguments
 from pharos.channels import Endpoint
 from pharos.errors import (
@@ -28,13 +27,12 @@ from pharos.errors import (
 )
 from pharos.intraprocess.copier import serialize
 from pharos.private_rospy.services import call_here, find_service
-from pharos.private_rospy.tcpros import keep_alive
+from pharos.private_rospy.tcpros import keep_alive, read_message
 from pharos.waiting import current
 
 LOOK_UP_LIMIT = 0.25  # seconds that look_up() waits for the type; call() asks again
 TYPE_LIMIT = 5.0  # seconds that a call without a timeout waits for the type
 _MAX_HEADER = 1 << 16  # bytes
-_MAX_PART = 1 << 20  # bytes that are read at once
 
 
 class OfferedService(Endpoint):
@@ -95,15 +93,6 @@ class Service:
         self.master = master
         self.name = name
         self.caller_id = caller_id
-        self.look_up()
-
-    def look_up(self) -> None:
-        """Ask the master for the provider, and the provider for the type.
-
-        A provider that does not answer at once is asked again by call().
-
-        :raises UnknownServiceError: if nobody offers the service, or the provider has died
-        """
         self.uri = self.master.call('lookupService', self.name)
         if not self.uri:
             raise UnknownServiceError(
@@ -144,7 +133,7 @@ class Service:
         try:
             if self.type is None:
                 self._ask_type(timeout or TYPE_LIMIT)
-            service_class = messages.service_class(self.type)
+            service_class = definitions.service_class(self.type)
             request = self._build_request(service_class, block, fields)
             self._check_md5sum(service_class)
             local = None
@@ -184,17 +173,18 @@ class Service:
 
         :param data: the bytes of the request
         """
-        deadline = None if timeout is None else monotonic() + timeout
         try:
             sock, _ = self._connect(self.md5sum, timeout)
         except ConnectionError:  # the provider may have moved
             self.uri = self.master.call('lookupService', self.name) or self.uri
             sock, _ = self._connect(self.md5sum, timeout)
-        with sock:
+        with sock, sock.makefile('rb') as stream:
             sock.sendall(struct.pack('<I', len(data)) + data)
-            is_ok, size = struct.unpack('<BI', _read(sock, 5, deadline))
-            answer = _read(sock, size, deadline)
-        if not is_ok:
+            is_failure = stream.read(1) == b'\0'
+            answer = read_message(stream)
+        if answer is None:
+            raise ConnectionError('it closed the connection')
+        if is_failure:
             raise ServiceException(answer.decode(errors='replace'))
         return service_class._response_class().deserialize(answer)
 
@@ -217,15 +207,3 @@ class Service:
 
     def __repr__(self):
         return f'<Service {self.name} ({self.type}) at {self.uri}>'
-
-
-def _read(sock, size, deadline):
-    data = bytearray()
-    while len(data) < size:
-        if deadline is not None:
-            sock.settimeout(max(deadline - monotonic(), 0.001))
-        part = sock.recv(min(size - len(data), _MAX_PART))
-        if not part:
-            raise ConnectionError('it closed the connection')
-        data += part
-    return bytes(data)

@@ -11,8 +11,6 @@ import time
 
 import rospy
 
-from pharos.intraprocess import links
-
 SAME_SIGNAL = 1.0  # seconds; people press Ctrl-C twice, and `timeout -s INT` sends two signals
 _SPIN_PERIOD = 0.01  # seconds
 
@@ -138,7 +136,6 @@ def _forget_nodes():
         node._current_run.mark_stopped()
     started_nodes.clear()
     restarting_nodes.clear()
-    links.runs.clear()
 
 
 atexit.register(_stop_at_exit)

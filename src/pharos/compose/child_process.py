@@ -9,6 +9,7 @@ import re
 import shutil
 import signal
 import subprocess
+import sys
 import threading
 import tty
 
@@ -17,7 +18,7 @@ import roslib.packages
 import rospkg
 from catkin.find_in_workspaces import find_in_workspaces
 
-from pharos.errors import PharosError, UnknownNodeError
+from pharos.errors import PharosError, PortInUseError, UnknownNodeError
 
 _TERMINAL_CODES = re.compile(r'\x1b\[[0-9;]*[A-Za-z]|\x1b\]0;[^\x07]*\x07')
 MAX_LINES = 10_000  # of output that are kept
@@ -114,6 +115,38 @@ class RosProcess(subprocess.Popen):
         self.terminate()
 
 
+def start_master(port):
+    """Start the master of :meth:`Master.embedded`, and return its URL and its subprocess.Popen."""
+    environ = dict(os.environ)
+    environ['PYTHONPATH'] = os.pathsep.join(folder for folder in sys.path if folder)
+    # rospy prefers ROS_HOSTNAME to ROS_IP
+    address = environ.pop('ROS_IP', '127.0.0.1')
+    environ.setdefault('ROS_HOSTNAME', address)
+    pipes = {'stdin': subprocess.PIPE, 'stdout': subprocess.PIPE, 'text': True}
+    command = [sys.executable, '-m', 'pharos.commands.embedded_master', str(port)]
+    process = subprocess.Popen(command, env=environ, start_new_session=True, **pipes)  # type: ignore
+    url = process.stdout.readline().strip()
+    if not url:
+        process.communicate()
+        raise PortInUseError(
+            f'no master starts at port {port}: choose another one, or 0 for any free one'
+        )
+    return url, process
+
+
+def run_program(url, package, executable, args, on_line):
+    """Do the work of :meth:`Master.run`."""
+    path = find_program(package, executable)
+    return RosProcess([path, *map(str, args)], url, on_line)
+
+
+def run_launch_file(url, package, file, args):
+    """Do the work of :meth:`Master.launch`."""
+    path = find_launch_file(package, file)
+    arguments = [f'{name}:={value}' for name, value in args.items()]
+    return RosProcess(['roslaunch', '--skip-log-check', path, *arguments], url)
+
+
 def descendants_of(process):
     """Return the children of a subprocess.Popen, and their children, as psutil's processes."""
     if process.poll() is not None:
@@ -139,6 +172,8 @@ def find_program(package, executable):
         paths = roslib.packages.find_node(package, executable)
     except rospkg.ResourceNotFound:  # some of Debian's packages have no package.xml
         folders = find_in_workspaces(['libexec'], project=package)
+        if not folders:
+            raise _no_package(package) from None
         found_paths = [shutil.which(executable, path=folder) for folder in folders]
         paths = [path for path in found_paths if path]
     if not paths:
@@ -161,4 +196,10 @@ def find_launch_file(package, file):
     try:
         return rlutil.resolve_launch_arguments(arguments)[0]
     except RLException as error:
+        if package and package not in rospkg.RosPack().list():
+            raise _no_package(package) from None
         raise UnknownNodeError(f'there is no launch file {file!r}: {error}') from None
+
+
+def _no_package(name):
+    return UnknownNodeError(f'no package {name!r}: is the workspace sourced?')

@@ -21,7 +21,7 @@ from rosgraph.names import get_ros_namespace, load_mappings, ns_join
 from pharos import signals
 from pharos.compose import control, roslaunch_parent
 from pharos.compose.child_process import RosProcess, find_program
-from pharos.compose.launch_file import Entry, Group
+from pharos.compose.launch_file import Entry, Group, LaunchFile
 from pharos.compose.script import ScriptNode, name_of_file, wait_for_end
 from pharos.compose.sources import (
     needs_process,
@@ -44,6 +44,14 @@ TERMINATE_LIMIT = 40.0  # seconds: 20 after the SIGINT, since roslaunch gives it
 POLL_PERIOD = 0.02  # seconds between two looks at the nodes that have ended
 #: seconds; with Python's default of 5 ms, nodes wait ten times as long beside a node that computes
 SWITCH_INTERVAL = 0.3e-3
+
+
+def compose(master, *options):
+    """Do the work of :meth:`Master.compose`; the options are those of LaunchFile."""
+    launch_file = LaunchFile(master.url, *options)
+    composition = Composition(master)
+    composition.launch(launch_file)
+    return composition
 
 
 class Composition:

@@ -2,15 +2,20 @@
 
 Each composition listens on a socket that is not in a file system; its name has the process's number.
 """
+from __future__ import annotations
+
 import contextlib
 import os
 import re
 import socket
 import threading
+from typing import TYPE_CHECKING
 
 from pharos.errors import PharosError, UnknownNodeError
-from pharos.master import Master
 from pharos.private_rospy.tcpros import check_user
+
+if TYPE_CHECKING:
+    from pharos.master import Master
 
 ANSWER_LIMIT = 60.0  # seconds
 MAX_TEXT = 4096  # bytes

@@ -72,7 +72,7 @@ def wait_for_end(predicate, timeout, name):
             raise TimeoutError(f'{name} has not ended within {timeout:g} s: stop() it')
 
 
-def load(master, package, executable, arguments, name, namespace, params, here):
+def load(master, package, executable, args, name, namespace, remap, params, here):
     """Do the work of :meth:`Master.load`."""
     path = os.path.abspath(package) if executable is None else find_program(package, executable)
     if not os.path.isfile(path):
@@ -83,9 +83,11 @@ def load(master, package, executable, arguments, name, namespace, params, here):
             f'{path} needs a process of its own: {reason}. Start it by master.run(), or'
             ' load(..., here=True)'
         )
+    arguments = [*map(str, args)]
+    arguments += [f'{old_name}:={new_name}' for old_name, new_name in remap.items()]
     if name:
         node_name = name
-        arguments = [*arguments, f'__name:={name.rpartition("/")[2]}']
+        arguments.append(f'__name:={name.rpartition("/")[2]}')
     else:
         node_name = name_of_file(path)
     if namespace:

@@ -22,13 +22,11 @@ from weakref import WeakValueDictionary
 from rosgraph import get_master_uri
 from rosgraph.names import anonymous_name, get_ros_namespace, load_mappings, ns_join
 
-import pharos
 from pharos import signals
 from pharos.blocks import block_name
 from pharos.compose.child_process import interrupt
 from pharos.compose.sources import SYSTEM_FOLDERS, compile_program
 from pharos.errors import PharosError
-from pharos.master import Master
 from pharos.private_rospy import loader
 from pharos.private_rospy.loader import Shim
 from pharos.private_rospy.patches import patch
@@ -38,6 +36,7 @@ from pharos.transcript import Transcript
 from pharos.waiting import current, wait
 
 SIGNAL_LIMIT = 0.2  # seconds that a signal waits for the main thread
+BLOCK_LIMIT = 1.0  # seconds that a thread has to end after an exception in it
 JOIN_PERIOD = 0.02  # seconds between two looks for a signal
 SPIN_PERIOD = 0.01  # seconds
 #: files whose frames tracebacks do not show
@@ -167,6 +166,12 @@ class ScriptRun(Run):
         self.descriptors[descriptor] = os.fstat(descriptor)
         return descriptor
 
+    def _tell_left_threads(self):
+        left_threads = join({*self.threads, *self.left_threads}, BLOCK_LIMIT)
+        if left_threads:
+            names = ', '.join(thread.name for thread in left_threads)
+            Transcript.show(f'{self.name} leaves threads that block, with what they use: {names}')
+
     def _close_descriptors(self):
         for descriptor, status in self.descriptors.items():
             with contextlib.suppress(OSError):  # it is closed
@@ -249,7 +254,7 @@ class ScriptRun(Run):
             name = anonymous_name(name)
         settings = self.settings
         url = get_master_uri(self.environ, self.argv)
-        master = Master(url, self.master.shared_memory)
+        master = type(self.master)(url, self.master.shared_memory)
         if master != self.master:
             self.master = settings.master = self.node.master = master
         self.base_name = load_mappings(self.argv).get('__name', name)
@@ -524,10 +529,8 @@ class ScriptRun(Run):
         These are ports, files, locks. The Transcript names threads that keep some.
         """
         super().stop(timeout)
-        left_threads = join({*self.threads, *self.left_threads}, SIGNAL_LIMIT)
-        if left_threads and not signals.is_ending():
-            names = ', '.join(thread.name for thread in left_threads)
-            Transcript.show(f'{self.name} leaves threads that block, with what they use: {names}')
+        if not signals.is_ending():
+            self._tell_left_threads()
         self.exit_request = None
         self.handlers.clear()
         self.created_nodes.clear()
@@ -627,7 +630,9 @@ class _Pharos(Shim):
     """
 
     def __init__(self, run):
-        class EntryMaster(Master):
+        facade = sys.modules['pharos']  # it lies above, and is loaded already
+
+        class EntryMaster(facade.Master):
             """A master that gives nodes the name, the namespace and the remappings of the entry."""
 
             _environ = run.environ
@@ -654,6 +659,6 @@ class _Pharos(Shim):
                 run.node.created_names.add(node._settings.name)
                 return node
 
-        transcript = type(pharos.Transcript)()
+        transcript = type(Transcript)()
         transcript.on_show(run.print)
-        super().__init__(pharos, Master=EntryMaster, spin=run.spin, Transcript=transcript)
+        super().__init__(facade, Master=EntryMaster, spin=run.spin, Transcript=transcript)

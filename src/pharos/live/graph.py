@@ -7,13 +7,15 @@ import pathlib
 import re
 import subprocess
 import time
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 from xml.sax.saxutils import escape
 
 from pharos.errors import PharosError
 from pharos.live.snapshot import Snapshot, take_snapshot, topic_rates
 from pharos.live.text_format import short_number
-from pharos.master import Master
+
+if TYPE_CHECKING:
+    from pharos.master import Master
 
 SUFFIXES = '.svg', '.png', '.pdf', '.dot'
 DRAW_TIMEOUT = 60  # seconds that graphviz has for a picture

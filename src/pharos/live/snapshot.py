@@ -1,17 +1,18 @@
 """Take a snapshot of a master and its nodes: topics, services, links and their traffic."""
 from __future__ import annotations
 
-import collections
 import concurrent.futures
 import time
 import urllib.parse
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import rosgraph.network
 
-from pharos.master import CALLER_ID, Master
-from pharos.private_rospy.run import Run, ServerProxy
+from pharos.private_rospy.xmlrpc import CALLER_ID, ServerProxy
+
+if TYPE_CHECKING:
+    from pharos.master import Master
 
 NODE_TIMEOUT = 1.0  # seconds that a node has for each answer
 MAX_THREADS = 50  # nodes that are asked at once
@@ -181,23 +182,3 @@ def topic_rates(link_rates: dict[Link, Traffic], unit: str) -> dict[str, float]:
     for (topic, _), rate in publisher_rates(link_rates, unit).items():
         rates[topic] = rates.get(topic, 0.0) + rate
     return rates
-
-
-def health_facts(run: Run) -> dict[str, Any]:
-    """Return the facts of :meth:`Node.health` that the master is not asked for."""
-    connections = run.topic_manager.get_pub_sub_info()
-    queues = list(run.callback_order.queues)
-    begin_times = [queue.begin_time for queue in queues if queue.begin_time]
-    ended_souls = [soul.name for soul in run.souls if not soul.is_alive()]
-    return {
-        'kind': type(run.node).__name__,
-        'connections': dict(collections.Counter(row[3] for row in connections)),
-        'dropped': sum(getattr(each, 'dropped', 0) for each in run.open_endpoints(object)),
-        'errors': run.failures.total,
-        'threads': sum(thread.is_alive() for thread in list(run.threads)),
-        'cpu_seconds': round(run.cpu_seconds(), 3),
-        'souls': len(run.souls) - len(ended_souls),
-        'ended_souls': ended_souls,
-        'callback_seconds': time.perf_counter() - min(begin_times) if begin_times else 0.0,
-        'waiting': sum(len(queue.jobs) for queue in queues),
-    }

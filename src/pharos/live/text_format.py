@@ -1,11 +1,16 @@
 """Format numbers, messages and nodes as text."""
+from __future__ import annotations
+
 import time
+from typing import TYPE_CHECKING
 
 import genpy
 
 from pharos.errors import UnknownNodeError
 from pharos.live.snapshot import take_snapshot
-from pharos.master import Master
+
+if TYPE_CHECKING:
+    from pharos.master import Master
 
 MAX_ITEMS = 12  # items of an array, and lines of a text, that are shown
 LINE_LENGTH = 80

@@ -5,18 +5,20 @@ import contextlib
 import itertools
 import queue
 import time
-from typing import Any, Iterator, NamedTuple
+from typing import TYPE_CHECKING, Any, Iterator, NamedTuple
 
 import rosgraph.names
 import rospy
 from genpy import Message
 
 from pharos.blocks import Block
-from pharos.channels import Topic
 from pharos.errors import UnknownTopicError
 from pharos.live.text_format import message_text, short_number
 from pharos.node import BlockNode
 from pharos.transcript import Transcript
+
+if TYPE_CHECKING:
+    from pharos.topic import Topic
 
 LAST_TIMEOUT = 3.0  # seconds that Topic.last waits
 FIRST_TIMEOUT = 1.0  # seconds that a measurement waits for the first message

@@ -13,7 +13,7 @@ import rospkg
 import rospy
 from rosgraph.network import ROSHandshakeException, decode_ros_handshake_header, is_local_address
 
-from pharos.private_rospy import tcpros, topics
+from pharos.private_rospy import connections, tcpros, topics
 from pharos.private_rospy.loader import Shim
 from pharos.private_rospy.services import call_by_proxy
 
@@ -101,26 +101,12 @@ def accept(original, run, self, sock, address):
     """
 
     def shake_hands():
-        _current_client.address = address
         tcpros.keep_alive(sock)
         original(self, sock, address)
 
     run.sockets.add(sock)
     if not run.start_thread(shake_hands):
         sock.close()
-
-
-@patch('rospy.impl.tcpros_base', 'logwarn')
-def name_client(original, run, text, *args):
-    """rospy logs a refusal without the client. This names the client's address."""
-    address = getattr(_current_client, 'address', ())
-    original(f'{":".join(map(str, address))}: {text}', *args)
-
-
-@patch('rospy.impl.tcpros_base', 'rospyerr')
-@patch('rospy.impl.tcpros_base', 'rospywarn')
-def log_no_traceback(original, run, *args):
-    """rospy logs a traceback for each client with a bad header. This leaves it to name_client()."""
 
 
 @patch('rospy.impl.tcpros_base', 'TCPServer.shutdown')
@@ -302,7 +288,7 @@ def subscribe(original, run, self, *args, **kwargs):
     """rospy connects before the callback is there. This connects after, as add_callback() does."""
     original(self, *args, **kwargs)
     if self.callback is None:  # otherwise add_callback() has connected
-        run.connect_all(self.resolved_name)
+        connections.connect_all(run, self.resolved_name)
 
 
 @patch('rospy.topics', 'QueuedConnection')
@@ -326,7 +312,7 @@ def register_once(original, run, self, name, data, registry):
 
     The watcher registers later whatever the master lacks.
     """
-    run.register(registry, name, data)
+    connections.register(run, registry, name, data)
 
 
 @patch('rospy.impl.registration', 'RegManager.publisher_update')
@@ -338,7 +324,7 @@ def publisher_update(original, run, self, name, uris):
     # publishers_changed() below has forgotten the list: it is equal at the further calls alone
     if uris != run.publisher_uris.get(name):
         run.publisher_uris[name] = uris
-        run.connect_all(name)
+        connections.connect_all(run, name)
 
 
 @patch('rospy.impl.masterslave', 'ROSHandler.publisherUpdate')

@@ -1,10 +1,8 @@
-"""Run: a node's life from a start to a stop, with its own rospy, souls, endpoints and failures.
-
-One thread of this process, the watcher, looks after all runs.
-"""
+"""Run: a node's life from a start to a stop, with its own rospy, souls, endpoints and failures."""
 from __future__ import annotations
 
 import atexit
+import collections
 import dataclasses
 import enum
 import errno
@@ -16,27 +14,21 @@ import threading
 import time
 import xmlrpc.client
 from contextlib import suppress
-from http.client import HTTPException
 from time import monotonic
 from typing import TYPE_CHECKING, Sequence
 from urllib.parse import urlsplit
 from weakref import WeakSet
-from xml.parsers.expat import ExpatError
 
 from pharos.blocks import block_name
-from pharos.errors import (
-    MasterUnreachableError,
-    MessageTypeError,
-    NodeNameInUseError,
-    PharosError,
-    PortInUseError,
-)
+from pharos.errors import MessageTypeError, NodeNameInUseError, PortInUseError
 from pharos.failures import Failure, Failures
 from pharos.intraprocess.callback_queues import CallbackOrder, CallbackQueue
-from pharos.intraprocess.links import link_topic, runs, runs_lock
-from pharos.private_rospy import patches
+from pharos.intraprocess.links import runs
+import pharos.private_rospy.inspecting  # noqa: F401: it has inspect find private modules
+from pharos.private_rospy import connections, patches
 from pharos.private_rospy.loader import PrivateModules, Shim, private_path
 from pharos.private_rospy.tcpros import shutdown_socket
+from pharos.private_rospy.xmlrpc import CALLER_ID, UNREACHABLE, ServerProxy
 from pharos.signals import may_be_signal
 from pharos.transcript import Transcript
 from pharos.waiting import let_others_run
@@ -44,23 +36,12 @@ from pharos.waiting import let_others_run
 if TYPE_CHECKING:
     from pharos.master import Master
 
-MASTER_LIMIT = 5.0  # seconds for each question to a master or node
 NAME_LIMIT = 1.0  # seconds for the question whether another node has the name
 STOP_LIMIT = 2.0  # seconds that a stop waits for threads of rospy
 CLOCK_LIMIT = 3.0  # seconds until a clock that stands still is told
+JOIN_PERIOD = 0.01  # seconds until the threads are counted anew: one may have started another
 HOLD_LIMIT = 2.0  # seconds that delegates wait for the end of start(); start() may wait for them
-RETRY_DELAY = 1.0  # seconds until the next attempt to connect
-WATCH_PERIOD = 0.5  # seconds between two looks of the watcher
-LOOKS_PER_MASTER = 4  # looks of the watcher for each one at the masters
 BACKLOG = 128  # clients that may wait for a connection; rospy allows five
-UNREACHABLE = OSError, xmlrpc.client.Error, HTTPException, ExpatError
-#: rospy's names of registries, in the order of the master's system state -> methods of the master
-_REGISTER_METHODS = {
-    'pub': 'registerPublisher',
-    'sub': 'registerSubscriber',
-    'srv': 'registerService',
-}
-_end_of_watch = threading.Event()
 
 
 class Lifecycle(enum.Enum):
@@ -88,31 +69,6 @@ class Settings:
     domain: str | None
     ports: tuple[int, int]
     remappings: Sequence[str]
-
-
-class _Transport(xmlrpc.client.Transport):
-    def make_connection(self, host):
-        connection = super().make_connection(host)
-        connection.timeout = self.limit
-        return connection
-
-    def single_request(self, *args):
-        try:
-            return super().single_request(*args)
-        finally:  # a call that Ctrl-C ended leaves an answer, which the next call would read
-            self.close()
-
-
-class ServerProxy(xmlrpc.client.ServerProxy):
-    """A proxy of the XML-RPC server at a URI; a call raises one of UNREACHABLE after a limit.
-
-    :param limit: seconds
-    """
-
-    def __init__(self, uri, limit=MASTER_LIMIT):
-        transport = _Transport()
-        transport.limit = limit
-        super().__init__(uri, transport)
 
 
 class Run:
@@ -155,9 +111,7 @@ class Run:
         self.callback_order = CallbackOrder(self.start_thread)
         self.callback_queue = CallbackQueue(self.callback_order)
         self.callback_queue.hold()  # until the node's start() has returned
-        self.hold_deadline = monotonic()  # the watcher ends the hold at its next look after this
-        if node._holds_delegates:  # else a user calls start(): there is no release after its end
-            self.hold_deadline += HOLD_LIMIT
+        self.hold_deadline = monotonic() + HOLD_LIMIT  # then the watcher ends the hold
         namespace, _, self.base_name = self.name.rpartition('/')
         self.clock_deadline = monotonic() + CLOCK_LIMIT  # when a clock that stands is told
         self.environ = {
@@ -274,12 +228,27 @@ class Run:
         for endpoint in self.endpoints:
             endpoint.closed = True
         self.lifecycle = Lifecycle.STOPPED
+        if runs.get(self.uri) is self:  # in a forked child
+            del runs[self.uri]
 
     def health_facts(self):
         """Return the facts of Node.health(), without the master's; ``pharos top`` asks for them."""
-        from pharos.live.snapshot import health_facts
-
-        return health_facts(self)
+        bus_info = self.topic_manager.get_pub_sub_info()
+        queues = list(self.callback_order.queues)
+        begin_times = [queue.begin_time for queue in queues if queue.begin_time]
+        ended_souls = [soul.name for soul in self.souls if not soul.is_alive()]
+        return {
+            'kind': type(self.node).__name__,
+            'connections': dict(collections.Counter(row[3] for row in bus_info)),
+            'dropped': sum(getattr(each, 'dropped', 0) for each in self.open_endpoints(object)),
+            'errors': self.failures.total,
+            'threads': sum(thread.is_alive() for thread in list(self.threads)),
+            'cpu_seconds': round(self.cpu_seconds(), 3),
+            'souls': len(self.souls) - len(ended_souls),
+            'ended_souls': ended_souls,
+            'callback_seconds': time.perf_counter() - min(begin_times) if begin_times else 0.0,
+            'waiting': sum(len(queue.jobs) for queue in queues),
+        }
 
     def cpu_seconds(self):
         """Return the CPU time of the node's threads."""
@@ -344,7 +313,6 @@ class Run:
         self._check_name_free()
         tcpros_base = self.modules.load('rospy.impl.tcpros_base')
         tcp_port, xmlrpc_port = self.settings.ports
-        asked_port = tcp_port
         try:
             # rospy's own start finds this server, and makes none: rospy does not report a busy port
             server = tcpros_base.init_tcpros_server(tcp_port)
@@ -352,7 +320,6 @@ class Run:
             server.tcp_ros_server = tcp_server
             tcp_server.server_sock.listen(BACKLOG)
             tcp_server.start()
-            asked_port = xmlrpc_port
             ports = {'xmlrpc_port': xmlrpc_port, 'tcpros_port': tcp_server.port}
             options = {'disable_signals': True, **options, **ports}
             self.modules.load('rospy.client').init_node(self.base_name, self.argv, **options)
@@ -360,7 +327,7 @@ class Run:
             if error.errno != errno.EADDRINUSE:
                 raise
             raise PortInUseError(
-                f'{self.name}: port {asked_port} is in use: choose another one, or 0 for any'
+                f'{self.name}: port {tcp_port} or {xmlrpc_port} is in use: choose another one, or 0'
             ) from None
         address = urlsplit(self.uri)
         self.settings.ports = tcp_server.port, address.port
@@ -378,9 +345,9 @@ class Run:
         name = None
         with suppress(*UNREACHABLE):
             proxy = ServerProxy(uri, NAME_LIMIT)
-            proxy.getPid('/pharos')  # raises if the URI is dead
+            proxy.getPid(CALLER_ID)  # raises if the URI is dead
             name = self.name
-            name = proxy.getName('/pharos')[2]  # another node may have the URI; roscpp raises
+            name = proxy.getName(CALLER_ID)[2]  # another node may have the URI; roscpp raises
         if name == self.name:
             raise NodeNameInUseError(
                 f'{name} is running already, at {uri}: choose another name, or end that one'
@@ -401,130 +368,7 @@ class Run:
 
             handler.protocol_handlers.insert(0, SharedMemoryHandler(self))
         handler.pharosHealth = lambda caller_id: (1, '', self.health_facts())
-        with runs_lock:
-            if not runs:
-                _end_of_watch.clear()
-                threading.Thread(target=_watch_runs, daemon=True).start()
-            runs[uri] = self
-
-    # -- registration and connections
-
-    def register(self, registry, name, data):
-        """Register a topic or service at the master; try once, since the watcher repairs the rest.
-
-        Have all nodes of this process connect to a new publisher.
-
-        :param registry: rospy's name of the registry: 'pub', 'sub' or 'srv'
-        :param data: the name of the topic's type, or the URI of the service
-        """
-        method = _REGISTER_METHODS[registry]
-        with suppress(MasterUnreachableError):
-            publishers = self.master.call(method, name, data, self.uri, caller_id=self.name)
-            if registry == 'sub' and publishers is not None:
-                self.publisher_uris[name] = publishers
-        if registry == 'pub':  # sooner than by the master's publisherUpdate
-            for run in list(runs.values()):
-                if run.master.url == self.master.url:
-                    run.connect(name, self.uri)
-
-    def connect_all(self, topic):
-        """Connect to the publishers of a topic, from the last list of the master.
-
-        Link those of this process in this thread, and connect to others in threads.
-        """
-        for uri in self.publisher_uris.get(topic, ()):
-            if uri in runs:
-                self.connect(topic, uri)
-            else:
-                self.start_connecting(topic, uri)
-
-    def connect(self, topic, uri):
-        """Connect the subscription of a topic to a publisher, by a link or a socket.
-
-        Do nothing if they are connected, or if another thread connects them already.
-
-        :param uri: the URI of the publisher's node
-        """
-        subscription = self.topic_manager.subs.get(topic)
-        if self.stopping.is_set() or not subscription or subscription.has_connection(uri):
-            return
-        attempt = topic, uri, id(subscription)
-        if attempt in self.connecting:
-            return
-        self.connecting.add(attempt)
-        try:
-            publisher_run = runs.get(uri)
-            if publisher_run:
-                link_topic(publisher_run, self, topic)
-            else:
-                self._negotiate(topic, uri, subscription)
-        finally:
-            self.connecting.discard(attempt)
-
-    def _negotiate(self, topic, uri, subscription):
-        """Have rospy offer the protocols of make_findable() and TCPROS, and connect by one."""
-        code = None
-        reason = ''
-        try:
-            code, _, _ = self.ros_handler._connect_topic(topic, uri)
-        except (AttributeError, UnboundLocalError):
-            pass  # rospy raises these if the subscription is closed meanwhile
-        except RuntimeError as error:  # no thread is left, but rospy has added the connection
-            reason = str(error)
-            for connection in subscription.connections:
-                if connection.endpoint_id == uri:
-                    connection.close()
-            code = 0
-        if code not in (1, None):
-            self.connect_later(topic, uri, reason)
-
-    def connect_later(self, topic, uri, reason=''):
-        """Have the watcher connect after RETRY_DELAY, if the master still names the publisher.
-
-        :param reason: the text of the last error, for the log, or ''
-        """
-        self.retries[topic, uri] = monotonic() + RETRY_DELAY, reason
-
-    def _retry_connections(self):
-        for (topic, uri), (retry_time, reason) in list(self.retries.items()):
-            if monotonic() < retry_time:
-                continue
-            del self.retries[topic, uri]
-            if uri not in self.publisher_uris.get(topic, ()):
-                continue
-            if reason:
-                self.troubles.add(f'{topic}: no connection to {uri}, it is tried again: {reason}')
-            self.start_connecting(topic, uri)
-
-    def start_connecting(self, topic, uri):
-        """Connect in a thread, or later if the system has none left."""
-        if not self.start_thread(functools.partial(self.connect, topic, uri)):
-            self.connect_later(topic, uri)
-
-    def register_missing(self, state):
-        """Register the topics and services that the master's system state lacks.
-
-        If the master knows nothing of the node, set its parameters anew, too.
-
-        :param state: lists of (name, nodes) for publishers, subscribers and services
-        """
-        registered = set()
-        for registry, entries in zip(_REGISTER_METHODS, state):
-            registered.update((registry, name) for name, nodes in entries if self.name in nodes)
-        topics = self.topic_manager
-        services = self.service_manager
-        getters = topics.get_publications, topics.get_subscriptions, services.get_services
-        with topics.lock, services.lock:  # or a topic closed meanwhile would be registered again
-            for registry, get_entries in zip(_REGISTER_METHODS, getters):
-                for name, data in get_entries():
-                    is_known = (registry, name) in registered
-                    if not is_known and not self.stopping.is_set():
-                        self.register(registry, name, data)
-                        self.connect_all(name)
-        if not registered and not self.stopping.is_set():  # this is a new master
-            self.modules.load('rospy.client')._init_node_params(self.argv, self.name)
-            for parameter in self.node._parameters:
-                parameter.subscribe()
+        connections.enter(self)
 
     def read_parameters(self):
         """Have the node's parameters read their values from the server."""
@@ -538,27 +382,10 @@ class Run:
         """
         self.deadlines[sock] = monotonic() + self.node.client_timeout
 
-    def check_peers(self):
-        """Drop peers that have left (ros_comm #927) or are silent, and tell the log of troubles.
-
-        End an overlong hold, and connect again after failures.
-
-        The watcher calls this every WATCH_PERIOD.
-        """
-        self.topic_manager.check_all()
-        self._retry_connections()
-        while self.troubles:
-            self.ros.logwarn_throttle_identical(60, self.troubles.pop())
-        now = monotonic()
-        if now > self.hold_deadline:
-            self.callback_queue.release()
-        if now > self.clock_deadline:
-            self.clock_deadline += 1e9  # it is told once
-            rostime = self.ros.rostime
-            if not (rostime.is_wallclock() or rostime.get_time()):
-                self.troubles.add('time stands still: /use_sim_time is set, and no /clock comes')
+    def close_silent_clients(self):
+        """Shut the sockets of clients whose time is over; the watcher calls this."""
         for sock, deadline in list(self.deadlines.items()):
-            if now > deadline:
+            if monotonic() > deadline:
                 self.deadlines.pop(sock, None)
                 shutdown_socket(sock)
 
@@ -581,10 +408,7 @@ class Run:
         :param timeout: seconds for messages under way
         """
         self._begin_stop()  # the end of a script calls close_rospy() before stop()
-        with runs_lock:
-            runs.pop(self.uri, None)
-            if not runs:
-                _end_of_watch.set()
+        connections.leave(self)
         deadline = monotonic() + timeout
         for publisher in list(self.topic_manager.pubs.values()):
             publisher.flush(deadline)
@@ -631,14 +455,10 @@ class Run:
         self.mark_stopped()
 
     def _wait_for_threads(self, timeout):
-        """Wait for the end of all threads but souls; one that ends may have started another."""
+        """Wait for the end of all threads but souls."""
         deadline = monotonic() + timeout
-        while monotonic() < deadline:
-            threads = set(self.threads) - set(self.souls) - {threading.current_thread()}
-            live_threads = [thread for thread in threads if thread.is_alive()]
-            if not live_threads:
-                break
-            join(live_threads, deadline - monotonic())
+        while join(set(self.threads) - set(self.souls), JOIN_PERIOD) and monotonic() < deadline:
+            pass
 
 
 def join(threads, timeout):
@@ -647,33 +467,11 @@ def join(threads, timeout):
     :param timeout: seconds for all of them together
     """
     deadline = monotonic() + timeout
-    others = [thread for thread in threads if thread is not threading.current_thread()]
+    others = [
+        thread
+        for thread in threads
+        if thread.is_alive() and thread is not threading.current_thread()
+    ]
     for thread in others:
         thread.join(max(0.0, deadline - monotonic()))
     return [thread for thread in others if thread.is_alive()]
-
-
-def _watch_runs():
-    """Look after all runs until the last one ends; every two seconds, compare with the masters."""
-    look_count = 0
-    while True:
-        is_over = _end_of_watch.wait(WATCH_PERIOD)
-        if is_over:
-            return
-        look_count += 1
-        for run in list(runs.values()):
-            run.check_peers()
-        run = None  # else a stopped run would live until the next look
-        if look_count % LOOKS_PER_MASTER == 0:
-            _ask_masters()
-
-
-def _ask_masters():
-    """Ask each master for its system state, and have the runs register again what is missing."""
-    all_runs = list(runs.values())
-    for url in {run.master.url for run in all_runs}:
-        with suppress(*UNREACHABLE, PharosError):
-            state = ServerProxy(url).getSystemState('/pharos')[2]
-            for run in all_runs:
-                if run.master.url == url and not run.stopping.is_set():
-                    run.register_missing(state)

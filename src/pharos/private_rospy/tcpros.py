@@ -6,6 +6,7 @@ import struct
 import threading
 
 from pharos.intraprocess.inboxes import BoundedQueue
+from pharos.private_rospy.connections import connect_later
 from pharos.waiting import let_others_run
 
 MAX_MESSAGE = 1_000_000_000  # bytes, as in roscpp
@@ -72,7 +73,7 @@ def end_connection(subscription, connection, uri, reason):
     if 'md5sum' in reason or 'do not match' in reason:  # rospy compares the names of types, too
         subscription.run.report_refusal(topic, reason)
     elif not subscription.closed:
-        subscription.run.connect_later(topic, uri, reason)
+        connect_later(subscription.run, topic, uri, reason)
 
 
 def _receive(connection, subscription):
@@ -87,21 +88,24 @@ def _receive(connection, subscription):
     message_class = subscription.data_class
     with sock.makefile('rb', _READ_BUFFER) as stream:
         while not connection.done:
-            data = _read_message(stream)
+            data = read_message(stream)
             if data is None:
                 return
             message = message_class().deserialize(data)
             subscription.deliver(message, connection, len(data) + _LENGTH.size)
 
 
-def _read_message(stream):
-    """Return the bytes of the next message, None at the end of the stream."""
+def read_message(stream):
+    """Return the bytes of the next message, None at the end of the stream.
+
+    :raises ConnectionError: if the length cannot be one
+    """
     head = stream.read(_LENGTH.size)
     if len(head) < _LENGTH.size:
         return None
     (size,) = _LENGTH.unpack(head)
     if size > MAX_MESSAGE:
-        raise ValueError(f'it announces a message of {size} bytes')
+        raise ConnectionError(f'it announces a message of {size} bytes')
     data = stream.read(size)
     if len(data) < size:
         return None
@@ -152,7 +156,7 @@ class Sender:
         self._bounded_queue = BoundedQueue()
         self._bounded_queue.queue_bytes = publication.run.node.queue_bytes
         self._queue = self._bounded_queue.messages  # lists of parts
-        self._unsent = []  # the parts of a message that the socket has not taken yet
+        self._unsent = [], []  # the parts of a message, and the numbers of bytes sent of them
         self._condition = threading.Condition()  # notified to wake the thread
 
     def __getattr__(self, name):
@@ -173,17 +177,17 @@ class Sender:
     def _write(self, parts, size):
         self._bounded_queue.queue_size = self._publication.queue_size
         if self._publication.queue_size is None:
-            self._unsent += parts
-            while self._unsent:
+            self._unsent = self._rest() + parts, []
+            while self._rest():
                 self._send()
             return
         if self.is_busy or self._queue or size > MAX_DIRECT:
             self._bounded_queue.add(parts, size)
         else:
-            self._unsent += parts
+            self._unsent = self._rest() + parts, []
             with contextlib.suppress(BlockingIOError):
                 self._send(socket.MSG_DONTWAIT)
-            if not self._unsent:
+            if not self._rest():
                 return
         if not self.is_busy:
             self.is_busy = self._wake_thread()
@@ -196,31 +200,43 @@ class Sender:
             self._has_thread = self._publication.run.start_thread(self._send_queue) is not None
         return self._has_thread
 
-    def _send(self, flags=0):
-        """Send the bytes that the socket takes, and keep the others."""
-        parts = self._unsent
-        sent_bytes = self._connection.socket.sendmsg(parts[:MAX_PARTS], [], flags)
-        self._connection.stat_bytes += sent_bytes
+    def _rest(self):
+        """Return the parts that the socket has not taken yet."""
+        parts, counts = self._unsent
+        parts = [*parts]
+        sent_bytes = sum(counts)
         while parts and sent_bytes >= len(parts[0]):
             sent_bytes -= len(parts.pop(0))
         if parts:
             parts[0] = memoryview(parts[0])[sent_bytes:]
-        else:
-            self._connection.stat_num_msg += 1
+        return parts
+
+    def _send(self, flags=0):
+        """Have the socket take bytes, and keep their number.
+
+        The handler of a signal may raise an exception between any two lines of Python: the next
+        publish() then sends the rest. extend() sends and keeps the number in C.
+        """
+        _, counts = self._unsent
+        counts.extend(
+            map(self._connection.socket.sendmsg, [self._rest()[:MAX_PARTS]], [[]], [flags])
+        )
+        self._connection.stat_bytes += counts[-1]
+        self._connection.stat_num_msg += not self._rest()
 
     def _send_queue(self):
         connection = self._connection
         while True:
             with self._condition:
-                if not self._unsent and not self._queue:
+                if not self._rest() and not self._queue:
                     self.is_busy = False
                     self._condition.wait(THREAD_REST)
                 if connection.done or not self.is_busy:
                     self.is_busy = False
                     self._has_thread = False
                     return
-                if not self._unsent:
-                    self._unsent += self._queue.popleft()
+                if not self._rest():
+                    self._unsent = self._queue.popleft(), []
             try:
                 self._send()
             except CLOSED:

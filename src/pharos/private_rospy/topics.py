@@ -13,6 +13,7 @@ from pharos.intraprocess.callback_queues import CallbackQueue, hand_over
 from pharos.intraprocess.copier import SERIALIZE_ERRORS, copier_for, copy_of
 from pharos.intraprocess.inboxes import Inbox
 from pharos.intraprocess.links import links_of
+from pharos.private_rospy import connections
 from pharos.private_rospy.tcpros import CLOSED, MessageParts, Sender
 
 SOCKET_BYTES = 6 << 20  # bytes that the two sockets of a connection hold, roughly
@@ -213,11 +214,11 @@ class PlainInbox(Inbox):
         Without a queue_size, messages wait in the sockets and in the publisher until the callbacks
         have ended. The thread that reads a socket of TCPROS runs them.
         """
-        if self.queue_size is None and connection.transport_type == 'TCPROS':
-            self.put((message, None, None), size)
-            self.callback_queue.run_jobs_here()
-            return
         if self.queue_size is None:
+            if connection.transport_type == 'TCPROS':
+                self.put((message, None, None), size)
+                self.callback_queue.run_jobs_here()
+                return
             connection.pause()
             self._paused_connections.append(connection)
         super().receive(message, size, connection)
@@ -324,7 +325,7 @@ class SubscriptionOverlay:
             for frozen in list(link.publisher.latches.values()):
                 inbox.put((frozen, link.thaw, link.header))
         inbox.callback_queue.request_thread()
-        self.run.connect_all(self.resolved_name)
+        connections.connect_all(self.run, self.resolved_name)
 
     def remove_callback(self, callback, args):
         self.rospy_remove_callback(callback, args)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import array
 import copy
-import fcntl
 import functools
 import itertools
 import mmap
@@ -37,7 +36,6 @@ POLL_LIMIT = 1000  # milliseconds between two looks if the connection is closed
 PACKET = struct.Struct('<bBQId')
 NO_FILE = -1
 WHOLE = 255
-_SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
 
 
 class MemoryFile:
@@ -48,10 +46,9 @@ class MemoryFile:
         self.capacity = size + size // 4  # messages grow
         self.number = 0  # of the message
         self.readers = set()  # senders that announce it later, or have no receipt yet
-        self.descriptor = os.memfd_create('pharos', os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        self.descriptor = os.memfd_create('pharos')
         try:
             os.ftruncate(self.descriptor, self.capacity)
-            fcntl.fcntl(self.descriptor, fcntl.F_ADD_SEALS, _SEALS)
             self.map = mmap.mmap(self.descriptor, self.capacity)
         except OSError:
             os.close(self.descriptor)
@@ -92,19 +89,23 @@ class MessageMemory:
     def write(self, parts, senders):
         """Send a message by the connections that share memory.
 
-        If no memory file can be had, the connections close, and the readers get TCPROS.
+        If that fails half way, the connections close, and the readers connect anew. If no memory
+        file could be had, they get TCPROS.
         """
+        is_complete = False
         try:
             with self.lock:
                 self._put(parts, senders)
+            is_complete = True
         except OSError as error:
             self.run.lacks_memory = True
             name = senders[0].name
             self.run.troubles.add(f'{name}: sends by TCPROS, since memory lacks a file: {error}')
+        finally:
             for sender in senders:
-                sender.give_up()
-        for sender in senders:
-            sender.close_if_broken()
+                if not is_complete:  # a signal's handler may have raised between any two lines
+                    sender.give_up()
+                sender.close_if_broken()
         if any(sender.is_sending for sender in senders):
             let_others_run()
 
@@ -148,6 +149,7 @@ class MessageMemory:
         oldest = (queued_files or files)[0]
         for sender in list(oldest.readers):
             sender.drop(oldest)
+        oldest.readers.clear()  # a signal may have ended an earlier drop
 
     def close(self):
         """Free the files."""

@@ -1,0 +1,210 @@
+"""Register a run's topics and services, and connect its subscriptions; try again after failures.
+
+One thread of this process, the watcher, looks after all runs.
+"""
+import functools
+import threading
+from contextlib import suppress
+from time import monotonic
+
+from pharos.errors import MasterUnreachableError, PharosError
+from pharos.intraprocess.links import link_topic, runs, runs_lock
+from pharos.private_rospy.xmlrpc import CALLER_ID, UNREACHABLE, ServerProxy
+
+RETRY_DELAY = 1.0  # seconds until the next attempt to connect
+WATCH_PERIOD = 0.5  # seconds between two looks of the watcher
+LOOKS_PER_MASTER = 4  # looks of the watcher for each one at the masters
+#: rospy's names of registries, in the order of the master's system state -> methods of the master
+_REGISTER_METHODS = {
+    'pub': 'registerPublisher',
+    'sub': 'registerSubscriber',
+    'srv': 'registerService',
+}
+_end_of_watch = threading.Event()
+
+
+def enter(run):
+    """Enter a run into ``links.runs``; the first one starts the watcher."""
+    with runs_lock:
+        if not runs:
+            _end_of_watch.clear()
+            threading.Thread(target=_watch, daemon=True).start()
+        runs[run.uri] = run
+
+
+def leave(run):
+    """Take a run out of ``links.runs``; the last one ends the watcher."""
+    with runs_lock:
+        runs.pop(run.uri, None)
+        if not runs:
+            _end_of_watch.set()
+
+
+def register(run, registry, name, data):
+    """Register a topic or service at the master; try once, since the watcher repairs the rest.
+
+    Have all nodes of this process connect to a new publisher.
+
+    :param registry: rospy's name of the registry: 'pub', 'sub' or 'srv'
+    :param data: the name of the topic's type, or the URI of the service
+    """
+    with suppress(MasterUnreachableError):
+        publishers = run.master.call(
+            _REGISTER_METHODS[registry], name, data, run.uri, caller_id=run.name
+        )
+        if registry == 'sub' and publishers is not None:
+            run.publisher_uris[name] = publishers
+    if registry == 'pub':  # sooner than by the master's publisherUpdate
+        for subscriber in list(runs.values()):
+            if subscriber.master.url == run.master.url:
+                _connect(subscriber, name, run.uri)
+
+
+def connect_all(run, topic):
+    """Connect to the publishers of a topic, from the last list of the master.
+
+    Link those of this process in this thread, and connect to others in threads.
+    """
+    for uri in run.publisher_uris.get(topic, ()):
+        if uri in runs:
+            _connect(run, topic, uri)
+        else:
+            _start_connecting(run, topic, uri)
+
+
+def _connect(run, topic, uri):
+    """Connect the subscription of a topic to a publisher, by a link or a socket.
+
+    Do nothing if they are connected, or if another thread connects them already.
+
+    :param uri: the URI of the publisher's node
+    """
+    subscription = run.topic_manager.subs.get(topic)
+    if run.stopping.is_set() or not subscription or subscription.has_connection(uri):
+        return
+    attempt = topic, uri, id(subscription)
+    if attempt in run.connecting:
+        return
+    run.connecting.add(attempt)
+    try:
+        publisher_run = runs.get(uri)
+        if publisher_run:
+            link_topic(publisher_run, run, topic)
+        else:
+            _negotiate(run, topic, uri, subscription)
+    finally:
+        run.connecting.discard(attempt)
+
+
+def _negotiate(run, topic, uri, subscription):
+    """Have rospy offer the protocols of Run.make_findable() and TCPROS, and connect by one."""
+    try:
+        code, _, _ = run.ros_handler._connect_topic(topic, uri)
+    except (AttributeError, UnboundLocalError):
+        return  # rospy raises these if the subscription is closed meanwhile
+    except RuntimeError as error:  # no thread is left, but rospy has added the connection
+        for connection in subscription.connections:
+            if connection.endpoint_id == uri:
+                connection.close()
+        connect_later(run, topic, uri, str(error))
+        return
+    if code != 1:
+        connect_later(run, topic, uri)
+
+
+def connect_later(run, topic, uri, reason=''):
+    """Have the watcher connect after RETRY_DELAY, if the master still names the publisher.
+
+    :param reason: the text of the last error, for the log, or ''
+    """
+    run.retries[topic, uri] = monotonic() + RETRY_DELAY, reason
+
+
+def _retry_connections(run):
+    for (topic, uri), (retry_time, reason) in list(run.retries.items()):
+        if monotonic() < retry_time:
+            continue
+        del run.retries[topic, uri]
+        if uri not in run.publisher_uris.get(topic, ()):
+            continue
+        if reason:
+            run.troubles.add(f'{topic}: no connection to {uri}, it is tried again: {reason}')
+        _start_connecting(run, topic, uri)
+
+
+def _start_connecting(run, topic, uri):
+    """Connect in a thread, or later if the system has none left."""
+    if not run.start_thread(functools.partial(_connect, run, topic, uri)):
+        connect_later(run, topic, uri)
+
+
+# -- the watcher
+
+
+def _watch():
+    """Look after all runs until the last one ends; every two seconds, compare with the masters."""
+    look_count = 0
+    while not _end_of_watch.wait(WATCH_PERIOD):
+        look_count += 1
+        for run in list(runs.values()):
+            _look_after(run)
+        run = None  # else a stopped run would live until the next look
+        if look_count % LOOKS_PER_MASTER == 0:
+            _ask_masters()
+
+
+def _look_after(run):
+    """Drop peers that have left (ros_comm #927) or are silent, and tell the log of troubles.
+
+    End an overlong hold, and connect again after failures.
+    """
+    run.topic_manager.check_all()
+    _retry_connections(run)
+    while run.troubles:
+        run.ros.logwarn_throttle_identical(60, run.troubles.pop())
+    now = monotonic()
+    if now > run.hold_deadline:
+        run.callback_queue.release()
+    if now > run.clock_deadline:
+        run.clock_deadline += 1e9  # it is told once
+        rostime = run.ros.rostime
+        if not (rostime.is_wallclock() or rostime.get_time()):
+            run.troubles.add('time stands still: /use_sim_time is set, and no /clock comes')
+    run.close_silent_clients()
+
+
+def _ask_masters():
+    """Ask each master for its system state, and have the runs register again what is missing."""
+    all_runs = list(runs.values())
+    for url in {run.master.url for run in all_runs}:
+        with suppress(*UNREACHABLE, PharosError):
+            state = ServerProxy(url).getSystemState(CALLER_ID)[2]
+            for run in all_runs:
+                if run.master.url == url and not run.stopping.is_set():
+                    _register_missing(run, state)
+
+
+def _register_missing(run, state):
+    """Register the topics and services that the master's system state lacks.
+
+    If the master knows nothing of the node, set its parameters anew, too.
+
+    :param state: lists of (name, nodes) for publishers, subscribers and services
+    """
+    registered = set()
+    for registry, entries in zip(_REGISTER_METHODS, state):
+        registered.update((registry, name) for name, nodes in entries if run.name in nodes)
+    topics = run.topic_manager
+    services = run.service_manager
+    getters = topics.get_publications, topics.get_subscriptions, services.get_services
+    with topics.lock, services.lock:  # or a topic closed meanwhile would be registered again
+        for registry, get_entries in zip(_REGISTER_METHODS, getters):
+            for name, data in get_entries():
+                is_known = (registry, name) in registered
+                if not is_known and not run.stopping.is_set():
+                    register(run, registry, name, data)
+                    connect_all(run, name)
+    if not registered and not run.stopping.is_set():  # this is a new master
+        run.modules.load('rospy.client')._init_node_params(run.argv, run.name)
+        for parameter in run.node._parameters:
+            parameter.subscribe()

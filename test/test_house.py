@@ -1,0 +1,72 @@
+"""The house: which file imports which, and the numbers that stand in several places."""
+import ast
+import fnmatch
+import re
+
+from helpers import ROOT
+
+SOURCE = ROOT / 'src' / 'pharos'
+FILES = {str(path.relative_to(SOURCE))[:-3]: path for path in sorted(SOURCE.rglob('*.py'))}
+ROOMS = [name for name in FILES if name.endswith('/__init__')]  # empty, but for commands
+
+
+def floors():
+    """The floors of architecture.md, the lowest first, as {file: number}."""
+    text = (ROOT / 'doc' / 'architecture.md').read_text()
+    table = text[text.index('| floor |') : text.index('| file |')].replace('\\', '')
+    numbers = {}
+    for number, row in enumerate(table.splitlines()[2:]):
+        for pattern in row.rpartition('|')[0].rpartition('|')[2].split():
+            numbers.update({name: number for name in fnmatch.filter(FILES, pattern)})
+    return numbers
+
+
+def imports_of(path):
+    """The files that a file imports, also in a function, but for hints alone."""
+    tree = ast.parse(path.read_text())
+    for item in ast.walk(tree):
+        if isinstance(item, ast.If) and getattr(item.test, 'id', '') == 'TYPE_CHECKING':
+            item.body = []
+    for item in ast.walk(tree):
+        names = []
+        if isinstance(item, ast.Import):
+            names = [(each.name,) for each in item.names]
+        elif isinstance(item, ast.ImportFrom):
+            names = [(f'{item.module}.{each.name}', item.module) for each in item.names]
+        for choices in names:  # a module of a package, or a name in a module
+            files = [re.sub('^pharos/', '', name.replace('.', '/')) for name in choices]
+            files = ['__init__' if file == 'pharos' else file for file in files]
+            yield from [file for file in files if file in FILES.keys() - ROOMS][:1]
+
+
+def test_no_file_imports_a_floor_above():
+    numbers = floors()
+    assert FILES.keys() - ROOMS <= numbers.keys()
+    wrong = [
+        (name, imported)
+        for name in FILES.keys() - ROOMS
+        for imported in imports_of(FILES[name])
+        if numbers[imported] > numbers[name]
+    ]
+    assert wrong == []
+
+
+def test_no_files_import_each_other():
+    left = {name: set(imports_of(FILES[name])) - {name} for name in FILES.keys() - ROOMS}
+    while free := {name for name, imported in left.items() if not imported & left.keys()}:
+        left = {name: left[name] for name in left.keys() - free}
+    assert left == {}
+
+
+def test_versions_are_equal():
+    places = {
+        'package.xml': r'<version>([\d.]+)<',
+        'src/pharos/__init__.py': r"__version__ = '([\d.]+)'",
+        'debian/changelog': r'pharos \(([\d.]+)-',
+        'packaging/robostack/recipe.yaml': r'version: ([\d.]+)\n',
+        'CHANGELOG.rst': r'\n([\d.]+) \(20',
+    }
+    versions = {
+        re.search(pattern, (ROOT / name).read_text())[1] for name, pattern in places.items()
+    }
+    assert len(versions) == 1
