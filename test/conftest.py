@@ -1,5 +1,6 @@
 """Fixtures: a real ROS master on a free port of the loopback, so that several runs go side by side."""
 import atexit
+import logging
 import os
 import pathlib
 import shutil
@@ -7,6 +8,8 @@ import sys
 import tempfile
 import threading
 
+import rosgraph
+import rosnode
 import rospkg
 
 # before pharos is imported: the tests have their own logs and addresses
@@ -29,6 +32,8 @@ import helpers  # noqa: E402
 import pharos  # noqa: E402
 from pharos.testing import until  # noqa: E402
 
+# rosmaster logs a traceback for each node that does not answer: a report would be full of them
+logging.getLogger('rosmaster').setLevel(logging.CRITICAL)
 collect_ignore = ['programs', 'robot']
 # rosmaster runs in this process: its threads end when the other side closes the connection
 SERVER_THREADS = 'process_request_thread', 'Dummy-'
@@ -61,8 +66,13 @@ def master(ros_master, monkeypatch):
         until(lambda: not any(master.system_state()), 10)
         until(lambda: not left_threads(threads), 10)
     except TimeoutError:
-        pytest.fail(f'left behind: {left_threads(threads)}, {master.system_state()}')
-    ros_master.forget()
+        state = master.system_state()
+        names = {name for kind in state for names in kind.values() for name in names}
+        # so that the next test does not fail, too
+        rosnode.cleanup_master_blacklist(rosgraph.Master('/test', master.url), names)
+        pytest.fail(f'left behind: {left_threads(threads)}, {state}')
+    finally:
+        ros_master.forget()
 
 
 def left_threads(before):

@@ -11,6 +11,7 @@ import sys
 import textwrap
 import threading
 
+import pytest
 import rosmaster.master
 
 import pharos
@@ -32,6 +33,8 @@ def say(text):
     with open(SAID, 'a') as file:
         print(text, file=file)
 '''
+INIT = "rospy.init_node('program')\n"
+SPIN = INIT + "say('ready')\nrospy.spin()\n"
 threading.Thread.isAlive = threading.Thread.is_alive  # the rospy of Debian 11 calls it at its end
 _created = []
 
@@ -331,6 +334,35 @@ def end(running):
     if running.poll() is None:
         running.signal(signal.SIGINT)
     return running.wait()
+
+
+# -- fixtures of a module: one master, and one peer for all its tests, which have names of their own
+
+
+@pytest.fixture(scope='module')
+def network(request):
+    """Yield a master, and a peer that has run the module's PEER."""
+    ros_master = InProcessMaster()
+    with Peer(ros_master.url) as peer:
+        peer.run(request.module.PEER)
+        yield Master(ros_master.url), peer
+        peer.run("rospy.signal_shutdown('the end')")  # ends the threads of an action server
+    ros_master.stop()
+
+
+@pytest.fixture
+def network_master(network, monkeypatch):
+    """Yield the master of the network, which a test leaves as it was."""
+    master, _ = network
+    monkeypatch.setenv('ROS_MASTER_URI', master.url)
+    yield master
+    stop_nodes(master)
+    until(lambda: [node.name for node in master.nodes()] == ['/peer'], 10, 'the end of all nodes')
+
+
+@pytest.fixture
+def network_peer(network):
+    return network[1]
 
 
 if __name__ == '__main__':

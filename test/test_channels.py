@@ -134,6 +134,20 @@ def test_value_fits_its_field(node, other):
         assert mailbox.next().data == mailbox.next().data == came
 
 
+@pytest.mark.parametrize(
+    'type_, fields, said',
+    [
+        ('sensor_msgs/CameraInfo', {'K': [1.0] * 3}, 'K takes 9 values, not 3'),
+        ('sensor_msgs/CameraInfo', {'K': [1.0] * 8 + ['x']}, r'K\[8\]'),
+        ('geometry_msgs/Polygon', {'points': [{}, 3]}, r'points\[1\]'),
+        ('geometry_msgs/Polygon', {'points': [{}, {'x': 'a'}]}, r'points\[1\].x'),
+    ],
+)
+def test_list_that_does_not_fit_is_named(node, type_, fields, said):
+    with pytest.raises(pharos.MessageTypeError, match=said):
+        node.send_to('/list', typed_as=type_, **fields)
+
+
 def test_unfit_field_is_refused(node, other):
     """The channel goes on, and the next message arrives."""
     table = [

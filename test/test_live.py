@@ -311,9 +311,12 @@ class Scene:
             self.pids = {'own': os.getpid(), 'peer': peer.pid}
             self.svg = folder / 'graph.svg'
             commands = {**COMMANDS, 'picture': f'graph --output {self.svg}'}
-            running = {key: program(command, master.url) for key, command in commands.items()}
-            self.codes = {key: each.wait() for key, each in running.items()}
-            self.output = {key: each.output for key, each in running.items()}
+            self.codes = {}
+            self.output = {}
+            for key, command in commands.items():
+                running = program(command, master.url)
+                self.codes[key] = running.wait()
+                self.output[key] = running.output
 
     def _fill(self, master, peer):
         sender = send_all_the_time(master)

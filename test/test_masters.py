@@ -414,6 +414,12 @@ def test_run_starts_installed_c_program(master):
     assert master.topic('/from').subscribers == []
 
 
+@pytest.mark.parametrize('way', ['run', 'launch', 'load', 'compose'])
+def test_unknown_package_is_named(master, way):
+    with pytest.raises(pharos.UnknownNodeError, match="no package 'lab_robt'"):
+        getattr(master, way)('lab_robt', 'robot.launch')
+
+
 def test_run_gives_arguments_unchanged(master, robot):
     shows = robot('shows', PRINTS_ARGUMENTS)
     with master.run('small_robot', shows, 'two words', 3, '--flag') as process:

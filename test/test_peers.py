@@ -12,9 +12,9 @@ import rosbag
 import std_msgs.msg
 from geometry_msgs.msg import PointStamped, TransformStamped
 
-from helpers import TIMEOUT, InProcessMaster, Peer, Program, create, stop_nodes
+import helpers
+from helpers import TIMEOUT, Peer, Program, create
 import pharos
-from pharos import Master
 from pharos.testing import Mailbox, until
 
 STRING = 'std_msgs/String'
@@ -28,30 +28,8 @@ needs_relay = pytest.mark.skipif(not os.path.exists(RELAY), reason='needs topic-
 needs_nodelet = pytest.mark.skipif(not os.path.exists(NODELET), reason='needs libnodeletlib-tools')
 
 
-@pytest.fixture(scope='module')
-def network():
-    """A ROS master, and one peer for all tests: each test has topics of its own."""
-    ros_master = InProcessMaster()
-    with Peer(ros_master.url) as peer:
-        peer.run('import threading, genpy.dynamic, std_msgs.msg, std_srvs.srv')
-        yield Master(ros_master.url), peer
-        peer.run("rospy.signal_shutdown('the end')")  # ends the threads of its action server
-    ros_master.stop()
-
-
-@pytest.fixture
-def master(network, monkeypatch):
-    """The master of the network, which a test leaves as it was."""
-    master, _ = network
-    monkeypatch.setenv('ROS_MASTER_URI', master.url)
-    yield master
-    stop_nodes(master)
-    until(lambda: [node.name for node in master.nodes()] == ['/peer'], 10, 'the end of all nodes')
-
-
-@pytest.fixture
-def peer(network):
-    return network[1]
+PEER = 'import threading, genpy.dynamic, std_msgs.msg, std_srvs.srv'
+network, master, peer = helpers.network, helpers.network_master, helpers.network_peer
 
 
 @pytest.fixture

@@ -13,9 +13,10 @@ import rosgraph
 import rospy
 import std_srvs.srv
 
-from helpers import PYTHON, TIMEOUT, InProcessMaster, Peer, create, registrations, stop_nodes
+import helpers
+from helpers import PYTHON, TIMEOUT, create, registrations
 import pharos
-from pharos import Master, Node, ServiceCallError, UnknownServiceError
+from pharos import Node, ServiceCallError, UnknownServiceError
 from pharos.testing import Mailbox, until
 
 EMPTY = 'std_srvs/Empty'
@@ -52,29 +53,7 @@ services = [
 pool = concurrent.futures.ThreadPoolExecutor()
 
 
-@pytest.fixture(scope='module')
-def network():
-    """A ROS master, and one peer for all tests: each test has service names of its own."""
-    ros_master = InProcessMaster()
-    with Peer(ros_master.url) as peer:
-        peer.run(PEER)
-        yield Master(ros_master.url), peer
-    ros_master.stop()
-
-
-@pytest.fixture
-def master(network, monkeypatch):
-    """The master of the network, which a test leaves as it was."""
-    master, _ = network
-    monkeypatch.setenv('ROS_MASTER_URI', master.url)
-    yield master
-    stop_nodes(master)
-    until(lambda: [node.name for node in master.nodes()] == ['/peer'], 10, 'the end of all nodes')
-
-
-@pytest.fixture
-def peer(network):
-    return network[1]
+network, master, peer = helpers.network, helpers.network_master, helpers.network_peer
 
 
 @pytest.fixture

@@ -455,16 +455,6 @@ def test_killed_publisher_is_replaced(master, node):
                 assert (data == data[:4] * (LARGE // 4)) is True
 
 
-def test_file_that_could_shrink_is_refused(master, node, listener, topic, monkeypatch):
-    monkeypatch.setattr('pharos.shared_memory.sending._SEALS', 0)
-    log = Mailbox(create(master, '/ear'), '/rosout', 'rosgraph_msgs/Log')
-    listener.listen(topic)
-    out = node.output_channel(topic, IMAGE)
-    until(lambda: out.connections)
-    out.send(data=bytes(LARGE))
-    log.wait_for(lambda line: 'without a seal' in line.msg)
-
-
 def test_file_of_one_large_message_is_given_back(node, listener, topic):
     listener.listen(topic)
     datas = map(bytes, (LARGE, 100_000, 100_000))

@@ -2,9 +2,7 @@
 import concurrent.futures
 import contextlib
 import itertools
-import json
 import os
-import pathlib
 import signal
 import socket
 import struct
@@ -21,7 +19,7 @@ import std_srvs.srv
 from rosgraph.network import encode_ros_handshake_header
 
 import pharos
-from helpers import PYTHON, TIMEOUT, Peer, Program, create, registrations
+from helpers import TIMEOUT, Peer, create, registrations
 from pharos import BlockNode, Master
 from pharos.testing import Mailbox, until
 from programs.raw_tcpros import (
@@ -37,7 +35,6 @@ from programs.raw_tcpros import (
 
 STRING = 'std_msgs/String'
 LOG = 'rosgraph_msgs/Log'
-BARE_ROSPY = pathlib.Path(__file__).parent / 'programs' / 'bare_rospy.py'
 LARGE = 'x' * 1_000_000
 
 
@@ -96,39 +93,6 @@ class LogOf:
                 found.append(line.msg)
             if marker in line.msg:
                 return found
-
-
-# -- the twins: bare rospy has the pain
-
-
-WISHES = """
-second_node starts_again no_core_is_busy_after_the_shutdown
-silent_client_blocks_none busy_xmlrpc_port_is_named busy_tcpros_port_is_named
-shutdown_for_an_earlier_owner_is_ignored first_messages_arrive small_messages_without_delay
-latched_by_value each_latched_publisher_keeps_its_message subscriber_that_left_is_known
-service_call_takes_a_timeout others_are_served_beside_one_that_reads_nothing
-one_callback_at_a_time subscription_needs_no_type one_interface_alone
-exception_in_a_callback_is_told""".split()
-
-
-@pytest.fixture(scope='module')
-def bare(ros_master):
-    """Return what a program with rospy alone can do, as ``{wish: True or False}``."""
-    # it has no pharos to measure, and its moments are shorter than a tracer allows
-    environ = {'COVERAGE_PROCESS_START': ''}
-    command = [PYTHON, '-W', 'ignore', str(BARE_ROSPY)]
-    with Program(command, ros_master.url, **environ) as program:
-        program.wait()
-    assert 'found ' in program.output, program.output
-    found = json.loads(program.output.rpartition('found ')[2])
-    assert set(found) == set(WISHES)
-    return found
-
-
-@pytest.mark.parametrize('wish', WISHES)
-def test_bare_rospy_still_fails(bare, wish):
-    """If this fails, rospy was mended: delete the twin."""
-    assert bare[wish] is False
 
 
 # -- the 21 pains, in the table's order
@@ -630,13 +594,11 @@ def test_nonsense_closes_its_client_alone(host, which):
 
 @pytest.mark.parametrize('kind', ['announced 4 GiB', 'HTTP', 'other type'])
 def test_nonsense_is_logged_in_one_line(master, host, kind):
-    """The line names the client's address."""
     log = LogOf(master, host)
     with connect(host.tcp_port) as client:
         client.sendall(NONSENSE['tcp_port'][kind])
         assert is_closed(client)
-        address = '{}:{}'.format(*client.getsockname())
-    lines = log.warnings(address)
+    lines = log.warnings('/bad' if kind == 'other type' else 'nbound TCP')
     host.log('the end', level='warning')
     assert log.warnings('the end') == ['the end']
     assert len(lines) == 1
@@ -762,6 +724,37 @@ def test_subscription_connects_after_lack_of_threads(master, peer, monkeypatch):
     until(lambda: peer.value('publisher.get_num_connections()') == 1)
     peer.run('publisher.publish("hello")')
     assert mailbox.next().data == 'hello'
+
+
+@pytest.mark.parametrize('queue_size', [None, 10])
+def test_handler_that_raises_in_publish(master, peer, queue_size):
+    """The next publish() sends the rest of a message that a signal has cut, and then its own."""
+    mouth = create(master, '/mouth')
+    peer.hear('/t', STRING)
+    publisher = mouth.ros.Publisher('/t', std_msgs.msg.String, queue_size=queue_size)
+    until(publisher.get_num_connections)
+
+    class Alarm(Exception):
+        pass
+
+    def handle(number, frame):
+        raise Alarm
+
+    former_handler = signal.signal(signal.SIGALRM, handle)
+    try:
+        os.kill(peer.pid, signal.SIGSTOP)
+        with pytest.raises(Alarm):
+            signal.setitimer(signal.ITIMER_REAL, 0.2)
+            while True:
+                publisher.publish('x' * 100_000)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, former_handler)
+        os.kill(peer.pid, signal.SIGCONT)
+
+    publisher.publish('whole')
+    until(lambda: peer.value('heard["/t"] and heard["/t"][-1].data') == 'whole')
+    assert set(peer.value('{message.data for message in heard["/t"]}')) == {'whole', 'x' * 100_000}
 
 
 # -- for a while

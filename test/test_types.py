@@ -311,7 +311,6 @@ def test_same_definition_gives_same_class():
     [
         (define_message, 'redefined_msgs/Leg', 'int8 length', 'int16 length'),
         (define_message, 'std_msgs/String', 'string data', 'string text'),
-        (define_service, 'redefined_msgs/Set', 'int8 x\n---', '---\nint8 x'),
         (define_service, 'std_srvs/Empty', '---', 'int8 x\n---'),
     ],
 )
@@ -388,3 +387,42 @@ def test_live_publisher_defines_type(master, peer, definition):
 def test_unknown_type_without_publisher_raises(master):
     with pytest.raises(UnknownTypeError, match='nobody_msgs/Leg'):
         create(master).interested_in('/legs', 'nobody_msgs/Leg')
+
+
+# -- nonsense
+
+
+def test_nonsense_raises_and_names_type():
+    for text in [
+        'int8',
+        'int8 a\n\nint8 b c\n',
+        'int8 1a',
+        'int8 é',
+        'int8 a-b',
+        'int8[-1] a',
+        'int8[2][3] a',
+        'int8[x] a',
+        'a/b/c d',
+        '../../etc a',
+        'int8 X=300',
+        'int8 X=a',
+        'string X; import os; Y=1',
+        'float32 X=__import__',
+        'int8 a\nint8 a',
+        'int8 serialize',
+        'no_msgs/Nonsuch x',
+        'Bad x',
+        'Other[] x\n===\nMSG: nonsense_msgs/Other\nBad[] y',
+        b'int8 a',
+        None,
+    ]:
+        with pytest.raises(UnknownTypeError, match='nonsense_msg'):
+            define_message('nonsense_msgs/Bad', text)
+        with pytest.raises(UnknownTypeError):
+            define_message('nonsense_msgs/User', 'Bad bad')
+
+
+@pytest.mark.parametrize('text', ['int8\n---\n', '---\nint8', '---\nNo x', None], ids=repr)
+def test_nonsense_service_raises_and_names_type(text):
+    with pytest.raises(UnknownTypeError, match='nonsense_srvs/Bad'):
+        define_service('nonsense_srvs/Bad', text)

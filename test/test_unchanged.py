@@ -11,12 +11,10 @@ import time
 import pytest
 
 import pharos
-from helpers import COMPOSE, HEAD, PYTHON, TIMEOUT, Program, create, end
+from helpers import COMPOSE, HEAD, INIT, PYTHON, SPIN, TIMEOUT, Program, create, end
 from pharos.testing import Mailbox, until
 
 STRING = 'std_msgs/String'
-INIT = "rospy.init_node('program')\n"
-SPIN = INIT + "say('ready')\nrospy.spin()\n"
 DRIVE = '''
 from geometry_msgs.msg import Twist, Vector3
 def go(speed):

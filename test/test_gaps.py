@@ -1,0 +1,334 @@
+"""Behaviour whose loss would hurt a robot; each test fails with exactly one change of the source."""
+import http.client
+import os
+import signal
+import threading
+import xmlrpc.client
+
+import pytest
+import rosgraph_msgs.msg
+import rospy
+import std_msgs.msg
+
+import pharos
+from helpers import INIT, SPIN, TIMEOUT, Peer, PharosPeer, create, end, free_port
+from pharos import NodeNameInUseError
+from pharos.testing import Mailbox, until
+
+STRING = 'std_msgs/String'
+LOG = 'rosgraph_msgs/Log'
+
+
+@pytest.fixture
+def node(master):
+    return create(master)
+
+
+# -- what waits, and what has ended
+
+
+class Gate:
+    """A delegate that blocks at each message until the gate is opened."""
+
+    def __init__(self):
+        self.heard = []
+        self.begun = threading.Event()
+        self.open = threading.Event()
+
+    def __call__(self, message):
+        self.heard.append(message.data)
+        self.begun.set()
+        self.open.wait(TIMEOUT)
+
+
+class Hasty(pharos.BlockNode):
+    stop_timeout = 0.05
+
+
+def fill(master):
+    """Return a node, its gate and channel, and a sender; one message is in the gate, and two wait."""
+    gate, ear, mouth = Gate(), create(master, '/ear', Hasty), create(master, '/mouth')
+    channel = ear.interested_in('/words', STRING, gate)
+    for word in 'first', 'old', 'older':
+        mouth.send_to('/words', typed_as=STRING, data=word)
+    assert gate.begun.wait(TIMEOUT)
+    return ear, gate, channel, mouth
+
+
+def test_restarted_node_hears_no_old_message(master):
+    ear, gate, _, mouth = fill(master)
+    ear.stop()
+    gate.open.set()
+    ear.start()
+    del gate.heard[:]
+    mouth.send_to('/words', data='new')
+    until(lambda: gate.heard)
+    assert gate.heard[0] == 'new'
+
+
+def test_stop_drops_what_waits(master):
+    ear, gate, channel, _ = fill(master)
+    ear.stop_timeout = TIMEOUT
+    stopping = threading.Thread(target=ear.stop)
+    stopping.start()
+    until(lambda: channel.callback_queue.closed)
+    gate.open.set()
+    stopping.join(TIMEOUT)
+    assert gate.heard == ['first']
+
+
+def test_closed_channel_drops_what_waits(master):
+    ear, gate, channel, mouth = fill(master)
+    after = Mailbox(ear, '/after', STRING)
+    channel.close()
+    gate.open.set()
+    mouth.send_to('/after', typed_as=STRING, data='x')
+    after.next()  # delegates of a node run in order
+    assert gate.heard == ['first']
+
+
+def test_failed_start_keeps_channels(master, node):
+    box = Mailbox(node, '/words', STRING)
+    node.stop()
+    with create(master, '/node'):
+        with pytest.raises(NodeNameInUseError):
+            node.start()
+    node.start()
+    create(master, '/other').send_to('/words', typed_as=STRING, data='x')
+    assert box.next().data == 'x'
+
+
+def test_ended_soul_is_not_run_again(node):
+    ran, begun = [], threading.Semaphore(0)
+    node.fork(lambda me: ran.append(1)).join(TIMEOUT)
+    node.fork(lambda me: (begun.release(), me.sleep(3600)))
+    assert begun.acquire(timeout=TIMEOUT)
+    node.restart()
+    assert begun.acquire(timeout=TIMEOUT)
+    assert ran == [1]
+
+
+def test_stop_ends_call_of_soul(master, node, peer):
+    peer.run(
+        'from std_srvs.srv import Empty\ncalled = []\n'
+        "hang = rospy.Service('/hang', Empty, lambda request: called.append(1) or rospy.sleep(3600))"
+    )
+    node.stop_timeout = TIMEOUT
+    thread = node.fork(lambda me: me.wait_for_service('/hang', TIMEOUT).call())
+    until(lambda: peer.value('called'))
+    stopping = threading.Thread(target=node.stop, daemon=True)
+    stopping.start()
+    stopping.join(TIMEOUT / 3)
+    assert not stopping.is_alive() and not thread.is_alive()
+
+
+def test_health_counts_souls_and_the_log_names_what_is_left(master):
+    node, free = create(master, node_class=Hasty), threading.Event()
+    log = Mailbox(create(master, '/ear'), '/rosout', LOG)
+    node.fork(lambda me: None, name='short').join(TIMEOUT)
+    node.fork(lambda me: free.wait(TIMEOUT), name='stubborn')
+    assert (node.health().souls, node.health().ended_souls) == (1, ['short'])
+    node.stop()
+    log.wait_for(lambda line: 'left behind' in line.msg and 'stubborn' in line.msg)
+    free.set()
+
+
+# -- messages
+
+
+def test_images_flat_out_are_whole(master, node):
+    torn, heard = [], threading.Event()
+
+    def look(message):
+        if message.data.count(message.data[0]) != len(message.data):
+            torn.append(message)
+        if message.encoding == 'last':
+            heard.set()
+
+    node.interested_in('/image', 'sensor_msgs/Image', look)
+    with PharosPeer(master.url) as camera:
+        camera.run("out = node.output_channel('/image', 'sensor_msgs/Image')")
+        camera.run(
+            'images = [bytes([n]) * (3 << 20) for n in range(20)]\n'
+            'for n in range(200): out.send(data=images[n % 20])\n'
+            "out.send(data=images[0], encoding='last')"
+        )
+        assert heard.wait(TIMEOUT)
+    assert not torn
+
+
+@pytest.mark.parametrize('library, size', [(Peer, 1 << 20), (PharosPeer, 60_000)])
+def test_queue_to_a_standing_subscriber_is_bounded(master, node, library, size):
+    with library(master.url) as ear:
+        ear.hear('/words', STRING)
+        out = node.output_channel('/words', STRING, queue_size=2)
+        os.kill(ear.pid, signal.SIGSTOP)
+        for number in range(100):
+            out.send(data=str(number).ljust(size))
+        os.kill(ear.pid, signal.SIGCONT)
+        numbers = "[message.data[:3].strip() for message in heard['/words']]"
+        until(lambda: ear.value(numbers)[-1:] == ['99'])
+        assert len(ear.value(numbers)) < 60
+
+
+def test_latched_message_goes_to_the_new_subscriber_alone(master, node):
+    create(master, '/map').output_channel('/map', STRING, latch=True).send(data='map')
+    first, second = [], []
+    node.ros.Subscriber('/map', std_msgs.msg.String, first.append)
+    until(lambda: first)
+    node.ros.Subscriber('/map', std_msgs.msg.String, second.append)
+    until(lambda: second)
+    assert len(first) == 1
+
+
+def test_closed_channel_takes_its_latched_message_along(master, node):
+    channels = [node.output_channel('/map', STRING, latch=True) for _ in range(2)]
+    for channel, text in zip(channels, ['old', 'new']):
+        channel.send(data=text)
+    channels[0].close()
+    box = Mailbox(create(master, '/late'), '/map', STRING)
+    assert box.next().data == 'new'
+    channels[1].send(data='last')
+    assert box.next().data == 'last'
+
+
+def test_channels_of_a_node_get_messages_of_their_own(node, peer):
+    boxes = [Mailbox(node, '/words', STRING) for _ in range(2)]
+    peer.run("out = rospy.Publisher('/words', message_class('std_msgs/String'), queue_size=1)")
+    until(lambda: peer.value('out.get_num_connections()'))
+    peer.run("out.publish('one')")
+    one, other = [box.next() for box in boxes]
+    assert one == other and one is not other
+
+
+# -- parameters, time, and calls from elsewhere
+
+
+@pytest.mark.parametrize('value', [True, 1.0])
+def test_change_of_type_is_heard(node, value):
+    rate, heard = node.parameter('~rate', 1), []
+    rate.on_change(heard.append)
+    rate.set(value)
+    until(lambda: heard)
+    assert type(heard[0]) is type(value)
+
+
+def test_clock_that_jumps_back_stops_no_turns(master):
+    master.parameters['/use_sim_time'] = True
+    node, turns = create(master), []
+    clock = create(master, '/clock_of_all').output_channel('/clock', 'rosgraph_msgs/Clock')
+
+    def tick(seconds):
+        clock.publish(rosgraph_msgs.msg.Clock(rospy.Time(seconds)))
+        until(lambda: node.ros.Time.now().to_sec() == seconds)
+
+    tick(100)
+    node.fork(lambda me: [turns.append(turn) for turn in me.every(1)])
+    until(lambda: turns)
+    for start in 100, 10:
+        count = len(turns)
+        for seconds in range(start + 2, start + 9, 2):
+            tick(seconds)
+        until(lambda count=count: len(turns) > count)
+    del master.parameters['/use_sim_time']
+
+
+@pytest.mark.parametrize('obeys', [False, True])
+def test_other_hosts_stop_a_node_if_it_allows_that(master, monkeypatch, obeys):
+    monkeypatch.setattr('pharos.private_rospy.patches.is_local_address', lambda host: False)
+    node = create(master)
+    node.allow_remote_shutdown = obeys
+
+    class Elsewhere(xmlrpc.client.Transport):
+        def make_connection(self, host):
+            return http.client.HTTPConnection(host, source_address=('127.0.0.2', 0))
+
+    with xmlrpc.client.ServerProxy(node.uri, Elsewhere()) as proxy:
+        code, _, _ = proxy.shutdown('/elsewhere', 'end')
+    assert code == int(obeys)
+    if obeys:
+        until(lambda: not node.is_running)
+
+
+# -- composed programs
+
+
+def test_end_of_main_waits_for_threads_and_calls_atexit_in_reverse(bench):
+    text = '''
+        def work():
+            over.wait()
+            time.sleep(0.1)
+            say('thread')
+        over = threading.Event()
+        rospy.init_node('program')
+        threading.Thread(target=work).start()
+        for text in 'first', 'second': atexit.register(say, text)
+        say('main')
+        over.set()
+        '''
+    bench.load(text).wait(TIMEOUT)
+    assert bench.said() == ['main', 'thread', 'second', 'first']
+
+
+def test_script_that_ignores_the_stop_gets_systemexit(bench, capfd):
+    text = '''
+        over = threading.Event()
+        rospy.init_node('program')
+        say('ready')
+        try:
+            while True: over.wait(0.01)
+        except SystemExit:
+            say('SystemExit')
+        '''
+    script = bench.load(text)
+    until(bench.said)
+    script.stop_timeout = 0.1
+    script.stop()
+    assert f'left behind, since it did not end in time: {script.path}' in capfd.readouterr().err
+    until(lambda: bench.said() == ['ready', 'SystemExit'])
+
+
+def test_last_node_can_be_stopped_and_started(master, bench):
+    with master.compose(None, bench.launch_file(program=SPIN)) as composition:
+        (script,) = composition.nodes
+        composition.control(script, 'stop')
+        with pytest.raises(TimeoutError):
+            composition.wait(0.2)
+        composition.control(script, 'start')
+        assert script.is_running
+
+
+def test_respawn_waits_for_its_delay(bench):
+    bench.write(INIT + 'say(time.time())\n')
+    more = 'respawn="true" respawn_delay="0.5"'
+    with bench.program(bench.launch_file(f'<node pkg="bench" type="program" name="p" {more}/>')):
+        until(lambda: len(bench.said()) >= 2)
+    first, second, *_ = map(float, bench.said())
+    assert second - first >= 0.5
+
+
+def test_node_with_a_folder_runs_there(bench):
+    bench.write(INIT + 'say(os.getcwd())\nrospy.spin()\n')
+    xml = '<node pkg="bench" type="program" name="program" cwd="node"/>'
+    with bench.program(bench.launch_file(xml)):
+        until(bench.said)
+    assert bench.said() == [str(bench.folder)]
+
+
+def test_program_with_a_window_runs_here_if_asked(bench):
+    path = bench.launch_file(program=f'import tkinter\n{INIT}say(os.getpid())\nrospy.spin()\n')
+    for options in [], ['--here', 'program']:
+        with bench.program(path, *options) as composed:
+            until(lambda options=options: len(bench.said()) == 1 + len(options) // 2)
+            is_here = bench.said()[-1] == str(composed.pid)
+        assert is_here == bool(options)
+
+
+def test_master_is_started_if_there_is_none(bench, monkeypatch):
+    bench.master = pharos.Master(f'http://127.0.0.1:{free_port()}/')
+    with bench.program(bench.launch_file(program=SPIN)) as composed:
+        until(lambda: bench.said() == ['ready'])
+        assert bench.master.node('/program').pid == composed.pid
+        assert 'no ROS master at' in composed.output
+        end(composed)
+    assert not bench.master.is_reachable()
