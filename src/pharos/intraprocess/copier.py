@@ -59,7 +59,7 @@ def copier_for(cls):
 
 def copy_of(message):
     """Return a copy of a message; raise the exceptions of ``serialize``."""
-    freeze, thaw = copier_for(type(message))
+    freeze, thaw = copier_for(type(message))  # type: ignore[arg-type]
     return thaw(freeze(message))
 
 

@@ -96,7 +96,7 @@ class Inbox(BoundedQueue):
         self.messages.append(job)
         self._jobs.append(job)
         if count >= self._capacity:  # drop last: a receiver must not find the queue empty
-            self.drop_beyond(self._capacity)
+            self.drop_beyond(self._capacity)  # type: ignore[arg-type]
 
     def forget(self, job):
         """Take a job away; return False if the thread has taken the job already."""

@@ -55,7 +55,7 @@ class Link(Transport):
 
     def close(self):
         """Close both ends: rospy closes no connection of a publisher that has left the topic."""
-        if self.done:
+        if self.done:  # type: ignore[has-type]
             return
         self.done = True
         self.other_end.done = True

@@ -178,7 +178,7 @@ def _ask_masters():
     all_runs = list(runs.values())
     for url in {run.master.url for run in all_runs}:
         with suppress(*UNREACHABLE, PharosError):
-            state = ServerProxy(url).getSystemState(CALLER_ID)[2]
+            state = ServerProxy(url).getSystemState(CALLER_ID)[2]  # type: ignore[index]
             for run in all_runs:
                 if run.master.url == url and not run.stopping.is_set():
                     _register_missing(run, state)

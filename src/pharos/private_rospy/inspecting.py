@@ -25,10 +25,10 @@ def _private_module(thing):
         frame = sys._getframe()
         while frame and not owner:
             owner = _owner_of_builtins(frame.f_globals.get('__builtins__'))
-            frame = frame.f_back
+            frame = frame.f_back  # type: ignore[assignment]
     else:
         variables = getattr(thing, 'f_globals', None) or getattr(thing, '__globals__', None) or {}
-        name = variables.get('__name__')
+        name = variables.get('__name__')  # type: ignore[assignment]
         owner = _owner_of_builtins(variables.get('__builtins__'))
     module = owner.modules.get(name) if owner else None
     return module if type(module) is ModuleType else None  # not a stand-in
@@ -60,7 +60,7 @@ def _getsourcefile(thing, original=inspect.getsourcefile):
     return original(thing)
 
 
-def _process_class(cls, *args, original=dataclasses._process_class, **kwargs):
+def _process_class(cls, *args, original=dataclasses._process_class, **kwargs):  # type: ignore
     """Have @dataclass find the module of a private class: it looks in sys.modules for ClassVar.
 
     Another node may be importing a module of the same name.
@@ -86,15 +86,15 @@ def _exec_module(loader, module, original=SourceFileLoader.exec_module):
     frame = sys._getframe(1)
     # code in C may import in a thread without another frame
     while frame and frame.f_globals.get('__name__', '').partition('.')[0] in _IMPORTERS:
-        frame = frame.f_back
+        frame = frame.f_back  # type: ignore[assignment]
     owner = frame and _owner_of_builtins(frame.f_globals.get('__builtins__'))
     if owner:
         vars(module)['__builtins__'] = owner.builtins
     original(loader, module)
 
 
-SourceFileLoader.exec_module = _exec_module
-dataclasses._process_class = _process_class
+SourceFileLoader.exec_module = _exec_module  # type: ignore[assignment]
+dataclasses._process_class = _process_class  # type: ignore[attr-defined]
 inspect.getmodule = _getmodule
 inspect.getfile = _getfile
 inspect.getsourcefile = _getsourcefile

@@ -58,9 +58,9 @@ def private_path():
         package_folders = getattr(package, '__dict__', {}).get('__path__') or ['']
         devel_folder, *source_folders = map(os.path.dirname, package_folders)
         for folder in source_folders:
-            if devel_folder in path and folder in path[: path.index(devel_folder)]:
-                path.remove(folder)
-                path.append(folder)
+            if devel_folder in path and folder in path[: path.index(devel_folder)]:  # type: ignore
+                path.remove(folder)  # type: ignore[arg-type]
+                path.append(folder)  # type: ignore[arg-type]
     return path
 
 
@@ -98,7 +98,7 @@ def _import_shared(name):
     if spec and not getattr(spec, '_initializing', False):
         return module
     with process_lock:
-        return importlib._bootstrap._gcd_import(name)
+        return importlib._bootstrap._gcd_import(name)  # type: ignore[attr-defined]
 
 
 def source_places(top_name):
@@ -109,7 +109,7 @@ def source_places(top_name):
     spec = getattr(sys.modules.get(top_name), '__spec__', None) or PathFinder.find_spec(top_name)
     if top_name in COMMON or spec is None or not str(spec.origin).endswith('.py'):
         return None, []
-    file = pathlib.Path(spec.origin)
+    file = pathlib.Path(spec.origin)  # type: ignore[arg-type]
     folders = list(spec.submodule_search_locations or ())
     # an __init__ in a devel space of catkin names the source folder
     source = re.search(r'__extended_path = [\'"]([^\'"]*)', file.read_text(errors='replace'))
@@ -224,8 +224,8 @@ class PrivateModules:
         spec = PathFinder.find_spec(top_name, [*self.path, *sys.path])
         if spec is None:
             return False
-        places = spec.submodule_search_locations or [spec.origin]
-        folder = os.path.dirname(places[0])
+        places = spec.submodule_search_locations or [spec.origin]  # type: ignore[list-item]
+        folder = os.path.dirname(places[0])  # type: ignore[type-var]
         if folder not in added_folders:
             return False
         if os.path.basename(folder) == 'site-packages':
@@ -279,7 +279,7 @@ class PrivateModules:
         if not fromlist:
             return self.load(name.partition('.')[0])
         if hasattr(module, '__path__'):
-            importlib._bootstrap._handle_fromlist(module, fromlist, self.load)
+            importlib._bootstrap._handle_fromlist(module, fromlist, self.load)  # type: ignore
         if '*' in fromlist:
             return self._with_private_modules(module)
         return module

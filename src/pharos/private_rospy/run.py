@@ -143,7 +143,7 @@ class Run:
             def start(self):
                 self.daemon = True
                 run.threads.add(self)  # before its start: a stop waits for it
-                self.run = functools.partial(run.run_thread, self, self.run)
+                self.run = functools.partial(run.run_thread, self, self.run)  # type: ignore
                 super().start()
 
         self.Thread = Thread
@@ -347,7 +347,8 @@ class Run:
             proxy = ServerProxy(uri, NAME_LIMIT)
             proxy.getPid(CALLER_ID)  # raises if the URI is dead
             name = self.name
-            name = proxy.getName(CALLER_ID)[2]  # another node may have the URI; roscpp raises
+            # another node may have the URI; roscpp raises
+            name = proxy.getName(CALLER_ID)[2]  # type: ignore[index]
         if name == self.name:
             raise NodeNameInUseError(
                 f'{name} is running already, at {uri}: choose another name, or end that one'
@@ -412,7 +413,7 @@ class Run:
         deadline = monotonic() + timeout
         for publisher in list(self.topic_manager.pubs.values()):
             publisher.flush(deadline)
-        self.rospy_signal_shutdown('stop')
+        self.rospy_signal_shutdown('stop')  # type: ignore[attr-defined]
 
     def _begin_stop(self):
         """End sleeps, waits and service calls of the node."""

@@ -62,7 +62,7 @@ def call_by_proxy(run, proxy, request):
     except ServiceException as error:
         text = str(error).encode()  # as in rospy, which prints the bytes
         raise ServiceException(
-            f'service [{proxy.resolved_name}] responded with an error: {text}'
+            f'service [{proxy.resolved_name}] responded with an error: {text}'  # type: ignore
         ) from None
     except SystemExit as error:  # ends the service's thread in rospy, and not the caller's
         if run.stopping.is_set():

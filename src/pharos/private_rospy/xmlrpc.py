@@ -11,7 +11,7 @@ UNREACHABLE = OSError, xmlrpc.client.Error, HTTPException, ExpatError
 class _Transport(xmlrpc.client.Transport):
     def make_connection(self, host):
         connection = super().make_connection(host)
-        connection.timeout = self.limit
+        connection.timeout = self.limit  # type: ignore[attr-defined]
         return connection
 
     def single_request(self, *args):
@@ -29,5 +29,5 @@ class ServerProxy(xmlrpc.client.ServerProxy):
 
     def __init__(self, uri, limit=CALL_LIMIT):
         transport = _Transport()
-        transport.limit = limit
+        transport.limit = limit  # type: ignore[attr-defined]
         super().__init__(uri, transport)

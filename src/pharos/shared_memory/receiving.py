@@ -155,7 +155,9 @@ class SharedMemoryHandler(ProtocolHandler):
     def _connect_by_tcpros(self, topic, uri):
         offer = self._tcpros_handler.get_supported()
         try:
-            code, text, answer = ServerProxy(uri).requestTopic(self.run.name, topic, offer)
+            code, text, answer = ServerProxy(uri).requestTopic(  # type: ignore[misc]
+                self.run.name, topic, offer
+            )
         except UNREACHABLE as error:
             return 0, str(error), 0
         if code != 1:

@@ -75,7 +75,7 @@ class MessageMemory:
 
     def split(self, message):
         """Return the slot of a large field and its bytes, or WHOLE and the message, and the rest."""
-        for slot in _byte_fields(type(message)):
+        for slot in _byte_fields(type(message)):  # type: ignore[arg-type]
             name = message.__slots__[slot]
             value = _view(getattr(message, name))
             if len(value) > MAX_PACKET:
