@@ -15,9 +15,6 @@ import rosgraph
 
 HERE = pathlib.Path(__file__).resolve().parent
 SOURCE = HERE.parent / 'src'
-BUILD = HERE.parent / 'build' / 'benchmark'
-CPP_NEEDS = 'catkin cmake g++ libnodeletlib-dev libgeometry-msgs-dev libsensor-msgs-dev'
-NODELETS = 'C++ nodelets'
 # row -> the words for player.py; 'two': a process sends, another receives
 ROWS = {
     'direct call': ['direct'],
@@ -26,7 +23,6 @@ ROWS = {
     'pharos inline, shared': ['pharos', 'inline', 'shared'],
     'pharos default': ['pharos'],
     'pharos default, send_to': ['pharos', 'send_to'],
-    NODELETS: ['nodelets'],
     'rospy, 1 process': ['rospy'],
     'pharos, 2 processes': ['pharos', 'two'],
     'rospy, 2 processes': ['rospy', 'two'],
@@ -122,7 +118,7 @@ def make(names, environment, folder, beside=None):
         for source in (SOURCE, beside) if beside and way == 'pharos' else (SOURCE,):
             label = f'row{len(found)}'
             command = ['/usr/bin/python3', str(HERE / 'player.py'), way, label, *words]
-            commands = [[str(BUILD / 'player'), way, label] if way == 'nodelets' else command]
+            commands = [command]
             if 'two' in words:
                 stamps = folder / f'{label}.stamps'
                 stamps.touch()
@@ -134,17 +130,6 @@ def make(names, environment, folder, beside=None):
             environ = {**environment, 'PYTHONPATH': str(source)}
             found.append(Row(name + mark, commands, environ, errors))
     return found
-
-
-def build_nodelets():
-    """Build the player in C++; False, and a message, if packages are missing."""
-    BUILD.mkdir(parents=True, exist_ok=True)
-    python = '-DPYTHON_EXECUTABLE=/usr/bin/python3 -DPython3_EXECUTABLE=/usr/bin/python3'
-    command = f'cmake {HERE}/nodelet -DCATKIN_ENABLE_TESTING=OFF {python} && cmake --build .'
-    done = subprocess.run(command, cwd=BUILD, shell=True, capture_output=True, text=True)
-    if done.returncode:
-        print(f'{done.stderr}without {NODELETS}: apt-get install {CPP_NEEDS}', file=sys.stderr)
-    return not done.returncode
 
 
 @contextlib.contextmanager
