@@ -1,5 +1,4 @@
 """The house: which file imports which, and the numbers that stand in several places."""
-import ast
 import fnmatch
 import re
 
@@ -21,20 +20,16 @@ def floors():
     return numbers
 
 
+HINTS = re.compile(r'^if TYPE_CHECKING:\n(?: .*\n|\n)+', re.M)
+IMPORT = re.compile(r'^ *(?:from (pharos[\w.]*) import (\([^)]*|.*)|import (pharos[\w.]*))', re.M)
+
+
 def imports_of(path):
     """The files that a file imports, also in a function, but for hints alone."""
-    tree = ast.parse(path.read_text())
-    for item in ast.walk(tree):
-        if isinstance(item, ast.If) and getattr(item.test, 'id', '') == 'TYPE_CHECKING':
-            item.body = []
-    for item in ast.walk(tree):
-        names = []
-        if isinstance(item, ast.Import):
-            names = [(each.name,) for each in item.names]
-        elif isinstance(item, ast.ImportFrom):
-            names = [(f'{item.module}.{each.name}', item.module) for each in item.names]
-        for choices in names:  # a module of a package, or a name in a module
-            files = [re.sub('^pharos/', '', name.replace('.', '/')) for name in choices]
+    for module, names, whole in IMPORT.findall(HINTS.sub('', path.read_text())):
+        for name in re.findall(r'\w+', re.sub(r' as \w+|#.*', '', names)) or ['']:
+            choices = f'{module}.{name}', module or whole  # a module of a package, or a name in one
+            files = [re.sub('^pharos/', '', choice.replace('.', '/')) for choice in choices]
             files = ['__init__' if file == 'pharos' else file for file in files]
             yield from [file for file in files if file in FILES.keys() - ROOMS][:1]
 

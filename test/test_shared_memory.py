@@ -119,7 +119,10 @@ def node(master):
 def memory_files(pid):
     """Return the descriptors of a process that are files of this package in memory."""
     folder = f'/proc/{pid}/fd'
-    links = [os.path.realpath(f'{folder}/{number}') for number in os.listdir(folder)]
+    links = []
+    for number in os.listdir(folder):
+        with contextlib.suppress(FileNotFoundError):  # it was closed meanwhile
+            links.append(os.readlink(f'{folder}/{number}'))
     return [link for link in links if link.startswith('/memfd:pharos')]
 
 
