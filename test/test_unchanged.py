@@ -11,70 +11,31 @@ import time
 import pytest
 
 import pharos
-from helpers import COMPOSE, HEAD, INIT, PYTHON, SPIN, TIMEOUT, Program, create, end
+from helpers import COMPOSE, HEAD, INIT, PYTHON, ROOT, SPIN, TIMEOUT, Program, create, end
 from pharos.testing import Mailbox, until
 
 STRING = 'std_msgs/String'
-DRIVE = '''
-from geometry_msgs.msg import Twist, Vector3
-def go(speed):
-    out.publish(Twist(linear=Vector3(speed, 0, 0)))
-def halt():
-    say(threading.current_thread() is threading.main_thread())
-    go(0.0)
-    {hook}
-rospy.init_node('program', disable_signals={disable})
-out = rospy.Publisher('/cmd_vel', Twist, queue_size=10)
-{disable} or rospy.on_shutdown(halt)
-try:
-    while not rospy.is_shutdown():
-        go(0.2)
-        {wait}
-        go(0.2)
-except rospy.ROSInterruptException: pass
-except KeyboardInterrupt: {disable} and halt()
-say('main')
-'''
+
+
+def text_of(name, *values, **named):
+    """The text of a program in test/programs, with values for its braces if it has some."""
+    text = (ROOT / 'test' / 'programs' / name).read_text()
+    return text.format(*values, **named) if values or named else text
+
+
 WORK = 'end = time.monotonic() + 1\n        while time.monotonic() < end: pass'
 DRIVES = {
-    'hook': DRIVE.format(hook='', wait='rospy.Rate(100).sleep()', disable=False),
-    'long hook': DRIVE.format(hook='rospy.sleep(0.3)', wait='rospy.sleep(0.01)', disable=False),
-    'interrupt': DRIVE.format(hook='', wait='while not time.sleep(0.01): go(0.2)', disable=True),
-    'busy': DRIVE.format(hook='', wait=WORK, disable=False),
+    'hook': dict(hook='', wait='rospy.Rate(100).sleep()', disable=False),
+    'long hook': dict(hook='rospy.sleep(0.3)', wait='rospy.sleep(0.01)', disable=False),
+    'interrupt': dict(hook='', wait='while not time.sleep(0.01): go(0.2)', disable=True),
+    'busy': dict(hook='', wait=WORK, disable=False),
 }
-TIMED = '''
-def measure(where):
-    begin = time.monotonic()
-    time.sleep(0.3)
-    say(f'{where} {time.monotonic() - begin > 0.29}')
-atexit.register(measure, 'atexit')
-rospy.init_node('program')
-rospy.on_shutdown(lambda: measure('hook'))
-say('ready')
-rospy.spin()
-measure('main')
-'''
-SERVE = '''
-import http.server
-server = http.server.HTTPServer(('127.0.0.1', 0), http.server.BaseHTTPRequestHandler)
-rospy.init_node('program', disable_signals=True)
-try:
-    say('ready')
-    server.serve_forever()
-except KeyboardInterrupt: say('interrupted')
-finally: server.server_close()
-'''
-QUIET = "rospy.init_node('program', disable_signals=True)\n"
-BYE = "def bye(number, frame):\n    say('handler')\n    sys.exit(7)\n"
-SET = 'signal.signal(signal.SIGINT, bye)\n'
-FOREVER = "say('ready')\nwhile True: time.sleep(0.01)\n"
-POLL = 'def poll():\n    while True: time.sleep(0.05)\n'
 STOPS = {
-    'sleeps': (TIMED, ['hook True', 'main True', 'atexit True'], 0),
-    'server': (SERVE, ['interrupted'], 0),
-    'handler after': (BYE + INIT + SET + FOREVER, ['handler'], 7),
-    'handler before': (BYE + SET + QUIET + FOREVER, ['handler'], 7),
-    'daemon': (POLL + 'threading.Thread(target=poll, daemon=True).start()\n' + SPIN, [], 0),
+    'timed': (['hook True', 'main True', 'atexit True'], 0),
+    'serve': (['interrupted'], 0),
+    'handler_after': (['handler'], 7),
+    'handler_before': (['handler'], 7),
+    'daemon': ([], 0),
 }
 FAIL = INIT + 'def fail(event=None): raise ValueError("in vain")\n'
 FAILS = [
@@ -82,32 +43,7 @@ FAILS = [
     'threading.Thread(target=fail).start()',
     'rospy.Timer(rospy.Duration(0.01), fail, oneshot=True)',
 ]
-CLOSE = '''
-def close():
-    say('closing')
-    time.sleep({})
-    say('closed')
-    time.sleep({})
-'''
-SLOW_NODE = '''
-class Slow(pharos.Node):
-    def stop(self):
-        close()
-        super().stop()
-pharos.Master().create(Slow, 'program')
-say('ready')
-pharos.spin()
-'''
-SLOW = {
-    'script': ([*COMPOSE, '--script'], f'{CLOSE}rospy.on_shutdown(close)\n{SPIN}'),
-    'program': ([PYTHON], CLOSE + SLOW_NODE),
-}
-ONCE = '''
-got = threading.Event()
-rospy.Subscriber('/camera', String, lambda message: got.set())
-got.wait()
-say('got')
-'''
+SLOW = {'slow_script': [*COMPOSE, '--script'], 'slow_node': [PYTHON]}
 IDIOMS = 'inspect asyncio argparse star_import stdout subprocess rosparam message_filters'.split()
 VALUES = 'class Pose:', 42, 'idioms', '/idioms', 'kept\n', 'hello\n', 7, True
 HELPER = 'import inspect, rospy\nclass Lonely: pass\ndef look(): return inspect.stack()[0]\n'
@@ -154,22 +90,6 @@ WINDOWS = [
     ('from helper import (\n    show,\n)', 'def show(x):\n    cv2.imshow("x", x)\n', 'imshow'),
     ('import helper', '# cv2.imshow("x", x)\n', ''),
 ]
-OWN = '''
-class Talker(pharos.Node):
-    def start(self):
-        super().start()
-        gain = self.parameter('~gain', 0).value
-        self.output_channel('words', 'std_msgs/String', latch=True).send(data=str(gain))
-master = pharos.Master()
-one = master.create(Talker, 'one', argv=sys.argv)
-two = master.create(pharos.BlockNode, 'two', argv=sys.argv)
-two.interested_in('/end', 'std_msgs/String', lambda message: [one.stop(), two.stop()])
-say('ready')
-pharos.spin()
-say('over')
-'''
-GROUP = '''<group ns="rig"><remap from="words" to="/speech"/><node pkg="bench" type="program"
-name="boss" respawn="true"><param name="gain" value="7"/></node></group>'''
 
 
 @pytest.mark.parametrize('way', ['Ctrl-C', 'stop', 'kill'])
@@ -178,7 +98,7 @@ def test_robot_stands_at_end(master, peer, bench, drive, way):
     """The base, another process, hears the zero last."""
     peer.hear('/cmd_vel', 'geometry_msgs/Twist')
     with contextlib.ExitStack() as stack:
-        path = bench.write(DRIVES[drive])
+        path = bench.write(text_of('drive', **DRIVES[drive]))
         if way == 'Ctrl-C':
             stack.enter_context(bench.program('--script', path))
         else:
@@ -193,13 +113,13 @@ def test_robot_stands_at_end(master, peer, bench, drive, way):
     assert drive == 'busy' or bench.said()[0] == 'True'  # in the main thread
 
 
-@pytest.mark.parametrize('text, lines, code', STOPS.values(), ids=STOPS)
-def test_stop_does_as_signal(bench, text, lines, code):
-    script = bench.load(text)
+@pytest.mark.parametrize('name', STOPS)
+def test_stop_does_as_signal(bench, name):
+    script = bench.load(text_of(name))
     until(lambda: bench.said() == ['ready'])
     begin = time.monotonic()
     script.stop()
-    assert (bench.said()[1:], script.exit_code) == (lines, code)
+    assert (bench.said()[1:], script.exit_code) == STOPS[name]
     assert time.monotonic() - begin < script.stop_timeout / 2
 
 
@@ -238,9 +158,9 @@ def test_exit_ends_one_script(master, bench, monkeypatch, last):
     assert bench.said() == ['line']
 
 
-@pytest.mark.parametrize('command, text', SLOW.values(), ids=SLOW)
-def test_quick_signals_are_one(master, bench, command, text):
-    with Program([*command, bench.write(text.format(0.5, 0))], master.url) as running:
+@pytest.mark.parametrize('name', SLOW)
+def test_quick_signals_are_one(master, bench, name):
+    with Program([*SLOW[name], bench.write(text_of(name, 0.5, 0))], master.url) as running:
         until(lambda: 'ready' in bench.said())
         begin = time.monotonic()
         running.signal(signal.SIGINT)
@@ -252,9 +172,9 @@ def test_quick_signals_are_one(master, bench, command, text):
     assert not any(master.system_state())
 
 
-@pytest.mark.parametrize('command, text', SLOW.values(), ids=SLOW)
-def test_late_signal_ends_at_once(mortal, bench, command, text):
-    with Program([*command, bench.write(text.format(1.2, 60))], mortal.url) as running:
+@pytest.mark.parametrize('name', SLOW)
+def test_late_signal_ends_at_once(mortal, bench, name):
+    with Program([*SLOW[name], bench.write(text_of(name, 1.2, 60))], mortal.url) as running:
         until(lambda: 'ready' in bench.said())
         running.signal(signal.SIGINT)
         until(lambda: 'closed' in bench.said())
@@ -266,7 +186,7 @@ def test_end_of_main_ends_node(master, peer, bench, last, code):
     """A publisher in another process does not hold it up; required and respawn see it."""
     peer.run(f"camera = rospy.Publisher('/camera', message_class('{STRING}'), latch=True)")
     peer.run("camera.publish('image')")
-    assert bench.load(INIT + ONCE + last).wait(TIMEOUT) == code
+    assert bench.load(text_of('once') + last).wait(TIMEOUT) == code
     node = '<node pkg="bench" type="program" name="program" {}="true"/>'
     with master.compose(None, bench.launch_file(node.format('required'))) as composition:
         assert composition.wait(TIMEOUT) == 1
@@ -470,7 +390,7 @@ def test_windows_need_own_process(bench, line, helper, why):
 
 
 def check_runs(master, bench, mailbox, names):
-    """Yield each time that OWN runs and its talker says its gain; all has ended at last."""
+    """Yield each time that the program talker runs and its talker says its gain; all has ended at last."""
     for runs in 1, 2:
         until(lambda: bench.said().count('ready') == runs)
         assert mailbox.next().data == '7'
@@ -483,7 +403,7 @@ def check_runs(master, bench, mailbox, names):
 def test_loaded_program_creates_nodes(master, bench):
     mailbox = Mailbox(create(master, '/ear'), '/speech', STRING)
     settings = {'name': 'arm', 'namespace': '/left', 'params': {'gain': 7}}
-    script = master.load(bench.write(OWN), remap={'words': '/speech'}, **settings)
+    script = master.load(bench.write(text_of('talker')), remap={'words': '/speech'}, **settings)
     for runs in check_runs(master, bench, mailbox, ['/left/arm', '/left/two']):
         script.restart() if runs == 1 else script.stop()
     assert script.exit_code == 0
@@ -491,10 +411,10 @@ def test_loaded_program_creates_nodes(master, bench):
 
 def test_launched_program_creates_nodes(master, bench):
     """It comes back, as respawn says, when its nodes have ended; and ends at Ctrl-C."""
-    bench.write(OWN)
+    bench.write(text_of('talker'))
     node = create(master, '/ear')
     mailbox, channel = Mailbox(node, '/speech', STRING), node.output_channel('/end', STRING)
-    with bench.program(bench.launch_file(GROUP)) as composed:
+    with bench.program(bench.launch_file(text_of('rig.xml'))) as composed:
         for runs in check_runs(master, bench, mailbox, ['/rig/boss', '/rig/two']):
             assert master.node('/rig/boss').pid == composed.pid
             channel.wait_for_subscribers(1, TIMEOUT)
