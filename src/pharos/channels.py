@@ -115,7 +115,7 @@ class InputChannel(DelegateHolder, Channel, Inbox):
     received = 0
 
     def __init__(self, node, topic, message_class, delegate, queue_size, inline, shared, from_):
-        Inbox.__init__(self, None, self._deliver, queue_size, inline, shared)
+        Inbox.__init__(self, None, self._run_delegate, queue_size, inline, shared)
         self.queue_bytes = node.queue_bytes
         self.from_ = from_
         self.delegate = delegate
@@ -129,10 +129,10 @@ class InputChannel(DelegateHolder, Channel, Inbox):
         self.ros_object = self.node.ros.Subscriber(self.topic, self.message_class, self)
 
     def __call__(self, message):
-        """Take a latched message of a connection or link that is older than the channel."""
+        """Take a latched message of a connection that is older than the channel; rospy calls this."""
         self.receive(message)
 
-    def _deliver(self, message):
+    def _run_delegate(self, message):
         try:
             if self.closed:
                 return
@@ -149,7 +149,7 @@ class InputChannel(DelegateHolder, Channel, Inbox):
     def _retry(self, message):
         """Run the delegate on a message once more, while no other delegate of the node runs."""
         self.node._check_active()
-        self.callback_queue.run_exclusively(lambda: self._deliver(message))
+        self.callback_queue.run_exclusively(lambda: self._run_delegate(message))
 
 
 class OutputChannel(Channel):

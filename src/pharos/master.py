@@ -87,7 +87,9 @@ class Master:
     """
 
     _environ = os.environ  # for ROS_NAMESPACE; a script's Master has its own
-    _first_nodes: Any = WeakValueDictionary()  # argv -> the first node that was created with it
+    _first_nodes: Any = (
+        WeakValueDictionary()
+    )  # remappings -> the first node that was created with them
 
     def __init__(self, url: str | None = None, shared_memory: bool | None = None):
         url = url or os.environ.get('ROS_MASTER_URI') or 'http://localhost:11311/'

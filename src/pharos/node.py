@@ -88,7 +88,7 @@ class Node(DelegateHolder):
     _run_class = Run
     _current_run: Run = None  # type: ignore[assignment]
     _settings: Settings = None  # type: ignore[assignment]
-    _holds_delegates = False  # True while _start_held() runs
+    _is_start_held = False  # True while _start_held() runs
 
     def __init__(self, *args, **kwargs):
         """Do nothing: :meth:`Master.create` has given the node its name and settings.
@@ -146,7 +146,7 @@ class Node(DelegateHolder):
                 if not self._has_own_start:
                     for endpoint in endpoints:
                         endpoint.open()
-                if not self._holds_delegates:
+                if not self._is_start_held:
                     run.callback_queue.release()
             except BaseException:
                 self._stop_run()
@@ -163,11 +163,11 @@ class Node(DelegateHolder):
 
         If a user calls start(), Node.start() itself lets delegates run.
         """
-        self._holds_delegates = True
+        self._is_start_held = True
         try:
             self.start()
         finally:
-            self._holds_delegates = False
+            self._is_start_held = False
         if self.lifecycle is Lifecycle.NEW:
             raise PharosError(f'{type(self).__name__}.start() must call super().start() first')
         self._current_run.callback_queue.release()
@@ -193,7 +193,7 @@ class Node(DelegateHolder):
         try:
             self._current_run.stop(self.stop_timeout)
         except (KeyboardInterrupt, SystemExit):
-            # of a signal: the stop that it asks for does nothing unless the node runs
+            # of a signal: its own stop, in the thread 'pharos end', must find the node running
             self._current_run.lifecycle = Lifecycle.RUNNING
             raise
         signals.started_nodes.remove(self)

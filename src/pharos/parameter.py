@@ -36,7 +36,7 @@ class Parameter(Endpoint):
             self.set(self._value)
         self.read()
 
-    _open = subscribe  # Run.register_missing() calls subscribe(), too, for a new master
+    _open = subscribe  # the watcher calls subscribe(), too, for a new master
 
     def _close(self):
         """Have the master report no more changes."""

@@ -30,9 +30,8 @@ from pharos.private_rospy.services import call_here, find_service
 from pharos.private_rospy.tcpros import keep_alive, read_message
 from pharos.waiting import current
 
-LOOK_UP_LIMIT = 0.25  # seconds that look_up() waits for the type; call() asks again
+LOOK_UP_LIMIT = 0.25  # seconds that the constructor waits for the type; call() asks again
 TYPE_LIMIT = 5.0  # seconds that a call without a timeout waits for the type
-_MAX_HEADER = 1 << 16  # bytes
 
 
 class OfferedService(Endpoint):
@@ -200,7 +199,7 @@ class Service:
             current.node._current_run.calls.add(sock)
         names = {'callerid': self.caller_id, 'service': self.name, 'md5sum': md5sum}
         write_ros_handshake_header(sock, {**names, **fields})
-        header = read_ros_handshake_header(sock, io.BytesIO(), _MAX_HEADER)
+        header = read_ros_handshake_header(sock, io.BytesIO(), 1 << 16)
         if 'error' in header:
             raise ConnectionError(header['error'])
         return sock, header

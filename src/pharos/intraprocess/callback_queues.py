@@ -30,13 +30,13 @@ class CallbackOrder:
     :param start_thread: ``start_thread(target)`` returns a thread of the node, None if the system
         has no more threads
     :ivar numbers: the numbers of the messages to come
-    :ivar is_paused: True: no callback begins, for TURN_LIMIT at most
+    :ivar is_paused: True: no callback that waits for its turn begins, for TURN_LIMIT at most
     :ivar queues: a dict with the open callback queues that have an inbox as its keys
     """
 
     def __init__(self, start_thread):
         self.start_thread = start_thread
-        self.first_run_time = 0.0  # when the first pause of the newest queue ends
+        self.newest_first_run_time = 0.0  # when the first pause of the newest queue ends
         self.numbers = itertools.count()
         self.queues = {}
         self.is_paused = False
@@ -83,18 +83,21 @@ class CallbackQueue:
     running_thread = None
     begin_time = None
     waits_for_turn = False
-    _is_slow = False  # True if the last callback took longer than SLOW
+    _was_slow = False  # True if the last callback took longer than SLOW
     _current_number = 0  # of the message whose callback runs
     thread = None
-    _is_requested = False  # True from request_thread() until the thread looks for jobs
+    #: True from request_thread() until the thread looks for jobs; a second request does nothing
+    _is_requested = False
 
     def __init__(self, order, first_pause=0.0):
         self.order = order
         self.jobs = collections.deque()
         self._running_lock = allocate_lock()  # held by the thread that runs callbacks
         self._first_run_time = perf_counter() + first_pause
-        order.first_run_time = max(order.first_run_time, self._first_run_time)
-        self._wake_lock = allocate_lock()  # released to wake the thread
+        order.newest_first_run_time = max(order.newest_first_run_time, self._first_run_time)
+        # released to wake the thread: from its rest, or from a wait for its turn. That wait may take
+        # what was meant to end the rest: so _loop() looks at _is_requested before each rest
+        self._wake_lock = allocate_lock()
         self._wake_lock.acquire()
         self.request_lock = allocate_lock()
 
@@ -132,7 +135,7 @@ class CallbackQueue:
         begin_time = self.begin_time
         if begin_time is not None:
             # one that was slow the last time delays nobody while it runs
-            is_slow = self._is_slow or now - begin_time > SLOW
+            is_slow = self._was_slow or now - begin_time > SLOW
             return self._current_number < number and not is_slow
         if self.holder or now < self._first_run_time:
             return False
@@ -185,13 +188,13 @@ class CallbackQueue:
             self._wait_for_turn()
         self._current_number = self.next_number()
         begin_time = self.begin_time = perf_counter()
-        if self._is_slow:  # the next callbacks need not wait for this one
+        if self._was_slow:  # the next callbacks need not wait for this one
             self.order.pass_turn()
         try:
             if self.may_begin:  # else a stop has begun
                 self._run_next()
         finally:
-            self._is_slow = perf_counter() - begin_time > SLOW
+            self._was_slow = perf_counter() - begin_time > SLOW
             self.begin_time = None
             self.order.pass_turn()
 
@@ -251,7 +254,7 @@ class CallbackQueue:
         pause = self._first_run_time - perf_counter()
         if pause > 0:
             sleep(pause)
-            self._first_run_time = self.order.first_run_time
+            self._first_run_time = self.order.newest_first_run_time
             sleep(max(0.0, self._first_run_time - perf_counter()))
 
     def _loop(self):

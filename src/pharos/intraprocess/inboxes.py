@@ -52,7 +52,8 @@ class BoundedQueue:
 class Inbox(BoundedQueue):
     """The messages that wait for one callback.
 
-    A message waits as the job ``(number, inbox, (value, thaw, header))``. The value is a frozen
+    ``jobs`` of the callback queue owns what waits; ``messages`` counts it, and orders the drops. A
+    message waits as the job ``(number, inbox, (value, thaw, header))``. The value is a frozen
     message. If ``thaw`` is None, the value is the message itself, which came from a socket or is
     shared. Several publishers may be here at once: who takes a job out of the callback queue's
     ``jobs`` runs it or drops it.

@@ -1,7 +1,7 @@
 """INTRAPROCESS links: connections from a publisher to a subscription of the same process.
 
 A link has two ends: one in the list of connections of rospy's publisher, and one in the list of its
-subscription. rospy itself lists links, closes them, and refuses a second one to the same peer.
+subscription. rospy itself lists links, and closes them one by one; add_link() refuses a second one.
 """
 import threading
 
@@ -28,7 +28,6 @@ class Link(Transport):
     No message passes through this object. A publisher puts messages into the inboxes of its links.
 
     :param direction: 'o' for the publisher's end, 'i' for the subscription's
-    :param run: the run of the receiving node
     :param thaw: makes a message of the subscription's class from a frozen one
     :ivar other_end: the Link at the other end
     :ivar inboxes: those of the subscription; the publisher's end has them
@@ -43,10 +42,9 @@ class Link(Transport):
     # rospy sets the count to 0 at first
     stat_num_msg = property(lambda self: self.publisher.seq, lambda self, zero: None)
 
-    def __init__(self, direction, publisher, run, endpoint_id, thaw):
+    def __init__(self, direction, publisher, endpoint_id, thaw):
         super().__init__(direction, publisher.name)
         self.publisher = publisher
-        self.run = run
         self.endpoint_id = endpoint_id
         self.thaw = thaw
 
@@ -88,15 +86,15 @@ def link_topic(sender, receiver, topic):
     publisher.make_header()
     thaw = thaw_function(sent_class, wanted_class)
     with publisher.lock:
-        sender_end = Link('o', publisher, receiver, receiver.name, thaw)
-        receiver_end = Link('i', publisher, receiver, sender.uri, thaw)
+        sender_end = Link('o', publisher, receiver.name, thaw)
+        receiver_end = Link('i', publisher, sender.uri, thaw)
         sender_end.other_end = receiver_end
         receiver_end.other_end = sender_end
         sender_end.inboxes = subscription.inboxes
         if publisher.closed or not subscription.add_link(receiver_end):
             return
         publisher.rospy_add_connection(sender_end)
-        for frozen in publisher.latches.values():
+        for frozen in list(publisher.latches.values()):  # a channel may close meanwhile
             for inbox in sender_end.inboxes:
                 inbox.put((frozen, thaw, publisher.header))
     for inbox in sender_end.inboxes:

@@ -20,15 +20,16 @@ _REGISTER_METHODS = {
     'sub': 'registerSubscriber',
     'srv': 'registerService',
 }
-_end_of_watch = threading.Event()
+_watch_end = None  # an Event, which ends the watcher
 
 
 def enter(run):
     """Enter a run into ``links.runs``; the first one starts the watcher."""
+    global _watch_end
     with runs_lock:
         if not runs:
-            _end_of_watch.clear()
-            threading.Thread(target=_watch, daemon=True).start()
+            _watch_end = threading.Event()  # another one: the former watcher may not have ended yet
+            threading.Thread(target=_watch, args=[_watch_end], daemon=True).start()
         runs[run.uri] = run
 
 
@@ -37,7 +38,7 @@ def leave(run):
     with runs_lock:
         runs.pop(run.uri, None)
         if not runs:
-            _end_of_watch.set()
+            _watch_end.set()  # type: ignore[union-attr]
 
 
 def register(run, registry, name, data):
@@ -141,10 +142,10 @@ def _start_connecting(run, topic, uri):
 # -- the watcher
 
 
-def _watch():
+def _watch(end):
     """Look after all runs until the last one ends; every two seconds, compare with the masters."""
     look_count = 0
-    while not _end_of_watch.wait(WATCH_PERIOD):
+    while not end.wait(WATCH_PERIOD):
         look_count += 1
         for run in list(runs.values()):
             _look_after(run)

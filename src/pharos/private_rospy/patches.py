@@ -303,6 +303,7 @@ def receive_and_retry(original, run, connection, address, port, uri, callback, t
 
     A publisher of another type is a failure of the node, and is not tried again.
     """
+    # the callback is the subscription's receive_callback()
     tcpros.receive_until_end(connection, address, port, uri, callback.__self__)
 
 
@@ -317,7 +318,7 @@ def register_once(original, run, self, name, data, registry):
 
 @patch('rospy.impl.registration', 'RegManager.publisher_update')
 def publisher_update(original, run, self, name, uris):
-    """rospy calls this once for each publisher, and leaves the connecting to a thread.
+    """rospy: ``for uri in uris: publisher_update(name, uris)``; a thread connects to each.
 
     This connects to all at the first call.
     """
@@ -352,7 +353,7 @@ def cleanup(original, run, self, reason):
 def send_goal(original, run, self, *args, **kwargs):
     """actionlib drops an answer that comes before send_goal() returns. Here the answer waits.
 
-    No callback of the node begins meanwhile: the feedback stays before the result.
+    No callback that waits for its turn begins meanwhile: the feedback stays before the result.
     """
     order = run.callback_order
     order.is_paused = True

@@ -228,7 +228,7 @@ class Run:
         for endpoint in self.endpoints:
             endpoint.closed = True
         self.lifecycle = Lifecycle.STOPPED
-        if runs.get(self.uri) is self:  # in a forked child
+        if runs.get(self.uri) is self:  # only in a forked child: leave() has taken it out before
             del runs[self.uri]
 
     def health_facts(self):
@@ -357,7 +357,8 @@ class Run:
     def make_findable(self, handler, uri):
         """Offer shared memory and the facts for top; enter the run into ``links.runs``.
 
-        The patch ``ready`` calls this when the XML-RPC server runs, before anything is registered.
+        The patch ``ready`` calls this when the XML-RPC server has its port, before anything is
+        registered.
 
         :param handler: rospy's ROSHandler
         :param uri: the URI of the node's XML-RPC server
@@ -422,7 +423,7 @@ class Run:
             shutdown_socket(sock)
 
     def stop(self, timeout):
-        """Send messages under way, unregister, free ports and threads; log threads left behind.
+        """Send messages under way, unregister, free ports and threads; log souls left behind.
 
         When this has returned, no thread of the node runs, unless one has blocked longer than its
         limit. The log names souls and delegates that have.

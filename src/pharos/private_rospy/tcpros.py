@@ -156,7 +156,8 @@ class Sender:
         self._bounded_queue = BoundedQueue()
         self._bounded_queue.queue_bytes = publication.run.node.queue_bytes
         self._queue = self._bounded_queue.messages  # lists of parts
-        self._unsent = [], []  # the parts of a message, and the numbers of bytes sent of them
+        # the parts of a message, and the numbers of bytes sent of them; while is_busy, the thread's alone
+        self._unsent = [], []
         self._condition = threading.Condition()  # notified to wake the thread
 
     def __getattr__(self, name):

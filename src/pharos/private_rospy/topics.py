@@ -39,7 +39,9 @@ class PublisherOverlay:
     def __init__(self, name, data_class):
         self.rospy___init__(name, data_class)
         self.lock = self.publock  # rospy's close() sets publock to None
-        self.latches = {}  # channel, or None for all Publishers of plain rospy -> frozen message
+        # channel, or None for all Publishers of plain rospy -> frozen message. A new connection gets
+        # them by add_connection(), a new link by link_topic(), a new callback by add_callback()
+        self.latches = {}
         self.last_wake = 0.0
         self.freeze, self.thaw = copier_for(data_class)
         self.has_header = getattr(data_class, '_has_header', False)
@@ -47,7 +49,7 @@ class PublisherOverlay:
         self.memory = None  # a MessageMemory, from SharedMemoryHandler's first reader on
         # the connections that self.receivers were found for, None: find them anew; rospy makes a new
         # list at each change
-        self.receivers_are_for = None
+        self.cached_connections = None
 
     def acquire(self):
         """Take no lock, but handle a pending signal of a script.
@@ -70,7 +72,8 @@ class PublisherOverlay:
         """Make the connection header for links: the one that TCPROS sends."""
         with self.lock:
             if self.header is None:
-                protocol_class = self.run.modules.load('rospy.impl.tcpros_pubsub').TCPROSPub
+                # not load(), which has a lock: a program that imports may hold it, and make a topic
+                protocol_class = self.run.modules.modules['rospy.impl.tcpros_pubsub'].TCPROSPub
                 protocol = protocol_class(
                     self.resolved_name, self.data_class, self.is_latch, self.headers
                 )
@@ -107,9 +110,9 @@ class PublisherOverlay:
                 raise rospy.ROSException('publish() to a closed topic')
             self.seq += 1
             if connection_override is None:
-                if self.receivers_are_for is not self.connections:
+                if self.cached_connections is not self.connections:
                     # set first: update_inboxes() sets None if the inboxes change meanwhile
-                    self.receivers_are_for = self.connections
+                    self.cached_connections = self.connections
                     self.receivers = receivers_of(self.connections)
                 receivers = self.receivers
                 is_latched = self.is_latch
@@ -123,7 +126,7 @@ class PublisherOverlay:
                 message.header.seq = self.seq
                 if message.header.frame_id is None:
                     message.header.frame_id = '0'
-            # frozen unless sockets alone receive; if nobody does, a channel has the fields checked
+            # links need a frozen message, and latches; if nobody receives, a channel has it checked
             if inboxes_by_thaw or is_latched or channel and not connections:
                 frozen = self.freeze(message)
                 if is_latched:
@@ -150,30 +153,30 @@ class PublisherOverlay:
         if self.memory:
             senders, connections = self.memory.sort(connections)
         try:
-            parts = self._serialize(message, senders, connections)
+            memory_parts, buffer = self._serialize(message, senders, connections)
         # a thawed copy has lists or bytes for numpy's arrays; freeze() raises if that is not enough
         except SERIALIZE_ERRORS:
-            parts = self._serialize(self.thaw(self.freeze(message)), senders, connections)
-        parts_in_memory, buffer = parts
+            message = self.thaw(self.freeze(message))
+            memory_parts, buffer = self._serialize(message, senders, connections)
         if senders:
-            self.memory.write(parts_in_memory, senders)
-        parts, size = buffer.with_length()
+            self.memory.write(memory_parts, senders)
+        wire_parts, size = buffer.with_length()
         self.message_data_sent += size
         for connection in connections:
             try:
-                connection.write_data(parts, size)
+                connection.write_data(wire_parts, size)
             except CLOSED:
                 connection.close()
 
     def _serialize(self, message, senders, connections):
         """Return the parts of a message for memory files, and a MessageParts for sockets."""
-        parts_in_memory = None
+        memory_parts = None
         buffer = MessageParts()
         if senders:
-            parts_in_memory = self.memory.split(message)
+            memory_parts = self.memory.split(message)
         if connections:
             message.serialize(buffer)
-        return parts_in_memory, buffer
+        return memory_parts, buffer
 
     def flush(self, deadline):
         """Wait until the sockets have taken all messages, or until a deadline as monotonic time."""
@@ -283,7 +286,7 @@ class SubscriptionOverlay:
         self.inboxes[:] = inboxes  # the links have this very list
         links = links_of(self.connections)
         for link in links:
-            link.publisher.receivers_are_for = None
+            link.publisher.cached_connections = None
         return links
 
     def deliver(self, message, connection, size):
@@ -317,14 +320,14 @@ class SubscriptionOverlay:
     def add_callback(self, callback, args):
         self.rospy_add_callback(callback, args)
         links = self.update_inboxes()
-        inbox = callback  # a channel
+        latch_inbox = callback  # a channel
         if not isinstance(callback, Inbox):  # only the new callback gets the latched messages
             invoke = functools.partial(self._invoke_plain, callback, args)
-            inbox = Inbox(self.plain_inbox.callback_queue, invoke)
+            latch_inbox = Inbox(self.plain_inbox.callback_queue, invoke)
         for link in links:
             for frozen in list(link.publisher.latches.values()):
-                inbox.put((frozen, link.thaw, link.header))
-        inbox.callback_queue.request_thread()
+                latch_inbox.put((frozen, link.thaw, link.header))
+        latch_inbox.callback_queue.request_thread()
         connections.connect_all(self.run, self.resolved_name)
 
     def remove_callback(self, callback, args):

@@ -169,7 +169,8 @@ class Reader:
     """The thread that reads all connections of this process by shared memory.
 
     Each round takes all messages that are there, and delivers them in the order of sending. If a
-    socket has a message, all that was sent before is there, too. The thread waits for no callback.
+    socket has a message, all that was sent before is there, too, but for what waits in a publisher
+    for a receipt. The thread waits for no callback.
     """
 
     def __init__(self):

@@ -45,7 +45,7 @@ class MemoryFile:
         self.position = position
         self.capacity = size + size // 4  # messages grow
         self.number = 0  # of the message
-        self.readers = set()  # senders that announce it later, or have no receipt yet
+        self.senders = set()  # senders that announce it later, or have no receipt yet
         self.descriptor = os.memfd_create('pharos')
         try:
             os.ftruncate(self.descriptor, self.capacity)
@@ -126,9 +126,9 @@ class MessageMemory:
 
     def _free_file(self, size):
         """Return a file that no reader needs, with room for so many bytes."""
-        if len(self._files) == MAX_FILES and all(file.readers for file in self._files):
+        if len(self._files) == MAX_FILES and all(file.senders for file in self._files):
             self._drop_oldest()
-        free_files = [file for file in self._files if not file.readers]
+        free_files = [file for file in self._files if not file.senders]
         for file in free_files:
             if size <= file.capacity <= MAX_EXCESS * size:
                 return file
@@ -144,12 +144,12 @@ class MessageMemory:
         """Drop the oldest message that no reader may be reading; else give up its readers."""
         files = sorted(self._files, key=lambda file: file.number)
         queued_files = [
-            file for file in files if not any(r.announced is file for r in file.readers)
+            file for file in files if not any(sender.announced is file for sender in file.senders)
         ]
         oldest = (queued_files or files)[0]
-        for sender in list(oldest.readers):
+        for sender in list(oldest.senders):
             sender.drop(oldest)
-        oldest.readers.clear()  # a signal may have ended an earlier drop
+        oldest.senders.clear()  # a signal may have ended an earlier drop
 
     def close(self):
         """Free the files."""
@@ -187,7 +187,8 @@ class MemoryTransport(Transport):
 class MemorySender(MemoryTransport, BoundedQueue):
     """The publisher's end of a connection.
 
-    The lock of the MessageMemory guards all attributes: its user holds the lock.
+    The lock of the MessageMemory guards the queue and the files. put(), drop(), take_receipts(),
+    _send_ready() and _break() need it held; is_busy, give_up() and close() take it.
 
     :ivar dropped: the number of messages that were dropped since the last packet
     """
@@ -221,7 +222,7 @@ class MemorySender(MemoryTransport, BoundedQueue):
         if self.done or self.is_broken:
             return
         if entry.file:
-            entry.file.readers.add(self)
+            entry.file.senders.add(self)
         self.add(entry, len(entry.data))
         self._send_ready()
         if self._queue and not self.is_sending:
@@ -230,7 +231,7 @@ class MemorySender(MemoryTransport, BoundedQueue):
     def forget(self, entry):
         """Free the file of a dropped message."""
         if entry.file:
-            entry.file.readers.discard(self)
+            entry.file.senders.discard(self)
         return True
 
     def drop(self, file):
@@ -252,7 +253,7 @@ class MemorySender(MemoryTransport, BoundedQueue):
         self.is_broken = True
         shutdown_socket(self._socket)
         if self.announced:
-            self.announced.readers.discard(self)
+            self.announced.senders.discard(self)
             self.announced = None
         self.drop_beyond(0)
 
@@ -297,7 +298,7 @@ class MemorySender(MemoryTransport, BoundedQueue):
         if not receipt:
             self._break()
         elif self.announced:
-            self.announced.readers.discard(self)
+            self.announced.senders.discard(self)
             self.announced = None
 
     def _send_queue(self):
