@@ -230,6 +230,7 @@ class OutputChannel(Channel):
         if self.closed:
             raise NodeStoppedError(f'{self!r} cannot send: open another one, or start the node')
         try:
+            # PublisherOverlay.publish(), which takes a connection and a channel, too
             self._publisher.publish(message, connection, self)
         except (ROSException, *SERIALIZE_ERRORS) as error:
             if self.closed:

@@ -243,6 +243,7 @@ class Master:
             if port not in range(65536):
                 raise ValueError(f'{port!r} cannot be a port: give 0 to 65535')
         mappings = [argument for argument in argv or () if is_legal_remap(argument)]
+        # __init__ of a class may use self.name already: so the node gets its settings before
         node = node_class.__new__(node_class)
         name = self._remapped_name(node, node_name(named), tuple(mappings))
         # the full name contains these already, and rospy would apply them once more

@@ -48,7 +48,8 @@ def response(cls, value):
     """Return the response for the value that the block of a service returned.
 
     The value is a response, a dict, tuple or list of its fields, or its only field. None stands for
-    an empty response.
+    an empty response. A list for a response whose only field is an array is that array, unless its
+    first item is a list: ``[1, 2]`` and ``[[1, 2]]`` both give an array of two numbers.
 
     :param cls: the class of the response
     :raises MessageTypeError: if the response cannot be sent

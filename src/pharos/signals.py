@@ -63,6 +63,7 @@ def spin() -> None:
     :raises SystemExit: with status 1, as soon as a required soul has ended
     """
     handle_signals()
+    # quiet_wait() lets a KeyboardInterrupt of the program's own handler through
     with contextlib.suppress(KeyboardInterrupt), quiet_wait():
         # a program may have called rospy.init_node(): then a signal is rospy's
         while own_nodes() and not (lost_names or rospy.core.is_shutdown_requested()):

@@ -97,8 +97,8 @@ class ScriptRun(Run):
         folder = os.path.dirname(os.path.realpath(node.path))
         self.path.insert(0, folder)
         self.modules.program_folder = folder
-        self.modules.modules['sys'].modules = collections.ChainMap(
-            self.modules.modules, sys.modules
+        self.modules.by_name['sys'].modules = collections.ChainMap(
+            self.modules.by_name, sys.modules
         )
         self.modules.builtins.update(print=self.print, exit=sys.exit, quit=sys.exit)
         self.ros.init_node = self.init_node
@@ -189,7 +189,7 @@ class ScriptRun(Run):
 
     def print(self, *values, file=None, **options):
         """Stand in for ``print``: write to the program's own sys.stdout, not to the process's."""
-        print(*values, file=file or self.modules.modules['sys'].stdout, **options)
+        print(*values, file=file or self.modules.by_name['sys'].stdout, **options)
 
     def print_error(self, error_class, error, trace, title=''):
         """Stand in for ``sys.excepthook``: print a traceback, without the frames of pharos."""
@@ -278,7 +278,7 @@ class ScriptRun(Run):
         except Exception as error:
             if self.lifecycle is Lifecycle.STOPPED:
                 return  # the hook is gone with the program
-            hook = self.modules.modules['threading'].excepthook
+            hook = self.modules.by_name['threading'].excepthook
             self.show_error(error, lambda *facts: hook(ExceptHookArgs([*facts, thread])))
             self.keep_failure(error, thread.name)
 
@@ -288,7 +288,7 @@ class ScriptRun(Run):
         main_module = types.ModuleType('__main__')
         main_module.__file__ = self.node.path
         vars(main_module)['__builtins__'] = self.modules.builtins
-        self.modules.modules['__main__'] = main_module
+        self.modules.by_name['__main__'] = main_module
         status = self._run_code(vars(main_module))
         try:
             self._run_all(self.thread_exit_functions)
@@ -314,7 +314,7 @@ class ScriptRun(Run):
         except SystemExit as error:
             return self._status_of(error)
         except BaseException as error:
-            self.show_error(error, self.modules.modules['sys'].excepthook)
+            self.show_error(error, self.modules.by_name['sys'].excepthook)
             if isinstance(error, KeyboardInterrupt):
                 return -signal.SIGINT
             if self.is_starting and not self.is_known:
@@ -359,7 +359,7 @@ class ScriptRun(Run):
     def _status_of(self, exit_request):
         """Return the exit status of a SystemExit; print its text if it has one."""
         if isinstance(exit_request.code, str):
-            self.print(exit_request.code, file=self.modules.modules['sys'].stderr)
+            self.print(exit_request.code, file=self.modules.by_name['sys'].stderr)
             return 1
         return exit_request.code or 0
 
@@ -449,7 +449,7 @@ class ScriptRun(Run):
         :raises PharosError: if one cannot be read as Python 3
         """
         compile_program(self.node.path)
-        for module in list(self.modules.modules.values()):
+        for module in list(self.modules.by_name.values()):
             path = getattr(module, '__file__', None) or '/usr/'
             if path.endswith('.py') and not path.startswith(SYSTEM_FOLDERS):
                 compile_program(path)
@@ -515,7 +515,7 @@ class ScriptRun(Run):
         self.signal_shutdown('stop')
         self.stop_created_nodes()
         self.finished.set()
-        thread_class = self.modules.modules['threading'].Thread
+        thread_class = self.modules.by_name['threading'].Thread
         own_threads = [thread for thread in self.threads.copy() if isinstance(thread, thread_class)]
         self.left_threads = join(own_threads, SIGNAL_LIMIT)  # others have slept, and ended
         self.threads.difference_update(self.left_threads)  # stop() does not wait for them
@@ -536,7 +536,7 @@ class ScriptRun(Run):
         self.created_nodes.clear()
         for failure in self.failures:
             failure.drop_frames()
-        self.modules.modules.clear()
+        self.modules.by_name.clear()
         if self.node.owns_process:
             os.environ.clear()
             os.environ.update(self.process_environ)

@@ -36,8 +36,7 @@ def enter(run):
 def leave(run):
     """Take a run out of ``links.runs``; the last one ends the watcher."""
     with runs_lock:
-        runs.pop(run.uri, None)
-        if not runs:
+        if runs.pop(run.uri, None) and not runs:
             _watch_end.set()  # type: ignore[union-attr]
 
 
@@ -163,10 +162,9 @@ def _look_after(run):
     _retry_connections(run)
     while run.troubles:
         run.ros.logwarn_throttle_identical(60, run.troubles.pop())
-    now = monotonic()
-    if now > run.hold_deadline:
+    if monotonic() > run.hold_deadline:
         run.callback_queue.release()
-    if now > run.clock_deadline:
+    if monotonic() > run.clock_deadline:
         run.clock_deadline += 1e9  # it is told once
         rostime = run.ros.rostime
         if not (rostime.is_wallclock() or rostime.get_time()):

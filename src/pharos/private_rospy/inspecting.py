@@ -30,7 +30,7 @@ def _private_module(thing):
         variables = getattr(thing, 'f_globals', None) or getattr(thing, '__globals__', None) or {}
         name = variables.get('__name__')  # type: ignore[assignment]
         owner = _owner_of_builtins(variables.get('__builtins__'))
-    module = owner.modules.get(name) if owner else None
+    module = owner.by_name.get(name) if owner else None
     return module if type(module) is ModuleType else None  # not a stand-in
 
 

@@ -169,20 +169,20 @@ class PrivateModules:
 
     :param substitutes: names of modules -> the stand-ins that private modules import instead
     :param patch: ``patch(module)`` is called right after the code of each private module has run
-    :ivar modules: names -> private modules and stand-ins
+    :ivar by_name: names -> private modules and stand-ins
     :ivar program_folder: the folder of a script's program, or None
     :ivar builtins: the ``__builtins__`` of all private modules
     """
 
     def __init__(self, substitutes, patch):
-        self.modules = {
+        self.by_name = {
             **substitutes,
             # one for all: ``except rospy.ROSException`` catches every node's
             'rospy.exceptions': rospy.exceptions,
             # one for all: this module numbers the connections, INTRAPROCESS and TCPROS ones
             'rospy.impl.transport': rospy.impl.transport,
         }
-        self.modules['importlib'] = Shim(importlib, import_module=self._import_module)
+        self.by_name['importlib'] = Shim(importlib, import_module=self._import_module)
         self._patch = patch
         self._lock = threading.RLock()
         self.program_folder = None
@@ -194,13 +194,18 @@ class PrivateModules:
     @property
     def path(self):
         """The folders to search: the current ``sys.path`` of the node."""
-        return self.modules['sys'].path
+        return self.by_name['sys'].path
 
     def _is_private(self, name):
-        """True if each node has a copy of the module.
+        """True if each node has a copy of the module. The first rule that fits decides::
 
-        These are libraries that reach rospy, and those in PRIVATE. For a script, modules beside the
-        program and in folders that the program has put on its sys.path are private, too.
+        generated messages and services             shared
+        PRIVATE                                     private
+        beside a script's program                   private
+        COMMON: Python's own, numpy and the like    shared
+        names rospy, or imports what does           private
+        in a folder that the script has added       private
+        all others                                  shared
         """
         top_name = name.partition('.')[0]
         if _is_generated(name):
@@ -239,25 +244,25 @@ class PrivateModules:
         :raises ModuleNotFoundError: if there is no such module
         """
         parent, _, leaf = name.rpartition('.')
-        if name not in self.modules and not self._is_private(name):
+        if name not in self.by_name and not self._is_private(name):
             module = _import_shared(name)
             if parent and self._is_private(parent):  # a package with code and messages
                 setattr(self.load(parent), leaf, module)
             return module
         with self._lock:  # other threads must not see a module that is half loaded
-            if name not in self.modules:
+            if name not in self.by_name:
                 # folders that the process has added since the start of the run come last
                 path = self.load(parent).__path__ if parent else [*self.path, *sys.path]
-                if name not in self.modules:  # the parent may have imported it
+                if name not in self.by_name:  # the parent may have imported it
                     self._execute(name, tuple(path))
-            if parent in self.modules:
-                setattr(self.modules[parent], leaf, self.modules[name])
-            return self.modules[name]
+            if parent in self.by_name:
+                setattr(self.by_name[parent], leaf, self.by_name[name])
+            return self.by_name[name]
 
     def _execute(self, name, path):
         spec, code = _find(name, path)
         module = module_from_spec(spec)
-        self.modules[name] = module
+        self.by_name[name] = module
         vars(module)['__builtins__'] = self.builtins
         try:
             if code is None and spec.loader and spec.has_location:  # an extension in C
@@ -265,7 +270,7 @@ class PrivateModules:
             else:
                 exec(code or '', vars(module))
         except BaseException:
-            del self.modules[name]
+            del self.by_name[name]
             raise
         self._patch(module)
 
@@ -292,6 +297,6 @@ class PrivateModules:
         starred = Shim(module)
         for key, value in vars(module).items():
             if isinstance(value, ModuleType):
-                value = self.modules.get(value.__name__, value)
+                value = self.by_name.get(value.__name__, value)
             vars(starred)[key] = value
         return starred

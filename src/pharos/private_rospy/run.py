@@ -134,7 +134,10 @@ class Run:
         self.service_manager = registration.get_service_manager()
 
     def substitutes(self):
-        """Return the stand-ins that the node's modules import for some modules of Python."""
+        """Return the stand-ins that the node's modules import for some modules of Python.
+
+        Make :attr:`Thread`, the class of the node's threads.
+        """
         run = self
 
         class Thread(threading.Thread):
@@ -446,14 +449,14 @@ class Run:
             )
         self.close_rospy(timeout)
         for sock in list(self.sockets):
-            shutdown_socket(sock)
+            shutdown_socket(sock)  # wakes the threads that read; close() would not
         self._wait_for_threads(STOP_LIMIT)
         self.finished.set()
         logging = self.modules.load('logging')
         logging.disable()  # or a thread left behind would open the file again
         logging.shutdown()
         for sock in list(self.sockets):
-            sock.close()
+            sock.close()  # now that no thread uses it: another file may get its number
         self.mark_stopped()
 
     def _wait_for_threads(self, timeout):

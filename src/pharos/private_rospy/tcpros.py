@@ -178,17 +178,17 @@ class Sender:
     def _write(self, parts, size):
         self._bounded_queue.queue_size = self._publication.queue_size
         if self._publication.queue_size is None:
-            self._unsent = self._rest() + parts, []
-            while self._rest():
+            self._unsent = self._unsent_parts() + parts, []
+            while self._unsent_parts():
                 self._send()
             return
         if self.is_busy or self._queue or size > MAX_DIRECT:
             self._bounded_queue.add(parts, size)
         else:
-            self._unsent = self._rest() + parts, []
+            self._unsent = self._unsent_parts() + parts, []
             with contextlib.suppress(BlockingIOError):
                 self._send(socket.MSG_DONTWAIT)
-            if not self._rest():
+            if not self._unsent_parts():
                 return
         if not self.is_busy:
             self.is_busy = self._wake_thread()
@@ -201,7 +201,7 @@ class Sender:
             self._has_thread = self._publication.run.start_thread(self._send_queue) is not None
         return self._has_thread
 
-    def _rest(self):
+    def _unsent_parts(self):
         """Return the parts that the socket has not taken yet."""
         parts, counts = self._unsent
         parts = [*parts]
@@ -220,23 +220,23 @@ class Sender:
         """
         _, counts = self._unsent
         counts.extend(
-            map(self._connection.socket.sendmsg, [self._rest()[:MAX_PARTS]], [[]], [flags])
+            map(self._connection.socket.sendmsg, [self._unsent_parts()[:MAX_PARTS]], [[]], [flags])
         )
         self._connection.stat_bytes += counts[-1]
-        self._connection.stat_num_msg += not self._rest()
+        self._connection.stat_num_msg += not self._unsent_parts()
 
     def _send_queue(self):
         connection = self._connection
         while True:
             with self._condition:
-                if not self._rest() and not self._queue:
+                if not self._unsent_parts() and not self._queue:
                     self.is_busy = False
                     self._condition.wait(THREAD_REST)
                 if connection.done or not self.is_busy:
                     self.is_busy = False
                     self._has_thread = False
                     return
-                if not self._rest():
+                if not self._unsent_parts():
                     self._unsent = self._queue.popleft(), []
             try:
                 self._send()

@@ -73,7 +73,7 @@ class PublisherOverlay:
         with self.lock:
             if self.header is None:
                 # not load(), which has a lock: a program that imports may hold it, and make a topic
-                protocol_class = self.run.modules.modules['rospy.impl.tcpros_pubsub'].TCPROSPub
+                protocol_class = self.run.modules.by_name['rospy.impl.tcpros_pubsub'].TCPROSPub
                 protocol = protocol_class(
                     self.resolved_name, self.data_class, self.is_latch, self.headers
                 )
