@@ -332,3 +332,22 @@ def test_master_is_started_if_there_is_none(bench, monkeypatch):
         assert 'no ROS master at' in composed.output
         end(composed)
     assert not bench.master.is_reachable()
+
+
+def test_soul_of_a_former_run_ends(node):
+    """A soul that restarts its node does not go on beside the new one."""
+    begun, ended = [], threading.Semaphore(0)
+
+    def watch(me):
+        begun.append(me)
+        try:
+            if len(begun) == 1:
+                me.restart()
+            me.sleep(3600)
+        except pharos.NodeStoppedError:
+            ended.release()
+            raise
+
+    node.fork(watch)
+    assert ended.acquire(timeout=TIMEOUT)
+    assert len(begun) == 2 and node.health().souls == 1

@@ -31,7 +31,8 @@ QUEUE_SIZE = 1000
 class Endpoint:
     """A channel, service or parameter of a node.
 
-    The node's stop closes the endpoint. The node's next start opens the endpoint again.
+    The node's stop closes what rospy has opened, and marks the endpoint as closed. The node's next
+    start opens the endpoint again, unless the node's class has a start() of its own.
 
     :ivar node: the node
     :ivar closed: True if the endpoint was closed, or the node is stopped

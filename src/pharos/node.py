@@ -193,7 +193,8 @@ class Node(DelegateHolder):
         try:
             self._current_run.stop(self.stop_timeout)
         except (KeyboardInterrupt, SystemExit):
-            # of a signal: its own stop, in the thread 'pharos end', must find the node running
+            # of a signal: its own stop, in the thread 'pharos end', must find the node running;
+            # stopping stays set
             self._current_run.lifecycle = Lifecycle.RUNNING
             raise
         signals.started_nodes.remove(self)
@@ -364,8 +365,10 @@ class Node(DelegateHolder):
         return block
 
     def _run_soul(self, block, required=False):
-        former_node = current.node
+        run = self._current_run  # a restart makes another one
+        former = current.node, current.run
         current.node = self
+        current.run = run
         is_node_soul = block is self.soul
 
         def retry(message):
@@ -374,15 +377,14 @@ class Node(DelegateHolder):
         try:
             return with_arguments(block, 'soul', 0, 1)(self)
         except BaseException as error:
-            is_stopping = self._current_run.stopping.is_set()
-            if not (is_stopping and isinstance(error, rospy.ROSException)):
-                self._current_run.report_failure(error, block, 'soul', retry=retry)
+            if not (run.stopping.is_set() and isinstance(error, rospy.ROSException)):
+                run.report_failure(error, block, 'soul', retry=retry)
         finally:
-            current.node = former_node
-            if required and not self._current_run.stopping.is_set():
+            current.node, current.run = former
+            if required and not run.stopping.is_set():
                 self.log(f'stops: {block_name(block)}, which is required, has ended', 'error')
                 signals.lost_names.add(self._settings.name)
-                self._current_run.request_stop()
+                run.request_stop()
         return None
 
     def sleep(self, seconds: float) -> None:
@@ -390,11 +392,13 @@ class Node(DelegateHolder):
 
         A stopped soul gets a NodeStoppedError. A sleep in start() lets delegates run from now on.
         """
-        with signals.quiet_wait():
-            self._check_active()
-            self._current_run.callback_queue.release_before_sleep()
-            self._current_run.ros.sleep(seconds)
-        if self._current_run.stopping.is_set() and current.node is self:
+        self._check_active()
+        run = current.run if current.node is self else self._current_run
+        if not run.stopping.is_set():
+            with signals.quiet_wait():
+                run.callback_queue.release_before_sleep()
+                run.ros.sleep(seconds)
+        if current.node is self and run.stopping.is_set():
             raise NodeStoppedError(f'{self._settings.name} stops, and this soul with it')
 
     def every(self, seconds: float) -> Iterator[int]:

@@ -9,9 +9,10 @@ from pharos.errors import PharosError
 
 
 class _Current(threading.local):
-    """The node with its soul or its program in this thread, or None."""
+    """The node with its soul or its program in this thread, and the run of the soul, or None."""
 
     node: Any = None
+    run: Any = None
 
 
 current = _Current()

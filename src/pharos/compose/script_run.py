@@ -50,7 +50,7 @@ def start_child(original, run, self, *args, env=None, **kwargs):
     The end of the program interrupts the child, as roslaunch and a terminal do.
     """
     original(self, *args, env=run.environ if env is None else env, **kwargs)
-    run.children = [*filter(is_alive, run.children), self]
+    run.children = [*filter(is_alive, getattr(run, "children", ())), self]
 
 
 class ScriptRun(Run):
@@ -285,6 +285,7 @@ class ScriptRun(Run):
     def run_main(self):
         """Run the program to its end, with its threads and exit functions; stop the node."""
         current.node = self.node
+        current.run = self
         main_module = types.ModuleType('__main__')
         main_module.__file__ = self.node.path
         vars(main_module)['__builtins__'] = self.modules.builtins
