@@ -2,6 +2,7 @@
 import http.client
 import os
 import signal
+import sys
 import threading
 import xmlrpc.client
 
@@ -11,8 +12,11 @@ import rospy
 import std_msgs.msg
 
 import pharos
-from helpers import INIT, SPIN, TIMEOUT, Peer, PharosPeer, create, end, free_port
+from helpers import INIT, SPIN, TIMEOUT, Peer, PharosPeer, Program, create, end, free_port
 from pharos import NodeNameInUseError
+from pharos.intraprocess.callback_queues import CallbackQueue
+from pharos.private_rospy.run import Run
+from pharos.private_rospy.topics import PublisherOverlay
 from pharos.testing import Mailbox, until
 
 STRING = 'std_msgs/String'
@@ -335,7 +339,6 @@ def test_master_is_started_if_there_is_none(bench, monkeypatch):
 
 
 def test_soul_of_a_former_run_ends(node):
-    """A soul that restarts its node does not go on beside the new one."""
     begun, ended = [], threading.Semaphore(0)
 
     def watch(me):
@@ -351,3 +354,226 @@ def test_soul_of_a_former_run_ends(node):
     node.fork(watch)
     assert ended.acquire(timeout=TIMEOUT)
     assert len(begun) == 2 and node.health().souls == 1
+
+
+# -- ends, queues and connections
+
+
+def has_come_to(thread, function):
+    """True if a thread stands in a function, or has ended."""
+    frame = sys._current_frames().get(thread.ident)
+    while frame and frame.f_code is not function.__code__:
+        frame = frame.f_back
+    return frame or not thread.is_alive()
+
+
+def test_node_whose_own_stop_fails_is_stopped(master):
+    class Careless(pharos.BlockNode):
+        def stop(self):
+            assert not self.is_running, 'its motor does not answer'
+
+    node = create(master, node_class=Careless)
+    node.ros.signal_shutdown('enough')
+    until(lambda: node.lifecycle is pharos.Lifecycle.STOPPED)
+    assert [type(error) for error in node.errors] == [AssertionError]
+
+
+def test_restart_without_a_master_keeps_the_node(mortal):
+    node = create(mortal.master)
+    mortal.end()
+    with pytest.raises(pharos.MasterUnreachableError):
+        node.restart()
+    assert node.is_running
+
+
+def test_node_becomes_another_class_after_the_delegate(master):
+    ear, gate, _, _ = fill(master)
+    former_class = type(ear)
+    thread = threading.Thread(target=ear.become, args=[pharos.BlockNode])
+    thread.start()
+    until(lambda: has_come_to(thread, CallbackQueue.run_exclusively))
+    assert type(ear) is former_class
+    gate.open.set()
+    thread.join(TIMEOUT)
+    assert type(ear) is pharos.BlockNode
+
+
+def test_interrupted_stop_is_done_all_the_same(master):
+    text = '''
+import threading, pharos
+over = threading.Event()
+def linger(me):
+    try:
+        me.sleep(3600)
+    finally:
+        print('lingers')
+        over.wait()
+me = pharos.Master().create(pharos.BlockNode, 'me', soul=linger)
+me.stop_timeout = 3600
+me.fork()
+try:
+    me.stop()
+except KeyboardInterrupt:
+    over.set()
+'''
+    with Program(text, master.url) as running:
+        running.expect('lingers')
+        running.signal(signal.SIGINT)
+        assert running.wait() == 0
+    assert not any(master.system_state())
+
+
+@pytest.mark.parametrize('end', ['close', 'stop'])
+def test_end_sends_what_waits(node, peer, end):
+    peer.hear('/words', STRING)
+    out = node.output_channel('/words', STRING)
+    os.kill(peer.pid, signal.SIGSTOP)
+    for number in range(10, 30):
+        out.send(data=str(number).ljust(1 << 20))
+    node.stop_timeout = TIMEOUT
+    thread = threading.Thread(target=out.close if end == 'close' else node.stop)
+    thread.start()
+    until(lambda: has_come_to(thread, PublisherOverlay.flush))
+    os.kill(peer.pid, signal.SIGCONT)
+    until(lambda: peer.value("[message.data[:2] for message in heard['/words']]")[-1:] == ['29'])
+    thread.join(TIMEOUT)
+    assert out.closed
+
+
+def test_end_waits_for_a_slow_program(master, bench, monkeypatch):
+    monkeypatch.setattr('pharos.compose.composition.SLOW_END', 0.01)
+    text = f"{INIT}rospy.on_shutdown(lambda: [time.sleep(0.5), say('stands')])\nsay('ready')\n"
+    with master.compose(None, bench.launch_file(program=f'{text}rospy.spin()')):
+        until(bench.said)
+    assert bench.said() == ['ready', 'stands']
+
+
+def test_callback_waits_for_one_on_an_earlier_message(master, node, monkeypatch):
+    for limit in 'SLOW', 'TURN_LIMIT':  # both are too short for a test
+        monkeypatch.setattr(f'pharos.intraprocess.callback_queues.{limit}', TIMEOUT)
+    order, gate, mouth = [], Gate(), create(master, '/mouth')
+    callbacks = {
+        '/first': lambda message: [gate(message), order.append('first')],
+        '/second': lambda message: order.append('second'),
+    }
+    for topic, callback in callbacks.items():
+        node.ros.Subscriber(topic, std_msgs.msg.String, callback)
+        mouth.send_to(topic, typed_as=STRING, data='x')
+    queues = node._current_run.callback_order.queues
+    until(lambda: order or gate.heard and any(queue.waits_for_turn for queue in list(queues)))
+    gate.open.set()
+    until(lambda: len(order) == 2)
+    assert order == ['first', 'second']
+
+
+def test_stop_waits_for_the_delegate(master, node):
+    words, gate, mouth = [], Gate(), create(master, '/mouth')
+    create(master, '/wheels').interested_in('/speed', STRING, lambda m: words.append(m.data))
+    speed = node.output_channel('/speed', STRING)
+    node.interested_in('/words', STRING, lambda message: [gate(message), speed.send(data='halt')])
+    mouth.send_to('/words', data='x')
+    assert gate.begun.wait(TIMEOUT)
+    node.stop_timeout = TIMEOUT
+    thread = threading.Thread(target=node.stop)
+    thread.start()
+    until(lambda: has_come_to(thread, CallbackQueue.close))
+    gate.open.set()
+    until(lambda: words or node.errors)
+    thread.join(TIMEOUT)
+    assert words == ['halt']
+
+
+def test_ctrl_c_in_a_soul_of_the_main_thread_ends_the_program(master):
+    text = '''
+import threading, pharos
+me = pharos.Master().create(pharos.BlockNode, 'me')
+me.soul = lambda me: [print('ready'), threading.Event().wait()]
+me.execute()
+print('went on')
+'''
+    with Program(text, master.url) as running:
+        running.expect('ready')
+        running.signal(signal.SIGINT)
+        assert running.wait() == -signal.SIGINT
+    assert 'went on' not in running.output
+
+
+def test_hooks_run_in_their_order(bench):
+    text = "for text in 'first', 'second': rospy.on_shutdown(lambda text=text: say(text))\n"
+    script = bench.load(f"{INIT}{text}say('ready')\nrospy.spin()")
+    until(bench.said)
+    script.stop()
+    assert bench.said() == ['ready', 'first', 'second']
+
+
+def test_refused_connection_is_tried_again(node, peer):
+    handler = node._current_run.ros_handler
+    connect = handler._connect_topic
+    answers = [(0, 'not now', 0)]
+    handler._connect_topic = lambda *names: answers.pop() if answers else connect(*names)
+    box = Mailbox(node, '/words', STRING)
+    peer.run("out = rospy.Publisher('/words', message_class('std_msgs/String'), latch=True)")
+    peer.run("out.publish('x')")
+    assert box.next().data == 'x' and not answers
+
+
+def test_stop_fires_no_timer(node):
+    fired = []
+    timer = node.ros.Timer(node.ros.Duration(3600), fired.append)
+    until(lambda: has_come_to(timer, Run.sleep))
+    node.stop()
+    assert not fired
+
+
+def test_program_whose_required_soul_has_ended_runs_again(bench):
+    text = '''
+        node = pharos.Master().create(pharos.BlockNode, 'program')
+        if os.path.exists(SAID):
+            node.fork(lambda me: [say('again') for turn in me.every(0.01)])
+        else:
+            say('first')
+            node.fork(lambda me: None, required=True)
+        pharos.spin()
+        '''
+    script = bench.load(text)
+    assert script.wait(TIMEOUT) == 1
+    script.start()
+    until(lambda: bench.said().count('again') > 5 or script.exit_code is not None)
+    assert script.is_running
+
+
+def test_start_may_wait_for_its_delegate(master, monkeypatch):
+    monkeypatch.setattr('pharos.private_rospy.run.HOLD_LIMIT', 0.1)
+
+    class Patient(pharos.BlockNode):
+        def start(self):
+            super().start()
+            heard = threading.Event()
+            self.interested_in('/map', STRING, lambda message: heard.set())
+            self.has_heard = heard.wait(TIMEOUT)
+
+    create(master, '/maps').output_channel('/map', STRING, latch=True).send(data='map')
+    assert create(master, '/patient', Patient).has_heard
+
+
+@pytest.mark.parametrize('option', ['--apart', '--group'])
+def test_nodes_end_with_a_killed_composition(master, bench, option):
+    path = bench.launch_file(program=INIT + "say('ready')\nrospy.spin()\n")
+    with bench.program(path, option, 'program') as composed:
+        until(bench.said)
+        os.kill(composed.pid, signal.SIGKILL)
+        until(lambda: not any(master.system_state()))
+
+
+def test_stop_at_a_hanging_master_closes_connections(mortal):
+    node, other = create(mortal.master), create(mortal.master, '/other')
+    channel = node.interested_in('/words', STRING)
+    other.output_channel('/words', STRING)
+    until(lambda: channel.connections)
+    os.kill(mortal.pid, signal.SIGSTOP)
+    other.stop()
+    os.kill(mortal.pid, signal.SIGCONT)
+    assert not channel.connections
+
+
+# tcpros: if user != os.getuid(): => if False:
