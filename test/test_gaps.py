@@ -20,7 +20,6 @@ from pharos.private_rospy.topics import PublisherOverlay
 from pharos.testing import Mailbox, until
 
 STRING = 'std_msgs/String'
-LOG = 'rosgraph_msgs/Log'
 
 
 @pytest.fixture
@@ -128,7 +127,7 @@ def test_stop_ends_call_of_soul(master, node, peer):
 
 def test_health_counts_souls_and_the_log_names_what_is_left(master):
     node, free = create(master, node_class=Hasty), threading.Event()
-    log = Mailbox(create(master, '/ear'), '/rosout', LOG)
+    log = Mailbox(create(master, '/ear'), '/rosout', 'rosgraph_msgs/Log')
     node.fork(lambda me: None, name='short').join(TIMEOUT)
     node.fork(lambda me: free.wait(TIMEOUT), name='stubborn')
     assert (node.health().souls, node.health().ended_souls) == (1, ['short'])
@@ -378,12 +377,13 @@ def test_node_whose_own_stop_fails_is_stopped(master):
     assert [type(error) for error in node.errors] == [AssertionError]
 
 
-def test_restart_without_a_master_keeps_the_node(mortal):
+def test_master_that_goes_away_is_told_and_keeps_its_nodes(mortal, capfd):
     node = create(mortal.master)
     mortal.end()
     with pytest.raises(pharos.MasterUnreachableError):
         node.restart()
     assert node.is_running
+    until(lambda: 'no master answers at' in capfd.readouterr().err)
 
 
 def test_node_becomes_another_class_after_the_delegate(master):

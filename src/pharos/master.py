@@ -16,8 +16,8 @@ from pharos import signals
 from pharos.blocks import Block
 from pharos.errors import MasterUnreachableError
 from pharos.external_node import ExternalNode
-from pharos.names import full_name, node_name
-from pharos.node import Node, check_node_class
+from pharos.names import check_node_class, full_name, node_name
+from pharos.node import Node
 from pharos.private_rospy.run import Settings
 from pharos.private_rospy.xmlrpc import CALLER_ID, UNREACHABLE, ServerProxy
 from pharos.service import Service
@@ -236,7 +236,7 @@ class Master:
         :raises TypeError: if the class is not a Node, or its ``__init__`` takes other arguments
         :raises ValueError: if the name, the address or a port cannot be one
         """
-        check_node_class(node_class)
+        check_node_class(node_class, Node)
         if not (domain is None or isinstance(domain, str) and re.fullmatch(r'[\w.:-]+', domain)):
             raise ValueError(f'{domain!r} cannot be an address: give one such as 127.0.0.1')
         for port in tcp_port, xmlrpc_port:

@@ -1,4 +1,4 @@
-"""Names of nodes, topics, services and parameters."""
+"""Names of nodes, topics, services and parameters, and of methods of a node's class."""
 import re
 
 import rosgraph.names
@@ -26,3 +26,17 @@ def node_name(name):
     if isinstance(name, str) and _NODE_NAME.fullmatch(name):
         return name
     raise ValueError(f'{name!r} cannot be the name of a node: give one such as /robot1/driver')
+
+
+def check_node_class(node_class, base):
+    """Raise TypeError if a class does not derive from Node, the base, or replaces private methods."""
+    if not (isinstance(node_class, type) and issubclass(node_class, base)):
+        raise TypeError(f'a node is made of a subclass of Node, not {node_class!r}')
+    own_names = {name for name in vars(base) if re.match('_[a-z]', name)}
+    for cls in node_class.__mro__[: node_class.__mro__.index(base)]:
+        taken_names = own_names.intersection(vars(cls))
+        if taken_names and not cls.__module__.startswith('pharos.'):
+            raise TypeError(
+                f'{cls.__name__} has {", ".join(sorted(taken_names))}, as Node has: choose another'
+                ' name'
+            )

@@ -1,7 +1,6 @@
 """Nodes: real ROS nodes of this process, written with blocks."""
 from __future__ import annotations
 
-import re
 import threading
 import types
 from contextlib import suppress
@@ -29,7 +28,7 @@ from pharos.errors import (
 )
 from pharos.external_node import ExternalNode
 from pharos.failures import Failures
-from pharos.names import legal_name, node_name
+from pharos.names import check_node_class, legal_name, node_name
 from pharos.parameter import Parameter
 from pharos.private_rospy.run import Lifecycle, Run, Settings
 from pharos.service import OfferedService, Service
@@ -243,7 +242,7 @@ class Node(DelegateHolder):
         :raises TypeError: if the class is not one of nodes
         :raises AttributeError: if the class lacks a method that is a block of the node
         """
-        check_node_class(node_class)
+        check_node_class(node_class, Node)
         self._check_active()
         run = self._current_run
 
@@ -642,20 +641,6 @@ class Node(DelegateHolder):
         """The parameters that :meth:`parameter` has returned."""
         endpoints = self._current_run.endpoints
         return [endpoint for endpoint in endpoints if isinstance(endpoint, Parameter)]
-
-
-def check_node_class(node_class):
-    """Raise TypeError if the class is not one of nodes, or replaces private methods of Node."""
-    if not (isinstance(node_class, type) and issubclass(node_class, Node)):
-        raise TypeError(f'a node is made of a subclass of Node, not {node_class!r}')
-    own_names = {name for name in vars(Node) if re.match('_[a-z]', name)}
-    for cls in node_class.__mro__[: node_class.__mro__.index(Node)]:
-        taken_names = own_names.intersection(vars(cls))
-        if taken_names and not cls.__module__.startswith('pharos.'):
-            raise TypeError(
-                f'{cls.__name__} has {", ".join(sorted(taken_names))}, as Node has: choose another'
-                ' name'
-            )
 
 
 class BlockNode(Node):

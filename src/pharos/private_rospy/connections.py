@@ -10,10 +10,11 @@ from contextlib import suppress
 from time import monotonic
 from typing import Any
 
-from pharos.errors import MasterUnreachableError, PharosError
+from pharos.errors import MasterUnreachableError, NodeNameInUseError, PharosError
 from pharos.intraprocess.links import link_topic, runs, runs_lock
 from pharos.private_rospy.xmlrpc import CALLER_ID, UNREACHABLE, ServerProxy
 
+NAME_LIMIT = 1.0  # seconds for the question whether another node has the name
 RETRY_DELAY = 1.0  # seconds until the next attempt to connect
 WATCH_PERIOD = 0.5  # seconds between two looks of the watcher
 LOOKS_PER_MASTER = 4  # looks of the watcher for each one at the masters
@@ -41,6 +42,24 @@ def leave(run: Any) -> None:
     with runs_lock:
         if runs.pop(run.uri, None) and not runs:
             _watch_end.set()  # type: ignore[union-attr]
+
+
+def check_name_free(run: Any) -> None:
+    """Raise NodeNameInUseError if a node of this name answers within NAME_LIMIT."""
+    uri = run.master.call('lookupNode', run.name)
+    if not uri:
+        return
+    name = None
+    with suppress(*UNREACHABLE):
+        proxy = ServerProxy(uri, NAME_LIMIT)
+        proxy.getPid(CALLER_ID)  # raises if the URI is dead
+        name = run.name
+        # another node may have the URI; roscpp raises
+        name = proxy.getName(CALLER_ID)[2]  # type: ignore
+    if name == run.name:
+        raise NodeNameInUseError(
+            f'{name} is running already, at {uri}: choose another name, or end that one'
+        )
 
 
 def register(run: Any, registry: str, name: str, data: str) -> None:
@@ -179,11 +198,14 @@ def _ask_masters() -> None:
     """Ask each master for its system state, and have the runs register again what is missing."""
     all_runs = list(runs.values())
     for url in {run.master.url for run in all_runs}:
-        with suppress(*UNREACHABLE, PharosError):
+        url_runs = [run for run in all_runs if run.master.url == url and not run.stopping.is_set()]
+        try:
             state = ServerProxy(url).getSystemState(CALLER_ID)[2]  # type: ignore[index]
-            for run in all_runs:
-                if run.master.url == url and not run.stopping.is_set():
-                    _register_missing(run, state)  # type: ignore[arg-type]
+            for run in url_runs:
+                _register_missing(run, state)  # type: ignore[arg-type]
+        except (*UNREACHABLE, PharosError) as error:
+            for run in url_runs[:1]:  # one line is enough
+                run.troubles.add(f'no master answers at {url}, it is asked again: {error}')
 
 
 def _register_missing(run: Any, state: list) -> None:

@@ -20,7 +20,7 @@ from urllib.parse import urlsplit
 from weakref import WeakSet
 
 from pharos.blocks import block_name
-from pharos.errors import MessageTypeError, NodeNameInUseError, PortInUseError
+from pharos.errors import MessageTypeError, PortInUseError
 from pharos.failures import Failure, Failures
 from pharos.intraprocess.callback_queues import CallbackOrder, CallbackQueue
 from pharos.intraprocess.links import runs
@@ -28,7 +28,7 @@ import pharos.private_rospy.inspecting  # noqa: F401: it has inspect find privat
 from pharos.private_rospy import connections, patches
 from pharos.private_rospy.loader import PrivateModules, Shim, private_path
 from pharos.private_rospy.tcpros import shutdown_socket
-from pharos.private_rospy.xmlrpc import CALLER_ID, UNREACHABLE, ServerProxy
+from pharos.private_rospy.xmlrpc import ServerProxy
 from pharos.signals import may_be_signal
 from pharos.transcript import Transcript
 from pharos.waiting import let_others_run
@@ -36,7 +36,6 @@ from pharos.waiting import let_others_run
 if TYPE_CHECKING:
     from pharos.master import Master
 
-NAME_LIMIT = 1.0  # seconds for the question whether another node has the name
 STOP_LIMIT = 2.0  # seconds that a stop waits for threads of rospy
 CLOCK_LIMIT = 3.0  # seconds until a clock that stands still is told
 JOIN_PERIOD = 0.01  # seconds until the threads are counted anew: one may have started another
@@ -328,7 +327,7 @@ class Run:
         :param options: further options of ``rospy.init_node``
         :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: stop() then cleans up
         """
-        self._check_name_free()
+        connections.check_name_free(self)
         tcpros_base = self.modules.load('rospy.impl.tcpros_base')
         tcp_port, xmlrpc_port = self.settings.ports
         try:
@@ -354,23 +353,6 @@ class Run:
         node.uri = self.uri
         node.tcp_port, node.xmlrpc_port = self.settings.ports
         node.domain = self.settings.domain
-
-    def _check_name_free(self) -> None:
-        """Raise NodeNameInUseError if a node of this name answers within NAME_LIMIT."""
-        uri = self.master.call('lookupNode', self.name)
-        if not uri:
-            return
-        name = None
-        with suppress(*UNREACHABLE):
-            proxy = ServerProxy(uri, NAME_LIMIT)
-            proxy.getPid(CALLER_ID)  # raises if the URI is dead
-            name = self.name
-            # another node may have the URI; roscpp raises
-            name = proxy.getName(CALLER_ID)[2]  # type: ignore
-        if name == self.name:
-            raise NodeNameInUseError(
-                f'{name} is running already, at {uri}: choose another name, or end that one'
-            )
 
     def make_findable(self, handler: Any, uri: str) -> None:
         """Offer shared memory and the facts for top; enter the run into ``links.runs``.
