@@ -4,6 +4,7 @@ import os
 import signal
 import sys
 import threading
+import types
 import xmlrpc.client
 
 import pytest
@@ -17,6 +18,7 @@ from pharos import NodeNameInUseError
 from pharos.intraprocess.callback_queues import CallbackQueue
 from pharos.private_rospy.run import Run
 from pharos.private_rospy.topics import PublisherOverlay
+from pharos.shared_memory.receiving import Reader
 from pharos.testing import Mailbox, until
 
 STRING = 'std_msgs/String'
@@ -577,3 +579,75 @@ def test_stop_at_a_hanging_master_closes_connections(mortal):
 
 
 # tcpros: if user != os.getuid(): => if False:
+
+
+def test_shared_memory_keeps_the_order_of_sending(master, node, monkeypatch):
+    heard, is_held, may_read = [], threading.Event(), threading.Event()
+    take = Reader._take_messages
+
+    def take_later(reader):
+        is_held.set()
+        may_read.wait(TIMEOUT)
+        return take(reader)
+
+    for topic in '/a', '/b':
+        node.interested_in(topic, STRING, lambda message: heard.append(message.data))
+    with PharosPeer(master.url) as peer:
+        peer.run("a, b = [node.output_channel(t, 'std_msgs/String') for t in ('/a', '/b')]")
+        monkeypatch.setattr(Reader, '_take_messages', take_later)
+        peer.run("a.send(data='0')")
+        assert is_held.wait(TIMEOUT)
+        peer.run("for out, text in (a, '1'), (a, '2'), (b, '3'): out.send(data=text)")
+        may_read.set()
+        until(lambda: len(heard) == 4)
+    assert heard == ['0', '1', '2', '3']
+
+
+def test_failed_import_fails_again(bench):
+    bench.write('import rospy\nraise OSError("no device")', 'helper.py', '')
+    text = '''
+        rospy.init_node('program')
+        for attempt in range(2):
+            try:
+                import helper
+                say('imported')
+            except OSError as error:
+                say(error)
+        '''
+    assert bench.load(text).wait(TIMEOUT) == 0
+    assert bench.said() == ['no device'] * 2
+
+
+def test_dataclass_of_a_program_leaves_the_process_its_module(bench, monkeypatch):
+    module = types.ModuleType('wheels')
+    monkeypatch.setitem(sys.modules, 'wheels', module)
+    text = 'import dataclasses\n@dataclasses.dataclass\nclass Wheel:\n    size: int = 1\n'
+    bench.write(text, 'wheels.py', '')
+    assert bench.load(f'import wheels\n{INIT}say(wheels.Wheel().size)').wait(TIMEOUT) == 0
+    assert bench.said() == ['1'] and sys.modules['wheels'] is module
+
+
+def test_only_program_comes_back_with_its_environment(bench):
+    bench.write(INIT + "say(os.environ.get('PATH'))\n")
+    xml = '<node pkg="bench" type="program" name="program" respawn="true"/>'
+    with bench.program(bench.launch_file(xml)):
+        until(lambda: len(bench.said()) >= 2)
+    first, second, *_ = bench.said()
+    assert first == second != 'None'
+
+
+def test_spin_lasts_while_the_only_node_restarts(master):
+    text = '''
+import threading, time, pharos
+class Slow(pharos.BlockNode):
+    def start(self):
+        time.sleep(0.2)
+        super().start()
+node = pharos.Master().create(Slow, 'me')
+threading.Thread(target=lambda: [node.restart(), print('restarted'), node.stop()]).start()
+pharos.spin()
+print('over')
+'''
+    with Program(text, master.url) as running:
+        assert running.wait() == 0
+    assert running.output.split() == ['restarted', 'over']
