@@ -143,12 +143,15 @@ Bare = type('Bare', (Node,), {})
 Named = type('Named', (Node,), {'__init__': lambda self: Node.__init__(self, 'named')})
 Wheeled = type('Wheeled', (Node,), {'__init__': lambda self, wheels=4: Node.__init__(self)})
 Superless = type('Superless', (Node,), {'start': lambda self: None})
+Hidden = type('Hidden', (Node,), {'delegate': lambda self, message: None})
 Early = type('Early', (Node,), {'start': lambda self: self.interested_in('/t', STRING)})
 MISTAKES = {
     'call': (lambda m: Bare(), PharosError, r"create\(Bare, named='bare'\)"),
     'argument': (lambda m: Bare('bare'), PharosError, r"create\(Bare, named='bare'\)"),
     'name': (lambda m: create(m, '/n', Named), PharosError, r"create\(Named, named=.*super"),
     'anonymous': (lambda m: create(m, '/n', Bare, anonymous=True), PharosError, 'named='),
+    'hidden': (lambda m: create(m, '/n', Hidden), TypeError, 'has delegate, as Node has'),
+    'size': (lambda m: create(m).interested_in('/t', STRING, print, 'left'), ValueError, 'left'),
     'keyword': (lambda m: create(m, '/n', Wheeled, anonymous=True), TypeError, 'named=anonymous'),
     'no super': (lambda m: create(m, '/n', Superless), PharosError, 'super'),
     'early': (lambda m: create(m, '/n', Early), NodeStoppedError, 'super'),

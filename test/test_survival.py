@@ -185,6 +185,7 @@ def test_restarted_master_knows_all_again(mortal):
     receiver.interested_in('/t', STRING)
     receiver.serve('/service', 'std_srvs/Empty', lambda request: None)
     receiver.parameter('~watched', 1).on_change(lambda value: changes(value, None))
+    other = receiver.parameter('~other', 3)
     sent = create(master, '/sender').output_channel('/t', STRING)
     before = [registrations(master, name) for name in ('/receiver', '/sender')]
     mortal.end()
@@ -199,7 +200,7 @@ def test_restarted_master_knows_all_again(mortal):
     assert len(heard.all()) == 3
     master.lookup_service('/service').call(timeout=TIMEOUT)
     master.parameters['/receiver/watched'] = 2
-    assert changes.wait_for(lambda value: value == 2)
+    assert changes.wait_for(lambda value: value == 2) and other.value == 3
 
 
 def test_first_message_arrives(master, peer):

@@ -84,8 +84,16 @@ class Channel(Endpoint):
     :ivar type: the name of the topic's message type
     """
 
+    queue_size: int | None
+
     def _open_on(self, node, topic, message_class):
-        """Set the attributes, and open the channel."""
+        """Set the attributes, and open the channel.
+
+        :raises ValueError: if the queue_size cannot be one
+        """
+        size = self.queue_size
+        if size is not None and not (isinstance(size, int) and size >= 0):
+            raise ValueError(f'{topic}: a queue_size is 0 or more messages, not {size!r}')
         self.node = node
         self.topic = topic
         self.message_class = message_class

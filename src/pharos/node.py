@@ -97,8 +97,9 @@ class Node(DelegateHolder):
         if self._settings and not args and not kwargs:
             return
         name = type(self).__name__
+        given = ', '.join([*map(repr, args), *kwargs])
         raise PharosError(
-            f"{name}: write Master().create({name}, named='{name.lower()}'), and super().__init__()"
+            f"{name}({given}): write Master().create({name}, named='{name.lower()}'), and super().__init__()"
             ' without a name'
         )
 

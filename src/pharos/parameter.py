@@ -28,15 +28,20 @@ class Parameter(Endpoint):
             near = difflib.get_close_matches(name, node.master.parameters)
             node.log(f'the server has no parameter {name}; near names: {near}', 'warning')
 
+    def restore(self):
+        """Set the node's value if the server has none."""
+        if self._value is not None and self.name not in self._run.master.parameters:
+            self._run.master.parameters[self.name] = self._value
+
     def subscribe(self):
-        """Have the master report changes; set the node's value if the server has none."""
+        """Have the master report changes, and read the value."""
         run = self._run
         run.master.call('subscribeParam', run.uri, self.name, caller_id=run.name)
-        if self._value is not None and self.name not in run.master.parameters:
-            self.set(self._value)
         self.read()
 
-    _open = subscribe  # the watcher calls subscribe(), too, for a new master
+    def _open(self):
+        self.restore()
+        self.subscribe()
 
     def _close(self):
         """Have the master report no more changes."""

@@ -229,6 +229,9 @@ def _register_missing(run: Any, state: list) -> None:
                     register(run, registry, name, data)
                     connect_all(run, name)
     if not registered and not run.stopping.is_set():  # this is a new master
+        # all values before any is set or reported: each such time all of them are read
+        for parameter in run.node._parameters:
+            parameter.restore()
         run.modules.load('rospy.client')._init_node_params(run.argv, run.name)
         for parameter in run.node._parameters:
             parameter.subscribe()

@@ -251,6 +251,7 @@ def shut_down_from_outside(original, run, self, caller_id, msg=''):
     if caller_id == '/master' and f'[{self.name}]' not in str(msg):
         obeys = False  # the call is for an earlier node, which had this URI
     if obeys:
+        run.ros.logwarn(f'stops for {caller_id} at {host}: {msg}')
         run.request_stop()
     else:
         run.ros.logwarn(f'does not stop for {caller_id} at {host}: {msg}')

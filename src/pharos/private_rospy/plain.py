@@ -3,9 +3,10 @@ import sys
 
 FUNCTIONS = (
     'loginfo logwarn logerr logdebug logfatal loginfo_once logwarn_once logerr_once get_param'
+    ' loginfo_throttle logwarn_throttle logerr_throttle get_rostime get_time sleep'
     ' set_param has_param search_param get_name get_namespace on_shutdown wait_for_message'
 ).split()
-CLASSES = 'Publisher Subscriber Service ServiceProxy'.split()
+CLASSES = 'Publisher Subscriber Service ServiceProxy Rate Timer'.split()
 _SYSTEM_FOLDERS = '/usr/', '/opt/ros/'
 
 
