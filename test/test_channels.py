@@ -138,9 +138,9 @@ def test_value_fits_its_field(node, other):
     'type_, fields, said',
     [
         ('sensor_msgs/CameraInfo', {'K': [1.0] * 3}, 'K takes 9 values, not 3'),
-        ('sensor_msgs/CameraInfo', {'K': [1.0] * 8 + ['x']}, r'K\[8\]'),
+        ('std_msgs/Int32MultiArray', {'data': [1, 'x']}, r'data\[1\]'),
         ('geometry_msgs/Polygon', {'points': [{}, 3]}, r'points\[1\]'),
-        ('geometry_msgs/Polygon', {'points': [{}, {'x': 'a'}]}, r'points\[1\].x'),
+        ('sensor_msgs/PointCloud2', {'fields': [{}, {'offset': 'a'}]}, r'fields\[1\].offset'),
     ],
 )
 def test_list_that_does_not_fit_is_named(node, type_, fields, said):
