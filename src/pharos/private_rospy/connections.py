@@ -2,13 +2,10 @@
 
 One thread of this process, the watcher, looks after all runs.
 """
-from __future__ import annotations
-
 import functools
 import threading
 from contextlib import suppress
 from time import monotonic
-from typing import Any
 
 from pharos.errors import MasterUnreachableError, NodeNameInUseError, PharosError
 from pharos.intraprocess.links import link_topic, runs, runs_lock
@@ -27,7 +24,7 @@ _REGISTER_METHODS = {
 _watch_end = None  # an Event, which ends the watcher
 
 
-def enter(run: Any) -> None:
+def enter(run):
     """Enter a run into ``links.runs``; the first one starts the watcher."""
     global _watch_end
     with runs_lock:
@@ -37,14 +34,14 @@ def enter(run: Any) -> None:
         runs[run.uri] = run
 
 
-def leave(run: Any) -> None:
+def leave(run):
     """Take a run out of ``links.runs``; the last one ends the watcher."""
     with runs_lock:
         if runs.pop(run.uri, None) and not runs:
             _watch_end.set()  # type: ignore[union-attr]
 
 
-def check_name_free(run: Any) -> None:
+def check_name_free(run):
     """Raise NodeNameInUseError if a node of this name answers within NAME_LIMIT."""
     uri = run.master.call('lookupNode', run.name)
     if not uri:
@@ -62,7 +59,7 @@ def check_name_free(run: Any) -> None:
         )
 
 
-def register(run: Any, registry: str, name: str, data: str) -> None:
+def register(run, registry, name, data):
     """Register a topic or service at the master; try once, since the watcher repairs the rest.
 
     Have all nodes of this process connect to a new publisher.
@@ -82,7 +79,7 @@ def register(run: Any, registry: str, name: str, data: str) -> None:
                 _connect(subscriber, name, run.uri)
 
 
-def connect_all(run: Any, topic: str) -> None:
+def connect_all(run, topic):
     """Connect to the publishers of a topic, from the last list of the master.
 
     Link those of this process in this thread, and connect to others in threads.
@@ -94,7 +91,7 @@ def connect_all(run: Any, topic: str) -> None:
             _start_connecting(run, topic, uri)
 
 
-def _connect(run: Any, topic: str, uri: str) -> None:
+def _connect(run, topic, uri):
     """Connect the subscription of a topic to a publisher, by a link or a socket.
 
     Do nothing if they are connected, or if another thread connects them already.
@@ -118,7 +115,7 @@ def _connect(run: Any, topic: str, uri: str) -> None:
         run.connecting.discard(attempt)
 
 
-def _negotiate(run: Any, topic: str, uri: str, subscription: Any) -> None:
+def _negotiate(run, topic, uri, subscription):
     """Have rospy offer the protocols of Run.make_findable() and TCPROS, and connect by one."""
     try:
         code, _, _ = run.ros_handler._connect_topic(topic, uri)
@@ -134,7 +131,7 @@ def _negotiate(run: Any, topic: str, uri: str, subscription: Any) -> None:
         connect_later(run, topic, uri)
 
 
-def connect_later(run: Any, topic: str, uri: str, reason: str = '') -> None:
+def connect_later(run, topic, uri, reason=''):
     """Have the watcher connect after RETRY_DELAY, if the master still names the publisher.
 
     :param reason: the text of the last error, for the log, or ''
@@ -142,7 +139,7 @@ def connect_later(run: Any, topic: str, uri: str, reason: str = '') -> None:
     run.retries[topic, uri] = monotonic() + RETRY_DELAY, reason
 
 
-def _retry_connections(run: Any) -> None:
+def _retry_connections(run):
     for (topic, uri), (retry_time, reason) in list(run.retries.items()):
         if monotonic() < retry_time:
             continue
@@ -154,7 +151,7 @@ def _retry_connections(run: Any) -> None:
         _start_connecting(run, topic, uri)
 
 
-def _start_connecting(run: Any, topic: str, uri: str) -> None:
+def _start_connecting(run, topic, uri):
     """Connect in a thread, or later if the system has none left."""
     if not run.start_thread(functools.partial(_connect, run, topic, uri)):
         connect_later(run, topic, uri)
@@ -163,7 +160,7 @@ def _start_connecting(run: Any, topic: str, uri: str) -> None:
 # -- the watcher
 
 
-def _watch(end: threading.Event) -> None:
+def _watch(end):
     """Look after all runs until the last one ends; every two seconds, compare with the masters."""
     look_count = 0
     while not end.wait(WATCH_PERIOD):
@@ -175,7 +172,7 @@ def _watch(end: threading.Event) -> None:
             _ask_masters()
 
 
-def _look_after(run: Any) -> None:
+def _look_after(run):
     """Drop peers that have left (ros_comm #927) or are silent, and tell the log of troubles.
 
     End an overlong hold, and connect again after failures.
@@ -194,7 +191,7 @@ def _look_after(run: Any) -> None:
     run.close_silent_clients()
 
 
-def _ask_masters() -> None:
+def _ask_masters():
     """Ask each master for its system state, and have the runs register again what is missing."""
     all_runs = list(runs.values())
     for url in {run.master.url for run in all_runs}:
@@ -208,7 +205,7 @@ def _ask_masters() -> None:
                 run.troubles.add(f'no master answers at {url}, it is asked again: {error}')
 
 
-def _register_missing(run: Any, state: list) -> None:
+def _register_missing(run, state):
     """Register the topics and services that the master's system state lacks.
 
     If the master knows nothing of the node, set its parameters anew, too.
