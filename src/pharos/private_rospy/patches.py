@@ -23,7 +23,8 @@ POLL_INTERVAL = 60  # seconds between two looks for a stop; the stop itself wake
 TABLE = {}
 
 
-#: the client that this thread answers; its address is ``(host, port)``
+#: the client that this thread answers: its address is ``(host, port)``; if it ends the node,
+#: must_stop is True
 _current_client = threading.local()
 
 
@@ -163,6 +164,7 @@ def process_request(original, run, self, request, address):
 
     def answer():
         _current_client.address = address
+        _current_client.must_stop = False
         self.process_request_thread(request, address)
         run.deadlines.pop(request, None)
 
@@ -175,9 +177,16 @@ def process_request(original, run, self, request, address):
 
 @patch('rosgraph.xmlrpc', 'SilenceableXMLRPCRequestHandler.do_POST')
 def wait_for_next(original, run, self):
-    """rospy waits for ever for the next request. This has a limit."""
-    original(self)
-    run.limit_silence(self.connection)
+    """rospy waits for ever for the next request. This has a limit.
+
+    A call that ends the node is answered before: the stop closes the connection.
+    """
+    try:
+        original(self)
+        run.limit_silence(self.connection)
+    finally:
+        if _current_client.must_stop:
+            run.request_stop()
 
 
 # -- life
@@ -252,7 +261,7 @@ def shut_down_from_outside(original, run, self, caller_id, msg=''):
         obeys = False  # the call is for an earlier node, which had this URI
     if obeys:
         run.ros.logwarn(f'stops for {caller_id} at {host}: {msg}')
-        run.request_stop()
+        _current_client.must_stop = True
     else:
         run.ros.logwarn(f'does not stop for {caller_id} at {host}: {msg}')
     return int(obeys), '' if obeys else 'only this host and the master may do that', 0
