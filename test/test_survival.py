@@ -19,7 +19,7 @@ import std_srvs.srv
 from rosgraph.network import encode_ros_handshake_header
 
 import pharos
-from helpers import TIMEOUT, Peer, create, registrations
+from helpers import TIMEOUT, Peer, PharosPeer, create, registrations
 from pharos import BlockNode, Master
 from pharos.testing import Mailbox, until
 from programs.raw_tcpros import (
@@ -730,32 +730,34 @@ def test_subscription_connects_after_lack_of_threads(master, peer, monkeypatch):
 @pytest.mark.parametrize('queue_size', [None, 10])
 def test_handler_that_raises_in_publish(master, peer, queue_size):
     """The next publish() sends the rest of a message that a signal has cut, and then its own."""
-    mouth = create(master, '/mouth')
     peer.hear('/t', STRING)
-    publisher = mouth.ros.Publisher('/t', std_msgs.msg.String, queue_size=queue_size)
-    until(publisher.get_num_connections)
+    text = f'''
+import signal
 
-    class Alarm(Exception):
-        pass
+def handle(number, frame):
+    raise LookupError
 
-    def handle(number, frame):
-        raise Alarm
+signal.signal(signal.SIGALRM, handle)
+publisher = rospy.Publisher('/t', message_class('std_msgs/String'), queue_size={queue_size})
 
-    former_handler = signal.signal(signal.SIGALRM, handle)
-    try:
+def publish_until_alarm():
+    signal.setitimer(signal.ITIMER_REAL, 0.2)
+    while True:
+        publisher.publish('x' * 100_000)
+'''
+    with PharosPeer(master.url, 'mouth') as mouth:  # its main thread; a test may have another one
+        mouth.run(text)
+        until(lambda: mouth.value('publisher.get_num_connections()'))
         os.kill(peer.pid, signal.SIGSTOP)
-        with pytest.raises(Alarm):
-            signal.setitimer(signal.ITIMER_REAL, 0.2)
-            while True:
-                publisher.publish('x' * 100_000)
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, former_handler)
-        os.kill(peer.pid, signal.SIGCONT)
-
-    publisher.publish('whole')
-    until(lambda: peer.value('heard["/t"] and heard["/t"][-1].data') == 'whole')
-    assert set(peer.value('{message.data for message in heard["/t"]}')) == {'whole', 'x' * 100_000}
+        try:
+            with pytest.raises(RuntimeError, match='LookupError'):
+                mouth.run('publish_until_alarm()')
+        finally:
+            os.kill(peer.pid, signal.SIGCONT)
+        mouth.run("publisher.publish('whole')")
+        until(lambda: peer.value('heard["/t"] and heard["/t"][-1].data') == 'whole')
+    heard = peer.value('{message.data for message in heard["/t"]}')
+    assert set(heard) == {'whole', 'x' * 100_000}
 
 
 # -- for a while
