@@ -183,6 +183,7 @@ def wait_for_next(original, run, self):
     """
     try:
         original(self)
+        self.wfile.flush()
         run.limit_silence(self.connection)
     finally:
         if _current_client.must_stop:

@@ -101,8 +101,8 @@ class SharedMemoryHandler(ProtocolHandler):
 
     def _add_reader(self, sock):
         """Shake hands, and add a connection to the publisher."""
-        sock.settimeout(self.run.node.client_timeout)
         try:
+            sock.settimeout(self.run.node.client_timeout)
             check_user(sock)
             header = decode_ros_handshake_header(sock.recv(MAX_HEADER))
             publisher = self.run.topic_manager.pubs.get(header['topic'])
@@ -117,10 +117,10 @@ class SharedMemoryHandler(ProtocolHandler):
             sock.send(encode_ros_handshake_header(answer))
             if 'error' in answer:
                 raise ConnectionError
+            sock.settimeout(None)
         except (OSError, LookupError, struct.error, ROSHandshakeException):
             sock.close()
             return
-        sock.settimeout(None)
         with publisher.lock:
             if not publisher.memory:
                 publisher.memory = MessageMemory(self.run)
