@@ -8,7 +8,6 @@ usage: pharos COMMAND [ARGUMENT ...]
   top             a live table of nodes and processes
   graph           the nodes, topics and links, as text or as a picture
   restart, stop, start    do so with a node of a composition
-  create_package  make a catkin package with nodes and tests
 
 'pharos COMMAND --help' tells the arguments of a command.
 """
@@ -36,7 +35,6 @@ COMMANDS = {
     'restart': 'control',
     'stop': 'control',
     'start': 'control',
-    'create_package': 'create_package',
 }
 
 

@@ -22,7 +22,7 @@ def top(arguments: list[str]) -> None:
 
       top NAME ...        only nodes that have a NAME in their names
 
-    Other commands: compose, graph, workspace, restart, stop, start, create_package.
+    Other commands: compose, graph, workspace, restart, stop, start.
     """
     parser = argument_parser(top)
     parser.add_argument('names', nargs='*', metavar='NAME', help='a part of a name')
