@@ -30,7 +30,6 @@ from pharos.errors import (
     UnknownTopicError,
     UnknownTypeError,
 )
-from pharos.external_node import ExternalNode
 from pharos.failures import Failure
 from pharos.master import Master
 from pharos.node import BlockNode, Node
@@ -47,6 +46,7 @@ if TYPE_CHECKING:
     from pharos.compose.child_process import RosProcess
     from pharos.compose.composition import Composition
     from pharos.compose.script import ScriptNode
+    from pharos.live.external_node import ExternalNode
     from pharos.live.graph import Graph
 
 __version__ = '0.3.0'
@@ -89,6 +89,7 @@ __all__ = [
 _guide(_rospy, _live_nodes)
 _EXTRA_MODULES = {
     'Composition': 'compose.composition',
+    'ExternalNode': 'live.external_node',
     'Graph': 'live.graph',
     'RosProcess': 'compose.child_process',
     'ScriptNode': 'compose.script',

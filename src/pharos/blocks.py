@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import inspect
-import types
 from typing import Any, Callable
 
 Block = Callable[..., Any]
@@ -80,19 +79,6 @@ class DelegateHolder:
     def delegate(self, block: Block | None) -> None:
         self._delegate_block = with_arguments(block, 'delegate', 1, 2)
         self._delegate = block
-
-
-def rebind(block, node, node_class):
-    """Return a block; a method of the node is replaced by the method of that name in a class.
-
-    :param block: a block, None, or a list of blocks, which gives a list
-    :raises AttributeError: if the class lacks the method
-    """
-    if isinstance(block, list):
-        return [rebind(item, node, node_class) for item in block]
-    if getattr(block, '__self__', None) is not node:
-        return block
-    return types.MethodType(getattr(node_class, block.__name__), node)
 
 
 def block_name(block):

@@ -6,7 +6,7 @@ import contextlib
 import inspect
 import os
 import re
-from typing import TYPE_CHECKING, Any, Callable, Sequence, TypeVar
+from typing import TYPE_CHECKING, Any, Sequence, TypeVar
 from weakref import WeakValueDictionary
 from xmlrpc.client import dumps, loads
 
@@ -15,7 +15,6 @@ from rosgraph.names import get_ros_namespace, is_legal_remap, load_mappings, ns_
 from pharos import signals
 from pharos.blocks import Block
 from pharos.errors import MasterUnreachableError
-from pharos.external_node import ExternalNode
 from pharos.names import check_node_class, full_name, node_name
 from pharos.node import Node
 from pharos.private_rospy.run import Settings
@@ -28,6 +27,7 @@ if TYPE_CHECKING:
     from pharos.compose.child_process import RosProcess
     from pharos.compose.composition import Composition
     from pharos.compose.script import ScriptNode
+    from pharos.live.external_node import ExternalNode
     from pharos.live.graph import Graph
 
 LIFE_LIMIT = 0.5  # seconds that a node has to show that the node lives
@@ -295,13 +295,15 @@ class Master:
         :raises UnknownNodeError: if the master knows no such node
         """
         node = self._find_node(full_name(node_name(name)))
-        if isinstance(node, ExternalNode):
+        if not isinstance(node, Node):
             node.uri  # raises if the master does not know the node
         return node
 
     def _find_node(self, name):
         nodes = [node for node in self.own_nodes() if node._settings.name == name]
         if not nodes:
+            from pharos.live.external_node import ExternalNode
+
             return ExternalNode(self, name)
         for node in nodes:
             if node._current_run.uri:  # '' for a script that creates its node with pharos
@@ -360,17 +362,15 @@ class Master:
         package: str,
         executable: str,
         *args,
-        on_line: Callable[[str], Any] | None = None,
     ) -> RosProcess:
         """Run a program of ROS as a process at this master, as rosrun does.
 
         :param args: the program's arguments
-        :param on_line: ``on_line(text)`` is called for each printed line, in another thread
         :raises UnknownNodeError: if there is no such program
         """
         from pharos.compose.child_process import run_program
 
-        return run_program(self.url, package, executable, args, on_line)
+        return run_program(self.url, package, executable, args)
 
     def launch(self, package: str | None, file: str, **args) -> RosProcess:
         """Run a launch file in a process of roslaunch, at this master.

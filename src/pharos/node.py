@@ -11,7 +11,7 @@ import rosgraph.names
 import rospy
 
 from pharos import definitions, signals
-from pharos.blocks import Block, DelegateHolder, block_name, rebind, with_arguments
+from pharos.blocks import Block, DelegateHolder, block_name, with_arguments
 from pharos.channels import (
     QUEUE_SIZE,
     Channel,
@@ -26,9 +26,8 @@ from pharos.errors import (
     NodeStoppedError,
     PharosError,
 )
-from pharos.external_node import ExternalNode
 from pharos.failures import Failures
-from pharos.names import check_node_class, legal_name, node_name
+from pharos.names import legal_name, node_name
 from pharos.parameter import Parameter
 from pharos.private_rospy.run import Lifecycle, Run, Settings
 from pharos.service import OfferedService, Service
@@ -243,21 +242,10 @@ class Node(DelegateHolder):
         :raises TypeError: if the class is not one of nodes
         :raises AttributeError: if the class lacks a method that is a block of the node
         """
-        check_node_class(node_class, Node)
+        from pharos.live.editing import become
+
         self._check_active()
-        run = self._current_run
-
-        def change():
-            receivers = [self, *run.endpoints]
-            # find all blocks before the first change: the new class may lack one
-            soul = rebind(self.soul, self, node_class)
-            delegates = [rebind(receiver.delegate, self, node_class) for receiver in receivers]
-            self.__class__ = node_class
-            self.soul = soul
-            for receiver, delegate in zip(receivers, delegates):
-                receiver.delegate = delegate
-
-        run.callback_queue.run_exclusively(change)
+        become(self, node_class, Node)
 
     def __enter__(self):
         return self
@@ -462,9 +450,8 @@ class Node(DelegateHolder):
         """Return the full name of a Node, an ExternalNode, or a node given by its name."""
         if isinstance(peer, Node):
             return peer._settings.name
-        if isinstance(peer, ExternalNode):
-            return peer.name
-        return rosgraph.names.resolve_name(node_name(peer), self._settings.name)
+        name = getattr(peer, 'name', peer)  # an ExternalNode has one
+        return rosgraph.names.resolve_name(node_name(name), self._settings.name)
 
     def interested_in(
         self,

@@ -134,10 +134,10 @@ def start_master(port):
     return url, process
 
 
-def run_program(url, package, executable, args, on_line):
+def run_program(url, package, executable, args):
     """Do the work of :meth:`Master.run`."""
     path = find_program(package, executable)
-    return RosProcess([path, *map(str, args)], url, on_line)
+    return RosProcess([path, *map(str, args)], url)
 
 
 def run_launch_file(url, package, file, args):

@@ -30,7 +30,7 @@ from pharos.compose.sources import (
     why_own_group,
 )
 from pharos.errors import PharosError
-from pharos.external_node import ExternalNode
+from pharos.live.external_node import ExternalNode
 from pharos.private_rospy.run import Lifecycle, Settings, join
 from pharos.private_rospy.tcpros import shutdown_socket
 from pharos.transcript import Transcript

@@ -5,12 +5,15 @@ of plain rospy. The thread begins a callback when those on earlier messages of t
 have run for SLOW. There are two exceptions. A publisher's thread runs the queue of an inline channel.
 A thread that reads TCPROS runs the callbacks of plain rospy without a queue_size.
 """
+from __future__ import annotations
+
 import collections
 import contextlib
 import itertools
 import threading
 from _thread import allocate_lock, get_ident
 from time import perf_counter, sleep
+from typing import Any, Callable
 
 BURST = 100e-6  # seconds; a publisher that woke a thread less than this ago does not wait for one
 YIELD_LIMIT = 1e-3  # seconds that a publisher waits at most until the receiver's thread runs
@@ -34,14 +37,14 @@ class CallbackOrder:
     :ivar queues: a dict with the open callback queues that have an inbox as its keys
     """
 
-    def __init__(self, start_thread):
+    def __init__(self, start_thread: Callable) -> None:
         self.start_thread = start_thread
         self.newest_first_run_time = 0.0  # when the first pause of the newest queue ends
         self.numbers = itertools.count()
         self.queues = {}
         self.is_paused = False
 
-    def has_turn(self, callback_queue, number):
+    def has_turn(self, callback_queue: CallbackQueue, number: float) -> bool:
         """True if no callback on a message before this number delays the queue's next one."""
         if self.is_paused:
             return False
@@ -51,7 +54,7 @@ class CallbackOrder:
                 return False
         return True
 
-    def pass_turn(self):
+    def pass_turn(self) -> None:
         """Wake the thread that waits for its turn with the lowest number."""
         waiting_queues = [queue for queue in list(self.queues) if queue.waits_for_turn]
         if waiting_queues:
@@ -89,7 +92,7 @@ class CallbackQueue:
     #: True from request_thread() until the thread looks for jobs; a second request does nothing
     _is_requested = False
 
-    def __init__(self, order, first_pause=0.0):
+    def __init__(self, order: CallbackOrder, first_pause: float = 0.0) -> None:
         self.order = order
         self.jobs = collections.deque()
         self._running_lock = allocate_lock()  # held by the thread that runs callbacks
@@ -101,36 +104,36 @@ class CallbackQueue:
         self._wake_lock.acquire()
         self.request_lock = allocate_lock()
 
-    def hold(self):
+    def hold(self) -> None:
         """Run no callback until release()."""
         self.holder = get_ident()
         self.may_begin = False
 
-    def release(self):
+    def release(self) -> None:
         """End a hold, if there is one; any thread may do so."""
         self.holder = None
         self.may_begin = not self.closed
         self.request_thread()
 
-    def release_before_sleep(self):
+    def release_before_sleep(self) -> None:
         """End a hold by this thread, which would sleep while delegates wait."""
         if self.holder == get_ident():
             self.release()
 
-    def is_current(self):
+    def is_current(self) -> bool:
         """True if this thread runs one of the callbacks."""
         return self.running_thread == get_ident()
 
     # -- the order
 
-    def next_number(self):
+    def next_number(self) -> float:
         """Return the number of the next message; infinity if there is none."""
         try:
             return self.jobs[0][0]
         except IndexError:  # another thread has taken the message
             return float('inf')
 
-    def delays(self, number, now):
+    def delays(self, number: float, now: float) -> bool:
         """True if a callback on the message of that number must wait for one of this queue."""
         begin_time = self.begin_time
         if begin_time is not None:
@@ -141,7 +144,7 @@ class CallbackQueue:
             return False
         return self.next_number() < number
 
-    def _wait_for_turn(self):
+    def _wait_for_turn(self) -> None:
         """Wait until callbacks on earlier messages have ended, or have run for SLOW."""
         deadline = perf_counter() + TURN_LIMIT
         self.waits_for_turn = True
@@ -153,7 +156,7 @@ class CallbackQueue:
 
     # -- running
 
-    def run_jobs(self, waits_for_turn=True):
+    def run_jobs(self, waits_for_turn: bool = True) -> None:
         """Run all jobs in this thread, unless another thread does so already.
 
         :param waits_for_turn: False: begin at once, whatever other queues of the node do
@@ -173,7 +176,7 @@ class CallbackQueue:
                 self.running_thread = None
                 self._running_lock.release()
 
-    def _run_next(self):
+    def _run_next(self) -> None:
         try:
             job = self.jobs.popleft()
         except IndexError:  # a publisher has dropped the last one
@@ -182,7 +185,7 @@ class CallbackQueue:
         job[1].run_callback(job)
         self.begin_time = None
 
-    def _run_in_order(self, waits_for_turn):
+    def _run_in_order(self, waits_for_turn: bool) -> None:
         """Run the next job in the queue's turn, and say so to the other queues of the node."""
         if waits_for_turn:
             self._wait_for_turn()
@@ -198,7 +201,7 @@ class CallbackQueue:
             self.begin_time = None
             self.order.pass_turn()
 
-    def run_jobs_here(self):
+    def run_jobs_here(self) -> None:
         """Run all jobs in this thread; wait while another thread runs some of them."""
         self._wait_for_first_run()
         while self.jobs and self.may_begin:
@@ -208,7 +211,7 @@ class CallbackQueue:
         if self._is_requested or self.closed:  # a wait for a turn here may have taken the wake
             self.wake()
 
-    def run_exclusively(self, block):
+    def run_exclusively(self, block: Any) -> None:
         """Run ``block()`` in this thread, while no callback runs, unless the queue is closed.
 
         If this thread runs a callback of the queue, run the block at once.
@@ -227,7 +230,7 @@ class CallbackQueue:
 
     # -- the thread
 
-    def request_thread(self):
+    def request_thread(self) -> bool:
         """Have the thread run the jobs; return True if this has started or woken the thread."""
         if self._is_requested or not (self.jobs and self.may_begin):
             return False
@@ -241,12 +244,12 @@ class CallbackQueue:
             self.request_lock.release()
         return False
 
-    def wake(self):
+    def wake(self) -> None:
         """End the thread's rest or wait; if there is none, the next one ends at once."""
         with contextlib.suppress(RuntimeError):  # another thread has woken this one already
             self._wake_lock.release()
 
-    def _wait_for_first_run(self):
+    def _wait_for_first_run(self) -> None:
         """Sleep until the first pause is over, and that of queues made meanwhile.
 
         A constructor that subscribes to several topics may still run.
@@ -257,7 +260,7 @@ class CallbackQueue:
             self._first_run_time = self.order.newest_first_run_time
             sleep(max(0.0, self._first_run_time - perf_counter()))
 
-    def _loop(self):
+    def _loop(self) -> None:
         self.thread = threading.current_thread()
         self._wait_for_first_run()
         try:
@@ -271,19 +274,19 @@ class CallbackQueue:
             self.thread = None
             self._accept_request()
 
-    def _accept_request(self):
+    def _accept_request(self) -> None:
         self._is_requested = False
         if self.request_lock.locked():
             self.request_lock.release()
 
-    def stop(self):
+    def stop(self) -> None:
         """Begin no more callbacks."""
         self.closed = True
         self.may_begin = False
         self.order.queues.pop(self, None)
         self.wake()
 
-    def close(self, timeout):
+    def close(self, timeout: float) -> bool:
         """Begin no more callbacks, drop all jobs, and wait for the callback that runs.
 
         :param timeout: seconds
@@ -299,7 +302,7 @@ class CallbackQueue:
         return has_ended
 
 
-def hand_over(callback_queues, last_wake, may_wait):
+def hand_over(callback_queues: list[CallbackQueue], last_wake: float, may_wait: bool) -> float:
     """Wake the threads of some callback queues; a publisher calls this.
 
     :param last_wake: the last time that the same publisher woke a thread, as of perf_counter()

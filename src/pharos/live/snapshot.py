@@ -1,9 +1,7 @@
 """Take a snapshot of a master and its nodes: topics, services, links and their traffic."""
 from __future__ import annotations
 
-import collections
 import concurrent.futures
-import contextlib
 import time
 import urllib.parse
 from dataclasses import dataclass, field
@@ -184,33 +182,3 @@ def topic_rates(link_rates: dict[Link, Traffic], unit: str) -> dict[str, float]:
     for (topic, _), rate in publisher_rates(link_rates, unit).items():
         rates[topic] = rates.get(topic, 0.0) + rate
     return rates
-
-
-def health_facts(run) -> dict[str, Any]:
-    """Return the facts of :meth:`Node.health` that the master is not asked for."""
-    bus_info = run.topic_manager.get_pub_sub_info()
-    queues = list(run.callback_order.queues)
-    begin_times = [queue.begin_time for queue in queues if queue.begin_time]
-    ended_souls = [soul.name for soul in run.souls if not soul.is_alive()]
-    return {
-        'kind': type(run.node).__name__,
-        'connections': dict(collections.Counter(row[3] for row in bus_info)),
-        'dropped': sum(getattr(each, 'dropped', 0) for each in run.open_endpoints(object)),
-        'errors': run.failures.total,
-        'threads': sum(thread.is_alive() for thread in list(run.threads)),
-        'cpu_seconds': round(_cpu_seconds(run), 3),
-        'souls': len(run.souls) - len(ended_souls),
-        'ended_souls': ended_souls,
-        'callback_seconds': time.perf_counter() - min(begin_times) if begin_times else 0.0,
-        'waiting': sum(len(queue.jobs) for queue in queues),
-    }
-
-
-def _cpu_seconds(run):
-    """Return the CPU time of the node's threads."""
-    seconds = run.ended_cpu_seconds
-    for thread in list(run.threads):
-        with contextlib.suppress(OSError):  # the thread ends at this moment
-            if thread.is_alive():
-                seconds += time.clock_gettime(time.pthread_getcpuclockid(thread.ident))
-    return seconds

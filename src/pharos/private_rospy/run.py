@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import atexit
+import collections
 import dataclasses
 import enum
 import errno
@@ -14,7 +15,7 @@ import time
 import xmlrpc.client
 from contextlib import suppress
 from time import monotonic
-from typing import TYPE_CHECKING, Sequence
+from typing import TYPE_CHECKING, Any, Callable, Iterable, Sequence
 from urllib.parse import urlsplit
 from weakref import WeakSet
 
@@ -87,7 +88,7 @@ class Run:
     lacks_memory = False  # True if the system had no memory or descriptor for a memory file
     lifecycle = Lifecycle.STARTING
 
-    def __init__(self, node, settings):
+    def __init__(self, node: Any, settings: Settings) -> None:
         self.node = node
         self.settings = settings
         self.name = settings.name
@@ -131,7 +132,7 @@ class Run:
         self.topic_manager = registration.get_topic_manager()
         self.service_manager = registration.get_service_manager()
 
-    def substitutes(self):
+    def substitutes(self) -> dict[str, Any]:
         """Return the stand-ins that the node's modules import for some modules of Python.
 
         Make :attr:`Thread`, the class of the node's threads.
@@ -141,7 +142,7 @@ class Run:
         class Thread(threading.Thread):
             """A daemon thread of the node; the node's stop waits for its end."""
 
-            def start(self):
+            def start(self) -> None:
                 self.daemon = True
                 run.threads.add(self)  # before its start: a stop waits for it
                 self.run = functools.partial(run.run_thread, self, self.run)  # type: ignore
@@ -160,7 +161,7 @@ class Run:
             'xmlrpc.client': client,
         }
 
-    def run_thread(self, thread, target):
+    def run_thread(self, thread: threading.Thread, target: Callable) -> None:
         """Run the target of a thread of the node, in this thread."""
         try:
             target()
@@ -168,7 +169,7 @@ class Run:
             self.ended_cpu_seconds += time.thread_time()
             self.threads.discard(thread)
 
-    def start_thread(self, target):
+    def start_thread(self, target: Callable) -> threading.Thread | None:
         """Start a thread of the node, and return the thread.
 
         :returns: None if the system has no thread left: the caller must try again, or close what
@@ -185,7 +186,7 @@ class Run:
             return None
         return thread
 
-    def sleep(self, seconds):
+    def sleep(self, seconds: float) -> None:
         """Stand in for ``time.sleep``: the node's stop ends the sleep.
 
         After the stop, a sleep ends its thread.
@@ -199,24 +200,24 @@ class Run:
         if is_stopping:  # a loop may sleep on
             let_others_run()
 
-    def checkpoint(self):
+    def checkpoint(self) -> None:
         """Do nothing: a run of a script handles its signals here.
 
         publish() and is_shutdown() call this, and so all loops of rospy programs do.
         """
 
-    def signal_shutdown(self, reason):
+    def signal_shutdown(self, reason: str) -> None:
         """Stand in for ``rospy.signal_shutdown``: stop the node in another thread."""
         self.request_stop()
 
     # -- state
 
     @property
-    def is_active(self):
+    def is_active(self) -> bool:
         """True if the node is registered: it runs, or its stop goes on."""
         return self.lifecycle in (Lifecycle.RUNNING, Lifecycle.STOPPING)
 
-    def open_endpoints(self, endpoint_class):
+    def open_endpoints(self, endpoint_class: Any) -> list:
         """Return the endpoints of a class that are open."""
         return [
             endpoint
@@ -224,7 +225,7 @@ class Run:
             if isinstance(endpoint, endpoint_class) and not endpoint.closed
         ]
 
-    def mark_stopped(self):
+    def mark_stopped(self) -> None:
         """Mark the run as stopped, and its endpoints as closed."""
         for endpoint in self.endpoints:
             endpoint.closed = True
@@ -232,23 +233,45 @@ class Run:
         if runs.get(self.uri) is self:  # only in a forked child: leave() has taken it out before
             del runs[self.uri]
 
-    def health_facts(self):
+    def health_facts(self) -> dict[str, Any]:
         """Return the facts of Node.health(), without the master's; ``pharos top`` asks for them."""
-        from pharos.live.snapshot import health_facts
+        bus_info = self.topic_manager.get_pub_sub_info()
+        queues = list(self.callback_order.queues)
+        begin_times = [queue.begin_time for queue in queues if queue.begin_time]
+        ended_souls = [soul.name for soul in self.souls if not soul.is_alive()]
+        return {
+            'kind': type(self.node).__name__,
+            'connections': dict(collections.Counter(row[3] for row in bus_info)),
+            'dropped': sum(getattr(each, 'dropped', 0) for each in self.open_endpoints(object)),
+            'errors': self.failures.total,
+            'threads': sum(thread.is_alive() for thread in list(self.threads)),
+            'cpu_seconds': round(self.cpu_seconds(), 3),
+            'souls': len(self.souls) - len(ended_souls),
+            'ended_souls': ended_souls,
+            'callback_seconds': time.perf_counter() - min(begin_times) if begin_times else 0.0,
+            'waiting': sum(len(queue.jobs) for queue in queues),
+        }
 
-        return health_facts(self)
+    def cpu_seconds(self) -> float:
+        """Return the CPU time of the node's threads."""
+        seconds = self.ended_cpu_seconds
+        for thread in list(self.threads):
+            with suppress(OSError):  # the thread ends at this moment
+                if thread.is_alive():
+                    seconds += time.clock_gettime(time.pthread_getcpuclockid(thread.ident))
+        return seconds
 
     # -- failures
 
     def report_failure(
         self,
-        error,
-        block,
-        role,
-        message=None,
-        channel=None,
-        retry=None,
-    ):
+        error: BaseException,
+        block: Any,
+        role: str,
+        message: Any = None,
+        channel: Any = None,
+        retry: Callable | None = None,
+    ) -> None:
         """Keep an exception of a block; at the 1st, 10th, 100th time, log and show the exception.
 
         An exception that may come from a signal is raised again: Ctrl-C ends the program.
@@ -280,25 +303,25 @@ class Run:
 
     def keep_failure(
         self,
-        error,
-        block,
-        message=None,
-        channel=None,
-        retry=None,
-    ):
+        error: BaseException,
+        block: Any,
+        message: Any = None,
+        channel: Any = None,
+        retry: Callable | None = None,
+    ) -> Failure:
         """Keep an exception of a block, without a log line, and return the Failure."""
         failure = Failure(error, block, message, channel, retry)
         self.failures.keep(failure)
         return failure
 
-    def report_refusal(self, topic, reason):
+    def report_refusal(self, topic: str, reason: str) -> None:
         """Report a publisher that sends another type as a failure of the node."""
         error = MessageTypeError(f'{self.name} does not receive from {topic}: {reason}')
         self.report_failure(error, topic, 'connection')
 
     # -- start
 
-    def start(self, **options):
+    def start(self, **options) -> None:
         """Bind the ports, start the servers, and set the address and ports of the node.
 
         :param options: further options of ``rospy.init_node``
@@ -331,7 +354,7 @@ class Run:
         node.tcp_port, node.xmlrpc_port = self.settings.ports
         node.domain = self.settings.domain
 
-    def make_findable(self, handler, uri):
+    def make_findable(self, handler: Any, uri: str) -> None:
         """Offer shared memory and the facts for top; enter the run into ``links.runs``.
 
         The patch ``ready`` calls this when the XML-RPC server has its port, before anything is
@@ -349,19 +372,19 @@ class Run:
         handler.pharosHealth = lambda caller_id: (1, '', self.health_facts())
         connections.enter(self)
 
-    def read_parameters(self):
+    def read_parameters(self) -> None:
         """Have the node's parameters read their values from the server."""
         for parameter in self.node._parameters:
             parameter.read()
 
-    def limit_silence(self, sock):
+    def limit_silence(self, sock: socket.socket) -> None:
         """Have the watcher shut a client's socket after the node's client_timeout.
 
         A client that speaks in time is taken out of ``deadlines``.
         """
         self.deadlines[sock] = monotonic() + self.node.client_timeout
 
-    def close_silent_clients(self):
+    def close_silent_clients(self) -> None:
         """Shut the sockets of clients whose time is over; the watcher calls this."""
         for sock, deadline in list(self.deadlines.items()):
             if monotonic() > deadline:
@@ -370,18 +393,18 @@ class Run:
 
     # -- stop
 
-    def request_stop(self):
+    def request_stop(self) -> None:
         """Stop the node, in another thread."""
         # not one of the node's threads: another stop would wait for that
         threading.Thread(target=self.node._stop_safely).start()
 
-    def end_program(self, timeout):
+    def end_program(self, timeout: float) -> None:
         """Do nothing: a run of a script ends its program here, before all else stops.
 
         :param timeout: seconds for the program
         """
 
-    def close_rospy(self, timeout):
+    def close_rospy(self, timeout: float) -> None:
         """Send messages under way, unregister, and close all topics and services.
 
         :param timeout: seconds for messages under way
@@ -393,13 +416,13 @@ class Run:
             publisher.flush(deadline)
         self.rospy_signal_shutdown('stop')  # type: ignore[attr-defined]
 
-    def _begin_stop(self):
+    def _begin_stop(self) -> None:
         """End sleeps, waits and service calls of the node."""
         self.stopping.set()
         for sock in list(self.calls):
             shutdown_socket(sock)
 
-    def stop(self, timeout):
+    def stop(self, timeout: float) -> None:
         """Send messages under way, unregister, free ports and threads; log souls left behind.
 
         When this has returned, no thread of the node runs, unless one has blocked longer than its
@@ -433,14 +456,14 @@ class Run:
             sock.close()  # now that no thread uses it: another file may get its number
         self.mark_stopped()
 
-    def _wait_for_threads(self, timeout):
+    def _wait_for_threads(self, timeout: float) -> None:
         """Wait for the end of all threads but souls."""
         deadline = monotonic() + timeout
         while join(set(self.threads) - set(self.souls), JOIN_PERIOD) and monotonic() < deadline:
             pass
 
 
-def join(threads, timeout):
+def join(threads: Iterable[threading.Thread], timeout: float) -> list[threading.Thread]:
     """Wait for the end of threads other than this one, and return those that go on.
 
     :param timeout: seconds for all of them together

@@ -2,10 +2,13 @@
 
 :mod:`pharos.private_rospy.patches` sets these methods on each node's own copy of rospy's classes.
 """
+from __future__ import annotations
+
 import collections
 import contextlib
 import functools
 import time
+from typing import Any, Callable, Iterable
 
 import rospy
 
@@ -36,7 +39,7 @@ class PublisherOverlay:
     subclass, and recurse.
     """
 
-    def __init__(self, name, data_class):
+    def __init__(self, name: str, data_class: type) -> None:
         self.rospy___init__(name, data_class)
         self.lock = self.publock  # rospy's close() sets publock to None
         # channel, or None for all Publishers of plain rospy -> frozen message. A new connection gets
@@ -51,7 +54,7 @@ class PublisherOverlay:
         # list at each change
         self.cached_connections = None
 
-    def acquire(self):
+    def acquire(self) -> None:
         """Take no lock, but handle a pending signal of a script.
 
         rospy locks here for the whole of a publish(). Our publish() has a lock of its own, and
@@ -60,15 +63,15 @@ class PublisherOverlay:
         if self.resolved_name != ROSOUT:  # this thread holds the log's lock
             self.run.checkpoint()
 
-    def release(self):
+    def release(self) -> None:
         """Do nothing: rospy unlocks here after a publish()."""
 
-    def enable_latch(self):  # rospy calls this after registering, when links may exist
+    def enable_latch(self) -> None:  # rospy calls this after registering, when links may exist
         self.is_latch = True
         if self.header:
             self.header['latching'] = '1'
 
-    def make_header(self):
+    def make_header(self) -> None:
         """Make the connection header for links: the one that TCPROS sends."""
         with self.lock:
             if self.header is None:
@@ -79,7 +82,7 @@ class PublisherOverlay:
                 )
                 self.header = protocol.get_header_fields()
 
-    def add_connection(self, connection):
+    def add_connection(self, connection: Any) -> bool:
         if not getattr(connection, 'has_own_queue', False):
             connection = Sender(connection, self)
         with self.lock:
@@ -88,11 +91,11 @@ class PublisherOverlay:
                 self.write(self.thaw(frozen), [connection])
         return True
 
-    def remove_connection(self, connection):
+    def remove_connection(self, connection: Any) -> None:
         if not self.closed:  # rospy trips over attributes that its close() has set to None
             self.rospy_remove_connection(connection)
 
-    def publish(self, message, connection_override=None, channel=None):
+    def publish(self, message: Any, connection_override: Any = None, channel: Any = None) -> None:
         """Publish to the links, then to memory files and sockets.
 
         If a node has inline delegates, all its waiting jobs run in this thread, after the lock is
@@ -144,7 +147,7 @@ class PublisherOverlay:
             may_wait = channel is not None
             self.last_wake = hand_over(thread_queues, self.last_wake, may_wait)
 
-    def write(self, message, connections):
+    def write(self, message: Any, connections: list) -> None:
         """Serialize a message, and write it to memory files and sockets.
 
         If a connection fails, it closes, and its subscriber connects anew.
@@ -168,7 +171,7 @@ class PublisherOverlay:
             except CLOSED:
                 connection.close()
 
-    def _serialize(self, message, senders, connections):
+    def _serialize(self, message: Any, senders: list, connections: list) -> tuple:
         """Return the parts of a message for memory files, and a MessageParts for sockets."""
         memory_parts = None
         buffer = MessageParts()
@@ -178,14 +181,14 @@ class PublisherOverlay:
             message.serialize(buffer)
         return memory_parts, buffer
 
-    def flush(self, deadline):
+    def flush(self, deadline: float) -> None:
         """Wait until the sockets have taken all messages, or until a deadline as monotonic time."""
         while any(getattr(connection, 'is_busy', False) for connection in self.connections):
             if time.monotonic() > deadline:
                 break
             time.sleep(FLUSH_PERIOD)
 
-    def flush_for_last(self, timeout):
+    def flush_for_last(self, timeout: float) -> None:
         """Flush if only one Publisher is left: its end closes the topic.
 
         :param timeout: seconds
@@ -193,7 +196,7 @@ class PublisherOverlay:
         if self.ref_count == 1:
             self.flush(time.monotonic() + timeout)
 
-    def close(self):
+    def close(self) -> None:
         close_topic(self)
         if self.memory:
             self.memory.close()
@@ -204,14 +207,14 @@ class PublisherOverlay:
 class PlainInbox(Inbox):
     """The messages that wait for a subscription's callbacks of plain rospy; all share one Inbox."""
 
-    def __init__(self, subscription, first_pause):
+    def __init__(self, subscription: Any, first_pause: float) -> None:
         callback_queue = CallbackQueue(subscription.run.callback_order, first_pause)
         super().__init__(callback_queue, subscription.call_plain, subscription.queue_size)
         self.subscription = subscription
         self.queue_bytes = subscription.run.node.queue_bytes
         self._paused_connections = collections.deque()
 
-    def receive(self, message, size, connection):
+    def receive(self, message: Any, size: int, connection: Any) -> None:  # type: ignore[override]
         """Take a message from a connection.
 
         Without a queue_size, messages wait in the sockets and in the publisher until the callbacks
@@ -226,13 +229,13 @@ class PlainInbox(Inbox):
             self._paused_connections.append(connection)
         super().receive(message, size, connection)
 
-    def run_callback(self, job):
+    def run_callback(self, job: tuple) -> None:
         """Run the callbacks on the message of a job, and have all connections read again."""
         super().run_callback(job)
         while self._paused_connections:
             self._paused_connections.popleft().resume()
 
-    def capacity_for(self, size):
+    def capacity_for(self, size: int) -> int:
         """Return how many messages would wait between processes: in publishers and in sockets."""
         connections = self.subscription.connections
         links = links_of(connections)
@@ -255,13 +258,13 @@ class SubscriptionOverlay:
     :ivar inboxes: the inboxes of all callbacks; links share this very list
     """
 
-    def __init__(self, name, data_class):
+    def __init__(self, name: str, data_class: type) -> None:
         self.rospy___init__(name, data_class)
         self.tcp_nodelay = True
         self.inboxes = []
-        self.plain_inbox = None
+        self.plain_inbox = None  # type: Any
 
-    def add_link(self, link):
+    def add_link(self, link: Any) -> bool:
         """Add a link, unless the topic is closed or has a connection to that node.
 
         :returns: True if the link was added
@@ -272,7 +275,7 @@ class SubscriptionOverlay:
             self.add_connection(link)
             return True
 
-    def update_inboxes(self):
+    def update_inboxes(self) -> list:
         """Find the inboxes of all callbacks anew, have the publishers do so, and return the links.
 
         A change of the callbacks calls this.
@@ -289,7 +292,7 @@ class SubscriptionOverlay:
             link.publisher.cached_connections = None
         return links
 
-    def deliver(self, message, connection, size):
+    def deliver(self, message: Any, connection: Any, size: int) -> None:
         """Count a message that came by a connection, and give each inbox a message of its own.
 
         :param size: bytes of the message and its length
@@ -307,17 +310,17 @@ class SubscriptionOverlay:
         if connection.is_latched:
             connection.latch = message
 
-    def call_plain(self, message):
+    def call_plain(self, message: Any) -> None:
         """Run the callbacks of plain rospy on a message."""
         for callback, args in self.callbacks or ():
             if not isinstance(callback, Inbox):
                 self._invoke_plain(callback, args, message)
 
-    def _invoke_plain(self, callback, args, message):
+    def _invoke_plain(self, callback: Callable, args: Any, message: Any) -> None:
         with contextlib.suppress(SystemExit):  # would end the thread of the callbacks
             self._invoke_callback(message, callback, args)
 
-    def add_callback(self, callback, args):
+    def add_callback(self, callback: Any, args: Any) -> None:
         self.rospy_add_callback(callback, args)
         links = self.update_inboxes()
         latch_inbox = callback  # a channel
@@ -330,17 +333,17 @@ class SubscriptionOverlay:
         latch_inbox.callback_queue.request_thread()
         connections.connect_all(self.run, self.resolved_name)
 
-    def remove_callback(self, callback, args):
+    def remove_callback(self, callback: Any, args: Any) -> None:
         self.rospy_remove_callback(callback, args)
         self.update_inboxes()
 
-    def close(self):
+    def close(self) -> None:
         close_topic(self)
         if self.plain_inbox:
             self.plain_inbox.callback_queue.close(0)
 
 
-def first_pause_for(callbacks):
+def first_pause_for(callbacks: Iterable[tuple]) -> float:
     """Return how many seconds some callbacks must wait for the constructor that subscribes.
 
     A function in C, and that of rospy's wait_for_message(), use nothing that a constructor sets.
@@ -349,7 +352,7 @@ def first_pause_for(callbacks):
     return 0.0 if modules <= {None, 'rospy.client'} else FIRST_PAUSE
 
 
-def receivers_of(connections):
+def receivers_of(connections: list) -> tuple:
     """Return the receivers of messages that are published to some connections.
 
     :returns: four values: ``{thaw: inboxes}``, the callback queues of inline inboxes, the callback
@@ -368,7 +371,7 @@ def receivers_of(connections):
     return inboxes, inline_queues, other_queues, others
 
 
-def close_topic(impl):
+def close_topic(impl: Any) -> None:
     """Close a publisher or subscription.
 
     Links close before rospy's close() holds its lock: a link needs the locks of both its ends.
@@ -380,7 +383,7 @@ def close_topic(impl):
     impl.connection_poll.poller.close()
 
 
-def connections_of(ros_object):
+def connections_of(ros_object: Any) -> list:
     """Return the connections of a rospy.Publisher or rospy.Subscriber."""
     impl = ros_object.impl
     if not impl or impl.closed:
