@@ -578,26 +578,3 @@ def test_missing_master_leaves_no_channel(mortal):
     mortal.come_back()
     node.output_channel('/marker', STRING)
     assert '/chatter' not in str(registrations(node.master, '/sender'))
-
-
-def test_messages_that_waited_at_a_restart_are_gone(master):
-    begun, go_on, heard = threading.Event(), threading.Event(), []
-
-    def hear(message):
-        heard.append(message.data)
-        begun.set()
-        go_on.wait(TIMEOUT)
-
-    ear, mouth = create(master, '/ear'), create(master, '/mouth')
-    ear.stop_timeout = 0.05
-    ear.interested_in('/words', STRING, hear)
-    for word in 'first', 'old', 'older':
-        mouth.send_to('/words', typed_as=STRING, data=word)
-    assert begun.wait(TIMEOUT)
-    ear.stop()
-    go_on.set()
-    ear.start()
-    del heard[:]
-    mouth.send_to('/words', data='new')
-    until(lambda: heard)
-    assert heard[0] == 'new'

@@ -1,4 +1,5 @@
 """Behaviour whose loss would hurt a robot; each test fails with exactly one change of the source."""
+import contextlib
 import http.client
 import os
 import signal
@@ -651,3 +652,31 @@ print('over')
     with Program(text, master.url) as running:
         assert running.wait() == 0
     assert running.output.split() == ['restarted', 'over']
+
+
+def test_thread_that_sleeps_ends_with_its_node(node):
+    sleep = node.ros.rostime.wallsleep
+
+    def work():
+        with contextlib.suppress(SystemExit):
+            while True:
+                sleep(0.01)
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    node.stop()
+    thread.join(TIMEOUT)
+    assert not thread.is_alive()
+
+
+def test_publisher_that_has_left_is_not_connected_again(node, monkeypatch, peer):
+    attempts, run = [], node._current_run
+    peer.run("out = rospy.Publisher('/words', message_class('std_msgs/String'), queue_size=1)")
+    channel = node.interested_in('/words', STRING)
+    until(lambda: channel.connections)
+    start = 'pharos.private_rospy.connections._start_connecting'
+    monkeypatch.setattr(start, lambda *arguments: attempts.append(arguments))
+    peer.run('out.unregister()')
+    until(lambda: run.retries)
+    until(lambda: not run.retries)
+    assert not attempts

@@ -264,27 +264,6 @@ def test_block_must_be_callable(node):
         node.execute()
 
 
-def test_delegates_run_one_at_a_time(master, node):
-    running, most, done = [], [], threading.Semaphore(0)
-
-    def delegate(message, channel):
-        running.append(channel)
-        most.append(len(running))
-        threading.Event().wait(0.001)
-        running.remove(channel)
-        done.release()
-
-    other = create(master, '/other', delegate=delegate)
-    for topic in '/a', '/b', '/c':
-        other.interested_in(topic, STRING)
-    for _ in range(5):
-        for topic in '/a', '/b', '/c':
-            node.send_to(topic, data='x')
-    for _ in range(15):
-        assert done.acquire(timeout=TIMEOUT)
-    assert set(most) == {1}
-
-
 # -- souls and time
 
 

@@ -422,7 +422,8 @@ def test_five_stopped_readers_hold_up_nobody(master, node, listener, topic):
         until(lambda: out.send(data=b'last') and all(each.value(last) for each in stopped), TIMEOUT)
         until(lambda: [kind for _, kind in out.connections] == [SHARED] * 6)
         for each in stopped:
-            assert each.numbers(topic) == sorted(set(each.numbers(topic)))
+            numbers = each.numbers(topic)  # more of them may come
+            assert numbers == sorted(set(numbers))
 
 
 def test_killed_reader_leaves_nothing(master, node, listener, topic):
