@@ -634,6 +634,7 @@ def test_commands_control_a_node(master, compose):
     assert sonar.is_running
     first_run = sonar.uri
     assert command('restart') == (0, '')
+    assert command("reload") == (0, "nothing has changed\n")
     assert sonar.is_running and sonar.uri != first_run
     status, output = command('restart', 'nobody')
     assert status == 1 and '/nobody is not a node of a composition' in output

@@ -680,3 +680,10 @@ def test_publisher_that_has_left_is_not_connected_again(node, monkeypatch, peer)
     until(lambda: run.retries)
     until(lambda: not run.retries)
     assert not attempts
+
+
+def test_delegate_may_close_its_channel_at_the_latched_message(master, node):
+    create(master, '/maps').output_channel('/map', STRING, latch=True).send(data='map')
+    channel = node.interested_in('/map', delegate=lambda message, channel: channel.close())
+    until(lambda: channel.closed or node.errors)
+    assert not node.errors and not channel.connections

@@ -110,14 +110,6 @@ def test_nothing_comes_twice(master, sender):
         assert [m.data for m in box.all()] == [*map(str, range(20)), 'end']
 
 
-def test_closed_channel_has_no_connections(sender, hearer):
-    box = Mailbox(hearer, '/a', STRING)
-    out = sender.output_channel('/a', STRING)
-    assert out.wait_for_subscribers(1, TIMEOUT)
-    box.channel.close()
-    until(lambda: out.connections == [])
-
-
 # -- whose message
 
 
@@ -207,28 +199,6 @@ def test_inline_delegate_runs_in_publishers_thread(sender, hearer):
     )
     sender.send_to('/a', data='x')
     assert threads == [threading.current_thread()]
-
-
-def test_delegate_runs_in_another_thread(sender, hearer):
-    box = Mailbox()
-    hearer.interested_in('/a', STRING, delegate=lambda m, c: box(threading.current_thread(), c))
-    sender.send_to('/a', data='x')
-    assert box.next() is not threading.current_thread()
-
-
-def test_publisher_does_not_wait_for_delegate(sender, hearer):
-    leave, box = threading.Event(), Mailbox()
-
-    def delegate(message, channel):
-        leave.wait(TIMEOUT)
-        box(message, channel)
-
-    hearer.interested_in('/a', STRING, delegate=delegate)
-    for number in range(10):
-        sender.send_to('/a', data=str(number))
-    assert box.empty()
-    leave.set()
-    assert [box.next().data for _ in range(10)] == [str(number) for number in range(10)]
 
 
 def test_blocked_delegate_holds_up_no_other(master, sender, hearer):

@@ -353,33 +353,6 @@ def test_stubborn_soul_is_left_behind(master):
     thread.join(TIMEOUT)
 
 
-def test_opening_soul_holds_no_stop(master, peer):
-    """Opening a channel is nobody's last word, though its subscriber does not connect."""
-
-    class Patient(BlockNode):
-        connect_timeout = stop_timeout = 3600
-
-    node, began, ended = create(master, '/node', Patient), threading.Event(), threading.Event()
-    peer.run("rospy.Subscriber('/late', message_class('std_msgs/Int8'))")
-
-    def soul(me):
-        try:
-            began.set()
-            me.sleep(3600)
-        finally:
-            try:
-                me.send_to('/late', typed_as=STRING, data='x')
-            finally:
-                ended.set()
-
-    node.fork(soul)
-    assert began.wait(TIMEOUT)
-    stopping = threading.Thread(target=node.stop, daemon=True)
-    stopping.start()
-    stopping.join(TIMEOUT)
-    assert not stopping.is_alive() and ended.is_set()
-
-
 def test_every_counts_its_turns(node):
     turns = []
     for turn in node.every(0.001):

@@ -1,8 +1,6 @@
 """The programs that rosrun starts, pharos.testing, spin() and the Transcript."""
 import contextlib
-import os
 import re
-import shutil
 import signal
 import subprocess
 import threading
@@ -278,22 +276,6 @@ def test_made_package_passes_its_tests(made):
         [PYTHON, '-m', 'pytest', '-q', 'test'], cwd=made, text=True, stdout=subprocess.PIPE
     )
     assert done.returncode == 0, done.stdout
-
-
-def test_made_package_tests_its_messages(made, tmp_path):
-    """They are in a devel space, as catkin_make writes it."""
-    package, devel = tmp_path / 'my_robot', tmp_path / 'devel' / 'my_robot'
-    shutil.copytree(made, package)
-    (devel / 'msg').mkdir(parents=True)
-    (devel / 'msg' / '__init__.py').write_text('from std_msgs.msg import String as Blob\n')
-    (devel / '__init__.py').write_text(
-        f'import sys\nfrom pkgutil import extend_path\nsys.path.insert(0, "{package}/src")\n'
-        '__path__ = extend_path(__path__, __name__)\n'
-    )
-    module = package / 'src' / 'my_robot' / 'camera.py'
-    module.write_text(f'from my_robot.msg import Blob\n{module.read_text()}')
-    environ = {**os.environ, 'PYTHONPATH': f'{devel.parent}:{os.environ["PYTHONPATH"]}'}
-    subprocess.run([PYTHON, '-m', 'pytest', '-q', 'test'], cwd=package, env=environ, check=True)
 
 
 def test_made_package_builds_and_runs(made, master):

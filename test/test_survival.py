@@ -181,11 +181,12 @@ def test_shutdown_for_earlier_owner_is_refused(master):
 def test_restarted_master_knows_all_again(mortal):
     master = Master(mortal.url)
     heard, changes = Mailbox(), Mailbox()
-    receiver = create(master, '/receiver', delegate=heard, argv=['_private:=7'])
+    receiver = create(master, '/receiver', delegate=heard, argv=['_private:=7', '_other:=7'])
     receiver.interested_in('/t', STRING)
     receiver.serve('/service', 'std_srvs/Empty', lambda request: None)
     receiver.parameter('~watched', 1).on_change(lambda value: changes(value, None))
-    other = receiver.parameter('~other', 3)
+    other = receiver.parameter('~other')
+    other.set(3)
     sent = create(master, '/sender').output_channel('/t', STRING)
     before = [registrations(master, name) for name in ('/receiver', '/sender')]
     mortal.end()
@@ -734,23 +735,30 @@ def test_handler_that_raises_in_publish(master, peer, queue_size):
     text = f'''
 import signal
 
+class Alarm(Exception):
+    pass
+
 def handle(number, frame):
-    raise LookupError
+    raise Alarm
 
 signal.signal(signal.SIGALRM, handle)
 publisher = rospy.Publisher('/t', message_class('std_msgs/String'), queue_size={queue_size})
 
 def publish_until_alarm():
-    signal.setitimer(signal.ITIMER_REAL, 0.2)
-    while True:
-        publisher.publish('x' * 100_000)
+    # again and again: one in a __del__() would be ignored
+    signal.setitimer(signal.ITIMER_REAL, 0.2, 0.2)
+    try:
+        while True:
+            publisher.publish('x' * 100_000)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
 '''
     with PharosPeer(master.url, 'mouth') as mouth:  # its main thread; a test may have another one
         mouth.run(text)
         until(lambda: mouth.value('publisher.get_num_connections()'))
         os.kill(peer.pid, signal.SIGSTOP)
         try:
-            with pytest.raises(RuntimeError, match='LookupError'):
+            with pytest.raises(RuntimeError, match='Alarm'):
                 mouth.run('publish_until_alarm()')
         finally:
             os.kill(peer.pid, signal.SIGCONT)

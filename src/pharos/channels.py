@@ -58,9 +58,9 @@ class Endpoint:
         :raises MasterUnreachableError: if the master does not answer
         """
         self._run.master.call('getPid')  # raises if the master does not answer
-        self._open()
-        self._run.endpoints = [*self._run.endpoints, self]
-        self.closed = False
+        if not self._open():  # a delegate may have closed it already
+            self._run.endpoints = [*self._run.endpoints, self]
+            self.closed = False
 
     def close(self) -> None:
         """Unregister, and receive, send or offer no more.
@@ -74,7 +74,8 @@ class Endpoint:
             self._close()
 
     def _close(self):
-        self.ros_object.unregister()
+        if self.ros_object:
+            self.ros_object.unregister()
 
 
 class Channel(Endpoint):
@@ -136,6 +137,9 @@ class InputChannel(DelegateHolder, Channel, Inbox):
         self.closed = False  # the first message may come before the Subscriber is made
         # the callback is an Inbox, which SubscriptionOverlay fills
         self.ros_object = self.node.ros.Subscriber(self.topic, self.message_class, self)
+        if self.closed:  # by the delegate, at that message
+            self._close()
+        return self.closed
 
     def __call__(self, message):
         """Take a latched message of a connection that is older than the channel; rospy calls this."""

@@ -221,8 +221,11 @@ class Node(DelegateHolder):
             self._check_active()  # raises
         with self._life_lock:
             self._settings.master.call('getPid')  # raises if the master does not answer
-            souls = self._current_run.souls.items()
-            live_souls = [(thread.name, *soul) for thread, soul in souls if thread.is_alive()]
+            live_souls = [
+                (thread.name, *soul)
+                for thread, soul in self._current_run.souls.items()
+                if thread.is_alive()
+            ]
             signals.restarting_nodes.append(self)  # or spin() would return
             try:
                 self.stop()
@@ -246,6 +249,20 @@ class Node(DelegateHolder):
 
         self._check_active()
         become(self, node_class, Node)
+
+    def reload(self) -> str:
+        """Have the edited files of the node's class, and of its program, take effect.
+
+        Functions, classes, imports and literal values that are new or differ change in place. Objects,
+        subscriptions and connections stay. All of a change takes effect at once.
+
+        :returns: lines: what is new, and what takes effect later
+        :raises PharosError: if a file is not valid, with its name and line; nothing has changed
+        """
+        from pharos.live.editing import reload
+
+        self._check_active()
+        return reload(self)
 
     def __enter__(self):
         return self
@@ -432,7 +449,7 @@ class Node(DelegateHolder):
         run = self._current_run
         if run and run.is_active:
             # called from here, not from a helper: rospy logs the caller of this method
-            run.write_log('%s', (text,), {}, level=level)
+            run.core._base_logger('%s', (text,), {}, level=level)
         else:
             Transcript.show(f'[{level.upper()}] {self._settings.name}: {text}')
 

@@ -7,7 +7,7 @@ usage: pharos COMMAND [ARGUMENT ...]
   compose         run the Python nodes of a launch file in one process
   top             a live table of nodes and processes
   graph           the nodes, topics and links, as text or as a picture
-  restart, stop, start    do so with a node of a composition
+  restart, stop, start, reload    do so with a node of a composition
 
 'pharos COMMAND --help' tells the arguments of a command.
 """
@@ -35,6 +35,7 @@ COMMANDS = {
     'restart': 'control',
     'stop': 'control',
     'start': 'control',
+    'reload': 'control',
 }
 
 

@@ -56,7 +56,6 @@ def _parse(arguments):
     )
     roslaunch_options = parser.add_argument_group('as for roslaunch')
     roslaunch_options.add_argument('--wait', action='store_true', help='wait for the master')
-    roslaunch_options.add_argument('-v', action='store_true', help='no effect: all is said anyway')
     for output in 'screen', 'log':
         roslaunch_options.add_argument(
             f'--{output}',

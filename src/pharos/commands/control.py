@@ -1,4 +1,4 @@
-"""The commands restart, stop and start."""
+"""The commands restart, stop, start and reload."""
 from __future__ import annotations
 
 from pharos.commands import argument_parser
@@ -21,10 +21,22 @@ def start(arguments: list[str]) -> None:
     _control(start, arguments)
 
 
+def reload(arguments: list[str]) -> None:
+    """Have the edited program of a node of a composition take effect, while the node runs.
+
+    Functions, classes, imports and literal values that are new or differ change in place. Objects,
+    subscriptions and connections stay. Other statements take effect at a restart; the answer has their
+    lines.
+    """
+    _control(reload, arguments)
+
+
 def _control(command, arguments):
     parser = argument_parser(command)
     parser.add_argument('node', metavar='NODE', help='the full name of the node')
     name = '/' + parser.parse_args(arguments).node.lstrip('/')
     program = control(command.__name__, name, Master())
-    if program != name:
+    if command is reload:
+        print(program)
+    elif program != name:
         print(f'{name} is a node of the program {program}: {command.__name__} of all its nodes')

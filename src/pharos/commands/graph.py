@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from pharos.commands import argument_parser
-from pharos.live.graph import NO_NAME, graph_of
+from pharos.live.graph import graph_of
 from pharos.master import Master
 
 
@@ -11,25 +11,17 @@ def graph(arguments: list[str]) -> None:
 
     graph                            as text
     graph --output graph.svg         as a picture: .svg, .png, .pdf (by graphviz) or .dot
-    graph --rates 2 --hide '/tf'     with messages a second, counted for 2 s, without /tf
+    graph --rates 2 --only '^(?!/tf)'    with messages a second, counted for 2 s, without /tf
     watch -n1 rosrun pharos graph    again and again
     """
     parser = argument_parser(graph)
     parser.add_argument('-o', '--output', metavar='FILE', help='save a picture')
-    parser.add_argument('--all', action='store_true', help='show names of every node, too: /rosout')
     parser.add_argument('--only', default='', metavar='REGEX', help='show only names that match')
-    parser.add_argument('--hide', default=NO_NAME, metavar='REGEX', help='hide names that match')
     parser.add_argument(
         '--rates', type=float, default=0, metavar='S', help='count messages for S s'
     )
     options = parser.parse_args(arguments)
-    ros_graph = graph_of(
-        Master(),
-        options.rates,
-        show_all=options.all,
-        only=options.only,
-        hide=options.hide,
-    )
+    ros_graph = graph_of(Master(), options.rates, only=options.only)
     if options.output:
         ros_graph.save(options.output)
     else:

@@ -20,19 +20,16 @@ def top(arguments: list[str]) -> None:
     The columns are messages and bytes a second, transports, dropped messages, failures, CPU and
     memory. The command subscribes to nothing.
 
-      top NAME ...        only nodes that have a NAME in their names
-
-    Other commands: compose, graph, workspace, restart, stop, start.
+    Other commands: compose, graph, workspace, restart, stop, start, reload.
     """
     parser = argument_parser(top)
-    parser.add_argument('names', nargs='*', metavar='NAME', help='a part of a name')
     parser.add_argument('--once', action='store_true', help='print the tables once')
     parser.add_argument('--json', action='store_true', help='print JSON once')
     parser.add_argument(
         '--interval', type=float, default=1, metavar='S', help='seconds between measurements'
     )
     options = parser.parse_args(arguments)
-    meter = Meter(Master(), options.names)
+    meter = Meter(Master())
     if sys.stdin.isatty() and sys.stdout.isatty() and not (options.once or options.json):
         show(meter, options.interval)
         return

@@ -298,10 +298,13 @@ class Composition:
             node._stop_safely()
 
     def control(self, node, action):
-        """Restart, stop or start a node; a required one may stop, too.
+        """Restart, stop or start a node, or reload its program; a required one may stop, too.
 
+        :returns: the node's name, or the answer of the reload
         :raises PharosError: if the node does not start
         """
+        if action == 'reload':
+            return node.reload()
         if action == 'restart':
             node._current_run.check_readable()  # else the node runs on
         Transcript.show(f'{node._settings.name}: {action}')
@@ -313,6 +316,7 @@ class Composition:
                 node._start_held()
             self._end_times.pop(node, None)
             self._stopped_nodes.discard(node)
+        return node._settings.name
 
     def _end(self, name):
         if not self.stopping.is_set():

@@ -59,18 +59,18 @@ def _answer(composition, action, name):
     for node in composition.nodes:
         if name in (node._settings.name, *node.created_names):
             try:
-                composition.control(node, action)
+                return DONE + composition.control(node, action)
             except PharosError as error:
                 return str(error)
-            return f'{DONE}{node._settings.name}'
     return ''
 
 
 def control(action: str, name: str, master: Master) -> str:
-    """Restart, stop or start a node of any composition of this user on this host, at a master.
+    """Restart, stop, start or reload a node of any composition of this user on this host, at a master.
 
-    :param action: 'restart', 'stop' or 'start'
-    :returns: the name of the node of the program, which may have created the node with pharos
+    :param action: 'restart', 'stop', 'start' or 'reload'
+    :returns: the name of the node of the program, which may have created the node with pharos; of a
+        reload, what :meth:`Node.reload` returns
     :raises UnknownNodeError: if no such composition has the node
     :raises PharosError: if the node does not start
     """

@@ -25,10 +25,10 @@ from rosgraph.names import anonymous_name, get_ros_namespace, load_mappings, ns_
 from pharos import signals
 from pharos.blocks import block_name
 from pharos.compose.child_process import interrupt
-from pharos.compose.sources import SYSTEM_FOLDERS, compile_program
+from pharos.compose.sources import compile_program
 from pharos.errors import PharosError
 from pharos.private_rospy import loader
-from pharos.private_rospy.loader import Shim
+from pharos.private_rospy.loader import SYSTEM_FOLDERS, Shim, remember_text
 from pharos.private_rospy.patches import patch
 from pharos.private_rospy.plain import guide
 from pharos.private_rospy.run import STOP_LIMIT, Lifecycle, Run, join
@@ -288,6 +288,7 @@ class ScriptRun(Run):
         current.run = self
         main_module = types.ModuleType('__main__')
         main_module.__file__ = self.node.path
+        remember_text(main_module)
         vars(main_module)['__builtins__'] = self.modules.builtins
         self.modules.by_name['__main__'] = main_module
         status = self._run_code(vars(main_module))

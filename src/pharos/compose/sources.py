@@ -7,7 +7,7 @@ import sys
 import tokenize
 
 from pharos.errors import PharosError
-from pharos.private_rospy.loader import source_places
+from pharos.private_rospy.loader import SYSTEM_FOLDERS, source_places
 
 _PYTHON = re.compile(r'#!\s*(\S*/)?(env\s.*\b)?python(3(?:\.\d+)?)?\b')
 _VERSIONS = None, '3', f'3.{sys.version_info.minor}'  # that a first line may name
@@ -35,7 +35,6 @@ _IMPORT = re.compile(
     r'^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]*(\([^)]*\)|[^\n(]+)|import[ \t]+([\w., \t]+))',
     re.MULTILINE,
 )
-SYSTEM_FOLDERS = '/usr/', '/opt/ros/'
 
 
 def source_of(path):

@@ -40,7 +40,6 @@ NODE_STYLE = 'shape=box, style="rounded,filled", fillcolor="#D9EAF7"'
 DEAD_NODE_STYLE = 'shape=box, style="rounded,filled", fillcolor="#EEEEEE"'
 TOPIC_STYLE = 'shape=box, style=filled, fillcolor="#FFF6D5"'
 FRAME_STYLE = 'style="rounded,filled"; color="#9AA5B1"; fillcolor="#F5F7F9"'
-NO_NAME = '(?!)'  # a regular expression that matches nothing
 
 
 class Edge(NamedTuple):
@@ -75,16 +74,10 @@ class Graph:
         self,
         snapshot: Snapshot,
         rates: dict[str, float],
-        show_all: bool = False,
         only: str = '',
-        hide: str = NO_NAME,
     ):
         def is_visible(name):
-            if re.search(hide, name):
-                return False
-            if COMMON_NAMES.fullmatch(name) and not show_all:
-                return False
-            return bool(re.search(only, name))
+            return not COMMON_NAMES.fullmatch(name) and bool(re.search(only, name))
 
         self.snapshot = snapshot
         self.rates = rates

@@ -11,7 +11,7 @@ import sys
 import termios
 import time
 import tty
-from typing import Any, Sequence
+from typing import Any
 
 import psutil
 from rich.live import Live
@@ -24,26 +24,23 @@ from pharos.master import Master
 
 VIEWS = {'n': 'nodes', 'p': 'processes'}  # key -> view
 KEY_HELP = 'n nodes  p processes  q quit'
-CONTROL_HELP = 'j k choose a node of a composition  r restart  x stop  a start'
-ACTIONS = {'r': 'restart', 'x': 'stop', 'a': 'start'}  # key -> action
+CONTROL_HELP = 'j k choose a node of a composition  r restart  x stop  a start  l reload'
+ACTIONS = {'r': 'restart', 'x': 'stop', 'a': 'start', 'l': 'reload'}  # key -> action
 WIDE_COLUMNS = 'NODE', 'PID'  # are never cut, however narrow the terminal is
 ALARM_COLUMNS = 'DROP', 'FAIL', 'PROBLEM'  # are red unless the value is 0 or empty
 HANG = 3.0  # seconds of a callback that are a problem
 BUSY_PROCESS = 90  # percent of a core
-BUSY_NODE = 20  # percent of a core
 SUM_COLUMNS = 'IN/S', 'OUT/S', 'IN B/S', 'OUT B/S', 'DROP', 'FAIL'
 
 
 class Meter:
     """Measures a master: each measurement tells the rates since the one before.
 
-    :param names: parts of names; only nodes that have one of them are measured
     :raises MasterUnreachableError: if the master does not answer
     """
 
-    def __init__(self, master: Master, names: Sequence[str] = ()):
+    def __init__(self, master: Master):
         self.master = master
-        self._names = names
         self._snapshot = take_snapshot(master)
         self.advice = ''  # of the last measurement
         self._processes: dict[int, psutil.Process] = {}  # each keeps its last CPU time
@@ -57,10 +54,6 @@ class Meter:
         self._snapshot = take_snapshot(self.master)
         link_rates = self._snapshot.rates_since(start)
         node_rows = list(_node_rows(self._snapshot, start, link_rates))
-        if self._names:
-            node_rows = [
-                row for row in node_rows if any(name in row['NODE'] for name in self._names)
-            ]
         process_rows = list(self._process_rows(node_rows))
         self.advice = '\n'.join(_advice(node_rows, process_rows))
         return {'nodes': node_rows, 'processes': process_rows}
@@ -100,10 +93,10 @@ def _advice(node_rows, process_rows):
         if len(rows) < 2 or (process['CPU%'] or 0) < BUSY_PROCESS:
             continue
         rows.sort(key=lambda row: -row['CPU%'])
-        names = [f'{row["NODE"]} {row["CPU%"]:.0f} %' for row in rows if row['CPU%'] >= BUSY_NODE]
+        names = [f'{row["NODE"]} {row["CPU%"]:.0f} %' for row in rows[:2]]
         yield (
             f'process {process["PID"]} keeps a core busy, and Python runs one thread at a time;'
-            f' put apart: {", ".join(names) or "half of its nodes"}'
+            f' put apart one of: {", ".join(names)}'
         )
 
 

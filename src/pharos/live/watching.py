@@ -38,26 +38,19 @@ class Rate(NamedTuple):
         return f'{self.rate:.4g} Hz, {bandwidth}, {self.window} messages'
 
 
-class Arrival(NamedTuple):
-    """A message, and the time at which the message arrived."""
-
-    time: float  # seconds, as of time.monotonic()
-    message: Any
-
-
 @contextlib.contextmanager
-def arrival_queue(topic: Topic, typed_as: Any = None) -> Iterator[queue.Queue[Arrival]]:
-    """Receive from a topic into a queue.
+def arrival_queue(topic: Topic, typed_as: Any = None) -> Iterator[queue.Queue]:
+    """Receive from a topic into a queue of pairs: time.monotonic() at the arrival, and message.
 
     :raises UnknownTopicError: if nobody publishes on the topic
     """
     if not topic.publishers:
         raise UnknownTopicError(f'nobody publishes on {topic.name}: see master.topics()')
-    arrivals: queue.Queue[Arrival] = queue.Queue(MAX_ARRIVALS)
+    arrivals: queue.Queue = queue.Queue(MAX_ARRIVALS)
 
     def keep_message(message):
         with contextlib.suppress(queue.Full):
-            arrivals.put_nowait(Arrival(time.monotonic(), message))
+            arrivals.put_nowait((time.monotonic(), message))
 
     name = rosgraph.names.anonymous_name('pharos_looks')
     with topic.master.create(BlockNode, named=name) as node:
@@ -67,13 +60,13 @@ def arrival_queue(topic: Topic, typed_as: Any = None) -> Iterator[queue.Queue[Ar
 
 def _collect_arrivals(arrivals, seconds):
     """Return the arrivals of some seconds, which begin with the first one."""
-    arrival_list: list[Arrival] = []
+    arrival_list: list[Any] = []
     deadline = time.monotonic() + seconds + FIRST_TIMEOUT
     with contextlib.suppress(queue.Empty):
         while time.monotonic() < deadline:
             arrival = arrivals.get(timeout=max(0.0, deadline - time.monotonic()))
             if not arrival_list:
-                deadline = arrival.time + seconds
+                deadline = arrival[0] + seconds
             arrival_list.append(arrival)
     return arrival_list
 
@@ -82,9 +75,9 @@ def measure(topic: Topic, seconds: float) -> Rate:
     """Measure the rate of a topic for :meth:`Topic.hz`."""
     with arrival_queue(topic, rospy.AnyMsg) as arrivals:
         arrival_list = _collect_arrivals(arrivals, seconds)
-    gaps = [later.time - earlier.time for earlier, later in zip(arrival_list, arrival_list[1:])]
-    byte_count = sum(len(arrival.message._buff) for arrival in arrival_list)
-    rate = len(gaps) / sum(gaps) if gaps else 0.0
+    times = [time for time, _ in arrival_list]
+    byte_count = sum(len(message._buff) for _, message in arrival_list)
+    rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 0.0
     return Rate(topic.name, rate, byte_count / seconds, len(arrival_list))
 
 
@@ -94,7 +87,7 @@ def last(topic: Topic) -> Message:
     :raises TimeoutError: if no message arrives within 3 s
     """
     with arrival_queue(topic) as arrivals, contextlib.suppress(queue.Empty):
-        return arrivals.get(timeout=LAST_TIMEOUT).message
+        return arrivals.get(timeout=LAST_TIMEOUT)[1]
     raise TimeoutError(f'no message came on {topic.name} within {LAST_TIMEOUT:g} s')
 
 
@@ -107,7 +100,7 @@ def watch(topic: Topic, count: int | None, block: Block | None) -> None:
     numbers = itertools.count() if count is None else range(count)
     with arrival_queue(topic) as arrivals, contextlib.suppress(KeyboardInterrupt):
         for _ in numbers:
-            show_message(arrivals.get().message)
+            show_message(arrivals.get()[1])
 
 
 def _show_message(message):

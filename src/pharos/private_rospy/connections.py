@@ -229,6 +229,8 @@ def _register_missing(run, state):
         # all values before any is set or reported: each such time all of them are read
         for parameter in run.node._parameters:
             parameter.restore()
-        run.modules.load('rospy.client')._init_node_params(run.argv, run.name)
+        # not those that a parameter has restored: its value may be another one by now
+        for name, value in run.ros.client.load_command_line_node_params(run.argv).items():
+            run.master.parameters.setdefault(f'{run.name}/{name}', value)
         for parameter in run.node._parameters:
             parameter.subscribe()

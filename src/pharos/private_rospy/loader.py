@@ -13,6 +13,7 @@ import pathlib
 import re
 import sys
 import threading
+from contextlib import suppress
 from functools import lru_cache
 from importlib.machinery import PathFinder
 from importlib.util import module_from_spec, resolve_name
@@ -34,6 +35,7 @@ PRIVATE = 'logging argparse optparse subprocess concurrent pkgutil runpy smach'.
 _IMPORT = re.compile(
     r'^\s*(?:from (\w+)[\w.]* import\b|import (\w+)[\w.]*\s*(?:$|[,;#]|as ))', re.M
 )
+SYSTEM_FOLDERS = '/usr/', '/opt/ros/'
 MAX_FILES = 300  # of a package that could be written on rospy
 
 
@@ -62,6 +64,14 @@ def private_path():
                 path.remove(folder)  # type: ignore[arg-type]
                 path.append(folder)  # type: ignore[arg-type]
     return path
+
+
+def remember_text(module):
+    """Keep the text of a module's file, for a reload; not of the system's modules."""
+    file = getattr(module, '__file__', None) or '/usr/'
+    if not file.startswith(SYSTEM_FOLDERS):
+        with suppress(OSError):  # it is in an archive, or gone
+            vars(module).setdefault('__text__', pathlib.Path(file).read_bytes())
 
 
 @lru_cache(None)
@@ -273,6 +283,7 @@ class PrivateModules:
             del self.by_name[name]
             raise
         self._patch(module)
+        remember_text(module)
 
     def _import_module(self, name, package=None):
         return self.load(resolve_name(name, package))

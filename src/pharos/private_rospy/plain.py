@@ -1,13 +1,14 @@
 """Plain rospy in a program whose nodes are made with pharos: it says what to write instead."""
 import sys
 
+from pharos.private_rospy.loader import SYSTEM_FOLDERS
+
 FUNCTIONS = (
     'loginfo logwarn logerr logdebug logfatal loginfo_once logwarn_once logerr_once get_param'
     ' loginfo_throttle logwarn_throttle logerr_throttle get_rostime get_time sleep'
     ' set_param has_param search_param get_name get_namespace on_shutdown wait_for_message'
 ).split()
 CLASSES = 'Publisher Subscriber Service ServiceProxy Rate Timer'.split()
-_SYSTEM_FOLDERS = '/usr/', '/opt/ros/'
 
 
 def guide(rospy, nodes):
@@ -55,7 +56,7 @@ def _advise(name, advices):
     if module == 'rospy':  # it was called itself, and has been told of
         return
     advice = f'node.ros.{name}'
-    if caller.f_code.co_filename.startswith(_SYSTEM_FOLDERS):  # a library on rospy
+    if caller.f_code.co_filename.startswith(SYSTEM_FOLDERS):  # a library on rospy
         advice = f"node.ros_import('{module}')"
     if advice not in advices:
         advices.add(advice)

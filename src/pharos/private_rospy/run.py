@@ -26,7 +26,7 @@ from pharos.intraprocess.callback_queues import CallbackOrder, CallbackQueue
 from pharos.intraprocess.links import runs
 import pharos.private_rospy.inspecting  # noqa: F401: it has inspect find private modules
 from pharos.private_rospy import connections, patches
-from pharos.private_rospy.loader import PrivateModules, Shim, private_path
+from pharos.private_rospy.loader import PrivateModules, Shim, private_path, remember_text
 from pharos.private_rospy.tcpros import shutdown_socket
 from pharos.private_rospy.xmlrpc import ServerProxy
 from pharos.signals import may_be_signal
@@ -123,12 +123,12 @@ class Run:
             self.environ['ROS_HOSTNAME'] = settings.domain
         self.argv = [self.base_name, *settings.remappings]
         self.path = private_path()
+        remember_text(sys.modules.get(type(node).__module__))
         patch = functools.partial(patches.apply, run=self)
         self.modules = PrivateModules(self.substitutes(), patch)
         self.ros = self.modules.load('rospy')
         self.core = self.ros.core
-        self.write_log = self.core._base_logger
-        registration = self.modules.load('rospy.impl.registration')
+        registration = self.ros.impl.registration
         self.topic_manager = registration.get_topic_manager()
         self.service_manager = registration.get_service_manager()
 
@@ -235,16 +235,17 @@ class Run:
 
     def health_facts(self) -> dict[str, Any]:
         """Return the facts of Node.health(), without the master's; ``pharos top`` asks for them."""
-        bus_info = self.topic_manager.get_pub_sub_info()
         queues = list(self.callback_order.queues)
         begin_times = [queue.begin_time for queue in queues if queue.begin_time]
         ended_souls = [soul.name for soul in self.souls if not soul.is_alive()]
         return {
             'kind': type(self.node).__name__,
-            'connections': dict(collections.Counter(row[3] for row in bus_info)),
+            'connections': dict(
+                collections.Counter(row[3] for row in self.topic_manager.get_pub_sub_info())
+            ),
             'dropped': sum(getattr(each, 'dropped', 0) for each in self.open_endpoints(object)),
             'errors': self.failures.total,
-            'threads': sum(thread.is_alive() for thread in list(self.threads)),
+            'threads': len(self.threads),
             'cpu_seconds': round(self.cpu_seconds(), 3),
             'souls': len(self.souls) - len(ended_souls),
             'ended_souls': ended_souls,
@@ -328,7 +329,7 @@ class Run:
         :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: stop() then cleans up
         """
         connections.check_name_free(self)
-        tcpros_base = self.modules.load('rospy.impl.tcpros_base')
+        tcpros_base = self.ros.impl.tcpros_base
         tcp_port, xmlrpc_port = self.settings.ports
         try:
             # rospy's own start finds this server, and makes none: rospy does not report a busy port
@@ -339,7 +340,7 @@ class Run:
             tcp_server.start()
             ports = {'xmlrpc_port': xmlrpc_port, 'tcpros_port': tcp_server.port}
             options = {'disable_signals': True, **options, **ports}
-            self.modules.load('rospy.client').init_node(self.base_name, self.argv, **options)
+            self.ros.client.init_node(self.base_name, self.argv, **options)
         except OSError as error:
             if error.errno != errno.EADDRINUSE:
                 raise

@@ -1,0 +1,112 @@
+"""Edit a running node: new code takes effect, state and connections stay."""
+import importlib
+import re
+
+import pytest
+
+from helpers import create
+from pharos import PharosError
+from pharos.testing import Mailbox, until
+
+INT = 'std_msgs/Int32'
+PROGRAM = '''
+import functools
+import helper
+GAIN = 1
+def logged(function):
+    @functools.wraps(function)
+    def call(*args):
+        return function(*args)
+    return call
+@logged
+def shape(value):
+    return value
+class Filter:
+    bias = 0
+    def __init__(self):
+        self.count = 0
+        self.out = rospy.Publisher('/out', Int32, queue_size=100)
+        rospy.Subscriber('/in', Int32, self.see, queue_size=100)
+    def see(self, message):
+        self.count += 1000
+        self.out.publish(self.count + shape(GAIN) + self.bias + helper.more())
+def main():
+    rospy.init_node('program')
+    Filter()
+    while not rospy.is_shutdown():
+        rospy.sleep(0.01)
+from std_msgs.msg import Int32
+main()
+'''
+EDITS = {
+    'constant': ('GAIN = 1', 'GAIN = 5', 5),
+    'class attribute': ('bias = 0', 'bias = 7', 8),
+    'callback': ('self.count + shape', 'self.count + 2 * shape', 2),
+    'decorated function': ('return value', 'return value + 2', 3),
+    'new import': ('import functools', 'import math, functools\nGAIN = 4', 4),
+    'method': ('    def see', '    bias = 6\n    def more(self): pass\n    def see', 7),
+    'renamed function': ('shape(', 'form(', 1),
+}
+
+
+@pytest.fixture
+def program(bench):
+    bench.write('def more(): return 0', 'helper.py', '')
+    return bench.load(PROGRAM)
+
+
+@pytest.fixture
+def ask(master, program):
+    """Return a function that sends a message to the program, and returns the answer."""
+    answers, mouth = Mailbox(create(master, '/ear'), '/out', INT), create(master, '/mouth')
+    return lambda: [mouth.send_to('/in', data=0), answers.next().data][1]
+
+
+@pytest.mark.parametrize('old, new, value', EDITS.values(), ids=EDITS)
+def test_edit_takes_effect_and_state_stays(bench, program, ask, old, new, value):
+    assert ask() == 1001
+    bench.write(PROGRAM.replace(old, new))
+    assert ': new: ' in program.reload()
+    assert ask() == 2000 + value
+    bench.write('def more(): return 100', 'helper.py', '')
+    assert 'helper.py: new: more' in program.reload()
+    assert ask() == 3100 + value
+    assert program.reload() == 'nothing has changed'
+
+
+def test_reload_loses_no_message(bench, master, program):
+    heard = []
+    create(master, '/ear').interested_in('/out', INT, lambda message: heard.append(message.data))
+    mouth = create(master, '/mouth')
+    mouth.fork(lambda me: [me.send_to('/in', data=0) for turn in zip(range(200), me.every(0.005))])
+    for gain in range(2, 30):
+        bench.write(PROGRAM.replace('GAIN = 1', f'GAIN = {gain}'))
+        program.reload()
+    until(lambda: len(heard) == 200)
+    assert [number // 1000 for number in heard] == [*range(1, 201)]
+
+
+@pytest.mark.parametrize('new', ['def broken(:', 'class Bad(int, int): pass'])
+def test_invalid_edit_changes_nothing(bench, program, ask, new):
+    text = PROGRAM.replace('GAIN = 1', f'{new}\nGAIN = 2')
+    with open(bench.write(text)) as file:
+        line = file.read().splitlines().index(new) + 1
+    with pytest.raises(PharosError, match=f'program:{line}: .*nothing has changed'):
+        program.reload()
+    assert ask() == 1001
+
+
+def test_what_takes_effect_later_is_named(bench, program):
+    bench.write(PROGRAM.replace('sleep(0.01)', 'sleep(0.02)').replace('\nmain()', '\nmain(), 1'))
+    answer = program.reload()
+    assert 'main() takes effect when it is called again, or at a restart' in answer
+    assert re.search(r'program:\d+: takes effect at a restart', answer)
+
+
+def test_own_class_is_edited(master, tmp_path, monkeypatch):
+    path = tmp_path / 'wheels.py'
+    path.write_text('import pharos\nclass Wheels(pharos.Node):\n    def speed(self): return 1\n')
+    monkeypatch.syspath_prepend(str(tmp_path))
+    wheels = create(master, '/wheels', importlib.import_module('wheels').Wheels)
+    path.write_text(path.read_text().replace('return 1', 'return 2'))
+    assert wheels.reload() == f'{path}: new: Wheels' and wheels.speed() == 2
