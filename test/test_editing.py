@@ -46,6 +46,7 @@ EDITS = {
     'new import': ('import functools', 'import math, functools\nGAIN = 4', 4),
     'method': ('    def see', '    bias = 6\n    def more(self): pass\n    def see', 7),
     'renamed function': ('shape(', 'form(', 1),
+    'slots': ('bias = 0', '__slots__ = "a",\n    bias = 7', 8),
 }
 
 
@@ -66,12 +67,11 @@ def ask(master, program):
 def test_edit_takes_effect_and_state_stays(bench, program, ask, old, new, value):
     assert ask() == 1001
     bench.write(PROGRAM.replace(old, new))
-    assert ': new: ' in program.reload()
+    assert ' is new' in program.reload()
     assert ask() == 2000 + value
     bench.write('def more(): return 100', 'helper.py', '')
-    assert 'helper.py: new: more' in program.reload()
+    assert program.reload() == 'more is new'
     assert ask() == 3100 + value
-    assert program.reload() == 'nothing has changed'
 
 
 def test_reload_loses_no_message(bench, master, program):
@@ -109,4 +109,4 @@ def test_own_class_is_edited(master, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     wheels = create(master, '/wheels', importlib.import_module('wheels').Wheels)
     path.write_text(path.read_text().replace('return 1', 'return 2'))
-    assert wheels.reload() == f'{path}: new: Wheels' and wheels.speed() == 2
+    assert wheels.reload() == 'Wheels is new' and wheels.speed() == 2

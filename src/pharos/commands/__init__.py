@@ -22,7 +22,6 @@ import sys
 from typing import Callable
 
 import rosgraph
-import rospkg
 
 import pharos
 
@@ -72,7 +71,7 @@ def run_command(name: str) -> int:
         sys.stdout.flush()
     except BrokenPipeError:  # by `| head`; the exit of Python flushes once more
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except (pharos.PharosError, ValueError, OSError, re.error, rospkg.ResourceNotFound) as error:
+    except (pharos.PharosError, ValueError, OSError, re.error) as error:
         print(f'{name}: {error}', file=sys.stderr)
         return 1
     except ModuleNotFoundError as error:

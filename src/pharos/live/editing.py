@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import ast
+import enum
 import inspect
 import pathlib
 import sys
@@ -49,16 +50,18 @@ def _rebind(block, node, node_class):
 def reload(node):
     """Do the work of :meth:`Node.reload`."""
     modules = [sys.modules.get(type(node).__module__), *node._current_run.modules.by_name.values()]
-    editable = [module for module in modules if '__text__' in getattr(module, '__dict__', ())]
     notes = []
-    edits = [(module, *_read(module, notes)) for module in editable]
+    edits = [
+        (module, *_read(module, notes))
+        for module in modules
+        if '__text__' in getattr(module, '__dict__', ())
+    ]
     interval = sys.getswitchinterval()
     sys.setswitchinterval(CHANGE_LIMIT)  # no thread shall see a half of the change
     for module, text, values in edits:
         module.__text__ = text
-        if values:
-            notes.append(f'{module.__file__}: new: {", ".join(values)}')
         for name, value in values.items():
+            notes.append(f'{name} is new')
             _change(module, name, value, notes)
     sys.setswitchinterval(interval)
     return '\n'.join(notes) or 'nothing has changed'
@@ -86,8 +89,9 @@ def _read(module, notes):
             else:
                 notes.append(f'{file}:{line}: takes effect at a restart')
     except Exception as error:
-        place = f'{file}:{getattr(error, "lineno", line)}'
-        raise PharosError(f'{place}: {error!r}; nothing has changed') from error
+        raise PharosError(
+            f'{file}:{getattr(error, "lineno", line)}: {error!r}; nothing has changed'
+        ) from error
     return text, values
 
 
@@ -102,9 +106,13 @@ def _is_definition(item):
 def _change(owner, name, new, notes):
     """Change a name of a module or class, functions and classes in place; add to the notes."""
     former = vars(owner).get(name)
+    if isinstance(former, enum.EnumMeta):  # its former members would not equal the new ones
+        notes.append(f'{name} takes effect at a restart')
+        return
     if isinstance(former, type) and isinstance(new, type):
         for member, value in vars(new).items():
-            if member not in ('__dict__', '__weakref__'):
+            # slots, and __dict__: they read objects of their own class alone
+            if not (inspect.ismemberdescriptor(value) or inspect.isgetsetdescriptor(value)):
                 _change(former, member, value, notes)
         return
     # those in decorators, staticmethods and classmethods
@@ -127,5 +135,8 @@ def _change(owner, name, new, notes):
 
 def _runs(code):
     """True if a thread runs that code."""
-    frames = sys._current_frames().values()
-    return any(each.f_code is code for frame in frames for each, _ in traceback.walk_stack(frame))
+    return any(
+        each.f_code is code
+        for frame in sys._current_frames().values()
+        for each, _ in traceback.walk_stack(frame)
+    )

@@ -77,7 +77,7 @@ class Graph:
         only: str = '',
     ):
         def is_visible(name):
-            return not COMMON_NAMES.fullmatch(name) and bool(re.search(only, name))
+            return not COMMON_NAMES.fullmatch(name) and re.search(only, name)
 
         self.snapshot = snapshot
         self.rates = rates

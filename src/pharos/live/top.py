@@ -23,8 +23,8 @@ from pharos.live.text_format import short_number
 from pharos.master import Master
 
 VIEWS = {'n': 'nodes', 'p': 'processes'}  # key -> view
-KEY_HELP = 'n nodes  p processes  q quit'
-CONTROL_HELP = 'j k choose a node of a composition  r restart  x stop  a start  l reload'
+HELP = '''n nodes  p processes  q quit
+j k choose a node of a composition  r restart  x stop  a start  l reload'''
 ACTIONS = {'r': 'restart', 'x': 'stop', 'a': 'start', 'l': 'reload'}  # key -> action
 WIDE_COLUMNS = 'NODE', 'PID'  # are never cut, however narrow the terminal is
 ALARM_COLUMNS = 'DROP', 'FAIL', 'PROBLEM'  # are red unless the value is 0 or empty
@@ -199,9 +199,8 @@ def _show_views(screen, meter, interval, keyboard):
     deadline = time.monotonic() + interval
     while True:
         rows = tables[view]
-        help_text = f'{KEY_HELP}\n{CONTROL_HELP}'
         page = Table.grid()
-        for part in help_text, line, table(rows, chosen_node):
+        for part in HELP, line, table(rows, chosen_node):
             page.add_row(part)
         screen.update(page, refresh=True)
         timeout = max(0, deadline - time.monotonic())
