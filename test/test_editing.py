@@ -23,13 +23,13 @@ def shape(value):
     return value
 class Filter:
     bias = 0
+    seen = []
     def __init__(self):
-        self.count = 0
         self.out = rospy.Publisher('/out', Int32, queue_size=100)
         rospy.Subscriber('/in', Int32, self.see, queue_size=100)
     def see(self, message):
-        self.count += 1000
-        self.out.publish(self.count + shape(GAIN) + self.bias + helper.more())
+        self.seen.append(message)
+        self.out.publish(1000 * len(self.seen) + shape(GAIN) + self.bias + helper.more())
 def main():
     rospy.init_node('program')
     Filter()
@@ -41,7 +41,7 @@ main()
 EDITS = {
     'constant': ('GAIN = 1', 'GAIN = 5', 5),
     'class attribute': ('bias = 0', 'bias = 7', 8),
-    'callback': ('self.count + shape', 'self.count + 2 * shape', 2),
+    'callback': ('+ shape', '+ 2 * shape', 2),
     'decorated function': ('return value', 'return value + 2', 3),
     'new import': ('import functools', 'import math, functools\nGAIN = 4', 4),
     'method': ('    def see', '    bias = 6\n    def more(self): pass\n    def see', 7),
@@ -67,10 +67,10 @@ def ask(master, program):
 def test_edit_takes_effect_and_state_stays(bench, program, ask, old, new, value):
     assert ask() == 1001
     bench.write(PROGRAM.replace(old, new))
-    assert ' is new' in program.reload()
+    assert ' takes effect' in program.reload()
     assert ask() == 2000 + value
     bench.write('def more(): return 100', 'helper.py', '')
-    assert program.reload() == 'more is new'
+    assert program.reload().startswith('more takes effect')
     assert ask() == 3100 + value
 
 
@@ -99,7 +99,7 @@ def test_invalid_edit_changes_nothing(bench, program, ask, new):
 def test_what_takes_effect_later_is_named(bench, program):
     bench.write(PROGRAM.replace('sleep(0.01)', 'sleep(0.02)').replace('\nmain()', '\nmain(), 1'))
     answer = program.reload()
-    assert 'main() takes effect when it is called again, or at a restart' in answer
+    assert 'main takes effect, functions at their next call' in answer
     assert re.search(r'program:\d+: takes effect at a restart', answer)
 
 
@@ -109,4 +109,4 @@ def test_own_class_is_edited(master, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     wheels = create(master, '/wheels', importlib.import_module('wheels').Wheels)
     path.write_text(path.read_text().replace('return 1', 'return 2'))
-    assert wheels.reload() == 'Wheels is new' and wheels.speed() == 2
+    assert wheels.reload().startswith('Wheels takes') and wheels.speed() == 2

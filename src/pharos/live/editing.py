@@ -2,11 +2,9 @@
 from __future__ import annotations
 
 import ast
-import enum
 import inspect
 import pathlib
 import sys
-import traceback
 from types import FunctionType, MethodType
 
 from pharos.errors import PharosError
@@ -58,36 +56,42 @@ def reload(node):
     ]
     interval = sys.getswitchinterval()
     sys.setswitchinterval(CHANGE_LIMIT)  # no thread shall see a half of the change
-    for module, text, values in edits:
-        module.__text__ = text
-        for name, value in values.items():
-            notes.append(f'{name} is new')
-            _change(module, name, value, notes)
-    sys.setswitchinterval(interval)
+    try:
+        for module, text, values in edits:
+            module.__text__ = text
+            for name, value in values.items():
+                notes.append(f'{name} takes effect, functions at their next call')
+                _change(module, name, value, notes)
+    finally:
+        sys.setswitchinterval(interval)
     return '\n'.join(notes) or 'nothing has changed'
 
 
 def _read(module, notes):
     """Run the definitions in a module's file that are new; the module stays as it is.
 
-    Add to the notes the places of other statements that are new.
+    Of a class that is there, run the members that are new. Add to the notes the places of other
+    statements that are new.
 
     :returns: the text of the file, and ``{name: value}``
     :raises PharosError: if the text is not valid, or a definition raises an exception
     """
     file = module.__file__
-    text = pathlib.Path(file).read_bytes()
-    former_items = [*map(ast.dump, ast.parse(module.__text__).body)]
     values, line = {}, 1
     try:
-        for item in ast.parse(text).body:
+        text = pathlib.Path(file).read_bytes()
+        former_items = ast.parse(module.__text__).body
+        members = {item.name: item.body for item in former_items if isinstance(item, ast.ClassDef)}
+        for item in _new_items(former_items, ast.parse(text).body):
             line = item.lineno
-            if ast.dump(item) in former_items:
-                continue
-            if _is_definition(item):
-                exec(compile(ast.Module([item], []), file, 'exec'), vars(module), values)
-            else:
+            if not _is_definition(item):
                 notes.append(f'{file}:{line}: takes effect at a restart')
+                continue
+            if isinstance(item, ast.ClassDef) and item.name in members:
+                item.body = _new_items(members[item.name], item.body) or [ast.Pass()]
+                item.decorator_list = []
+            code = compile(ast.fix_missing_locations(ast.Module([item], [])), file, 'exec', 0, True)
+            exec(code, vars(module), values)
     except Exception as error:
         raise PharosError(
             f'{file}:{getattr(error, "lineno", line)}: {error!r}; nothing has changed'
@@ -95,48 +99,45 @@ def _read(module, notes):
     return text, values
 
 
+def _new_items(former_items, items):
+    """Return the statements that the former ones lack."""
+    former_dumps = [*map(ast.dump, former_items)]
+    return [item for item in items if ast.dump(item) not in former_dumps]
+
+
 def _is_definition(item):
-    """True for functions, classes, imports, and names with literal values."""
+    """True for functions, classes, imports, and a name with a literal value."""
+    if not isinstance(item, ast.Assign):
+        return isinstance(item, DEFINITIONS)
     try:
-        return isinstance(item, DEFINITIONS) or bool([ast.literal_eval(item.value)])
-    except (AttributeError, ValueError):  # another statement, or another value
+        ast.literal_eval(item.value)
+    except ValueError:
         return False
+    return isinstance(item.targets[0], ast.Name)
 
 
 def _change(owner, name, new, notes):
     """Change a name of a module or class, functions and classes in place; add to the notes."""
     former = vars(owner).get(name)
-    if isinstance(former, enum.EnumMeta):  # its former members would not equal the new ones
-        notes.append(f'{name} takes effect at a restart')
-        return
     if isinstance(former, type) and isinstance(new, type):
+        if type(former) is not type:  # members of an Enum would not equal the former ones
+            notes.append(f'{name}: only at a restart')
+            return
         for member, value in vars(new).items():
-            # slots, and __dict__: they read objects of their own class alone
-            if not (inspect.ismemberdescriptor(value) or inspect.isgetsetdescriptor(value)):
+            is_own = isinstance(value, FunctionType) or not member.startswith('__')
+            if is_own and not inspect.ismemberdescriptor(value):  # a slot reads its own class alone
                 _change(former, member, value, notes)
         return
     # those in decorators, staticmethods and classmethods
     function, new_function = (
         inspect.unwrap(getattr(value, '__func__', value)) for value in (former, new)
     )
-    if isinstance(function, FunctionType) and isinstance(new_function, FunctionType):
-        code, new_code = function.__code__, new_function.__code__
-        if code.co_freevars == new_code.co_freevars in ((), ('__class__',)):
-            if code.co_code != new_code.co_code and _runs(code):
-                notes.append(f'{name}() takes effect when it is called again, or at a restart')
-            for part in '__code__', '__defaults__', '__kwdefaults__':
-                setattr(function, part, getattr(new_function, part))
-            return
-        notes.append(f'{name}: what holds the former function keeps it until a restart')
-        if '__class__' in new_code.co_freevars:
-            return  # its super() would not find the former class
+    code, new_code = (getattr(each, '__code__', None) for each in (function, new_function))
+    if code and new_code and code.co_freevars == new_code.co_freevars in ((), ('__class__',)):
+        for part in '__code__', '__defaults__', '__kwdefaults__':
+            setattr(function, part, getattr(new_function, part))
+        return
+    if new_code and (code or '__class__' in new_code.co_freevars):  # super() needs the class
+        notes.append(f'{name}: only at a restart')
+        return
     setattr(owner, name, new)
-
-
-def _runs(code):
-    """True if a thread runs that code."""
-    return any(
-        each.f_code is code
-        for frame in sys._current_frames().values()
-        for each, _ in traceback.walk_stack(frame)
-    )

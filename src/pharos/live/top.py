@@ -55,7 +55,12 @@ class Meter:
         link_rates = self._snapshot.rates_since(start)
         node_rows = list(_node_rows(self._snapshot, start, link_rates))
         process_rows = list(self._process_rows(node_rows))
-        self.advice = '\n'.join(_advice(node_rows, process_rows))
+        self.advice = '\n'.join(
+            f'process {row["PID"]} keeps a core busy, and Python runs one thread at a time: put its'
+            ' busiest node apart'
+            for row in process_rows
+            if (row['CPU%'] or 0) > BUSY_PROCESS and ' ' in row['NODES']
+        )
         return {'nodes': node_rows, 'processes': process_rows}
 
     def _process_rows(self, node_rows):
@@ -84,20 +89,6 @@ class Meter:
             }
         except psutil.Error:  # the process has ended
             return {}
-
-
-def _advice(node_rows, process_rows):
-    """Yield a line for each process of this host that keeps a core busy with several nodes."""
-    for process in process_rows:
-        rows = [row for row in node_rows if row['PID'] == process['PID'] and row['CPU%']]
-        if len(rows) < 2 or (process['CPU%'] or 0) < BUSY_PROCESS:
-            continue
-        rows.sort(key=lambda row: -row['CPU%'])
-        names = [f'{row["NODE"]} {row["CPU%"]:.0f} %' for row in rows[:2]]
-        yield (
-            f'process {process["PID"]} keeps a core busy, and Python runs one thread at a time;'
-            f' put apart one of: {", ".join(names)}'
-        )
 
 
 def _cpu_percent(name, snapshot, start):
