@@ -251,12 +251,10 @@ class Node(DelegateHolder):
         become(self, node_class, Node)
 
     def reload(self) -> str:
-        """Have the edited files of the node's class, and of its program, take effect.
+        """Have the edited files of the node's class or program take effect; return lines on that.
 
-        Functions, classes, imports and literal values that are new or differ change in place. Objects,
-        subscriptions and connections stay. All of a change takes effect at once.
+        Objects, subscriptions and connections stay; doc/live.md says what changes, and what cannot.
 
-        :returns: lines: what is new, and what takes effect later
         :raises PharosError: if a file is not valid, with its name and line; nothing has changed
         """
         from pharos.live.editing import reload
