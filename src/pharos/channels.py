@@ -222,8 +222,8 @@ class OutputChannel(Channel):
     def publish(self, *values: Any, **fields) -> None:
         """Send a message, or one with these values of all its fields, or with these fields.
 
-        Inline delegates of nodes of this process run before this returns. This never waits for the
-        subscribers.
+        Inline delegates of nodes of this process run before this returns, unless another thread runs a
+        callback of the node. This waits for sockets alone, and only without a queue_size.
 
         :raises MessageTypeError: if the message is of another type, or cannot be serialized
         :raises NodeStoppedError: if the channel is closed

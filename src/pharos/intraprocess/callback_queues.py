@@ -27,8 +27,8 @@ _no_yield_before = 0.0
 class CallbackOrder:
     """The order of the callbacks of one node.
 
-    Each message gets a number when it reaches the node. A queue that has its turn is the one with
-    the lowest number.
+    Each message gets a number when it reaches the node. A queue has its turn if no other one with a
+    lower number delays it.
 
     :param start_thread: ``start_thread(target)`` returns a thread of the node, None if the system
         has no more threads
@@ -231,7 +231,7 @@ class CallbackQueue:
     # -- the thread
 
     def request_thread(self) -> bool:
-        """Have the thread run the jobs; return True if this has started or woken the thread."""
+        """Have the thread run the jobs; return True if this has woken the thread."""
         if self._is_requested or not (self.jobs and self.may_begin):
             return False
         self._is_requested = True

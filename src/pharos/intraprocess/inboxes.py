@@ -107,7 +107,7 @@ class Inbox(BoundedQueue):
         return False
 
     def run_callback(self, job):
-        """Run the callback on the message of a job; the thread of the callback queue calls this."""
+        """Run the callback on the message of a job; who runs the callback queue calls this."""
         try:
             self.messages.remove(job)
         except ValueError:  # drop_beyond() has taken the message, and forget() comes too late

@@ -1,7 +1,7 @@
 """INTRAPROCESS links: connections from a publisher to a subscription of the same process.
 
 A link has two ends: one in the list of connections of rospy's publisher, and one in the list of its
-subscription. rospy itself lists links, and closes them one by one; add_link() refuses a second one.
+subscription. rospy itself lists links; add_link() refuses a second one.
 """
 import threading
 

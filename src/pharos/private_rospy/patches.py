@@ -17,7 +17,7 @@ from pharos.private_rospy import connections, tcpros, topics
 from pharos.private_rospy.loader import Shim
 from pharos.private_rospy.services import call_by_proxy
 
-MAX_REQUEST = 1 << 20  # bytes of a connection header, and of an XML-RPC request
+MAX_REQUEST = 1 << 20  # bytes of a connection header
 POLL_INTERVAL = 60  # seconds between two looks for a stop; the stop itself wakes the server
 #: module -> [(target, function that makes the replacement)]
 TABLE = {}

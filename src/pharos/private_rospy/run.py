@@ -400,7 +400,7 @@ class Run:
         threading.Thread(target=self.node._stop_safely).start()
 
     def end_program(self, timeout: float) -> None:
-        """Do nothing: a run of a script ends its program here, before all else stops.
+        """Do nothing: a run of a script ends its program here, before souls and rospy.
 
         :param timeout: seconds for the program
         """
