@@ -1,11 +1,14 @@
 """Behaviour whose loss would hurt a robot; each test fails with exactly one change of the source."""
 import contextlib
+import functools
+import gc
 import http.client
 import os
 import signal
 import sys
 import threading
 import types
+import weakref
 import xmlrpc.client
 
 import pytest
@@ -15,7 +18,7 @@ import std_msgs.msg
 
 import pharos
 from helpers import INIT, SPIN, TIMEOUT, Peer, PharosPeer, Program, create, end, free_port
-from pharos import NodeNameInUseError
+from pharos import Node, NodeNameInUseError, NodeStoppedError, PharosError
 from pharos.intraprocess.callback_queues import CallbackQueue
 from pharos.private_rospy.run import Run
 from pharos.private_rospy.topics import PublisherOverlay
@@ -126,6 +129,46 @@ def test_stop_ends_call_of_soul(master, node, peer):
     stopping.start()
     stopping.join(TIMEOUT / 3)
     assert not stopping.is_alive() and not thread.is_alive()
+
+
+def test_ended_soul_leaves_its_name_alone(node):
+    blocks = weakref.WeakSet()
+    for number in range(30):
+        block = functools.partial(print, end='')
+        blocks.add(block)
+        node.fork(block, name=f'job {number}').join(TIMEOUT)
+    del block
+    until(lambda: gc.collect() >= 0 and not blocks)
+    assert node.health().ended_souls == [f'job {number}' for number in range(20, 30)]
+
+
+def test_sender_learns_that_its_node_stops(master):
+    """A thread of the program's own sends until the stop; rospy says that the topic is closed."""
+    for _ in range(10):
+        node, errors = create(master, '/sender'), []
+
+        def send(node=node, errors=errors):
+            try:
+                while True:
+                    node.send_to('/t', typed_as=STRING, data='x')
+            except PharosError as error:
+                errors.append(type(error))
+
+        thread = threading.Thread(target=send)
+        thread.start()
+        until(lambda: node.channels and node.channels[0].sent)
+        node.stop()
+        thread.join(TIMEOUT)
+        assert errors == [NodeStoppedError]
+
+
+def test_constructor_cannot_wait_for_a_service(master):
+    class Early(Node):
+        def __init__(self):
+            self.wait_for_service('/clear')
+
+    with pytest.raises(NodeStoppedError):
+        create(master, node_class=Early)
 
 
 def test_health_counts_souls_and_the_log_names_what_is_left(master):

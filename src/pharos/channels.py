@@ -48,6 +48,7 @@ class Endpoint:
         return self.node._current_run
 
     def _open(self):
+        """Register with the master; return True if a delegate has closed the endpoint meanwhile."""
         raise NotImplementedError
 
     def open(self):
@@ -58,7 +59,7 @@ class Endpoint:
         :raises MasterUnreachableError: if the master does not answer
         """
         self._run.master.call('getPid')  # raises if the master does not answer
-        if not self._open():  # a delegate may have closed it already
+        if not self._open():
             self._run.endpoints = [*self._run.endpoints, self]
             self.closed = False
 
@@ -104,8 +105,11 @@ class Channel(Endpoint):
     @property
     def connections(self) -> list[tuple[str, str]]:
         """The connected peers: ``(name of the node, 'INTRAPROCESS', 'SHARED_MEMORY' or 'TCPROS')``."""
-        connections = [each for each in connections_of(self.ros_object) if peer_of(each)]
-        return [(peer_of(connection), connection.transport_type) for connection in connections]
+        return [
+            (peer_of(connection), connection.transport_type)
+            for connection in connections_of(self.ros_object)
+            if peer_of(connection)
+        ]
 
     def __repr__(self):
         state = 'closed ' if self.closed else ''
@@ -118,7 +122,7 @@ class InputChannel(DelegateHolder, Channel, Inbox):
 
     The channel is an Inbox: messages wait in the channel itself for its delegate.
 
-    :ivar received: the number of messages that the delegate was run on
+    :ivar received: the number of messages that were taken for the delegate
     :ivar dropped: the number of messages that were dropped because the queue was full
     """
 
@@ -223,7 +227,8 @@ class OutputChannel(Channel):
         """Send a message, or one with these values of all its fields, or with these fields.
 
         Inline delegates of nodes of this process run before this returns, unless another thread runs a
-        callback of the node. This waits for sockets alone, and only without a queue_size.
+        callback of the node. This waits for sockets only without a queue_size, and for the thread of
+        a receiver 1 ms at most.
 
         :raises MessageTypeError: if the message is of another type, or cannot be serialized
         :raises NodeStoppedError: if the channel is closed
@@ -246,7 +251,7 @@ class OutputChannel(Channel):
             # PublisherOverlay.publish(), which takes a connection and a channel, too
             self._publisher.publish(message, connection, self)
         except (ROSException, *SERIALIZE_ERRORS) as error:
-            if self.closed:
+            if self._publisher.closed:  # the node's stop closes it before the channel
                 raise NodeStoppedError(f'{self!r} was closed while it sent') from error
             raise messages.explain(message, error) from error
         self.sent += 1

@@ -83,7 +83,8 @@ def message_class(type_: str | type, ask: Callable | None = None) -> type[Messag
     """Return the class of a message type, such as ``'geometry_msgs/Twist'``.
 
     A type is sought in installed Python packages, then in ``.msg`` files on ROS_PACKAGE_PATH, then
-    by ``ask``. The last places are the types given to :func:`define_message`, and turtlesim's.
+    by ``ask``, but for turtlesim's. The last places are the types given to :func:`define_message`,
+    and turtlesim's.
 
     :param type_: the name of the type; or a message class, which is returned
     :param ask: ``ask(type_)`` returns the definition that a publisher sends, or None
@@ -115,7 +116,7 @@ def define_message(type_: str, text: str) -> type[Message]:
 
     Texts of unknown nested types follow, each after a line of ``=`` and ``MSG: package/Type``.
 
-    :raises MessageTypeError: if the type is known already, with other fields
+    :raises MessageTypeError: if the type is known already, with other fields, and is not turtlesim's
     :raises UnknownTypeError: if the text cannot be read, or a nested type is not found
     """
     return _define('msg', type_, text, message_class, _make_message)
@@ -147,6 +148,7 @@ def _find_definition(suffix, type_name, ask=None):
         folder = pathlib.Path(rospkg.RosPack().get_path(package), suffix)
         return (folder / f'{name}.{suffix}').read_text('utf-8', 'replace')
     key = suffix, type_name
+    # a question takes up to connect_timeout; for turtlesim's types, which are here, it is not worth it
     if ask and key not in _shipped_definitions:
         definition = ask(type_name)
         if isinstance(definition, str):
@@ -186,12 +188,12 @@ def _read(load, type_name, text):
     :param load: genmsg's function for the text of a message or of a service
     """
     context = genmsg.MsgContext.create_default()
-    own_text, *parts = re.split(r'\n=+[ \t]*\nMSG: *', f'\n{text}')
+    own_text, *parts = re.split(r'(?m)^=+[ \t]*\nMSG: *', text)
     given_texts = {}
     for part in parts:
         name, _, nested_text = part.partition('\n')
         given_texts[name.strip()] = nested_text
-    spec = load(context, own_text[1:], type_name)
+    spec = load(context, own_text, type_name)
     for part in getattr(spec, 'request', spec), getattr(spec, 'response', spec):
         _register_nested(context, part, given_texts)
     load_depends(context, spec, {})

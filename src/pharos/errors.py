@@ -23,7 +23,7 @@ class UnknownNodeError(PharosError):
 
 
 class UnknownTopicError(PharosError):
-    """The master knows no type of that topic."""
+    """The master knows no type of that topic, or nobody publishes on it."""
 
 
 class UnknownTypeError(PharosError):
@@ -35,7 +35,7 @@ class MessageTypeError(PharosError):
 
 
 class UnknownServiceError(PharosError):
-    """The master knows no service of that name."""
+    """The master knows no service of that name, or its provider is dead."""
 
 
 class ServiceTypeError(PharosError):

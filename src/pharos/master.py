@@ -188,7 +188,7 @@ class Master:
         return tuple(map(dict, self.call('getSystemState')))
 
     def topic_type(self, name: str) -> str | None:
-        """Return the type of a topic, None if the master knows none."""
+        """Return the type of a topic, by its full name; None if the master knows none."""
         return dict(self.call('getTopicTypes')).get(name)
 
     def topics(self) -> list[Topic]:
@@ -274,6 +274,7 @@ class Master:
                 self._first_nodes[mappings] = node
                 namespace = name[: name.rfind('/') + 1]
                 name = namespace + node_name(special_names['__name'])
+        # the namespace of a launch file's group holds for '/driver', too, as in rospy.init_node()
         if '__ns' in special_names and name.startswith('/'):
             name = name[name.rfind('/') + 1 :]
         return ns_join(get_ros_namespace(self._environ, mappings), name)
@@ -306,7 +307,8 @@ class Master:
 
             return ExternalNode(self, name)
         for node in nodes:
-            if node._current_run.uri:  # '' for a script that creates its node with pharos
+            # a script that makes its node with pharos has the node's name, and no uri
+            if node._current_run.uri:
                 return node
         return nodes[0]
 

@@ -52,7 +52,7 @@ def response(cls, value):
     first item is a list: ``[1, 2]`` and ``[[1, 2]]`` both give an array of two numbers.
 
     :param cls: the class of the response
-    :raises MessageTypeError: if the response cannot be sent
+    :raises MessageTypeError, TypeError: if the response cannot be sent
     """
     message = value
     has_only_list = len(cls.__slots__) == 1 and cls._slot_types[0].endswith(']')

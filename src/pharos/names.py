@@ -32,6 +32,7 @@ def check_node_class(node_class, base):
     """Raise TypeError if a class does not derive from Node, the base, or hides names."""
     if not (isinstance(node_class, type) and issubclass(node_class, base)):
         raise TypeError(f'a node is made of a subclass of Node, not {node_class!r}')
+    # create() sets soul and delegate on the object, which would hide methods of these names
     own_names = {name for name in vars(base) if re.match('_[a-z]', name)} | {'soul', 'delegate'}
     for cls in node_class.__mro__[: node_class.__mro__.index(base)]:
         taken_names = own_names.intersection(vars(cls))

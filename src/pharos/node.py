@@ -53,7 +53,8 @@ class Node(DelegateHolder):
                 self.send_to('/cmd_vel', typed_as='turtlesim/Velocity', linear=1.0)
 
     All methods may be called from any thread. A node's delegates run one at a time, in one thread of
-    the node. The first one runs when :meth:`start` has returned, or sleeps, or after 2 s. Delegates
+    the node, unless it has an inline channel. After create() and restart(), the first one runs when
+    :meth:`start` has returned, or sleeps, or after 2 s. Delegates
     and callbacks of plain rospy begin in the order in which their messages came; doc/guide.md says
     how long one that blocks delays others. All private names of this class begin with an underscore:
     a subclass may have a ``run``, ``report`` or ``state``. Methods that need a started node raise
@@ -175,7 +176,7 @@ class Node(DelegateHolder):
         """End the souls, send messages under way, unregister, free ports and threads.
 
         Do nothing if the node is stopped. Wait up to :attr:`stop_timeout` for souls, then for the
-        delegate that runs, then for messages. The log names threads that go on after that.
+        delegate that runs, then for messages. The log names souls that go on after that.
         """
         run = self._current_run
         if (
@@ -223,8 +224,7 @@ class Node(DelegateHolder):
             self._settings.master.call('getPid')  # raises if the master does not answer
             live_souls = [
                 (thread.name, *soul)
-                for thread, soul in self._current_run.souls.items()
-                if thread.is_alive()
+                for thread, soul in list(self._current_run.souls.items())
             ]
             signals.restarting_nodes.append(self)  # or spin() would return
             try:
@@ -309,7 +309,7 @@ class Node(DelegateHolder):
             is silent), ``kind`` (the class's name), ``connections`` ({transport: number}),
             ``dropped`` (number of messages), ``errors`` (how often blocks failed), ``threads``
             (number), ``cpu_seconds``, ``souls`` (number of those that run in threads),
-            ``ended_souls`` (names), ``callback_seconds`` (since the callback has begun that runs
+            ``ended_souls`` (names of the last ten), ``callback_seconds`` (since the callback has begun that runs
             now), ``waiting`` (number of messages)
         """
         if not self._current_run:
@@ -485,7 +485,8 @@ class Node(DelegateHolder):
         :param typed_as: type name or message class; default: the type known to node or master
         :param delegate: for this channel only; default: :attr:`delegate`
         :param queue_size: messages that wait at most; the oldest are dropped, and counted
-        :param inline: True: the delegate runs in the thread of a publisher of this process
+        :param inline: True: a publisher of this process runs the delegate in its own thread, and with
+            it the node's other delegates if messages wait for them
         :param shared: True: the delegate gets the published object itself, which nobody may change
         :param from_: receive from that node alone: its name, Node or ExternalNode
         :raises UnknownTopicError, UnknownTypeError: if the type is not known
@@ -625,6 +626,7 @@ class Node(DelegateHolder):
         :param timeout: seconds, None: without limit; the node's stop ends the wait, too
         :raises UnknownServiceError: if nobody offers the service in time
         """
+        self._check_active()
         return wait_for(lambda: self.lookup_service(name), timeout, self)
 
     def parameter(self, name: str, initialized=None) -> Parameter:

@@ -25,7 +25,7 @@ class Parameter(Endpoint):
         self._blocks_lock = threading.Lock()  # held by the thread that runs the blocks
         self.open()
         if self._value is None:
-            near = difflib.get_close_matches(name, node.master.parameters)
+            near = difflib.get_close_matches(name, self._run.master.parameters)
             node.log(f'the server has no parameter {name}; near names: {near}', 'warning')
 
     def restore(self):
@@ -104,7 +104,7 @@ class Parameter(Endpoint):
 
         The block runs in the thread that sets or reads the value, not in that of the node's
         delegates. The blocks get the values in their order, and run one at a time. An exception of
-        the block goes to :attr:`Node.failures`.
+        the block goes to :attr:`Node.failures`. What changed while the node was stopped is not told.
 
         :raises TypeError: if the block does not take one argument
         """

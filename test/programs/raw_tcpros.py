@@ -74,6 +74,8 @@ class FakeNode:
         self.name, self.topic, self.type = name, topic, type_
         self.asked = threading.Semaphore(0)
         self._bind()
+        self._refusing = socket.socket()
+        self._refusing.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self._server = xmlrpc.server.SimpleXMLRPCServer(('127.0.0.1', 0), logRequests=False)
         answers = {'publisherUpdate': 0, 'getPid': os.getpid(), 'getBusInfo': bus_info}
         for name, answer in answers.items():
@@ -143,6 +145,9 @@ class FakeNode:
         self._server.shutdown()
         self._server.server_close()
         self._thread.join(LIMIT)
+        # else another program may get the port; a second call finds it bound already
+        with contextlib.suppress(OSError):
+            self._refusing.bind(self._server.server_address)
 
     def __enter__(self):
         self._thread.start()
@@ -152,4 +157,5 @@ class FakeNode:
         self.api.unregisterPublisher(self.topic, self.uri)
         self.api.unregisterSubscriber(self.topic, self.uri)
         self.stop_answering()
+        self._refusing.close()
         self.close_port()

@@ -2,8 +2,9 @@
 
 A callback queue has one thread. A node has one queue for its delegates, and one for each subscription
 of plain rospy. The thread begins a callback when those on earlier messages of the node have ended, or
-have run for SLOW. There are two exceptions. A publisher's thread runs the queue of an inline channel.
-A thread that reads TCPROS runs the callbacks of plain rospy without a queue_size.
+have run for SLOW; :meth:`CallbackQueue.delays` and TURN_LIMIT have more. Two other threads run
+callbacks: a publisher runs the queue of an inline channel, and a thread that reads TCPROS runs those
+of plain rospy without a queue_size.
 """
 from __future__ import annotations
 
@@ -65,7 +66,7 @@ class CallbackQueue:
     """Runs callbacks one at a time: a node's delegates, or those of a subscription of plain rospy.
 
     The thread starts with the first message, and ends with the queue. Objects bound to their thread
-    (a connection of SQLite, a context of CUDA) keep working.
+    (a connection of SQLite, a context of CUDA) keep working, unless a channel of the node is inline.
 
     :param order: the CallbackOrder of the node
     :param first_pause: seconds until the first callback
@@ -75,8 +76,9 @@ class CallbackQueue:
     :ivar running_thread: the identifier of the thread that runs callbacks, or None
     :ivar thread: the thread of the queue, from the first message on; None if the thread has ended
     :ivar begin_time: the time when the callback that runs began, as of perf_counter(), or None
-    :ivar request_lock: held from a request until the thread looks for jobs; then by a publisher that
-        waited for that, until the thread looks for jobs once more
+    :ivar request_lock: a signal, not a guard. request_thread() takes it, and _accept_request() frees
+        it in the queue's thread. So a publisher waits for the thread by taking it; the next
+        _accept_request() frees it again
     :ivar waits_for_turn: True while the next callback waits for those of other queues
     """
 
@@ -231,10 +233,11 @@ class CallbackQueue:
     # -- the thread
 
     def request_thread(self) -> bool:
-        """Have the thread run the jobs; return True if this has woken the thread."""
+        """Have the thread run the jobs; return True if there is a thread, and this has asked it."""
         if self._is_requested or not (self.jobs and self.may_begin):
             return False
         self._is_requested = True
+        # two publishers may both have come here: one of them starts the thread
         is_first = self.request_lock.acquire(False)
         if self.thread:
             self.wake()
@@ -318,6 +321,7 @@ def hand_over(callback_queues: list[CallbackQueue], last_wake: float, may_wait: 
             continue
         last_wake = now
         if waits:
+            # _accept_request() frees the lock
             waits = callback_queue.request_lock.acquire(True, YIELD_LIMIT)
             if not waits:
                 _no_yield_before = now + YIELD_PAUSE

@@ -59,7 +59,7 @@ class Inbox(BoundedQueue):
     ``jobs`` runs it or drops it.
 
     :param callback_queue: the CallbackQueue that runs the callback
-    :param callback: called as ``callback(message)``; raises nothing
+    :param callback: called as ``callback(message)``; raises only what a signal raises
     :param queue_size: as for BoundedQueue
     :param inline: True: the thread of the publisher runs the callback
     :param shared: True: the callback gets the published object, not a copy

@@ -182,7 +182,7 @@ def _look_after(run):
     while run.troubles:
         run.ros.logwarn_throttle_identical(60, run.troubles.pop())
     if monotonic() > run.hold_deadline:
-        run.callback_queue.release()
+        run.callback_queue.release()  # each time: there may have been no thread for the queue
     if monotonic() > run.clock_deadline:
         run.clock_deadline += 1e9  # it is told once
         rostime = run.ros.rostime

@@ -54,7 +54,10 @@ def _getfile(thing, original=inspect.getfile):
 
 
 def _getsourcefile(thing, original=inspect.getsourcefile):
-    """Return the file of a frame from linecache: a look at the disk lets other threads run."""
+    """Return the file of a frame from linecache; rospy asks for that at each line of the log.
+
+    Python looks at the disk, which lets other threads run: the logging thread waits up to 5 ms.
+    """
     if inspect.isframe(thing) and thing.f_code.co_filename in linecache.cache:
         return thing.f_code.co_filename
     return original(thing)

@@ -156,7 +156,8 @@ def _reaches_rospy(top_name):
     new_names = {top_name}
     while new_names and new_names.isdisjoint(('rospy', 'rosgraph', 'pharos')):
         seen_names |= new_names
-        # not union(*map(...)): a program that calls gc.get_objects() meanwhile would see the tuple
+        # not union(*map(...)): if a program calls gc.get_objects() meanwhile, Python raises a
+        # SystemError here, since somebody else holds the tuple that it makes
         imported_names = set()
         for name in new_names:
             imported_names |= _imports_of(name)

@@ -333,7 +333,8 @@ def publisher_update(original, run, self, name, uris):
 
     This connects to all at the first call.
     """
-    # publishers_changed() below has forgotten the list: it is equal at the further calls alone
+    # publishers_changed() below has forgotten the list: the first call finds none, and the further
+    # ones find this very list
     if uris != run.publisher_uris.get(name):
         run.publisher_uris[name] = uris
         connections.connect_all(run, name)

@@ -94,7 +94,9 @@ class Run:
         self.name = settings.name
         self.master = settings.master
         self.failures = Failures()
-        self.souls = {}  # thread -> its block, None for the node's soul, and True if it is required
+        # thread that runs -> its block, None for the node's soul, and True if it is required
+        self.souls = {}
+        self.ended_souls = collections.deque(maxlen=10)  # names, the newest last
         self.endpoints = []  # also those that the stop has closed, for the next start
         self.stopping = threading.Event()  # set when a stop begins: sleeps and waits end
         self.finished = threading.Event()  # set at the end of a stop: threads left behind end
@@ -150,6 +152,8 @@ class Run:
 
         self.Thread = Thread
         client = Shim(xmlrpc.client, ServerProxy=ServerProxy)
+        # a hook of fork or exit would keep each stopped run alive; rospy's 60 s for sockets would hold
+        # for all of the process
         return {
             'os': Shim(os, environ=self.environ, register_at_fork=lambda **hooks: None),
             'sys': Shim(sys, argv=self.argv, path=self.path),
@@ -168,6 +172,8 @@ class Run:
         finally:
             self.ended_cpu_seconds += time.thread_time()
             self.threads.discard(thread)
+            if self.souls.pop(thread, None):
+                self.ended_souls.append(thread.name)
 
     def start_thread(self, target: Callable) -> threading.Thread | None:
         """Start a thread of the node, and return the thread.
@@ -214,7 +220,7 @@ class Run:
 
     @property
     def is_active(self) -> bool:
-        """True if the node is registered: it runs, or its stop goes on."""
+        """True if the node runs, or its stop goes on."""
         return self.lifecycle in (Lifecycle.RUNNING, Lifecycle.STOPPING)
 
     def open_endpoints(self, endpoint_class: Any) -> list:
@@ -237,7 +243,6 @@ class Run:
         """Return the facts of Node.health(), without the master's; ``pharos top`` asks for them."""
         queues = list(self.callback_order.queues)
         begin_times = [queue.begin_time for queue in queues if queue.begin_time]
-        ended_souls = [soul.name for soul in self.souls if not soul.is_alive()]
         return {
             'kind': type(self.node).__name__,
             'connections': dict(
@@ -247,8 +252,8 @@ class Run:
             'errors': self.failures.total,
             'threads': len(self.threads),
             'cpu_seconds': round(self.cpu_seconds(), 3),
-            'souls': len(self.souls) - len(ended_souls),
-            'ended_souls': ended_souls,
+            'souls': len(self.souls),
+            'ended_souls': list(self.ended_souls),
             'callback_seconds': time.perf_counter() - min(begin_times) if begin_times else 0.0,
             'waiting': sum(len(queue.jobs) for queue in queues),
         }
@@ -381,7 +386,8 @@ class Run:
     def limit_silence(self, sock: socket.socket) -> None:
         """Have the watcher shut a client's socket after the node's client_timeout.
 
-        A client that speaks in time is taken out of ``deadlines``.
+        The end of a handshake takes the client out of ``deadlines``. A call of XML-RPC, with its answer,
+        has that time as a whole.
         """
         self.deadlines[sock] = monotonic() + self.node.client_timeout
 
@@ -436,7 +442,7 @@ class Run:
         self.callback_queue.stop()
         self.end_program(timeout)
         self._begin_stop()
-        left_behind = [thread.name for thread in join(self.souls, timeout)]
+        left_behind = [thread.name for thread in join(list(self.souls), timeout)]
         has_ended = self.callback_queue.close(timeout)
         if not has_ended:
             left_behind.append('a delegate')
@@ -448,7 +454,10 @@ class Run:
         self.close_rospy(timeout)
         for sock in list(self.sockets):
             shutdown_socket(sock)  # wakes the threads that read; close() would not
-        self._wait_for_threads(STOP_LIMIT)
+        deadline = monotonic() + STOP_LIMIT
+        # souls have had their time; a thread that ends may have started another one
+        while join(set(self.threads) - set(self.souls), JOIN_PERIOD) and monotonic() < deadline:
+            pass
         self.finished.set()
         logging = self.modules.load('logging')
         logging.disable()  # or a thread left behind would open the file again
@@ -456,12 +465,6 @@ class Run:
         for sock in list(self.sockets):
             sock.close()  # now that no thread uses it: another file may get its number
         self.mark_stopped()
-
-    def _wait_for_threads(self, timeout: float) -> None:
-        """Wait for the end of all threads but souls."""
-        deadline = monotonic() + timeout
-        while join(set(self.threads) - set(self.souls), JOIN_PERIOD) and monotonic() < deadline:
-            pass
 
 
 def join(threads: Iterable[threading.Thread], timeout: float) -> list[threading.Thread]:

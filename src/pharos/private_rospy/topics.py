@@ -200,6 +200,7 @@ class PublisherOverlay:
         close_topic(self)
         if self.memory:
             self.memory.close()
+        # rospy has set these to None; a connection that comes at this moment reads them
         self.headers = {}
         self.subscriber_listeners = []
 
@@ -260,7 +261,7 @@ class SubscriptionOverlay:
 
     def __init__(self, name: str, data_class: type) -> None:
         self.rospy___init__(name, data_class)
-        self.tcp_nodelay = True
+        self.tcp_nodelay = True  # else a publisher may hold a small message back for 40 ms
         self.inboxes = []
         self.plain_inbox = None  # type: Any
 
@@ -389,5 +390,5 @@ def connections_of(ros_object: Any) -> list:
     if not impl or impl.closed:
         return []
     impl.check()  # rospy notices only now and then that peers have left (ros_comm #927)
-    with impl.c_lock:  # the watcher may remove a connection meanwhile
+    with impl.c_lock:  # a check() of the watcher sets the new list while it holds this
         return impl.connections

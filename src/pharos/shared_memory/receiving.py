@@ -130,7 +130,7 @@ class SharedMemoryHandler(ProtocolHandler):
     # -- subscriptions
 
     def create_transport(self, topic, uri, answer):
-        """Connect to a publisher, or by TCPROS if its socket cannot be reached."""
+        """Connect to a publisher, or by TCPROS if its socket cannot be reached or the class is no plain one."""
         subscription = self.run.topic_manager.subs.get(topic)
         sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:

@@ -199,9 +199,9 @@ class MemorySender(MemoryTransport, BoundedQueue):
 
     def __init__(self, publisher, reader_name, sock):
         MemoryTransport.__init__(self, 'o', publisher.resolved_name, reader_name, sock)
-        BoundedQueue.__init__(self, publisher.queue_size)
+        BoundedQueue.__init__(self)  # its messages are Entries
+        self._publisher = publisher
         self._memory = publisher.memory
-        self._queue = self.messages  # of Entries
         self.queue_bytes = self._memory.run.node.queue_bytes
         self._known_files = {}  # position -> the file that the reader has mapped
 
@@ -211,11 +211,11 @@ class MemorySender(MemoryTransport, BoundedQueue):
 
     @property
     def is_busy(self):
-        """True until the reader has read all: the end of the socket would take the last message."""
+        """True until the reader has read all: if its receipt finds the socket closed, it drops a message."""
         with self._memory.lock:
             if self.announced:
                 self.take_receipts()
-            return bool(self._queue or self.announced)
+            return bool(self.messages or self.announced)
 
     def put(self, entry):
         """Add a message to the queue, and send all that the socket takes; never waits."""
@@ -223,9 +223,11 @@ class MemorySender(MemoryTransport, BoundedQueue):
             return
         if entry.file:
             entry.file.senders.add(self)
+        # rospy sets this after the first connections may have been made
+        self.queue_size = self._publisher.queue_size
         self.add(entry, len(entry.data))
         self._send_ready()
-        if self._queue and not self.is_sending:
+        if self.messages and not self.is_sending:
             self.is_sending = self._memory.run.start_thread(self._send_queue) is not None
 
     def forget(self, entry):
@@ -238,10 +240,9 @@ class MemorySender(MemoryTransport, BoundedQueue):
         """Drop the message in a file. If the reader may be reading it, give up the reader."""
         if self.announced is file:
             self._break()
-        for entry in [each for each in self._queue if each.file is file]:
-            self._queue.remove(entry)
-            self.dropped += 1
-            self.forget(entry)
+        for entry in [each for each in self.messages if each.file is file]:
+            self.messages.remove(entry)
+            self.dropped += self.forget(entry)
 
     def give_up(self):
         """Have the reader connect anew."""
@@ -259,8 +260,8 @@ class MemorySender(MemoryTransport, BoundedQueue):
 
     def _send_ready(self):
         """Send the messages that the socket takes, one in a file at a time."""
-        while self._queue:
-            entry = self._queue[0]
+        while self.messages:
+            entry = self.messages[0]
             if entry.file and self.announced:
                 return
             try:
@@ -270,7 +271,7 @@ class MemorySender(MemoryTransport, BoundedQueue):
             except OSError:  # the reader has gone
                 self._break()
                 return
-            self._queue.popleft()
+            self.messages.popleft()
             self.announced = entry.file or self.announced
             self.dropped = 0
             self.stat_num_msg += 1
@@ -307,10 +308,10 @@ class MemorySender(MemoryTransport, BoundedQueue):
             with self._memory.lock:
                 self.take_receipts()
                 self._send_ready()
-                if not self._queue:
+                if not self.messages:
                     self.is_sending = False
                     break
-                waits_for_receipt = self._queue[0].file and self.announced
+                waits_for_receipt = self.messages[0].file and self.announced
                 event = select.POLLIN if waits_for_receipt else select.POLLOUT
                 poller.register(self._socket, event)
             poller.poll(POLL_LIMIT)
