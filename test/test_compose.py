@@ -308,11 +308,6 @@ def stop_when_ready(script, path):
     return path.read_text().split()
 
 
-def test_end_comes_in_order(ends, tmp_path):
-    lines = stop_when_ready(ends('order'), tmp_path / 'said')
-    assert lines == ['on_shutdown', 'main', 'atexit']
-
-
 @pytest.mark.parametrize('name', ['SIGINT', 'SIGTERM'])
 def test_signal_handler_is_called_at_stop(ends, tmp_path, name):
     script = ends(name)
@@ -674,12 +669,6 @@ def test_stop_ends_all_nodes(master, compose):
     composition.stop()
     assert not any(each.is_running for each in composition.nodes)
     assert composition.process.poll() is not None
-
-
-def test_composition_ends_with_its_block(compose):
-    with compose('sensing.launch') as composition:
-        assert all(each.is_running for each in composition.nodes)
-    assert not any(each.is_running for each in composition.nodes)
 
 
 # -- rosrun pharos compose

@@ -271,34 +271,6 @@ def test_debug_looks_at_raising_frame(master):
     assert debugger.exitstatus == 0
 
 
-# -- the Transcript
-
-
-def test_transcript_shows_on_standard_output(capsys):
-    Transcript.show(42)
-    assert capsys.readouterr().out == '42\n'
-
-
-def test_transcript_lines_stay_whole(transcript):
-    def show(number):
-        for _ in range(200):
-            Transcript.show(f'<{number}>' * 20)
-
-    threads = [threading.Thread(target=show, args=[number]) for number in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(TIMEOUT)
-    assert sorted(transcript) == sorted([f'<{n}>' * 20 for n in range(4)] * 200)
-
-
-def test_on_show_returns_former_receiver():
-    first, second = [].append, [].append
-    before = Transcript.on_show(first)
-    assert Transcript.on_show(second) is first
-    assert Transcript.on_show(before) is second
-
-
 # -- the errors
 
 

@@ -277,14 +277,6 @@ def test_frozen_master_ends_questions(mortal):
     assert url in top.output
 
 
-@pytest.mark.parametrize('command', ['graph', 'top --once'])
-def test_program_names_missing_master(command):
-    with program(command, REFUSED) as running:
-        assert running.wait() == 1
-    assert REFUSED in running.output
-    assert 'Traceback' not in running.output
-
-
 # -- the programs graph and top: they look at one scene, all at once
 
 COMMANDS = {

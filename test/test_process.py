@@ -621,16 +621,3 @@ def test_driver_of_pharos_respawns_and_opens_its_device_again(bench, port):
     launch = bench.launch_file('<node pkg="bench" type="program" name="program" respawn="true"/>')
     with bench.program(launch):
         until(lambda: bench.said().count('opened') >= 3)
-
-
-def test_restart_of_the_only_node_ends_no_program(master, bench):
-    text = """
-        node = pharos.Master().create(pharos.BlockNode, 'one')
-        threading.Timer(0.2, lambda: [node.restart(), say('restarted')]).start()
-        pharos.spin()
-        say('over')
-        """
-    with Program([bench.write(text)], master.url) as program:
-        until(lambda: 'restarted' in bench.said())
-        assert bench.said() == ['restarted']
-        end(program)

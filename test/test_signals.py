@@ -237,13 +237,6 @@ def test_program_without_stop_unregisters(program, end):
     assert counts(running)[1] == 1
 
 
-def test_spin_returns_after_the_last_stop(program):
-    running = program(
-        BEGIN + 'pharos.Node.stop(other)\nme.fork(lambda me: me.stop())\npharos.spin()\nready()'
-    )
-    assert running.wait() == 0
-
-
 FORK = """
 me = create()
 back = me.output_channel('/back', 'std_msgs/String')
