@@ -5,7 +5,7 @@ usage: pharos COMMAND [ARGUMENT ...]
 
   workspace       a session in IPython, with the live graph at hand
   compose         run the Python nodes of a launch file in one process
-  top             a live table of nodes and processes
+  top             a live table of nodes
   graph           the nodes, topics and links, as text or as a picture
   restart, stop, start, reload    do so with a node of a composition
 

@@ -11,19 +11,19 @@ from pharos.commands import argument_parser
 from pharos.live.top import Meter, show, table
 from pharos.master import Master
 
-FILE_WIDTH = 10000  # columns of a table that is not for a terminal, so that nothing is cut
+FILE_WIDTH = 10000  # columns of the table if it is not for a terminal, so that nothing is cut
 
 
 def top(arguments: list[str]) -> None:
-    """Show the nodes and processes of the ROS master in a live table.
+    """Show the nodes of the ROS master in a live table.
 
-    The columns are messages and bytes a second, transports, dropped messages, failures, CPU and
-    memory. The command subscribes to nothing.
+    The columns are messages and bytes a second, transports, dropped messages, failures and
+    CPU of nodes made with pharos. The command subscribes to nothing.
 
     Other commands: compose, graph, workspace, restart, stop, start, reload.
     """
     parser = argument_parser(top)
-    parser.add_argument('--once', action='store_true', help='print the tables once')
+    parser.add_argument('--once', action='store_true', help='print the table once')
     parser.add_argument('--json', action='store_true', help='print JSON once')
     parser.add_argument(
         '--interval', type=float, default=1, metavar='S', help='seconds between measurements'
@@ -33,14 +33,10 @@ def top(arguments: list[str]) -> None:
     if sys.stdin.isatty() and sys.stdout.isatty() and not (options.once or options.json):
         show(meter, options.interval)
         return
-    meter.measure()
     time.sleep(options.interval)
-    tables = meter.measure()
+    rows = meter.measure()
     if options.json:
-        print(json.dumps(tables))
+        print(json.dumps({'nodes': rows}))
         return
     console = Console(width=None if sys.stdout.isatty() else FILE_WIDTH)
-    for rows in tables.values():
-        console.print(table(rows))
-    if meter.advice:
-        console.print(meter.advice)
+    console.print(table(rows))

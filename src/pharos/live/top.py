@@ -1,10 +1,9 @@
-"""Measure the nodes and processes of a master, and show them as tables in a terminal.
+"""Measure the nodes of a master, and show them as a table in a terminal.
 
 Nodes count their messages anyway. Two snapshots give rates, so top subscribes to nothing.
 """
 from __future__ import annotations
 
-import collections
 import os
 import select
 import sys
@@ -13,24 +12,19 @@ import time
 import tty
 from typing import Any
 
-import psutil
 from rich.live import Live
 from rich.table import Table
 
 from pharos.errors import MasterUnreachableError, PharosError
-from pharos.live.snapshot import LOCAL_HOST, publisher_rates, take_snapshot
+from pharos.live.snapshot import publisher_rates, take_snapshot
 from pharos.live.text_format import short_number
 from pharos.master import Master
 
-VIEWS = {'n': 'nodes', 'p': 'processes'}  # key -> view
-HELP = '''n nodes  p processes  q quit
-j k choose a node of a composition  r restart  x stop  a start  l reload'''
+HELP = 'q quit  j k choose a node of a composition  r restart  x stop  a start  l reload'
 ACTIONS = {'r': 'restart', 'x': 'stop', 'a': 'start', 'l': 'reload'}  # key -> action
 WIDE_COLUMNS = 'NODE', 'PID'  # are never cut, however narrow the terminal is
 ALARM_COLUMNS = 'DROP', 'FAIL', 'PROBLEM'  # are red unless the value is 0 or empty
 HANG = 3.0  # seconds of a callback that are a problem
-BUSY_PROCESS = 90  # percent of a core
-SUM_COLUMNS = 'IN/S', 'OUT/S', 'IN B/S', 'OUT B/S', 'DROP', 'FAIL'
 
 
 class Meter:
@@ -42,53 +36,15 @@ class Meter:
     def __init__(self, master: Master):
         self.master = master
         self._snapshot = take_snapshot(master)
-        self.advice = ''  # of the last measurement
-        self._processes: dict[int, psutil.Process] = {}  # each keeps its last CPU time
 
-    def measure(self) -> dict[str, list[dict[str, Any]]]:
-        """Return ``{view: rows}``; a row is ``{column: value}``, None if the value is unknown.
+    def measure(self) -> list[dict[str, Any]]:
+        """Return a row ``{column: value}`` for each node; a value is None if it is unknown.
 
         :raises MasterUnreachableError: if the master does not answer
         """
         start = self._snapshot
         self._snapshot = take_snapshot(self.master)
-        link_rates = self._snapshot.rates_since(start)
-        node_rows = list(_node_rows(self._snapshot, start, link_rates))
-        process_rows = list(self._process_rows(node_rows))
-        self.advice = '\n'.join(
-            f'process {row["PID"]} keeps a core busy, and Python runs one thread at a time: put its'
-            ' busiest node apart'
-            for row in process_rows
-            if (row['CPU%'] or 0) > BUSY_PROCESS and ' ' in row['NODES']
-        )
-        return {'nodes': node_rows, 'processes': process_rows}
-
-    def _process_rows(self, node_rows):
-        """Yield the sums of each process's nodes, with the load of processes of this host."""
-        rows_by_process = collections.defaultdict(list)
-        for row in node_rows:
-            process_id = row['PID'] or row['NODE']
-            rows_by_process[row['HOST'], process_id].append(row)
-        for (host, process_id), rows in rows_by_process.items():
-            process_row = {'PID': process_id, 'HOST': host, 'CPU%': None, 'MEM': None, 'THR': None}
-            if host == LOCAL_HOST and isinstance(process_id, int):
-                process_row.update(self._process_load(process_id))
-            for column in SUM_COLUMNS:
-                values = [row[column] for row in rows]
-                process_row[column] = sum(value for value in values if value is not None)
-            process_row['NODES'] = ' '.join(row['NODE'] for row in rows)
-            yield process_row
-
-    def _process_load(self, process_id):
-        try:
-            process = self._processes.setdefault(process_id, psutil.Process(process_id))
-            return {
-                'CPU%': process.cpu_percent(),
-                'MEM': process.memory_info().rss,
-                'THR': process.num_threads(),
-            }
-        except psutil.Error:  # the process has ended
-            return {}
+        return list(_node_rows(self._snapshot, start))
 
 
 def _cpu_percent(name, snapshot, start):
@@ -102,7 +58,8 @@ def _cpu_percent(name, snapshot, start):
     return max(0.0, 100 * (end_seconds - start_seconds) / (snapshot.time - start.time))
 
 
-def _node_rows(snapshot, start, link_rates):
+def _node_rows(snapshot, start):
+    link_rates = snapshot.rates_since(start)
     message_rates = publisher_rates(link_rates, 'messages')
     for name, node in snapshot.nodes.items():
         input_traffic = [rate for link, rate in link_rates.items() if link.subscriber == name]
@@ -168,7 +125,7 @@ def _cell_text(column, value):
 
 
 def show(meter: Meter, interval: float) -> None:
-    """Show the tables in the terminal until the key q or Ctrl-C.
+    """Show the table in the terminal until the key q or Ctrl-C.
 
     :param interval: seconds between two measurements
     """
@@ -177,31 +134,28 @@ def show(meter: Meter, interval: float) -> None:
     tty.setcbreak(keyboard)
     try:
         with Live(screen=True, auto_refresh=False) as screen:
-            _show_views(screen, meter, interval, keyboard)
+            _show_nodes(screen, meter, interval, keyboard)
     finally:
         termios.tcsetattr(keyboard, termios.TCSADRAIN, terminal_settings)
 
 
-def _show_views(screen, meter, interval, keyboard):
-    view = 'nodes'
+def _show_nodes(screen, meter, interval, keyboard):
+    rows = meter.measure()
     chosen_node = ''
-    tables = meter.measure()
-    line = meter.advice
+    line = ''
     deadline = time.monotonic() + interval
     while True:
-        rows = tables[view]
         page = Table.grid()
-        for part in HELP, line, table(rows, chosen_node):
-            page.add_row(part)
+        page.add_row(HELP)
+        page.add_row(line)
+        page.add_row(table(rows, chosen_node))
         screen.update(page, refresh=True)
         timeout = max(0, deadline - time.monotonic())
         if select.select([keyboard], [], [], timeout)[0]:
             key = os.read(keyboard, 1).decode('latin-1')
             if key == 'q':
                 return
-            if key in VIEWS:
-                view = VIEWS[key]
-            elif key in 'jk' and view == 'nodes':
+            if key in 'jk':
                 step = 1 if key == 'j' else -1
                 chosen_node = _next_node(rows, chosen_node, step)
             elif key in ACTIONS and chosen_node:
@@ -209,8 +163,8 @@ def _show_views(screen, meter, interval, keyboard):
         else:
             deadline = time.monotonic() + interval
             try:
-                tables = meter.measure()
-                line = meter.advice
+                rows = meter.measure()
+                line = ''
             except MasterUnreachableError as error:
                 line = str(error)
 
