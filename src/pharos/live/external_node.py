@@ -93,7 +93,7 @@ class ExternalNode:
 
     def describe(self, seconds: float = 1.0) -> str:
         """Return the node's topics, services, peers and rates as text; count for some seconds."""
-        from pharos.live.text_format import describe
+        from pharos.live.graph import describe
 
         return describe(self.master, self.name, seconds)
 

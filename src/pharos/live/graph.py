@@ -7,11 +7,11 @@ import pathlib
 import re
 import subprocess
 import time
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Iterator, NamedTuple
 from xml.sax.saxutils import escape
 
-from pharos.errors import PharosError
-from pharos.live.snapshot import Snapshot, take_snapshot, topic_rates
+from pharos.errors import PharosError, UnknownNodeError
+from pharos.live.snapshot import Link, Snapshot, take_snapshot, topic_rates
 from pharos.live.text_format import short_number
 
 if TYPE_CHECKING:
@@ -45,20 +45,31 @@ FRAME_STYLE = 'style="rounded,filled"; color="#9AA5B1"; fillcolor="#F5F7F9"'
 class Edge(NamedTuple):
     """An arrow from a node to a topic, or from a topic to a node."""
 
-    start: str
-    end: str
+    node: str
+    topic: str
     is_incoming: bool  # True if the arrow ends at the node
-    transports: tuple[str, ...]  # empty if nothing is connected
+    links: list[Link]  # empty if nothing is connected
 
     @property
-    def node(self) -> str:
-        """The name of the node."""
-        return self.end if self.is_incoming else self.start
+    def start(self) -> str:
+        """The name of the node or topic where the arrow begins."""
+        return self.topic if self.is_incoming else self.node
 
     @property
-    def topic(self) -> str:
-        """The name of the topic."""
-        return self.start if self.is_incoming else self.end
+    def end(self) -> str:
+        """The name of the node or topic where the arrow ends."""
+        return self.node if self.is_incoming else self.topic
+
+    @property
+    def transports(self) -> tuple[str, ...]:
+        """The transports of the links."""
+        return tuple(sorted({link.transport for link in self.links}))
+
+    def peers(self) -> Iterator[str]:
+        """Yield the nodes at the other ends, as '/node (transport)'."""
+        for link in self.links:
+            name = link.publisher if self.is_incoming else link.subscriber
+            yield f'{name} ({link.transport})'
 
 
 class Graph:
@@ -85,15 +96,21 @@ class Graph:
         self.edges: list[Edge] = []
         for name, node in self.nodes.items():
             for topic in filter(is_visible, node.publishes):
-                self.edges.append(Edge(name, topic, False, self._transports(name, topic, False)))
+                links = [
+                    link
+                    for link in snapshot.links
+                    if link.topic == topic and link.publisher == name
+                ]
+                self.edges.append(Edge(name, topic, False, links))
             for topic in filter(is_visible, node.subscribes):
-                self.edges.append(Edge(topic, name, True, self._transports(name, topic, True)))
+                links = [
+                    link
+                    for link in snapshot.links
+                    if link.topic == topic and link.subscriber == name
+                ]
+                self.edges.append(Edge(name, topic, True, links))
         edge_topics = {edge.topic for edge in self.edges}
         self.topics = {name: snapshot.topics[name] for name in sorted(edge_topics)}
-
-    def _transports(self, node_name, topic, is_incoming):
-        links = self.snapshot.links_of(node_name, topic, is_incoming)
-        return tuple(sorted({link.transport for link in links}))
 
     def processes(self) -> dict[tuple[str, Any], list[str]]:
         """Return ``{(host, process id): names of nodes}``."""
@@ -129,16 +146,15 @@ class Graph:
             yield f'process {process_id}, {host}'
             for name in names:
                 yield f'  {name}  {self.nodes[name].problem}'
-                for edge in self.edges:
-                    if edge.node == name:
-                        yield self._edge_text(edge)
+                yield from self.edge_lines(name)
 
-    def _edge_text(self, edge):
-        links = self.snapshot.links_of(edge.node, edge.topic, edge.is_incoming)
-        peers = [f'{link.peer_of(edge.node)} ({link.transport})' for link in links]
-        peer_text = ', '.join(peers) or 'not connected'
-        arrow = '<-' if edge.is_incoming else '->'
-        return f'    {arrow} {edge.topic}  {self._topic_label(edge.topic)}  {peer_text}'
+    def edge_lines(self, node_name: str) -> Iterator[str]:
+        """Yield a line for each topic of a node, with the node's peers."""
+        for edge in self.edges:
+            if edge.node == node_name:
+                arrow = '<-' if edge.is_incoming else '->'
+                peer_text = ', '.join(edge.peers()) or 'not connected'
+                yield f'    {arrow} {edge.topic}  {self._topic_label(edge.topic)}  {peer_text}'
 
     # -- as a picture
 
@@ -241,16 +257,34 @@ def _dot_box(prefix, name, caption, style):
     return f'{_dot_id(prefix, name)} [{style}, label=<{label}>]'
 
 
-def graph_of(master: Master, seconds: float = 0, **options: Any) -> Graph:
-    """Return the graph of :meth:`Master.graph`; the options are keywords of :class:`Graph`.
+def graph_of(master: Master, seconds: float = 0, only: str = '') -> Graph:
+    """Return the graph of :meth:`Master.graph`.
 
     :param seconds: how long messages are counted, for rates; 0: no rates
+    :param only: a regular expression; names of nodes and topics that lack it are left out
     :raises MasterUnreachableError: if the master does not answer
     """
     start = take_snapshot(master)
     if not seconds:
-        return Graph(start, {}, **options)
+        return Graph(start, {}, only)
     time.sleep(seconds)
     snapshot = take_snapshot(master)
-    rates = topic_rates(snapshot.rates_since(start), 'messages')
-    return Graph(snapshot, rates, **options)
+    rates = topic_rates(snapshot.rates_since(start))
+    return Graph(snapshot, rates, only)
+
+
+def describe(master: Master, node_name: str, seconds: float) -> str:
+    """Return a text about a node, with rates that are counted for some seconds.
+
+    :raises UnknownNodeError: if the master does not know the node
+    """
+    graph = graph_of(master, seconds)
+    node = graph.snapshot.nodes.get(node_name)
+    if not node:
+        raise UnknownNodeError(f'no node {node_name} is known at {master.url}: see rosnode list')
+    health = ', '.join(f'{fact} {value}' for fact, value in node.health.items())
+    lines = [f'{node_name}: pid {node.pid} at {node.host}, {node.uri} {node.problem}']
+    lines.append(f'    {health}')
+    lines += graph.edge_lines(node_name)
+    lines += [f'    offers {service}' for service in node.offers]
+    return '\n'.join(lines)

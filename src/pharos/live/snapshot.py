@@ -29,10 +29,6 @@ class Link(NamedTuple):
     subscriber: str
     transport: str  # 'INTRAPROCESS', 'SHARED_MEMORY', 'TCPROS' or 'UDPROS'
 
-    def peer_of(self, node_name: str) -> str:
-        """Return the name of the node at the other end."""
-        return self.publisher if node_name == self.subscriber else self.subscriber
-
 
 class Traffic(NamedTuple):
     """The messages and bytes of a link: in all, or as rates in one second."""
@@ -79,13 +75,6 @@ class Snapshot:
                 byte_count = (traffic.bytes - old_traffic.bytes) % 2**32  # XML-RPC has 32 bits
                 rates[link] = Traffic(message_count / seconds, byte_count / seconds)
         return rates
-
-    def links_of(self, node_name: str, topic: str, is_incoming: bool) -> list[Link]:
-        """Return the links of a topic that end at a node, or else those that begin there."""
-        links = [link for link in self.links if link.topic == topic]
-        if is_incoming:
-            return [link for link in links if link.subscriber == node_name]
-        return [link for link in links if link.publisher == node_name]
 
 
 def take_snapshot(master: Master) -> Snapshot:
@@ -164,21 +153,18 @@ def _merge_links(nodes):
     return links
 
 
-def publisher_rates(link_rates: dict[Link, Traffic], unit: str) -> dict[tuple, float]:
-    """Return ``{(topic, publisher): rate}``, the rate of the publisher's fastest link.
-
-    :param unit: 'messages' or 'bytes'
-    """
-    rates: dict[tuple, float] = {}
+def publisher_rates(link_rates: dict[Link, Traffic]) -> dict[tuple[str, str], float]:
+    """Return ``{(topic, publisher): messages in one second}``, those of the fastest link."""
+    rates: dict[tuple[str, str], float] = {}
     for link, traffic in link_rates.items():
         key = link.topic, link.publisher
-        rates[key] = max(rates.get(key, 0.0), getattr(traffic, unit))
+        rates[key] = max(rates.get(key, 0.0), traffic.messages)
     return rates
 
 
-def topic_rates(link_rates: dict[Link, Traffic], unit: str) -> dict[str, float]:
-    """Return ``{topic: rate}``, the sum of the topic's publishers; see :func:`publisher_rates`."""
+def topic_rates(link_rates: dict[Link, Traffic]) -> dict[str, float]:
+    """Return ``{topic: messages in one second}``, the sum of the topic's publishers."""
     rates: dict[str, float] = {}
-    for (topic, _), rate in publisher_rates(link_rates, unit).items():
+    for (topic, _), rate in publisher_rates(link_rates).items():
         rates[topic] = rates.get(topic, 0.0) + rate
     return rates

@@ -1,16 +1,5 @@
-"""Format numbers, messages and nodes as text."""
-from __future__ import annotations
-
-import time
-from typing import TYPE_CHECKING
-
+"""Format numbers and messages as text."""
 import genpy
-
-from pharos.errors import UnknownNodeError
-from pharos.live.snapshot import take_snapshot
-
-if TYPE_CHECKING:
-    from pharos.master import Master
 
 MAX_ITEMS = 12  # items of an array, and lines of a text, that are shown
 LINE_LENGTH = 80
@@ -56,39 +45,3 @@ class _PlainText:
 
     def __str__(self):
         return self._text
-
-
-class Description(str):
-    """A text that a prompt shows without quotes."""
-
-    __repr__ = str.__str__
-
-
-def describe(master: Master, node_name: str, seconds: float) -> Description:
-    """Return a text about a node, with rates that are counted for some seconds.
-
-    :raises UnknownNodeError: if the master does not know the node
-    """
-    start = take_snapshot(master)
-    time.sleep(seconds)
-    snapshot = take_snapshot(master)
-    if node_name not in snapshot.nodes:
-        raise UnknownNodeError(f'no node {node_name} is known at {master.url}: see rosnode list')
-    node = snapshot.nodes[node_name]
-    link_rates = snapshot.rates_since(start)
-
-    def topic_text(topic, is_incoming):
-        links = snapshot.links_of(node_name, topic, is_incoming)
-        peers = [f'{link.peer_of(node_name)} by {link.transport}' for link in links]
-        peer_text = ', '.join(peers) or 'nobody'
-        rates = [link_rates[link].messages for link in links if link in link_rates]
-        rate_text = short_number(max(rates, default=0))
-        return f'{topic} [{snapshot.topics[topic]}] {rate_text} Hz: {peer_text}'
-
-    health = ', '.join(f'{fact} {value}' for fact, value in node.health.items())
-    lines = [f'{node_name}: pid {node.pid} at {node.host}, {node.uri} {node.problem}']
-    lines.append(f'  {health}')
-    lines += [f'  publishes {topic_text(topic, False)}' for topic in node.publishes]
-    lines += [f'  subscribes to {topic_text(topic, True)}' for topic in node.subscribes]
-    lines += [f'  offers {service}' for service in node.offers]
-    return Description('\n'.join(lines))

@@ -60,7 +60,7 @@ def _cpu_percent(name, snapshot, start):
 
 def _node_rows(snapshot, start):
     link_rates = snapshot.rates_since(start)
-    message_rates = publisher_rates(link_rates, 'messages')
+    message_rates = publisher_rates(link_rates)
     for name, node in snapshot.nodes.items():
         input_traffic = [rate for link, rate in link_rates.items() if link.subscriber == name]
         output_traffic = [rate for link, rate in link_rates.items() if link.publisher == name]
