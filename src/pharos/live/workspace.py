@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import atexit
 import os
-from typing import Any, Sequence
+import sys
+from typing import Any
 
 import rosgraph.names
 from genpy import Message
@@ -23,12 +24,11 @@ Tab completes, x? explains x, Ctrl-C ends a line, Ctrl-D the session and its nod
 """
 
 
-def namespace(argv: Sequence[str] | None = None) -> dict[str, Any]:
+def namespace() -> dict[str, Any]:
     """Return the names of a session: all of pharos, ``master``, and the node ``me``.
 
-    Starts a master if none answers.
-
-    :param argv: ROS's remappings and private parameters, for the node
+    Starts a master if none answers. The node gets ROS's remappings and private parameters of the
+    program.
     """
     master = Master()
     if not master.is_reachable():
@@ -40,18 +40,16 @@ def namespace(argv: Sequence[str] | None = None) -> dict[str, Any]:
         name = rosgraph.names.anonymous_name('workspace')
     names = {each: getattr(pharos, each) for each in pharos.__all__}
     names['master'] = master
-    names['me'] = master.create(BlockNode, named=name, argv=argv)
+    names['me'] = master.create(BlockNode, named=name, argv=sys.argv)
     return names
 
 
-def load_ipython_extension(shell: Any, names: dict[str, Any] | None = None) -> None:
+def load_ipython_extension(shell: Any) -> None:
     """Make a session of IPython a workspace; ``%load_ext`` calls this.
 
     :param shell: the InteractiveShell
-    :param names: default: those of :func:`namespace`
     """
-    if names is None:
-        names = namespace()
+    names = namespace()
     master = names['master']
     shell.push(names)
     atexit.register(signals.stop_all)  # in the IPython of Debian 11, before it clears the names
