@@ -7,7 +7,7 @@ import pathlib
 import re
 import subprocess
 import time
-from typing import TYPE_CHECKING, Any, Iterator, NamedTuple
+from typing import TYPE_CHECKING, Iterator, NamedTuple
 from xml.sax.saxutils import escape
 
 from pharos.errors import PharosError, UnknownNodeError
@@ -37,7 +37,6 @@ LEGEND = (
     ' frames: processes'
 )
 NODE_STYLE = 'shape=box, style="rounded,filled", fillcolor="#D9EAF7"'
-DEAD_NODE_STYLE = 'shape=box, style="rounded,filled", fillcolor="#EEEEEE"'
 TOPIC_STYLE = 'shape=box, style=filled, fillcolor="#FFF6D5"'
 FRAME_STYLE = 'style="rounded,filled"; color="#9AA5B1"; fillcolor="#F5F7F9"'
 
@@ -112,13 +111,6 @@ class Graph:
         edge_topics = {edge.topic for edge in self.edges}
         self.topics = {name: snapshot.topics[name] for name in sorted(edge_topics)}
 
-    def processes(self) -> dict[tuple[str, Any], list[str]]:
-        """Return ``{(host, process id): names of nodes}``."""
-        processes = collections.defaultdict(list)
-        for name in self.nodes:
-            processes[self._process_of(name)].append(name)
-        return processes
-
     def _process_of(self, name):
         """Return ``(host, process id)``; a node that does not tell it counts as a process."""
         node = self.nodes[name]
@@ -142,7 +134,10 @@ class Graph:
 
     def _text_lines(self):
         yield f'{self.snapshot.master}: {len(self.nodes)} nodes, {len(self.topics)} topics'
-        for (host, process_id), names in self.processes().items():
+        processes = collections.defaultdict(list)
+        for name in self.nodes:
+            processes[self._process_of(name)].append(name)
+        for (host, process_id), names in processes.items():
             yield f'process {process_id}, {host}'
             for name in names:
                 yield f'  {name}  {self.nodes[name].problem}'
@@ -163,20 +158,25 @@ class Graph:
         return '\n'.join(self._dot_lines())
 
     def _dot_lines(self):
-        clock_time = time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(self.snapshot.time))
         yield 'digraph pharos { rankdir=LR; newrank=true; ranksep=0.4; nodesep=0.14; nslimit=2'
         yield 'node [fontname="Helvetica", fontsize=11, height=0.3]; edge [arrowsize=0.7]'
-        yield f'label="{self.snapshot.master}, {clock_time}\\n{LEGEND}"; labeljust=l; fontsize=10'
-        for process, boxes in self._boxes_by_process().items():
-            if process is None:
-                yield from boxes
-            else:
-                host, process_id = process
-                frame_id = _dot_id('cluster', str(process))
-                yield f'subgraph {frame_id} {{ label="process {process_id}, {host}"'
-                yield f'labeljust=l; fontsize=10; {FRAME_STYLE}'
-                yield from boxes
-                yield '}'
+        yield f'label="{self.snapshot.master}\\n{LEGEND}"; labeljust=l; fontsize=10'
+        frames = collections.defaultdict(list)  # (host, process id) -> ids of nodes and topics
+        for name, node in self.nodes.items():
+            caption = 'does not answer' if node.problem else ''
+            yield _dot_box('n', name, caption, NODE_STYLE)
+            frames[self._process_of(name)].append(_dot_id('n', name))
+        for topic in self.topics:
+            yield _dot_box('t', topic, self._topic_label(topic), TOPIC_STYLE)
+            frames[self._topic_process(topic)].append(_dot_id('t', topic))
+        frames.pop(None, None)  # topics of several processes have no frame
+        for process, ids in frames.items():
+            host, process_id = process
+            frame_id = _dot_id('cluster', str(process))
+            yield f'subgraph {frame_id} {{ label="process {process_id}, {host}"'
+            yield f'labeljust=l; fontsize=10; {FRAME_STYLE}'
+            yield from ids
+            yield '}'
         for edge in self.edges:
             node_id = _dot_id('n', edge.node)
             topic_id = _dot_id('t', edge.topic)
@@ -186,22 +186,6 @@ class Graph:
             if not edge.transports:
                 yield f'{arrow} [{LOOSE_STYLE}]'
         yield '}'
-
-    def _boxes_by_process(self):
-        """Return ``{(host, process id): lines}``; the lines of None are outside all frames."""
-        boxes: dict[Any, list[str]] = {None: []}
-        for process in self.processes():
-            boxes[process] = []
-        for name, node in self.nodes.items():
-            if node.problem:
-                box = _dot_box('n', name, 'does not answer', DEAD_NODE_STYLE)
-            else:
-                box = _dot_box('n', name, '', NODE_STYLE)
-            boxes[self._process_of(name)].append(box)
-        for topic in self.topics:
-            box = _dot_box('t', topic, self._topic_label(topic), TOPIC_STYLE)
-            boxes[self._topic_process(topic)].append(box)
-        return boxes
 
     def _topic_process(self, topic):
         """Return the process of the publishers, or else of the subscribers; None if of several."""
