@@ -75,7 +75,7 @@ class Graph:
     """The graph of a master; :meth:`Master.graph` makes one.
 
     :ivar nodes: ``{name: NodeReport}``
-    :ivar topics: ``{name: type}``
+    :ivar topics: ``{name: type}``, '*' if the master knows no type
     :ivar edges: the arrows, each an :class:`Edge`
     :ivar rates: ``{topic: messages a second}``, empty if they were not measured
     """
@@ -109,7 +109,8 @@ class Graph:
                 ]
                 self.edges.append(Edge(name, topic, True, links))
         edge_topics = {edge.topic for edge in self.edges}
-        self.topics = {name: snapshot.topics[name] for name in sorted(edge_topics)}
+        types = snapshot.topic_types
+        self.topics = {name: types.get(name, '*') for name in sorted(edge_topics)}
 
     def _process_of(self, name):
         """Return ``(host, process id)``; a node that does not tell it counts as a process."""
@@ -120,7 +121,7 @@ class Graph:
 
     def _topic_label(self, topic):
         """Return the type of a topic, and the rate if one was measured."""
-        label = self.topics[topic] or 'type unknown'
+        label = self.topics[topic]
         rate = self.rates.get(topic)
         if rate:
             label += f', {short_number(rate)} Hz'

@@ -60,7 +60,7 @@ class Snapshot:
     master: str  # its URL
     time: float  # seconds, as of time.time()
     nodes: dict[str, NodeReport]
-    topics: dict[str, str]  # name -> type, '' if the master knows none
+    topic_types: dict[str, str]  # '*' for a topic that has only subscribers, of any type
     links: dict[Link, Traffic]  # traffic since the links began
 
     def rates_since(self, start: Snapshot) -> dict[Link, Traffic]:
@@ -84,20 +84,15 @@ def take_snapshot(master: Master) -> Snapshot:
     """
     topic_types = dict(master.call('getTopicTypes'))
     nodes: dict[str, NodeReport] = {}
-    topics: set[str] = set()
     for registry, registrations in zip(REGISTRIES, master.system_state()):
         for name, users in sorted(registrations.items()):
-            for user in sorted(set(users)):
+            for user in users:
                 node = nodes.setdefault(user, NodeReport(user))
                 getattr(node, registry).append(name)
-    for node in nodes.values():
-        topics.update(node.publishes, node.subscribes)
     with concurrent.futures.ThreadPoolExecutor(MAX_THREADS) as pool:
         list(pool.map(lambda node: _ask_node(master, node), nodes.values()))
-    # The master tells '*' if the topic has only subscribers, of any type.
-    types = {topic: topic_types.get(topic, '').replace('*', '') for topic in sorted(topics)}
     links = _merge_links(nodes.values())
-    return Snapshot(master.url, time.time(), dict(sorted(nodes.items())), types, links)
+    return Snapshot(master.url, time.time(), dict(sorted(nodes.items())), topic_types, links)
 
 
 def _ask_node(master, node):
