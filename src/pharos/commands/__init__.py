@@ -25,7 +25,7 @@ import rosgraph
 
 import pharos
 
-#: name of a command, and of its function -> module; compose has a main(), for its status
+#: name of a command, and of its function -> module; compose has a main(), too, which ends its threads
 COMMANDS = {
     'workspace': 'workspace',
     'compose': 'compose',
@@ -53,7 +53,7 @@ def main() -> int:
     return run_command(name)
 
 
-def argument_parser(command: Callable[[list[str]], None]) -> argparse.ArgumentParser:
+def argument_parser(command: Callable[[list[str]], int | None]) -> argparse.ArgumentParser:
     """Return a parser of arguments; the docstring of the command is its help."""
     return argparse.ArgumentParser(
         description=inspect.getdoc(command), formatter_class=argparse.RawDescriptionHelpFormatter
@@ -63,12 +63,13 @@ def argument_parser(command: Callable[[list[str]], None]) -> argparse.ArgumentPa
 def run_command(name: str) -> int:
     """Run the command of that name with the program's arguments, and return the exit status.
 
-    Remappings of ROS are not passed on. An error that the user can mend is printed in one line.
+    The command gets no remappings of ROS. An error that the user can mend is printed in one line.
     """
     try:
         module = importlib.import_module(f'pharos.commands.{COMMANDS[name]}')
-        getattr(module, name)(rosgraph.myargv()[1:])
+        status = getattr(module, name)(rosgraph.myargv()[1:])
         sys.stdout.flush()
+        return status or 0
     except BrokenPipeError:  # by `| head`; the exit of Python flushes once more
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (pharos.PharosError, ValueError, OSError, re.error) as error:

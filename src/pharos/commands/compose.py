@@ -1,14 +1,6 @@
-"""Run the Python nodes of a launch file, or several programs, unmodified, in one process.
+"""The command compose."""
+from __future__ import annotations
 
-  compose PKG FILE.launch [arg:=value ...]     as roslaunch; nodes that are not Python run apart
-  compose FILE.launch [arg:=value ...]         the same, by its path
-  compose --script PKG/EXECUTABLE ... [_rate:=5 old:=new ...]    programs, as rosrun runs them
-  compose talker.py ...                        the same, by paths
-
-Programs with windows, and those with a state that a process has but once, run as plain processes; a line
-says which and why. It ends when all nodes have ended, or by Ctrl-C.
-"""
-import argparse
 import contextlib
 import faulthandler
 import os
@@ -16,34 +8,40 @@ import sys
 
 import rospkg
 
-from pharos import Master, PharosError
+from pharos import Master
+from pharos.commands import argument_parser, run_command
 from pharos.compose.composition import SWITCH_INTERVAL, Composition, leave
 from pharos.compose.launch_file import LaunchFile
 from pharos.waiting import wait
 
 
-def main(argv=None):
-    """Start, wait, and return the exit status."""
+def main() -> int:
+    """Run the command, and return the exit status."""
+    return leave(run_command('compose'))
+
+
+def compose(arguments: list[str]) -> int:
+    """Run the Python nodes of a launch file, or several programs, unmodified, in one process.
+
+      compose PKG FILE.launch [arg:=value ...]     as roslaunch; nodes that are not Python run apart
+      compose FILE.launch [arg:=value ...]         the same, by its path
+      compose --script PKG/EXECUTABLE ... [_rate:=5 old:=new ...]    programs, as rosrun runs them
+      compose talker.py ...                        the same, by paths
+
+    Programs with windows, and those with a state that a process has but once, run as plain processes; a line
+    says which and why. It ends when all nodes have ended, or by Ctrl-C.
+    """
     faulthandler.enable(all_threads=False)  # a crash in C says where in Python it was
     sys.setswitchinterval(SWITCH_INTERVAL)
-    options, mappings = _parse(sys.argv[1:] if argv is None else argv)
-    status = 0
+    options = _parse(arguments)
+    mappings = [each for each in sys.argv if ':=' in each]
     with contextlib.ExitStack() as stack:
-        try:
-            status = _run(stack, options, mappings)
-        except (PharosError, ValueError) as error:
-            print(f'compose: {error}', file=sys.stderr)
-            status = 1
-        except KeyboardInterrupt:
-            pass
-    return leave(status)
+        status = _run(stack, options, mappings)
+    return status
 
 
 def _parse(arguments):
-    """Return the options, and the arguments of the form name:=value."""
-    parser = argparse.ArgumentParser(
-        'compose', description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argument_parser(compose)
     parser.add_argument('file', nargs='*', help='PKG FILE.launch, or its path alone')
     parser.add_argument('--script', nargs='+', default=[], help='programs to run')
     parser.add_argument('--only', nargs='+', default=[], help='of the file, these nodes alone')
@@ -64,8 +62,7 @@ def _parse(arguments):
             dest='output',
             help=f"all nodes have output='{output}'",
         )
-    options = parser.parse_args([each for each in arguments if ':=' not in each])
-    mappings = [each for each in arguments if ':=' in each]
+    options = parser.parse_args(arguments)
     if options.file and options.file[0].endswith('.py'):
         options.script = options.file
         options.file = []
@@ -74,7 +71,7 @@ def _parse(arguments):
     names_nodes = options.only or options.apart or options.group
     if options.script and (options.file or names_nodes) or len(options.file) > 2:
         parser.error('give one launch file, by package and name or by its path, first; or --script')
-    return options, mappings
+    return options
 
 
 def _run(stack, options, mappings):
