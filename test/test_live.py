@@ -398,9 +398,9 @@ def test_keys_of_top_restart_a_node(master, tmp_path):
         with Terminal(master.url, 'rosrun', 'pharos', 'top', '--interval', '0.2') as top:
             top.wait_for('/clock')
             top.press('j', '/clock')
-            top.press('x', '/clock: stop done')
+            top.press('x', 'stop done: /clock')
             assert not master.call('lookupNode', '/clock')
-            top.press('a', '/clock: start done')
+            top.press('a', 'start done: /clock')
             assert master.node('/clock').uri != uri
         composed.signal(signal.SIGINT)
         composed.wait()

@@ -182,7 +182,7 @@ def _control(action, name, master):
     from pharos.compose.control import control
 
     try:
-        program = control(action, name, master)
+        answer = control(action, name, master)
     except PharosError as error:
         return str(error)
-    return f'{program}: {action} done'
+    return f'{action} done: {answer}'
