@@ -9,6 +9,7 @@ import pickle
 import signal
 import socket
 import sys
+import tempfile
 import threading
 import time
 
@@ -382,32 +383,28 @@ class _Part:
 
     :param entries: an :class:`Entry` for each node
     :param command: the command of the process
-    :param data_of: ``data_of(entries)`` is pickled for a program of this package, which gets the
-        file with that, and the number of this process
+    :param parcel_of: ``parcel_of(entries)`` is pickled for a program of this package, which gets
+        the file with that, and the number of this process
     :ivar is_told: True if the end of the process has been looked at
     """
 
-    def __init__(self, master, entries, command, data_of=None):
+    def __init__(self, master, entries, command, parcel_of=None):
         self.entries = entries
         self._master = master
         self._command = command
-        self._data_of = data_of
+        self._parcel_of = parcel_of
 
     def start(self):
         """Start the process with the nodes in ``entries``."""
         self.is_told = False
         self._comeback_time = math.inf  # as of time.monotonic(); infinity: nobody respawns
-        url = self._master.url
-        if not self._data_of:
-            self.process = RosProcess(self._command, url, Transcript.show, stdin=None)
-            return
-        with open(os.memfd_create('pharos'), 'wb') as file, _blocked_interrupts():
-            pickle.dump(self._data_of(self.entries), file)
-            file.flush()
-            command = [*self._command, f'/proc/self/fd/{file.fileno()}', str(os.getpid())]
-            self.process = RosProcess(
-                command, url, Transcript.show, stdin=None, pass_fds=[file.fileno()]
-            )
+        command = self._command
+        if self._parcel_of:
+            with tempfile.NamedTemporaryFile(delete=False) as file:  # the process deletes the file
+                pickle.dump(self._parcel_of(self.entries), file)
+            # the process takes no SIGINT until it says so: an import may lose the signal
+            command = ['env', '--block-signal=INT', *command, file.name, str(os.getpid())]
+        self.process = RosProcess(command, self._master.url, Transcript.show, stdin=None)
 
     @property
     def names(self):
@@ -445,16 +442,6 @@ class _Part:
             self.entries = [each for each in self.entries if each.roslaunch_node.respawn]
             delays = [float(entry.roslaunch_node.respawn_delay) for entry in self.entries]
             self._comeback_time = time.monotonic() + max(delays)
-
-
-@contextlib.contextmanager
-def _blocked_interrupts():
-    """Have a new process take no SIGINT until it says so: an import may lose the signal."""
-    former_mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, former_mask)
 
 
 def leave(status):

@@ -26,11 +26,10 @@ def end_with(parent):
 
 
 def read_parcel(path):
-    """Return what is pickled in a file that the parent has passed on, and close the file."""
+    """Return the object that the parent has pickled in a file, and delete the file."""
     with open(path, 'rb') as file:
-        parcel = pickle.load(file)
-    os.close(int(os.path.basename(path)))  # else the nodes would inherit the descriptor
-    return parcel
+        os.remove(path)
+        return pickle.load(file)
 
 
 def main(path, parent):
