@@ -22,7 +22,7 @@ from rosgraph.names import get_ros_namespace, load_mappings, ns_join
 from pharos import signals
 from pharos.compose import control, roslaunch_parent
 from pharos.compose.child_process import RosProcess, find_program
-from pharos.compose.launch_file import Entry, Group, LaunchFile
+from pharos.compose.launch_file import Entry, LaunchFile
 from pharos.compose.script import ScriptNode, name_of_file, wait_for_end
 from pharos.compose.sources import (
     needs_process,
@@ -162,9 +162,16 @@ class Composition:
             groups[group].append(entry)
         own_entries = groups.pop('', [])
         search_path = os.pathsep.join(folder for folder in sys.path if folder)
-        command = ['env', f'PYTHONPATH={search_path}', sys.executable, '-m', 'pharos.compose.group']
+        command = [
+            'env',
+            f'PYTHONPATH={search_path}',
+            f'PHAROS_SHARED_MEMORY={int(self.master.shared_memory)}',
+            sys.executable,
+            '-m',
+            'pharos.compose.group',
+        ]
         for group_entries in groups.values():
-            self._start_part(group_entries, command, self._group_of)
+            self._start_part(group_entries, command, list)
         self.start_entries(own_entries)
 
     def start_entries(self, entries):
@@ -182,10 +189,6 @@ class Composition:
         self._has_started = True
         self._parts.append(part)
         return part
-
-    def _group_of(self, entries):
-        master = self.master
-        return Group(entries, master.url, master.shared_memory)
 
     @contextlib.contextmanager
     def _show_failure(self, name):

@@ -1,7 +1,8 @@
 """Run a group of programs in a process of their own: ``python3 -m pharos.compose.group FILE PARENT``.
 
-A composition starts this program for each of its groups. FILE has a pickled Group. The program ends
-when its programs have ended, when a required one has, and when the process PARENT has ended.
+A composition starts this program for each of its groups. FILE has the pickled list of entries. The
+environment names the master. The program ends when its programs have ended, when a required one has,
+and when the process PARENT has ended.
 """
 import faulthandler
 import signal
@@ -16,13 +17,13 @@ def main(path: str, parent: int) -> int:
     """Run the group in a file, and return the exit status of its composition."""
     faulthandler.enable(all_threads=False)
     sys.setswitchinterval(SWITCH_INTERVAL)
-    group = read_parcel(path)
+    entries = read_parcel(path)
     end_with(parent)
     try:
-        master = Master(group.url, group.shared_memory)
+        master = Master()
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])  # the parent has blocked it
         with Composition(master, owns_process=True) as composition:
-            composition.start_entries(group.entries)
+            composition.start_entries(entries)
             return composition.wait()
     except KeyboardInterrupt:
         return 0

@@ -43,14 +43,6 @@ class Entry(NamedTuple):
     is_here: bool = False
 
 
-class Group(NamedTuple):
-    """The nodes of a process, and the settings of their master."""
-
-    entries: list[Entry]
-    url: str
-    shared_memory: bool
-
-
 class LaunchFile:
     """A launch file with all included files.
 
