@@ -91,8 +91,6 @@ class Composition:
         launch_file.set_parameters(run_id)
         for text in launch_file.config.config_errors:
             Transcript.show(text)
-        for name, reason in launch_file.reasons.items():
-            Transcript.show(f'{name} runs as a plain process: {reason}')
         if launch_file.entries_apart:
             command = [sys.executable, roslaunch_parent.__file__]
             self._roslaunch_part = self._start_part(

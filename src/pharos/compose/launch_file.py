@@ -46,8 +46,8 @@ class Entry(NamedTuple):
 class LaunchFile:
     """A launch file with all included files.
 
-    A name of a node may lack its slash, or its namespace. The Transcript shows why a node cannot
-    start at all.
+    A name of a node may lack its slash, or its namespace. The Transcript shows why a node runs
+    as a plain process, or cannot start at all.
 
     :param url: the URL of the master
     :param package: None: ``file`` is a path
@@ -60,7 +60,6 @@ class LaunchFile:
     :ivar config: roslaunch's configuration
     :ivar entries: an :class:`Entry` for each node of this process and of groups
     :ivar entries_apart: one for each plain process, without its program
-    :ivar reasons: the names of nodes apart -> texts that say why they are
     :raises UnknownNodeError: if there is no such package, file, argument or node
     :raises PharosError: if roslaunch cannot read the file
     """
@@ -73,7 +72,6 @@ class LaunchFile:
         self.config.master.uri = url
         self.entries: list[Entry] = []
         self.entries_apart: list[Entry] = []
-        self.reasons: dict[str, str] = {}
         nodes = {
             rosgraph.names.ns_join(node.namespace, node.name): node for node in self.config.nodes
         }
@@ -134,7 +132,7 @@ class LaunchFile:
             Transcript.show(f'{name} is not started: {error}')
             return
         if reason:
-            self.reasons[name] = reason
+            Transcript.show(f'{name} runs as a plain process: {reason}')
             self.entries_apart.append(Entry(name, '', [], node))
             return
         self.entries.append(Entry(name, source_of(command[0]), command[1:], node, group, is_here))
