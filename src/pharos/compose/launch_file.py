@@ -1,7 +1,6 @@
 """Launch files, read by roslaunch itself: some of their nodes can run in this process."""
 from __future__ import annotations
 
-import copy
 import os
 from typing import Any, NamedTuple
 
@@ -164,12 +163,9 @@ class LaunchFile:
 
     def config_of(self, entries):
         """Return a configuration with nothing but some nodes, for a process of roslaunch."""
-        config = copy.copy(self.config)
+        config = roslaunch.config.ROSLaunchConfig()
+        config.master = self.config.master
+        config.machines = self.config.machines
         config.nodes = [entry.roslaunch_node for entry in entries]
-        config.nodes_core = []
-        config.tests = []
-        config.executables = []
-        config.params = {}
-        config.clear_params = []
-        config.config_errors = []
+        config.assign_machines()
         return config
