@@ -140,7 +140,6 @@ class ScriptRun(Run):
         stand_ins['os'].getenv = self.environ.get
         stand_ins['os']._exit = self.exit_now
         stand_ins['os'].open = self.open_descriptor
-        stand_ins['asyncio'] = _Asyncio(self)
         stand_ins['pharos'] = _Pharos(self)
         self.stdout = NamedLines(sys.__stdout__, self)
         self.stderr = NamedLines(sys.__stderr__, self)
@@ -286,6 +285,8 @@ class ScriptRun(Run):
         """Run the program to its end, with its threads and exit functions; stop the node."""
         current.node = self.node
         current.run = self
+        # asyncio itself makes one in the main thread of the process alone
+        asyncio.set_event_loop(asyncio.new_event_loop())
         main_module = types.ModuleType('__main__')
         main_module.__file__ = self.node.path
         remember_text(main_module)
@@ -607,22 +608,6 @@ class NamedLines:
         with contextlib.suppress(OSError, ValueError):
             self._stream.write(text)
             self._stream.flush()
-
-
-class _Asyncio(Shim):
-    """A stand-in for asyncio that gives the main thread of a program an event loop.
-
-    asyncio itself makes a loop in the main thread of the process alone.
-    """
-
-    def __init__(self, run):
-        super().__init__(asyncio, _run=run, _has_loop=False)
-
-    def __getattr__(self, name):
-        if not self._has_loop and threading.current_thread() is self._run.main:
-            self._has_loop = True
-            asyncio.set_event_loop(asyncio.new_event_loop())
-        return super().__getattr__(name)
 
 
 class _Pharos(Shim):
