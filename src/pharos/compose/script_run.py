@@ -60,7 +60,7 @@ class ScriptRun(Run):
     this order.
 
     :ivar is_end_requested: True: the stop has begun
-    :ivar has_signal, pending_signal: a signal waits for the main thread
+    :ivar pending_signal: a signal waits for the main thread
     :ivar signal_accepted: the program's handlers run
     :ivar has_run_hooks: True: the hooks of rospy.on_shutdown() run, or have run
     :ivar stopping: ``is_shutdown()`` is True
@@ -73,7 +73,6 @@ class ScriptRun(Run):
     is_registered = False  # True once rospy.init_node() has registered the node
     is_starting = True  # False once start() has returned
     is_end_requested = False
-    has_signal = False
     has_run_hooks = False
     left_threads = ()  # of the program, which do not end at their next line
     main_has_ended = True  # there is no main thread yet; False from start() on
@@ -389,7 +388,7 @@ class ScriptRun(Run):
 
     def checkpoint(self):
         """Handle a pending signal if this is the main thread; wait if another thread handles it."""
-        if self.has_signal and threading.current_thread() is self.main:
+        if self.is_end_requested and threading.current_thread() is self.main:
             self.handle_signal()
 
     def handle_signal(self):
@@ -503,7 +502,6 @@ class ScriptRun(Run):
         for child in filter(is_alive, self.children):
             interrupt(child)
         if not self.main_has_ended:
-            self.has_signal = True
             self.pending_signal.set()
             threads = [self.main]
             is_accepted = self.signal_accepted.wait(SIGNAL_LIMIT)
