@@ -202,13 +202,6 @@ class ScriptRun(Run):
         """Stand in for ``threading.excepthook``."""
         self.print_error(*args[:3], f'Exception in thread {args.thread.name}:\n')
 
-    def show_error(self, error, show):
-        """Call ``show(class, error, traceback)``, a hook that the program may have set."""
-        try:
-            show(type(error), error, error.__traceback__)
-        except Exception as new_error:
-            self.show_error(new_error, self.print_error)
-
     # -- start
 
     def start(self):
@@ -276,9 +269,9 @@ class ScriptRun(Run):
         except Exception as error:
             if self.lifecycle is Lifecycle.STOPPED:
                 return  # the hook is gone with the program
-            hook = self.modules.by_name['threading'].excepthook
-            self.show_error(error, lambda *facts: hook(ExceptHookArgs([*facts, thread])))
             self.keep_failure(error, thread.name)
+            hook = self.modules.by_name['threading'].excepthook
+            hook(ExceptHookArgs([type(error), error, error.__traceback__, thread]))
 
     def run_main(self):
         """Run the program to its end, with its threads and exit functions; stop the node."""
@@ -291,8 +284,9 @@ class ScriptRun(Run):
         remember_text(main_module)
         vars(main_module)['__builtins__'] = self.modules.builtins
         self.modules.by_name['__main__'] = main_module
-        status = self._run_code(vars(main_module))
+        status = 1  # stays if the program's own sys.excepthook raises an exception
         try:
+            status = self._run_code(vars(main_module))
             self._run_all(self.thread_exit_functions)
             self._join_threads()
             # rospy's own function was the first to be registered, and comes last
@@ -316,7 +310,7 @@ class ScriptRun(Run):
         except SystemExit as error:
             return self._status_of(error)
         except BaseException as error:
-            self.show_error(error, self.modules.by_name['sys'].excepthook)
+            self.modules.by_name['sys'].excepthook(type(error), error, error.__traceback__)
             if isinstance(error, KeyboardInterrupt):
                 return -signal.SIGINT
             if self.is_starting and not self.is_known:
@@ -331,7 +325,7 @@ class ScriptRun(Run):
             try:
                 function()
             except (Exception, SystemExit, KeyboardInterrupt) as error:
-                self.show_error(error, self.print_error)
+                self.print_error(type(error), error, error.__traceback__)
                 self.keep_failure(error, block_name(function.func))
 
     def exit_now(self, status):
@@ -471,7 +465,7 @@ class ScriptRun(Run):
                 hook()
             except (Exception, SystemExit) as error:
                 if error is not self.exit_request:  # of os._exit()
-                    self.show_error(error, self.print_error)
+                    self.print_error(type(error), error, error.__traceback__)
                     self.keep_failure(error, block_name(hook))
         self.close_rospy(STOP_LIMIT)
 
