@@ -128,7 +128,9 @@ class Composition:
             path = find_program(package, executable)
         path = os.path.abspath(path)
         name = ns_join(get_ros_namespace(argv=arguments), name_of_file(path))
-        entry = Entry(name, source_of(path), arguments, None, is_here=is_here)
+        # a node without a name: that of the program holds
+        roslaunch_node = roslaunch.core.Node('pharos', 'program', output='screen')
+        entry = Entry(name, source_of(path), arguments, roslaunch_node, is_here=is_here)
         command = [path]
         reason = why_not_this_python(path, needs_first_line=False)
         if not reason and not is_here:
@@ -151,8 +153,7 @@ class Composition:
             group = entry.group
             reason = ''
             if not (group or entry.is_here or is_alone):
-                environ = entry.roslaunch_node.env_args if entry.roslaunch_node else ()
-                reason = why_own_group(entry.path, environ)
+                reason = why_own_group(entry.path, entry.roslaunch_node.env_args)
             if reason:
                 group = entry.name
             if group:
@@ -204,12 +205,11 @@ class Composition:
         node = ScriptNode.__new__(ScriptNode)
         node._configure(Settings(entry.name, self.master, None, (0, 0), ()), None, None)
         roslaunch_node = entry.roslaunch_node
-        environ = roslaunch_node.env_args if roslaunch_node else ()
-        ScriptNode.__init__(node, entry.path, entry.args, None, environ)
+        ScriptNode.__init__(node, entry.path, entry.args, None, roslaunch_node.env_args)
         node.init_timeout = HEAD_START
         node.owns_process = owns_process
         node.roslaunch_node = roslaunch_node
-        if roslaunch_node and roslaunch_node.output != 'screen':
+        if roslaunch_node.output != 'screen':
             log = load_mappings(entry.args)['__log']
             node.output_file = log.replace('.log', '-stdout.log')  # as roslaunch names it
         self.nodes.append(node)
@@ -228,8 +228,7 @@ class Composition:
         if self._stopped_nodes:
             return False
         for node in self.nodes:
-            respawns = node.roslaunch_node and node.roslaunch_node.respawn
-            if respawns or node.lifecycle is not Lifecycle.STOPPED:
+            if node.roslaunch_node.respawn or node.lifecycle is not Lifecycle.STOPPED:
                 return False
         return all(part.is_over for part in self._parts)
 
@@ -283,8 +282,6 @@ class Composition:
             self._end_times[node] = now
             Transcript.show(f'{name} has ended, with exit code {node.exit_code}')
         roslaunch_node = node.roslaunch_node
-        if not roslaunch_node:
-            return
         if roslaunch_node.required:
             self._end(name)
         elif roslaunch_node.respawn:
@@ -341,7 +338,7 @@ class Composition:
         self.stop()
         if self._has_failed or not self._has_started:
             return 1
-        if is_over and len(self.nodes) == 1 and not self.nodes[0].roslaunch_node:
+        if is_over and len(self.nodes) == 1 and not self.nodes[0].roslaunch_node.name:
             return self.nodes[0].exit_code or 0
         return 0
 
@@ -415,7 +412,7 @@ class _Part:
     @property
     def has_required(self):
         """True if the process has a required node."""
-        return any(entry.roslaunch_node.required for entry in self.entries if entry.roslaunch_node)
+        return any(entry.roslaunch_node.required for entry in self.entries)
 
     @property
     def is_over(self):
@@ -438,8 +435,7 @@ class _Part:
         names = [entry.name for entry in self.entries]
         with contextlib.suppress(OSError, rosgraph.MasterException):
             rosnode.cleanup_master_blacklist(rosgraph.Master('/pharos', self._master.url), names)
-        nodes = [entry.roslaunch_node for entry in self.entries]
-        if any(node and node.respawn for node in nodes):
+        if any(entry.roslaunch_node.respawn for entry in self.entries):
             self.entries = [each for each in self.entries if each.roslaunch_node.respawn]
             delays = [float(entry.roslaunch_node.respawn_delay) for entry in self.entries]
             self._comeback_time = time.monotonic() + max(delays)

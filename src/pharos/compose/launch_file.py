@@ -29,7 +29,7 @@ class Entry(NamedTuple):
     :ivar name: the full name
     :ivar path: the file of the program
     :ivar args: the arguments of the program, with ROS's
-    :ivar roslaunch_node: roslaunch's Node
+    :ivar roslaunch_node: roslaunch's Node; it has no name if the program has no launch file
     :ivar group: the name of the group; '' for the composition's own process
     :ivar is_here: True: in the composition's own process, whatever the program has
     """
