@@ -4,7 +4,6 @@ import os
 import pathlib
 import re
 import sys
-import tokenize
 
 from pharos.errors import PharosError
 from pharos.private_rospy.loader import SYSTEM_FOLDERS, source_places
@@ -53,8 +52,8 @@ def compile_program(path):
     :raises PharosError: if the file cannot be read as Python 3
     """
     try:
-        with tokenize.open(path) as file:
-            return compile(file.read(), path, 'exec', dont_inherit=True)
+        # compile() decodes bytes as the file's first lines say
+        return compile(pathlib.Path(path).read_bytes(), path, 'exec', dont_inherit=True)
     except (SyntaxError, ValueError, OSError) as error:
         line = getattr(error, 'lineno', None) or 1
         raise PharosError(f'{path}:{line}: cannot be read as Python 3: {error}') from error
