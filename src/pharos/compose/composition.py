@@ -331,7 +331,11 @@ class Composition:
             started; the status of the program if there is but one, without a launch file
         :raises TimeoutError: if not all nodes have ended in time
         """
-        wait_for_end(self._must_end, timeout, 'the composition')
+        wait_for_end(
+            lambda: self.is_over or self.stopping.is_set() or signals.is_ending(),
+            timeout,
+            'the composition',
+        )
         is_over = self.is_over
         if is_over:
             self._watcher.join()  # the watcher shows all ends before this returns
@@ -341,9 +345,6 @@ class Composition:
         if is_over and len(self.nodes) == 1 and not self.nodes[0].roslaunch_node.name:
             return self.nodes[0].exit_code or 0
         return 0
-
-    def _must_end(self):
-        return self.is_over or self.stopping.is_set() or signals.is_ending()
 
     def stop(self) -> None:
         """End all nodes, also those in processes of their own, and wait for their ends.

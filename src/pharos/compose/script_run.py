@@ -410,14 +410,6 @@ class ScriptRun(Run):
             return [signal.SIGINT, signal.SIGTERM]
         return [signal.SIGINT]
 
-    def _start_handling(self):
-        """Have another thread handle the signal; return a list of that thread."""
-        thread = self.start_thread(self.handle_signal_for_main)
-        if thread:
-            return [thread]
-        self.handle_signal_for_main()  # the interpreter ends, and starts no thread
-        return []
-
     def handle_signal_for_main(self):
         """Handle the signal in this thread: the main thread is blocked or computes.
 
@@ -500,7 +492,11 @@ class ScriptRun(Run):
             threads = [self.main]
             is_accepted = self.signal_accepted.wait(SIGNAL_LIMIT)
             if not is_accepted:
-                threads += self._start_handling()
+                thread = self.start_thread(self.handle_signal_for_main)
+                if thread:
+                    threads.append(thread)
+                else:  # the interpreter ends, and starts no thread
+                    self.handle_signal_for_main()
             if join(threads, timeout):
                 self.ros.logwarn(f'left behind, since it did not end in time: {self.node.path}')
                 self.raise_in_main(SystemExit())
