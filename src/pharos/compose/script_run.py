@@ -50,7 +50,8 @@ def start_child(original, run, self, *args, env=None, **kwargs):
     The end of the program interrupts the child, as roslaunch and a terminal do.
     """
     original(self, *args, env=run.environ if env is None else env, **kwargs)
-    run.children = [*filter(is_alive, getattr(run, "children", ())), self]
+    former_children = getattr(run, 'children', ())
+    run.children = [self, *(child for child in former_children if child.poll() is None)]
 
 
 class ScriptRun(Run):
@@ -355,7 +356,7 @@ class ScriptRun(Run):
     def _status_of(self, exit_request):
         """Return the exit status of a SystemExit; print its text if it has one."""
         if isinstance(exit_request.code, str):
-            self.print(exit_request.code, file=self.modules.by_name['sys'].stderr)
+            self.stderr.write(f'{exit_request.code}\n')
             return 1
         return exit_request.code or 0
 
@@ -485,7 +486,7 @@ class ScriptRun(Run):
         :param timeout: seconds for the main thread, which then gets a SystemExit
         """
         self.is_end_requested = True
-        for child in filter(is_alive, self.children):
+        for child in self.children:
             interrupt(child)
         if not self.main_has_ended:
             self.pending_signal.set()
@@ -534,11 +535,6 @@ class ScriptRun(Run):
         if not signals.is_ending():
             gc.collect()
         self._close_descriptors()
-
-
-def is_alive(process):
-    """True if a subprocess.Popen goes on."""
-    return process.poll() is None
 
 
 def end_reads(thread):
