@@ -105,7 +105,10 @@ class ScriptRun(Run):
 
     def substitutes(self):
         """Return the stand-ins that the program imports for some modules of Python."""
-        self.process_environ = dict(os.environ)
+        # without ${node}: NamedLines puts the node's name in front
+        self.environ['ROSCONSOLE_FORMAT'] = os.environ.get(
+            'ROSCONSOLE_FORMAT', '[${severity}] [${time}]: ${message}'
+        )
         if self.node.owns_process:  # code in C and shared modules see the program's variables
             os.environ.update(self.environ)
             self.environ = os.environ
@@ -149,10 +152,6 @@ class ScriptRun(Run):
         stand_ins['sys'].stdout = self.stdout
         stand_ins['sys'].stderr = self.stderr
         stand_ins['sys'].excepthook = self.print_error
-        # without ${node}: NamedLines puts the node's name in front
-        self.environ['ROSCONSOLE_FORMAT'] = self.process_environ.get(
-            'ROSCONSOLE_FORMAT', '[${severity}] [${time}]: ${message}'
-        )
         return stand_ins
 
     def _register_at_exit(self, function, *args, **kwargs):
@@ -529,9 +528,6 @@ class ScriptRun(Run):
         for failure in self.failures:
             failure.drop_frames()
         self.modules.by_name.clear()
-        if self.node.owns_process:
-            os.environ.clear()
-            os.environ.update(self.process_environ)
         if not signals.is_ending():
             gc.collect()
         self._close_descriptors()
