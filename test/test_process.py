@@ -32,7 +32,7 @@ class Driver:
     def __init__(self):
         self.device = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.device.bind(('127.0.0.1', {port}))
-        self.lock = os.open(SAID, os.O_RDWR)
+        self.lock = open(SAID)
         fcntl.flock(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self.subscriber = rospy.Subscriber('/wheels', String, self.drive)
         self.timer = rospy.Timer(rospy.Duration(0.01), self.look)

@@ -81,7 +81,6 @@ class ScriptRun(Run):
     def __init__(self, node, settings):
         self.process_id = os.getpid()  # os.fork() makes another one
         self.children = []  # processes, as subprocess.Popen
-        self.descriptors = {}  # of os.open() -> the status of the file
         self.exit_functions = []  # of atexit
         self.thread_exit_functions = []  # of threading._register_atexit, which run before
         self.threads_to_join = []  # those that are not daemons
@@ -142,7 +141,6 @@ class ScriptRun(Run):
         stand_ins['atexit'].unregister = lambda function: None
         stand_ins['os'].getenv = self.environ.get
         stand_ins['os']._exit = self.exit_now
-        stand_ins['os'].open = self.open_descriptor
         stand_ins['pharos'] = _Pharos(self)
         self.stdout = NamedLines(sys.__stdout__, self)
         self.stderr = NamedLines(sys.__stderr__, self)
@@ -158,23 +156,11 @@ class ScriptRun(Run):
         self.exit_functions.append(functools.partial(function, *args, **kwargs))
         return function
 
-    def open_descriptor(self, *args, **kwargs):
-        """Stand in for ``os.open``: the end of the program closes the descriptor."""
-        descriptor = os.open(*args, **kwargs)
-        self.descriptors[descriptor] = os.fstat(descriptor)
-        return descriptor
-
     def _tell_left_threads(self):
         left_threads = join({*self.threads, *self.left_threads}, BLOCK_LIMIT)
         if left_threads:
             names = ', '.join(thread.name for thread in left_threads)
             Transcript.show(f'{self.name} leaves threads that block, with what they use: {names}')
-
-    def _close_descriptors(self):
-        for descriptor, status in self.descriptors.items():
-            with contextlib.suppress(OSError):  # it is closed
-                if os.path.samestat(status, os.fstat(descriptor)):
-                    os.close(descriptor)
 
     def _handler_of(self, number):
         default = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
@@ -530,7 +516,6 @@ class ScriptRun(Run):
         self.modules.by_name.clear()
         if not signals.is_ending():
             gc.collect()
-        self._close_descriptors()
 
 
 def end_reads(thread):
