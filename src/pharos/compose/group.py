@@ -5,11 +5,10 @@ environment names the master. The program ends when its programs have ended, whe
 and when the process PARENT has ended.
 """
 import faulthandler
-import signal
 import sys
 
 from pharos.compose.composition import SWITCH_INTERVAL, Composition, leave
-from pharos.compose.roslaunch_parent import end_with, read_parcel
+from pharos.compose.roslaunch_parent import receive
 from pharos.master import Master
 
 
@@ -17,11 +16,9 @@ def main(path: str, parent: int) -> int:
     """Run the group in a file, and return the exit status of its composition."""
     faulthandler.enable(all_threads=False)
     sys.setswitchinterval(SWITCH_INTERVAL)
-    entries = read_parcel(path)
-    end_with(parent)
     try:
         master = Master()
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])  # the parent has blocked it
+        entries = receive(path, parent)
         with Composition(master, owns_process=True) as composition:
             composition.start_entries(entries)
             return composition.wait()

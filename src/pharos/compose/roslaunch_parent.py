@@ -14,8 +14,11 @@ import time
 PARENT_PERIOD = 1.0  # seconds between two looks at the parent
 
 
-def end_with(parent):
-    """Have this process end, as by Ctrl-C, when its parent has ended."""
+def receive(path, parent):
+    """Return the object that the parent has pickled in a file, and delete the file.
+
+    From now on, SIGINT and the end of the parent end this process, as Ctrl-C does.
+    """
 
     def watch():
         while os.getppid() == parent:
@@ -23,13 +26,11 @@ def end_with(parent):
         os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=watch, daemon=True).start()
-
-
-def read_parcel(path):
-    """Return the object that the parent has pickled in a file, and delete the file."""
     with open(path, 'rb') as file:
         os.remove(path)
-        return pickle.load(file)
+        parcel = pickle.load(file)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])  # the parent has blocked it
+    return parcel
 
 
 def main(path, parent):
@@ -40,12 +41,10 @@ def main(path, parent):
     """
     interrupts = []
     signal.signal(signal.SIGINT, lambda *_: interrupts.append(True))
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])  # the parent has blocked it
     import roslaunch.parent
     import roslaunch.rlutil
 
-    config = read_parcel(path)
-    end_with(parent)
+    config = receive(path, parent)
     run_id = roslaunch.rlutil.get_or_generate_uuid(None, False)
     roslaunch.configure_logging(run_id)
     launch = roslaunch.parent.ROSLaunchParent(run_id, [], show_summary=False)
