@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import os
+import pathlib
 import re
 from typing import Any
 
@@ -97,5 +98,4 @@ def load(master, package, executable, args, name, namespace, remap, params, here
 
 def name_of_file(path):
     """Return the name of a program's node until the program calls ``rospy.init_node``."""
-    file_name = re.sub(r'\.py$', '', os.path.basename(path))
-    return re.sub(r'\W|^(?=[^A-Za-z])', 'x', file_name)
+    return re.sub(r'\W|^(?=[^A-Za-z])', 'x', pathlib.Path(path).stem)
