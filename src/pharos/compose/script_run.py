@@ -273,10 +273,10 @@ class ScriptRun(Run):
         status = 1  # stays if the program's own sys.excepthook raises an exception
         try:
             status = self._run_code(vars(main_module))
-            self._run_all(self.thread_exit_functions)
+            self._run_all(self.thread_exit_functions, -1)
             self._join_threads()
             # rospy's own function was the first to be registered, and comes last
-            self._run_all(self.exit_functions)
+            self._run_all(self.exit_functions, -1)
         finally:
             self.stdout.flush()
             self.stderr.flush()
@@ -305,14 +305,19 @@ class ScriptRun(Run):
                 self.keep_failure(error, self.node.path)
             return 1
 
-    def _run_all(self, functions):
+    def _run_all(self, functions, position):
+        """Run functions of the program; each leaves the list before.
+
+        :param position: 0: the first one comes first; -1: the last one
+        """
         while functions:
-            function = functions.pop()
+            function = functions.pop(position)
             try:
                 function()
             except (Exception, SystemExit, KeyboardInterrupt) as error:
-                self.print_error(type(error), error, error.__traceback__)
-                self.keep_failure(error, block_name(function.func))
+                if error is not self.exit_request:  # of os._exit()
+                    self.print_error(type(error), error, error.__traceback__)
+                    self.keep_failure(error, block_name(getattr(function, 'func', function)))
 
     def exit_now(self, status):
         """Stand in for ``os._exit``: end the program, not the process, without hooks."""
@@ -436,15 +441,7 @@ class ScriptRun(Run):
         if self.has_run_hooks:
             return
         self.has_run_hooks = True
-        hooks = self.core._client_shutdown_hooks
-        while hooks:
-            hook = hooks.pop(0)
-            try:
-                hook()
-            except (Exception, SystemExit) as error:
-                if error is not self.exit_request:  # of os._exit()
-                    self.print_error(type(error), error, error.__traceback__)
-                    self.keep_failure(error, block_name(hook))
+        self._run_all(self.core._client_shutdown_hooks, 0)
         self.close_rospy(STOP_LIMIT)
 
     def stop_created_nodes(self):
