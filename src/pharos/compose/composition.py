@@ -17,7 +17,7 @@ import rosgraph
 import roslaunch.core
 import rosnode
 import rospkg
-from rosgraph.names import get_ros_namespace, load_mappings, ns_join
+from rosgraph.names import get_ros_namespace, ns_join
 
 from pharos import signals
 from pharos.compose import control, roslaunch_parent
@@ -100,9 +100,9 @@ class Composition:
         os.makedirs(log_folder, exist_ok=True)
         entries = []
         for number, entry in enumerate(launch_file.entries, 1):
-            log_name = f'{entry.name[1:].replace("/", "-")}-{number}.log'  # as roslaunch names logs
-            arguments = [*entry.args, f'__log:={log_folder}/{log_name}']
-            entries.append(entry._replace(args=arguments))
+            # as roslaunch names logs
+            log = f'{log_folder}/{entry.name[1:].replace("/", "-")}-{number}'
+            entries.append(entry._replace(args=[*entry.args, f'__log:={log}.log'], log=log))
         self._start_groups(entries)
 
     def run_scripts(self, programs, arguments, programs_here):
@@ -210,8 +210,7 @@ class Composition:
         node.owns_process = owns_process
         node.roslaunch_node = roslaunch_node
         if roslaunch_node.output != 'screen':
-            log = load_mappings(entry.args)['__log']
-            node.output_file = log.replace('.log', '-stdout.log')  # as roslaunch names it
+            node.output_file = f'{entry.log}-stdout.log'
         self.nodes.append(node)
         Transcript.show(f'{entry.name} starts')
         node._start_held()

@@ -32,6 +32,7 @@ class Entry(NamedTuple):
     :ivar roslaunch_node: roslaunch's Node; it has no name if the program has no launch file
     :ivar group: the name of the group; '' for the composition's own process
     :ivar is_here: True: in the composition's own process, whatever the program has
+    :ivar log: the path of the program's logs, but for their ends
     """
 
     name: str
@@ -40,6 +41,7 @@ class Entry(NamedTuple):
     roslaunch_node: Any
     group: str = ''
     is_here: bool = False
+    log: str = ''
 
 
 class LaunchFile:
