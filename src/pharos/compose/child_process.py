@@ -156,11 +156,9 @@ def descendants_of(process):
 
 def interrupt(process):
     """Send SIGINT to a subprocess.Popen and its descendants, as Ctrl-C in a terminal does."""
-    descendants = descendants_of(process)
-    process.send_signal(signal.SIGINT)
-    for child in descendants:
+    for each in [process, *descendants_of(process)]:
         with contextlib.suppress(psutil.Error):
-            child.send_signal(signal.SIGINT)
+            each.send_signal(signal.SIGINT)
 
 
 def find_program(package, executable):
