@@ -179,6 +179,7 @@ def test_health_counts_souls_and_the_log_names_what_is_left(master):
     assert (node.health().souls, node.health().ended_souls) == (1, ['short'])
     node.stop()
     log.wait_for(lambda line: 'left behind' in line.msg and 'stubborn' in line.msg)
+    assert '/node' not in str(master.system_state())
     free.set()
 
 
@@ -620,9 +621,6 @@ def test_stop_at_a_hanging_master_closes_connections(mortal):
     other.stop()
     os.kill(mortal.pid, signal.SIGCONT)
     assert not channel.connections
-
-
-# tcpros: if user != os.getuid(): => if False:
 
 
 def test_shared_memory_keeps_the_order_of_sending(master, node, monkeypatch):

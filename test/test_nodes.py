@@ -4,7 +4,6 @@ import socket
 import threading
 import urllib.parse
 
-import psutil
 import pytest
 import rosgraph_msgs.msg
 import rospy
@@ -105,13 +104,6 @@ def test_name_of_peer_is_refused(master, peer):
     assert peer.value('rospy.is_shutdown()') is False
 
 
-def test_name_of_dead_peer_is_free(master, peer):
-    peer.hear('/dead', STRING)
-    peer.end()
-    create(master, peer.name)
-    assert registrations(master, peer.name)[1] == []
-
-
 def test_first_node_takes_name_of_argv(master):
     argv = ['__name:=pilot', '__ns:=/robot', '/a:=/b']
     names = [create(master, name, argv=argv).name for name in ('one', 'two', 'three')]
@@ -138,12 +130,6 @@ def test_nodes_are_many_in_one_process(master):
     assert len({node.uri for node in nodes}) == len({node.tcp_port for node in nodes}) == 10
 
 
-def test_rosnode_lists_and_pings_node(master, node):
-    with Program(['rosnode', 'ping', '-c', '1', '/node'], master.url) as program:
-        assert program.wait() == 0
-        assert 'xmlrpc reply from http://127.0.0.1' in program.output
-
-
 # -- addresses
 
 
@@ -157,16 +143,6 @@ def test_ports_are_those_asked_for(master):
     assert urllib.parse.urlsplit(node.uri).port == ports[1]
 
 
-@pytest.mark.parametrize('which', ['tcp_port', 'xmlrpc_port'])
-def test_busy_port_leaves_nothing_behind(master, which):
-    with socket.create_server(('127.0.0.1', 0)) as taken:
-        port = taken.getsockname()[1]
-        with pytest.raises(pharos.PortInUseError, match=str(port)):
-            create(master, '/node', **{which: port})
-    assert registrations(master, '/node') == [[], [], []]
-    assert create(master, '/node', **{which: port}).is_running
-
-
 def test_impossible_port_is_refused(master):
     for port in [-1, 65536, 'any', 1.5]:
         with pytest.raises((ValueError, TypeError)):
@@ -176,14 +152,6 @@ def test_impossible_port_is_refused(master):
 def test_domain_is_what_node_advertises(master):
     node = create(master, '/node', domain='127.0.0.2')
     assert node.domain == urllib.parse.urlsplit(node.uri).hostname == '127.0.0.2'
-
-
-def test_loopback_domain_listens_there_alone(master):
-    node = create(master, '/node', domain='127.0.0.2')
-    connections = psutil.Process().connections('tcp')  # another process may have these ports
-    listening = [each.laddr for each in connections if each.status == psutil.CONN_LISTEN]
-    for port in node.tcp_port, node.xmlrpc_port:
-        assert [address.ip for address in listening if address.port == port] == ['127.0.0.2']
 
 
 def test_impossible_domain_is_refused(master):
@@ -197,24 +165,6 @@ def test_impossible_domain_is_refused(master):
 
 def test_keywords_go_to_init(master):
     assert create(master, '/driver', Driver, wheels=3).wheels == 3
-
-
-def test_unknown_keyword_is_a_type_error(master):
-    with pytest.raises(TypeError):
-        create(master, '/driver', Driver, wings=2)
-    assert registrations(master, '/driver') == [[], [], []]
-
-
-def test_class_must_be_a_node(master):
-    with pytest.raises(TypeError):
-        create(master, '/node', dict)
-
-
-def test_subclass_opens_channels_in_start(master, node):
-    create(master, '/driver', Driver)
-    box = Mailbox(node, '/steered', STRING)
-    node.send_to('/steer', data='left')
-    assert box.next().data == 'left 4'
 
 
 def test_failing_start_leaves_nothing(master):
@@ -242,18 +192,6 @@ def test_delegate_gets_message_and_channel(master, node):
     node.send_to('/a', data='hello')
     assert box.next().data == 'hello'
     assert box.next() is channel
-
-
-def test_new_delegate_takes_next_message(master, node):
-    first, second = Mailbox(), Mailbox()
-    other = create(master, '/other', delegate=first)
-    other.interested_in('/a', STRING)
-    node.send_to('/a', data='one')
-    assert first.next().data == 'one'
-    other.delegate = second
-    node.send_to('/a', data='two')
-    assert second.next().data == 'two'
-    assert len(first.all()) == 1
 
 
 def test_block_must_be_callable(node):
@@ -322,37 +260,6 @@ def test_stop_ends_soul(node, wait):
     assert not node.errors
 
 
-def test_soul_says_farewell(master, node):
-    box = Mailbox(create(master, '/ear'), '/speed', STRING)
-    began = threading.Event()
-
-    def soul(me):
-        try:
-            for _ in me.every(3600):
-                me.send_to('/speed', data='full')
-                began.set()
-        finally:
-            me.send_to('/speed', data='zero')
-
-    node.fork(soul)
-    assert began.wait(TIMEOUT)
-    node.stop()
-    assert [box.next().data for _ in range(2)] == ['full', 'zero']
-
-
-def test_stubborn_soul_is_left_behind(master):
-    class Hasty(BlockNode):
-        stop_timeout = 0.05
-
-    node, end = create(master, '/hasty', Hasty), threading.Event()
-    thread = node.fork(lambda me: end.wait(TIMEOUT))
-    node.stop()
-    assert thread.is_alive()
-    assert registrations(master, '/hasty') == [[], [], []]
-    end.set()
-    thread.join(TIMEOUT)
-
-
 def test_every_counts_its_turns(node):
     turns = []
     for turn in node.every(0.001):
@@ -408,16 +315,6 @@ def test_stop_unregisters_everything(master, node):
     assert registrations(master, '/node') == [[], [], []]
 
 
-def test_stop_frees_ports_and_threads(master):
-    threads = threading.active_count()
-    node = create(master)
-    ports = node.tcp_port, node.xmlrpc_port
-    node.stop()
-    for port in ports:
-        socket.create_server(('127.0.0.1', port)).close()
-    until(lambda: threading.active_count() <= threads + 1)
-
-
 def test_second_stop_does_nothing(node):
     node.stop()
     node.stop()
@@ -428,12 +325,6 @@ def test_second_start_is_an_error(node):
     with pytest.raises(PharosError):
         node.start()
     assert node.is_running
-
-
-def test_with_block_stops_node(master):
-    with create(master) as node:
-        assert node.is_running
-    assert not node.is_running
 
 
 def test_lifecycle_is_told(master):
@@ -476,14 +367,6 @@ def test_sent_before_stop_arrives(master, node, peer):
     assert [message.data for message in peer.heard('/a', 50)] == [str(n) for n in range(50)]
 
 
-def test_node_starts_again(master, node):
-    about = node.name, node.tcp_port, node.xmlrpc_port
-    node.stop()
-    node.start()
-    assert (node.name, node.tcp_port, node.xmlrpc_port) == about
-    assert '/node' in [each.name for each in master.nodes()]
-
-
 @pytest.mark.parametrize('again', ['start', 'restart'])
 def test_channels_and_services_come_back(master, node, again):
     other = create(master, '/other')
@@ -513,19 +396,6 @@ def test_start_of_class_opens_once(master, node):
     node.send_to('/steer', data='right')
     assert box.next().data == 'right 4'
     assert log == ['start', 'stop', 'start']
-
-
-def test_restart_forks_souls_again(node):
-    begun = threading.Semaphore(0)
-
-    def soul(me):
-        begun.release()
-        me.sleep(3600)
-
-    node.fork(soul)
-    assert begun.acquire(timeout=TIMEOUT)
-    node.restart()
-    assert begun.acquire(timeout=TIMEOUT)
 
 
 def test_overridden_stop_runs_at_rosnode_kill(master):
@@ -614,17 +484,6 @@ def test_rospy_of_node_is_whole(node):
     assert node.ros.Time.now().to_sec() > 0
 
 
-def test_imported_library_belongs_to_node(master, node):
-    filters = node.ros_import('message_filters')
-    heard = Mailbox()
-    filters.Subscriber('/a', pharos.message_class(STRING)).registerCallback(
-        lambda m: heard(m, None)
-    )
-    assert registrations(master, '/node')[1] == ['/a']
-    create(master, '/other').send_to('/a', data='x')
-    assert heard.next().data == 'x'
-
-
 @pytest.mark.parametrize(
     'level, number', [('info', 2), ('warn', 4), ('warning', 4), ('error', 8), ('fatal', 16)]
 )
@@ -650,9 +509,3 @@ def test_health_tells_about_node(master, node, peer):
     assert (health.dropped, health.errors) == (0, 0)
     assert health.threads > 0
     assert 'registered=True' in str(health)
-
-
-def test_other_process_sees_service_of_node(master, node, peer):
-    node.serve('/add', 'std_srvs/SetBool', lambda request: (request.data, 'done'))
-    answer = peer.value("rospy.ServiceProxy('/add', __import__('std_srvs.srv').srv.SetBool)(True)")
-    assert (answer.success, answer.message) == (True, 'done')

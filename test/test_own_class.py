@@ -153,6 +153,8 @@ MISTAKES = {
     'hidden': (lambda m: create(m, '/n', Hidden), TypeError, 'has delegate, as Node has'),
     'size': (lambda m: create(m).interested_in('/t', STRING, print, 'left'), ValueError, 'left'),
     'keyword': (lambda m: create(m, '/n', Wheeled, anonymous=True), TypeError, 'named=anonymous'),
+    'unknown': (lambda m: create(m, '/n', Wheeled, wings=2), TypeError, 'wings'),
+    'class': (lambda m: create(m, '/n', dict), TypeError, ''),
     'no super': (lambda m: create(m, '/n', Superless), PharosError, 'super'),
     'early': (lambda m: create(m, '/n', Early), NodeStoppedError, 'super'),
     'soul': (lambda m: create(m, '/n', soul=wait), TypeError, 'async'),
