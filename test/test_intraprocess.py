@@ -5,7 +5,6 @@ import xmlrpc.client
 
 import pytest
 
-import helpers
 import pharos
 from helpers import TIMEOUT, create
 from pharos.testing import Mailbox, until
@@ -75,20 +74,6 @@ def test_plain_rospy_goes_the_same_way(sender, hearer, sends, hears):
     assert transports(sender, '/a') == transports(hearer, '/a') == ['INTRAPROCESS']
 
 
-def test_nodes_of_other_masters_are_apart(master, sender):
-    there = helpers.InProcessMaster()
-    try:
-        other = pharos.Master(there.url)
-        with other.create(pharos.BlockNode, named='/hearer') as far:
-            box = Mailbox(far, '/a', STRING)
-            near = Mailbox(create(master, '/hearer'), '/a', STRING)
-            sender.send_to('/a', data='here')
-            assert near.next().data == 'here'
-            assert box.channel.connections == [] and box.empty()
-    finally:
-        there.stop()
-
-
 def test_restart_keeps_the_way(sender, hearer):
     box = Mailbox(hearer, '/a', STRING)
     out = sender.output_channel('/a', STRING)
@@ -98,16 +83,6 @@ def test_restart_keeps_the_way(sender, hearer):
         sender.send_to('/a', data=node.name)
         assert box.next().data == node.name
         assert out.connections == [('/hearer', 'INTRAPROCESS')]
-
-
-def test_nothing_comes_twice(master, sender):
-    boxes = [Mailbox(create(master, f'/hearer{n}'), '/a', STRING) for n in range(5)]
-    for number in range(20):
-        sender.send_to('/a', data=str(number))
-    sender.send_to('/a', data='end')
-    for box in boxes:
-        box.wait_for(lambda message: message.data == 'end')
-        assert [m.data for m in box.all()] == [*map(str, range(20)), 'end']
 
 
 # -- whose message
@@ -142,14 +117,6 @@ def test_shared_channel_gets_the_object(sender, hearer):
     hearer.interested_in('/a', IMAGE, delegate=box, shared=True)
     sent = sender.send_to('/a', data=b'abc')
     assert box.next() is sent
-
-
-def test_latched_message_stays_as_published(master, sender):
-    out = sender.output_channel('/a', POSE, latch=True)
-    sent = out.send()
-    sent.pose.position.x = 7.0
-    box = Mailbox(create(master, '/late'), '/a', POSE)
-    assert box.next().pose.position.x == 0.0
 
 
 # -- headers
@@ -199,18 +166,6 @@ def test_inline_delegate_runs_in_publishers_thread(sender, hearer):
     )
     sender.send_to('/a', data='x')
     assert threads == [threading.current_thread()]
-
-
-def test_blocked_delegate_holds_up_no_other(master, sender, hearer):
-    leave = threading.Event()
-    create(master, '/slow').interested_in(
-        '/a', STRING, delegate=lambda message, channel: leave.wait(TIMEOUT)
-    )
-    box = Mailbox(hearer, '/a', STRING)
-    for number in range(10):
-        sender.send_to('/a', data=str(number))
-    assert [box.next().data for _ in range(10)] == [str(number) for number in range(10)]
-    leave.set()
 
 
 @pytest.mark.parametrize('inline', [False, True], ids=['worker', 'inline'])

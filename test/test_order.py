@@ -238,29 +238,6 @@ def test_external_topics_keep_their_order(master):
     assert wrong <= TOLERATED
 
 
-def test_nothing_begins_after_stop_or_close(master):
-    """Messages that wait when a stop or a close begins are not delivered any more."""
-    node, mouth = create(master, '/ear'), create(master, '/mouth')
-    heard, may_go_on = [], threading.Event()
-
-    def take(message):
-        heard.append(message.data)
-        may_go_on.wait(30)
-
-    first = node.interested_in('/first', INT, take)
-    other = node.interested_in('/other', INT, heard.append)
-    for topic in '/first', '/other', '/first':
-        mouth.send_to(topic, typed_as=INT, data=1)
-    until(lambda: first.received)
-    other.close()
-    stop = threading.Thread(target=node.stop)
-    stop.start()
-    until(lambda: not node.is_running)
-    may_go_on.set()
-    stop.join()
-    assert heard == [1]
-
-
 def test_full_queue_of_two_publishers_goes_on(master):
     """Bursts of two publishers into a queue of one message: the last message always comes."""
     heard = Mailbox()

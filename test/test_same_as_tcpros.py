@@ -1,7 +1,6 @@
 """Messages arrive alike within a process, by shared memory, and over TCPROS."""
 import inspect
 import math
-import threading
 
 import numpy
 import pytest
@@ -115,29 +114,6 @@ def test_unfit_value_is_refused_alike(both, receivers):
 
 
 # -- queues
-
-
-@pytest.mark.parametrize('size, count', [(1, 40), (5, 3), (12, 40)])
-def test_full_queue_keeps_the_newest(both, size, count):
-    entered, leave, got = threading.Event(), threading.Event(), []
-
-    def delegate(message, channel):
-        got.append(message.data)
-        entered.set()
-        leave.wait(TIMEOUT)
-
-    channel = both.hearer.interested_in(
-        '/queue', 'std_msgs/Int32', delegate=delegate, queue_size=size
-    )
-    both.sender.send_to('/queue', typed_as='std_msgs/Int32', data=-1)
-    assert entered.wait(TIMEOUT)
-    for number in range(count):
-        both.sender.send_to('/queue', data=number)
-    leave.set()
-    until(lambda: len(got) + channel.dropped == count + 1)
-    assert got == [-1, *range(max(0, count - size), count)]
-    assert channel.dropped == max(0, count - size)
-    channel.close()
 
 
 # -- headers, latches, other classes

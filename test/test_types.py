@@ -384,11 +384,6 @@ def test_live_publisher_defines_type(master, peer, definition):
     assert (message.a, message.leg.length) == (5, 2.5)
 
 
-def test_unknown_type_without_publisher_raises(master):
-    with pytest.raises(UnknownTypeError, match='nobody_msgs/Leg'):
-        create(master).interested_in('/legs', 'nobody_msgs/Leg')
-
-
 # -- nonsense
 
 
