@@ -303,9 +303,9 @@ class Bench:
         path.chmod(0o755)
         return str(path)
 
-    def load(self, text, **options):
+    def load(self, text, *args, **options):
         """Load a script; the fixture of the master stops it."""
-        return self.master.load(self.write(text), **options)
+        return self.master.load(self.write(text), None, *args, **options)
 
     @contextlib.contextmanager
     def program(self, *words):

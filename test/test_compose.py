@@ -2,70 +2,21 @@
 import importlib
 import inspect
 import os
-import pathlib
-import shutil
 import signal
 import sys
-import textwrap
 import xmlrpc.client
-from unittest import mock
 
 import genpy
 import pytest
 import rospy
 
 import pharos
-from helpers import TIMEOUT, Peer, Program, create, registrations
+from helpers import ROOT, SPIN, TIMEOUT, Peer, Program, create, registrations
 from pharos import ExternalNode, Master, PharosError, ScriptNode, UnknownNodeError
 from pharos.testing import Mailbox, until
 
-ROBOT = pathlib.Path(__file__).parent / 'robot'
-COMPOSE = ['rosrun', 'pharos', 'compose']
+pytestmark = pytest.mark.usefixtures('bench')  # ROS finds the package robot
 STRING = 'std_msgs/String'
-HEAD = (
-    '#!/usr/bin/python3\nimport os, sys, threading\nimport rospy\nfrom std_msgs.msg import String\n'
-)
-SPIN = "rospy.init_node('program')\nrospy.spin()\n"
-
-
-@pytest.fixture(scope='module')
-def packages(tmp_path_factory):
-    """A folder with the package robot, where rospack does not ignore it."""
-    folder = tmp_path_factory.mktemp('packages')
-    shutil.copytree(
-        ROBOT, folder / 'robot', ignore=shutil.ignore_patterns('CATKIN_IGNORE', '*.pyc')
-    )
-    return folder
-
-
-@pytest.fixture(autouse=True)
-def package_path(packages, monkeypatch, tmp_path):
-    """ROS finds the package robot, and the package of the test's own scripts."""
-    (tmp_path / 'bench').mkdir()
-    (tmp_path / 'bench' / 'package.xml').write_text('<package><name>bench</name></package>')
-    paths = [packages, tmp_path / 'bench', os.environ.get('ROS_PACKAGE_PATH', ''), '/usr/share']
-    monkeypatch.setenv('ROS_PACKAGE_PATH', os.pathsep.join(map(str, paths)))
-    monkeypatch.setenv('ROS_HOME', str(tmp_path))
-
-
-@pytest.fixture
-def write(tmp_path):
-    """``write(text, name)`` makes a script of the package bench; returns its path."""
-
-    def write(text, name='program', head=HEAD):
-        path = tmp_path / 'bench' / name
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(head + textwrap.dedent(text))
-        path.chmod(0o755)
-        return str(path)
-
-    return write
-
-
-@pytest.fixture
-def load(master, write):
-    """``load(text, *args, **options)`` loads a script; the fixture of the master stops it."""
-    return lambda text, *args, **options: master.load(write(text), None, *args, **options)
 
 
 @pytest.fixture
@@ -75,16 +26,14 @@ def ends(master, tmp_path):
 
 
 @pytest.fixture
-def compose(master, tmp_path):
+def compose(master, bench):
     """``compose('<node .../>')`` or ``compose('a.launch')`` of robot; it ends with the test."""
     begun = []
 
     def compose(what, **options):
         package = 'robot'
         if what.startswith('<'):
-            package, path = None, tmp_path / 'test.launch'
-            path.write_text(f'<launch>{what}</launch>')
-            what = str(path)
+            package, what = None, bench.launch_file(what)
         begun.append(master.compose(package, what, **options))
         return begun[-1]
 
@@ -117,7 +66,7 @@ FACTS = (
 def behaviour(start):
     """Return what a rospy node in another process finds out about the robot that `start` starts."""
     with Master.embedded() as master, Peer(master.url) as peer:
-        peer.run((ROBOT / 'observer.py').read_text())
+        peer.run((ROOT / 'test' / 'robot' / 'observer.py').read_text())
         with start(master):
             facts = peer.value('observe()')
             names = [f'/rover/{name}' for name in SCRIPTS]
@@ -127,22 +76,13 @@ def behaviour(start):
         return facts
 
 
-@pytest.fixture(scope='module')
-def robots(packages):
-    """Facts that others find out about the robot: composed, and started by roslaunch."""
-    path = os.pathsep.join([str(packages), '/usr/share'])
-    with mock.patch.dict(os.environ, ROS_PACKAGE_PATH=path):
-        composed = behaviour(lambda master: master.compose('robot', 'robot.launch'))
-        launched = behaviour(lambda master: master.launch('robot', 'robot.launch'))
-    return composed, launched
-
-
 @pytest.mark.skipif(
     'isAlive' in inspect.getsource(rospy.core.signal_shutdown),
     reason='rospy of Debian 11 ends by an AttributeError, roslaunch too: hooks may not run',
 )
-def test_composed_robot_behaves_as_launched(robots):
-    composed, launched = robots
+def test_composed_robot_behaves_as_launched():
+    composed = behaviour(lambda master: master.compose('robot', 'robot.launch'))
+    launched = behaviour(lambda master: master.launch('robot', 'robot.launch'))
     for fact in FACTS:
         assert (fact, composed[fact]) == (fact, launched[fact])
 
@@ -150,17 +90,17 @@ def test_composed_robot_behaves_as_launched(robots):
 # -- master.load: one script
 
 
-def test_loaded_script_is_a_node(master, load):
-    script = load(SPIN)
+def test_loaded_script_is_a_node(master, bench):
+    script = bench.load(SPIN)
     assert isinstance(script, ScriptNode) and isinstance(script, pharos.Node)
     assert master.node('/program') is script
     assert script in master.nodes()
     assert script.is_running
 
 
-def test_path_and_args_are_kept(master, packages):
+def test_path_and_args_are_kept(master, bench):
     script = master.load('robot', 'gripper', '--fast', 'x:=y')
-    assert script.path == str(packages / 'robot' / 'scripts' / 'gripper')
+    assert script.path == str(bench.folder.parent / 'robot' / 'scripts' / 'gripper')
     assert list(script.args)[:2] == ['--fast', 'x:=y']
 
 
@@ -175,13 +115,13 @@ def test_path_and_args_are_kept(master, packages):
         (['__ns:=/right', '__name:=leg'], {}, '/right/leg'),
     ],
 )
-def test_node_takes_given_name(load, args, options, name):
-    script = load(SPIN, *args, **options)
+def test_node_takes_given_name(bench, args, options, name):
+    script = bench.load(SPIN, *args, **options)
     assert script.name == script.ros.get_name() == name
 
 
-def test_anonymous_names_are_unique(master, write):
-    path = write("rospy.init_node('program', anonymous=True)\nrospy.spin()")
+def test_anonymous_names_are_unique(master, bench):
+    path = bench.write("rospy.init_node('program', anonymous=True)\nrospy.spin()")
     with master.load(path) as one, master.load(path) as other:
         assert one.name.startswith('/program_')
         assert one.name != other.name
@@ -206,9 +146,11 @@ SAY = "rospy.init_node('program')\nrospy.set_param('/said', {})\nrospy.spin()"
         ("__import__('actionlib.msg').msg.TestGoal.__name__", 'TestGoal'),
     ],
 )
-def test_script_finds_what_it_was_given(master, load, expression, expected):
+def test_script_finds_what_it_was_given(master, bench, expression, expected):
     args = '--mode', 'two words', '_depth:=3'
-    load(SAY.format(expression), *args, remap={'range': '/sonar'}, params={'gains': {'p': [1, 2]}})
+    bench.load(
+        SAY.format(expression), *args, remap={'range': '/sonar'}, params={'gains': {'p': [1, 2]}}
+    )
     until(lambda: '/said' in master.parameters)
     assert master.parameters['/said'] == (master.url if expected == 'URL' else expected)
 
@@ -223,12 +165,12 @@ def test_exit_code_is_the_scripts(master, ends):
         assert registrations(master, '/ends') == [[], [], []]
 
 
-def test_script_without_node_has_exit_code(load):
-    assert load('sys.exit(4)').wait(TIMEOUT) == 4
+def test_script_without_node_has_exit_code(bench):
+    assert bench.load('sys.exit(4)').wait(TIMEOUT) == 4
 
 
-def test_error_in_script_is_its_failure(load, transcript):
-    script = load("rospy.init_node('program')\nrospy.sleep(0)\n1 / 0")
+def test_error_in_script_is_its_failure(bench, transcript):
+    script = bench.load("rospy.init_node('program')\nrospy.sleep(0)\n1 / 0")
     script.wait(TIMEOUT)
     assert isinstance(script.errors[0], ZeroDivisionError)
     assert '\n1 / 0\n' in script.failures[0].traceback.replace('    ', '')
@@ -250,27 +192,27 @@ def test_missing_script_is_an_error(master, error, arguments):
 
 
 @pytest.mark.parametrize('text, cause', [('1 / 0', ZeroDivisionError), ('return 1', SyntaxError)])
-def test_early_failure_is_an_error(load, text, cause):
+def test_early_failure_is_an_error(bench, text, cause):
     with pytest.raises(PharosError) as error:
-        load(text)
+        bench.load(text)
     assert isinstance(error.value.__cause__, cause)
 
 
-def test_name_in_use_is_refused(load, master, write):
-    first = load(SPIN)
+def test_name_in_use_is_refused(bench, master):
+    first = bench.load(SPIN)
     with pytest.raises(pharos.NodeNameInUseError):
-        master.load(write(SPIN, 'another'))
+        master.load(bench.write(SPIN, 'another'))
     assert first.is_running
 
 
-def test_script_needs_a_master(write):
+def test_script_needs_a_master(bench):
     with pytest.raises(pharos.MasterUnreachableError):
-        Master('http://127.0.0.1:1/').load(write(SPIN))
+        Master('http://127.0.0.1:1/').load(bench.write(SPIN))
 
 
-def test_wait_has_a_time_limit(load):
+def test_wait_has_a_time_limit(bench):
     with pytest.raises(TimeoutError):
-        load(SPIN).wait(0.01)
+        bench.load(SPIN).wait(0.01)
 
 
 @pytest.mark.parametrize('how', ['spin', 'loop', 'rate', 'threads'])
@@ -294,8 +236,8 @@ def test_script_starts_again(master, ends):
     until(lambda: master.parameters['/ends/starts'] == 3)
 
 
-def test_rosnode_kill_ends_script(master, load):
-    script = load(SPIN)
+def test_rosnode_kill_ends_script(master, bench):
+    script = bench.load(SPIN)
     with Program(['rosnode', 'kill', '/program'], master.url) as program:
         program.expect('killed')
     assert script.wait(TIMEOUT) == 0
@@ -334,11 +276,11 @@ class Place:
 '''
 
 
-def test_helpers_beside_scripts_are_their_own(master, write):
+def test_helpers_beside_scripts_are_their_own(master, bench):
     for side in 'left', 'right':
-        write(f'SIDE = {side!r}', f'{side}/helpers.py')
-        write(DATA, f'{side}/places.py', '')
-        path = write(
+        bench.write(f'SIDE = {side!r}', f'{side}/helpers.py')
+        bench.write(DATA, f'{side}/places.py', '')
+        path = bench.write(
             "import helpers, places\nrospy.init_node('program')\nrospy.set_param('~side', helpers.SIDE)",
             f'{side}/program',
         )
@@ -346,8 +288,8 @@ def test_helpers_beside_scripts_are_their_own(master, write):
     assert [master.parameters[f'/{side}/side'] for side in ('left', 'right')] == ['left', 'right']
 
 
-def test_dataclass_of_program_may_have_class_variable(master, write):
-    path = write(
+def test_dataclass_of_program_may_have_class_variable(master, bench):
+    path = bench.write(
         f"{DATA}\nimport rospy\nrospy.init_node('program')\n"
         "rospy.set_param('~fields', [each.name for each in dataclasses.fields(Place)])\n",
         head='',
@@ -356,9 +298,9 @@ def test_dataclass_of_program_may_have_class_variable(master, write):
     assert master.parameters['/program/fields'] == ['x']
 
 
-def test_each_run_has_modules_anew(master, write):
-    write('calls = []', 'helpers.py')
-    path = write(
+def test_each_run_has_modules_anew(master, bench):
+    bench.write('calls = []', 'helpers.py')
+    path = bench.write(
         '''
         import helpers
         rospy.init_node('program')
@@ -374,10 +316,10 @@ def test_each_run_has_modules_anew(master, write):
         assert master.parameters[f'/{name}/calls'] == 1
 
 
-def test_library_on_rospy_is_each_scripts(master, write, tmp_path, monkeypatch):
-    write('def name():\n    return rospy.get_name()', 'lib/names_its_node.py')
-    monkeypatch.syspath_prepend(str(tmp_path / 'bench' / 'lib'))
-    path = write(
+def test_library_on_rospy_is_each_scripts(master, bench, monkeypatch):
+    bench.write('def name():\n    return rospy.get_name()', 'lib/names_its_node.py')
+    monkeypatch.syspath_prepend(str(bench.folder / 'lib'))
+    path = bench.write(
         '''
         import names_its_node
         rospy.init_node('program')
@@ -393,16 +335,18 @@ def test_library_on_rospy_is_each_scripts(master, write, tmp_path, monkeypatch):
     'module, is_shared',
     [('numpy', True), ('std_msgs.msg', True), ('rospy', False), ('actionlib', False)],
 )
-def test_modules_without_rospy_are_shared(master, load, module, is_shared):
-    load(SAY.format(f"str(id(__import__('importlib').import_module({module!r})))"))
+def test_modules_without_rospy_are_shared(master, bench, module, is_shared):
+    bench.load(SAY.format(f"str(id(__import__('importlib').import_module({module!r})))"))
     until(lambda: '/said' in master.parameters)
     ours = str(id(importlib.import_module(module)))
     assert (master.parameters['/said'] == ours) == is_shared
 
 
-def test_settings_of_process_stay(load):
+def test_settings_of_process_stay(bench):
     before = os.getcwd(), list(sys.argv), list(sys.path)
-    load("os.environ['GREETING'] = 'x'\nsys.argv[:] = []\nsys.path.insert(0, '/x')").wait(TIMEOUT)
+    bench.load("os.environ['GREETING'] = 'x'\nsys.argv[:] = []\nsys.path.insert(0, '/x')").wait(
+        TIMEOUT
+    )
     assert 'GREETING' not in os.environ
     assert before == (os.getcwd(), sys.argv, sys.path)
 
@@ -423,9 +367,9 @@ def test_own_node_hears_script_intraprocess(master):
         assert node_.channels[0].connections == [('/sonar', 'INTRAPROCESS')]
 
 
-def test_clock_moves_time_of_script(master, load):
+def test_clock_moves_time_of_script(master, bench):
     master.parameters['/use_sim_time'] = True
-    script = load(
+    script = bench.load(
         '''
         rospy.init_node('program')
         rospy.sleep(1000)
@@ -443,8 +387,8 @@ def test_clock_moves_time_of_script(master, load):
     assert master.parameters['/woke'] >= 1000
 
 
-def test_scripts_of_two_masters_are_apart(master, write):
-    path = write(SPIN)
+def test_scripts_of_two_masters_are_apart(master, bench):
+    path = bench.write(SPIN)
     with Master.embedded() as other, master.load(path) as one, other.load(path) as two:
         assert one.name == two.name
         assert (one.master.url, two.master.url) == (master.url, other.url)
@@ -492,7 +436,10 @@ def test_only_chosen_nodes_run(compose):
     assert composition.process is None
 
 
-def test_parameters_of_launch_file_are_set(master, compose, tmp_path):
+def test_parameters_of_launch_file_are_set(master, bench, compose):
+    bench.write('loaded: true', 'a.yaml', '')
+    part = '<launch><arg name="x"/><param name="a" value="$(arg x)"/></launch>'
+    bench.write(part, 'part.launch', '')
     for xml, name, value in [
         ('<param name="a" value="1" type="str"/>', '/a', '1'),
         ('<group ns="n"><param name="a" value="x"/></group>', '/n/a', 'x'),
@@ -502,12 +449,8 @@ def test_parameters_of_launch_file_are_set(master, compose, tmp_path):
         ('<param name="a" command="echo text"/>', '/a', 'text\n'),
         ('<group ns="o" clear_params="true"><param name="b" value="1"/></group>', '/o', {'b': 1}),
         ('<rosparam command="load" file="$(find bench)/a.yaml"/>', '/loaded', True),
-        ('<include file="$(find bench)/a.launch"><arg name="x" value="5"/></include>', '/a', 5),
+        ('<include file="$(find bench)/part.launch"><arg name="x" value="5"/></include>', '/a', 5),
     ]:
-        (tmp_path / 'bench' / 'a.yaml').write_text('loaded: true')
-        (tmp_path / 'bench' / 'a.launch').write_text(
-            '<launch><arg name="x"/><param name="a" value="$(arg x)"/></launch>'
-        )
         master.parameters['/o/value'] = 1
         compose(xml)
         assert master.parameters[name] == value
@@ -524,8 +467,8 @@ def test_parameters_of_launch_file_are_set(master, compose, tmp_path):
         ('<node pkg="bench" type="tell" name="x" args="\'2 3\'"/>', 'rospy.myargv()[1]', '2 3'),
     ],
 )
-def test_node_of_launch_file_gets(master, compose, write, xml, expression, value):
-    write(SAY.format(expression), 'tell')
+def test_node_of_launch_file_gets(master, compose, bench, xml, expression, value):
+    bench.write(SAY.format(expression), 'tell')
     compose(xml.replace('{}', node('tell')))
     until(lambda: '/said' in master.parameters)
     assert master.parameters['/said'] == value
@@ -549,9 +492,9 @@ def test_bad_launch_file_is_an_error(compose):
 @pytest.mark.parametrize(
     'bad', [node('no_such_program'), node('x', 'no_such_package'), node('broken'), node('fails')]
 )
-def test_others_run_without_bad_node(compose, write, transcript, bad):
-    write('return 1', 'broken')
-    write('1 / 0', 'fails')
+def test_others_run_without_bad_node(compose, bench, transcript, bad):
+    bench.write('return 1', 'broken')
+    bench.write('1 / 0', 'fails')
     composition = compose(bad + node('sonar', 'robot'))
     assert [each.name for each in composition.nodes if each.is_running] == ['/sonar']
     assert transcript
@@ -562,8 +505,9 @@ def ending(more=''):
     return node('ends', 'robot', f'args="told" {more}')
 
 
-def test_respawned_node_starts_again(master, compose):
-    compose(ending('respawn="true"'))
+@pytest.mark.parametrize('where', [{}, {'groups': [['ends']]}])
+def test_respawned_node_starts_again(master, compose, where):
+    compose(ending('respawn="true"'), **where)
     until(lambda: master.parameters.get('/ends/starts', 0) >= 3)
 
 
@@ -576,11 +520,6 @@ def test_required_node_ends_all(master, compose, where):
     master.parameters['/stay'] = False
     assert composition.wait(TIMEOUT) == 1
     assert not any(each.is_running for each in composition.nodes)
-
-
-def test_group_respawns_its_node(master, compose):
-    compose(ending('respawn="true"'), groups=[['ends']])
-    until(lambda: master.parameters.get('/ends/starts', 0) >= 3)
 
 
 GROUPED = node('sonar', 'robot') + node('avoider', 'robot') + node('heartbeat', 'robot')
@@ -603,13 +542,11 @@ def test_launch_file_names_groups(master, compose):
     assert len(pids) == 1 and os.getpid() not in pids
 
 
-def test_program_takes_groups(master, program):
-    composed = program('robot', 'sensing.launch', '--group', 'sonar')
-    assert master.wait_for_node('/avoider', TIMEOUT).pid == composed.pid
-    sonar = master.wait_for_node('/sonar', TIMEOUT)
-    assert sonar.pid != composed.pid
-    composed.signal(signal.SIGINT)
-    composed.wait()
+def test_program_takes_groups(master, bench):
+    with bench.program('robot', 'sensing.launch', '--group', 'sonar') as composed:
+        assert master.wait_for_node('/avoider', TIMEOUT).pid == composed.pid
+        sonar = master.wait_for_node('/sonar', TIMEOUT)
+        assert sonar.pid != composed.pid
     assert not sonar.is_alive()
 
 
@@ -642,16 +579,6 @@ def test_commands_leave_other_masters_alone(compose):
     assert sonar.is_running
 
 
-def test_node_runs_on_if_its_new_program_cannot_be_read(compose, write):
-    path = write(SPIN)
-    composition = compose(node('program'))
-    (program,) = composition.nodes
-    pathlib.Path(path).write_text('def')
-    with pytest.raises(PharosError, match='cannot be read as Python 3'):
-        composition.control(program, 'restart')
-    assert program.is_running
-
-
 def test_wait_returns_when_all_ended(master, compose):
     master.parameters['/stay'] = True
     composition = compose(ending())
@@ -674,46 +601,29 @@ def test_stop_ends_all_nodes(master, compose):
 # -- rosrun pharos compose
 
 
-@pytest.fixture
-def program(master):
-    """``program(*arguments)`` runs rosrun pharos compose, which ends with the test."""
-    begun = []
-
-    def program(*arguments, url=master.url):
-        begun.append(Program(COMPOSE, url, *map(str, arguments)))
-        return begun[-1]
-
-    yield program
-    for each in begun:
-        if each.poll() is None:
-            each.signal(signal.SIGINT)
-            each.wait()
-        each.__exit__()
-
-
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_program_composes_until_signal(master, program, number):
-    composed = program('robot', 'mixed.launch', 'frame:=back')
-    mailbox = Mailbox(create(master, '/ear'), '/relayed', 'sensor_msgs/Range')
-    assert mailbox.next().header.frame_id == 'back'
-    assert master.wait_for_node('/sonar', TIMEOUT).pid == composed.pid
-    wait_for_gripper(master)
-    composed.signal(number)
-    composed.wait()
+def test_program_composes_until_signal(master, bench, number):
+    with bench.program('robot', 'mixed.launch', 'frame:=back') as composed:
+        mailbox = Mailbox(create(master, '/ear'), '/relayed', 'sensor_msgs/Range')
+        assert mailbox.next().header.frame_id == 'back'
+        assert master.wait_for_node('/sonar', TIMEOUT).pid == composed.pid
+        wait_for_gripper(master)
+        composed.signal(number)
+        composed.wait()
     until(lambda: {each.name for each in master.nodes()} <= {'/ear', '/rosout', '/pharos'})
 
 
-def test_program_takes_only_and_apart(master, program):
+def test_program_takes_only_and_apart(master, bench):
     chosen = '--only', 'heartbeat', 'gripper', '--apart', 'gripper'
-    composed = program('robot', 'robot.launch', 'robot:=r2', *chosen)
-    assert master.wait_for_node('/r2/heartbeat', TIMEOUT).pid == composed.pid
-    wait_for_gripper(master, '/r2/gripper')
-    assert master.node('/r2/gripper').pid != composed.pid
-    assert '/r2/mission' not in [each.name for each in master.nodes()]
+    with bench.program('robot', 'robot.launch', 'robot:=r2', *chosen) as composed:
+        assert master.wait_for_node('/r2/heartbeat', TIMEOUT).pid == composed.pid
+        wait_for_gripper(master, '/r2/gripper')
+        assert master.node('/r2/gripper').pid != composed.pid
+        assert '/r2/mission' not in [each.name for each in master.nodes()]
 
 
-def test_program_prefixes_what_scripts_print(master, program, write):
-    path = write(
+def test_program_prefixes_what_scripts_print(master, bench):
+    path = bench.write(
         '''
         rospy.init_node('program')
         print('printed')
@@ -722,18 +632,18 @@ def test_program_prefixes_what_scripts_print(master, program, write):
         1 / 0
         '''
     )
-    composed = program('--script', path)
-    composed.wait()
+    with bench.program('--script', path) as composed:
+        composed.wait()
     lines = composed.output.splitlines()
     assert {'[/program] printed', '[/program] aside'} <= set(lines)
     assert any(line.startswith('[/program] [INFO]') and 'logged' in line for line in lines)
     assert any('1 / 0' in line for line in lines)
 
 
-def test_program_runs_several_scripts(master, program):
-    composed = program('--script', 'robot/gripper', 'robot/heartbeat')
-    for name in '/gripper', '/heartbeat':
-        assert master.wait_for_node(name, TIMEOUT).pid == composed.pid
+def test_program_runs_several_scripts(master, bench):
+    with bench.program('--script', 'robot/gripper', 'robot/heartbeat') as composed:
+        for name in '/gripper', '/heartbeat':
+            assert master.wait_for_node(name, TIMEOUT).pid == composed.pid
 
 
 @pytest.mark.parametrize(
@@ -745,19 +655,18 @@ def test_program_runs_several_scripts(master, program):
         (['--script', 'robot/no_such_program'], 'no_such_program'),
     ],
 )
-def test_program_fails_with_status(program, arguments, said, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / 'bad.launch').write_text('<launch><node></launch>')
-    composed = program(*arguments)
-    assert composed.wait() == 1
+def test_program_fails_with_status(bench, arguments, said, monkeypatch):
+    monkeypatch.chdir(bench.folder)
+    bench.write('<launch><node></launch>', 'bad.launch', '')
+    with bench.program(*arguments) as composed:
+        assert composed.wait() == 1
     assert said in composed.output
     assert 'Traceback' not in composed.output
 
 
-def test_required_node_is_programs_status(program, tmp_path):
-    element = ending('required="true"')
-    (tmp_path / 'a.launch').write_text(f'<launch>{element}</launch>')
-    assert program(tmp_path / 'a.launch').wait() == 1
+def test_required_node_is_programs_status(bench):
+    with bench.program(bench.launch_file(ending('required="true"'))) as composed:
+        assert composed.wait() == 1
 
 
 def test_stopped_node_does_not_respawn(master, compose):

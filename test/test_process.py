@@ -46,7 +46,6 @@ driver = Driver()
 say('opened')
 {rest}
 '''
-DEVICE_READERS = 'nobody', 'loop', 'socket'
 ENDS = {'exit': 'sys.exit(1)', 'exception': "raise RuntimeError('USB has gone')"}
 
 
@@ -63,7 +62,7 @@ def port():
         return sock.getsockname()[1]
 
 
-@pytest.mark.parametrize('reader', DEVICE_READERS)
+@pytest.mark.parametrize('reader', READERS)
 @pytest.mark.parametrize('rest', ENDS.values(), ids=ENDS)
 def test_driver_respawns_and_opens_its_device_again(bench, port, reader, rest):
     bench.write(driver(port, reader, rest))
@@ -72,7 +71,7 @@ def test_driver_respawns_and_opens_its_device_again(bench, port, reader, rest):
         until(lambda: bench.said().count('opened') >= 3)
 
 
-@pytest.mark.parametrize('reader', DEVICE_READERS)
+@pytest.mark.parametrize('reader', READERS)
 def test_stop_gives_the_device_back(bench, port, reader):
     script = bench.load(driver(port, reader))
     until(lambda: bench.said() == ['begins', 'opened'])
@@ -552,9 +551,7 @@ def test_output_is_as_with_roslaunch(bench, output, option, is_shown):
 
 
 def test_silent_client_keeps_no_other_out(master, bench):
-    bench.write(SPIN)
-    launch = bench.launch_file('<node pkg="bench" type="program" name="program"/>')
-    with master.compose(None, launch) as composition:
+    with master.compose(None, bench.launch_file(program=SPIN)) as composition:
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as silent:
             silent.connect(f'\0pharos-compose-{os.getpid()}')
             control('restart', '/program', master)
@@ -585,14 +582,19 @@ def test_program_is_controlled_by_the_names_of_its_nodes(master, bench):
         until(lambda: bench.said() == ['ready'] * 2)
 
 
-def test_restart_keeps_a_node_if_a_module_cannot_be_read(master, bench):
+@pytest.mark.parametrize(
+    'name, text, said',
+    [
+        ('helper.py', 'import rospy\nx = = 1\n', r'helper\.py:2: '),
+        ('program', 'def', 'cannot be read as Python 3'),
+    ],
+)
+def test_restart_keeps_a_node_that_cannot_be_read(master, bench, name, text, said):
     bench.write('import rospy\n', 'helper.py', '')
-    bench.write('import helper\n' + SPIN)
-    launch = bench.launch_file('<node pkg="bench" type="program" name="program"/>')
-    with master.compose(None, launch) as composition:
+    with master.compose(None, bench.launch_file(program='import helper\n' + SPIN)) as composition:
         until(lambda: bench.said() == ['ready'])
-        bench.write('import rospy\nx = = 1\n', 'helper.py', '')
-        with pytest.raises(pharos.PharosError, match=r'helper\.py:2: '):
+        bench.write(text, name, '')
+        with pytest.raises(pharos.PharosError, match=said):
             composition.control(composition.nodes[0], 'restart')
         assert composition.nodes[0].is_running
 
