@@ -77,11 +77,12 @@ def master(ros_master, monkeypatch):
 
 def left_threads(before):
     """The threads that a test left behind."""
-    return [
-        thread
-        for thread in set(threading.enumerate()) - before
-        if not any(name in f'{thread.name} {thread._target}' for name in SERVER_THREADS)
-    ]
+    left = []
+    for thread in set(threading.enumerate()) - before:
+        target = getattr(thread, '_target', None)  # a thread that ends deletes it
+        if not any(name in f'{thread.name} {target}' for name in SERVER_THREADS):
+            left.append(thread)
+    return left
 
 
 @pytest.fixture
