@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import collections
 import contextlib
-import math
 import os
 import pickle
 import signal
@@ -256,23 +255,28 @@ class Composition:
         roslaunch and groups end with a required node.
         """
         code = part.process.poll()
-        if code is None:
+        if code is None or part.is_over:
             return
-        if part.is_due:
+        names = part.names
+        has_required = part.has_required
+        if code < 0:
+            self._has_failed = True
+            Transcript.show(f'{names}: {signal.Signals(-code).name} has ended their process')
+            part.forget_nodes()
+        if has_required:
+            self._end(f'one of {names}')
+        if code < 0 and part.entries:
+            self._respawn_part(part)
+        else:
+            part.is_over = True
+
+    def _respawn_part(self, part):
+        self.stopping.wait(max(float(each.roslaunch_node.respawn_delay) for each in part.entries))
+        if not self.stopping.is_set():
             Transcript.show(f'{part.names}: back in a new process')
             part.start()
             if self.stopping.is_set():  # stop() may have looked before the start
                 part.process.terminate(TERMINATE_LIMIT)
-        elif not part.is_told:
-            names = part.names
-            has_required = part.has_required
-            if code < 0:
-                self._has_failed = True
-                Transcript.show(f'{names}: {signal.Signals(-code).name} has ended their process')
-                part.forget_nodes()
-            part.is_told = True
-            if has_required:
-                self._end(f'one of {names}')
 
     def _look_at_ended(self, node):
         name = node._settings.name
@@ -383,7 +387,7 @@ class _Part:
     :param command: the command of the process
     :param parcel_of: ``parcel_of(entries)`` is pickled for a program of this package, which gets
         the file with that, and the number of this process
-    :ivar is_told: True if the end of the process has been looked at
+    :ivar is_over: True if the process has ended, that was told, and no node respawns
     """
 
     def __init__(self, master, entries, command, parcel_of=None):
@@ -391,11 +395,10 @@ class _Part:
         self._master = master
         self._command = command
         self._parcel_of = parcel_of
+        self.is_over = False
 
     def start(self):
         """Start the process with the nodes in ``entries``."""
-        self.is_told = False
-        self._comeback_time = math.inf  # as of time.monotonic(); infinity: nobody respawns
         command = self._command
         if self._parcel_of:
             with tempfile.NamedTemporaryFile(delete=False) as file:  # the process deletes the file
@@ -414,16 +417,6 @@ class _Part:
         """True if the process has a required node."""
         return any(entry.roslaunch_node.required for entry in self.entries)
 
-    @property
-    def is_over(self):
-        """True if the process has ended, that was told, and no node respawns."""
-        return self.is_told and self._comeback_time == math.inf
-
-    @property
-    def is_due(self):
-        """True if the nodes that respawn must start now."""
-        return time.monotonic() >= self._comeback_time
-
     def forget_nodes(self):
         """Unregister the nodes after a crash of the process; keep the entries that respawn.
 
@@ -435,10 +428,7 @@ class _Part:
         names = [entry.name for entry in self.entries]
         with contextlib.suppress(OSError, rosgraph.MasterException):
             rosnode.cleanup_master_blacklist(rosgraph.Master('/pharos', self._master.url), names)
-        if any(entry.roslaunch_node.respawn for entry in self.entries):
-            self.entries = [each for each in self.entries if each.roslaunch_node.respawn]
-            delays = [float(entry.roslaunch_node.respawn_delay) for entry in self.entries]
-            self._comeback_time = time.monotonic() + max(delays)
+        self.entries = [entry for entry in self.entries if entry.roslaunch_node.respawn]
 
 
 def leave(status):
