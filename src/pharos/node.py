@@ -223,8 +223,7 @@ class Node(DelegateHolder):
         with self._life_lock:
             self._settings.master.call('getPid')  # raises if the master does not answer
             live_souls = [
-                (thread.name, *soul)
-                for thread, soul in list(self._current_run.souls.items())
+                (thread.name, *soul) for thread, soul in list(self._current_run.souls.items())
             ]
             signals.restarting_nodes.append(self)  # or spin() would return
             try:

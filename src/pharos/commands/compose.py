@@ -12,7 +12,6 @@ from pharos import Master
 from pharos.commands import argument_parser, run_command
 from pharos.compose.composition import SWITCH_INTERVAL, Composition, leave
 from pharos.compose.launch_file import LaunchFile
-from pharos.waiting import wait
 
 
 def main() -> int:
@@ -52,16 +51,7 @@ def _parse(arguments):
     parser.add_argument(
         '--group', nargs='+', action='append', default=[], help='these in one other process'
     )
-    roslaunch_options = parser.add_argument_group('as for roslaunch')
-    roslaunch_options.add_argument('--wait', action='store_true', help='wait for the master')
-    for output in 'screen', 'log':
-        roslaunch_options.add_argument(
-            f'--{output}',
-            action='store_const',
-            const=output,
-            dest='output',
-            help=f"all nodes have output='{output}'",
-        )
+    parser.add_argument('--screen', action='store_true', help="all nodes have output='screen'")
     options = parser.parse_args(arguments)
     if options.file and options.file[0].endswith('.py'):
         options.script = options.file
@@ -77,8 +67,6 @@ def _parse(arguments):
 def _run(stack, options, mappings):
     """Run as the options say, and return the exit status; the stack ends all."""
     master = Master()
-    if options.wait:
-        wait(master.is_reachable)
     if not master.is_reachable():
         port = int(master.url.rstrip('/').rpartition(':')[2])
         print(f'no ROS master at {master.url}: it is started here', file=sys.stderr)
@@ -96,7 +84,7 @@ def _read_launch_file(url, options, mappings):
     args = dict(each.split(':=', 1) for each in mappings if not each.startswith('_'))
     package = options.file[0] if len(options.file) == 2 else None
     names = options.only, options.apart, options.here, options.group
-    launch_file = LaunchFile(url, package, options.file[-1], args, *names, options.output)
+    launch_file = LaunchFile(url, package, options.file[-1], args, *names, options.screen)
     home = rospkg.get_ros_home()
     os.makedirs(home, exist_ok=True)
     os.chdir(home)

@@ -57,7 +57,7 @@ class LaunchFile:
     :param apart: the names of nodes that are plain processes
     :param here: the names of nodes that run in this process even if they show windows
     :param groups: lists of names of nodes that run in one process each
-    :param output: 'screen' or 'log' for all nodes; default: what the file says
+    :param screen: True: all nodes have the output 'screen'
     :ivar config: roslaunch's configuration
     :ivar entries: an :class:`Entry` for each node of this process and of groups
     :ivar entries_apart: one for each plain process, without its program
@@ -66,7 +66,7 @@ class LaunchFile:
     """
 
     def __init__(
-        self, url, package, file, args, only=(), apart=(), here=(), groups=(), output=None
+        self, url, package, file, args, only=(), apart=(), here=(), groups=(), screen=False
     ):
         self.path = find_launch_file(package, file)
         self._read(args)
@@ -81,7 +81,8 @@ class LaunchFile:
         given_names = [*only, *apart, *here, *(name for group in groups for name in group)]
         self._check(given_names, set().union(*short_names.values()), 'node')
         for name, node in nodes.items():
-            node.output = output or node.output
+            if screen:
+                node.output = 'screen'
             if not only or short_names[name] & set(only):
                 is_apart = not short_names[name].isdisjoint(apart)
                 is_here = not short_names[name].isdisjoint(here)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Iterator, NamedTuple
 from xml.sax.saxutils import escape
 
 from pharos.errors import PharosError, UnknownNodeError
-from pharos.live.snapshot import Link, Snapshot, take_snapshot, topic_rates
+from pharos.live.snapshot import Link, Snapshot, publisher_rates, take_snapshot
 from pharos.live.text_format import short_number
 
 if TYPE_CHECKING:
@@ -254,8 +254,10 @@ def graph_of(master: Master, seconds: float = 0, only: str = '') -> Graph:
         return Graph(start, {}, only)
     time.sleep(seconds)
     snapshot = take_snapshot(master)
-    rates = topic_rates(snapshot.rates_since(start))
-    return Graph(snapshot, rates, only)
+    topic_rates: dict[str, float] = collections.defaultdict(float)
+    for (topic, _), rate in publisher_rates(snapshot.rates_since(start)).items():
+        topic_rates[topic] += rate
+    return Graph(snapshot, topic_rates, only)
 
 
 def describe(master: Master, node_name: str, seconds: float) -> str:

@@ -155,11 +155,3 @@ def publisher_rates(link_rates: dict[Link, Traffic]) -> dict[tuple[str, str], fl
         key = link.topic, link.publisher
         rates[key] = max(rates.get(key, 0.0), traffic.messages)
     return rates
-
-
-def topic_rates(link_rates: dict[Link, Traffic]) -> dict[str, float]:
-    """Return ``{topic: messages in one second}``, the sum of the topic's publishers."""
-    rates: dict[str, float] = {}
-    for (topic, _), rate in publisher_rates(link_rates).items():
-        rates[topic] = rates.get(topic, 0.0) + rate
-    return rates
