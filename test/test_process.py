@@ -247,17 +247,18 @@ def test_crash_of_a_group_is_told_and_its_node_respawns(master, bench, ending):
     bench.write(SPIN.replace("'program'", "'beside'"), 'beside')
     xml = f'<node pkg="bench" type="program" name="program" respawn="true">{GROUP}</node>'
     xml += f'<node pkg="bench" type="beside" name="beside">{GROUP}</node>'
+    def process_ids():
+        return [int(line) for line in bench.said() if line.isdigit()]
+
     with bench.program(bench.launch_file(xml)) as composed:
         for count in 1, 2:
-            until(
-                lambda count=count: len(bench.said()) >= count and master.wait_for_node('/program')
-            )
-            (pid,) = [line for line in bench.said() if line.isdigit()][count - 1 :]
+            until(lambda count=count: len(process_ids()) == count)
+            master.wait_for_node('/program', TIMEOUT)
             if ending == 'SIGKILL':
-                os.kill(int(pid), signal.SIGKILL)
+                os.kill(process_ids()[-1], signal.SIGKILL)
             else:
                 master.parameters['/crash'] = True
-            until(lambda count=count: len([x for x in bench.said() if x.isdigit()]) == count + 1)
+            until(lambda count=count: len(process_ids()) == count + 1)
             until(lambda: '/beside' not in [each.name for each in master.nodes()])
         assert end(composed) == 1
     assert f'/program: {ending} has ended their process' in composed.output
