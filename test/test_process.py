@@ -247,6 +247,7 @@ def test_crash_of_a_group_is_told_and_its_node_respawns(master, bench, ending):
     bench.write(SPIN.replace("'program'", "'beside'"), 'beside')
     xml = f'<node pkg="bench" type="program" name="program" respawn="true">{GROUP}</node>'
     xml += f'<node pkg="bench" type="beside" name="beside">{GROUP}</node>'
+
     def process_ids():
         return [int(line) for line in bench.said() if line.isdigit()]
 

@@ -83,7 +83,7 @@ class ScriptRun(Run):
         self.children = []  # processes, as subprocess.Popen
         self.exit_functions = []  # of atexit
         self.thread_exit_functions = []  # of threading._register_atexit, which run before
-        self.threads_to_join = []  # those that are not daemons
+        self.threads_to_join = set()  # those that are not daemons
         self.handlers = {}  # number of a signal -> the program's handler
         self.created_nodes = []  # the nodes that the program has created with pharos
         self.pending_signal = threading.Event()
@@ -125,7 +125,7 @@ class ScriptRun(Run):
 
             def start(self):
                 if not self.daemon:
-                    run.threads_to_join.append(self)
+                    run.threads_to_join.add(self)
                 super().start()
 
         stand_ins['threading'] = Shim(
@@ -218,7 +218,9 @@ class ScriptRun(Run):
         """True if the program has a node of its own, or has created one with pharos."""
         return self.is_registered or bool(self.created_nodes)
 
-    def init_node(self, name, argv=None, anonymous=False, disable_signals=False, **options):
+    def init_node(
+        self, name, argv=None, anonymous=False, log_level=None, *, disable_signals=False, **options
+    ):
         """Stand in for ``rospy.init_node``: give the node its name, and register the node.
 
         A second call does nothing.
@@ -241,7 +243,7 @@ class ScriptRun(Run):
         settings.ports = options.pop('tcpros_port', 0), options.pop('xmlrpc_port', 0)
         for parameter_name, value in self.node.params.items():
             self.master.parameters[f'{self.name}/{parameter_name}'] = value
-        super().start(disable_signals=disable_signals, **options)
+        super().start(disable_signals=disable_signals, log_level=log_level, **options)
         self.is_registered = True
 
     # -- the program
@@ -258,6 +260,8 @@ class ScriptRun(Run):
             self.keep_failure(error, thread.name)
             hook = self.modules.by_name['threading'].excepthook
             hook(ExceptHookArgs([type(error), error, error.__traceback__, thread]))
+        finally:
+            self.threads_to_join.discard(thread)
 
     def run_main(self):
         """Run the program to its end, with its threads and exit functions; stop the node."""
@@ -340,8 +344,7 @@ class ScriptRun(Run):
         with contextlib.suppress(KeyboardInterrupt, SystemExit):
             while self.threads_to_join and not self.finished.is_set():
                 self.checkpoint()
-                self.threads_to_join[0].join(JOIN_PERIOD)
-                self.threads_to_join = [each for each in self.threads_to_join if each.is_alive()]
+                join(list(self.threads_to_join), JOIN_PERIOD)
 
     def _status_of(self, exit_request):
         """Return the exit status of a SystemExit; print its text if it has one."""
