@@ -454,8 +454,8 @@ def test_killed_publisher_is_replaced(master, node):
             camera.end()
             until(lambda: not box.channel.connections, TIMEOUT)
             until(lambda: not memory_files(os.getpid()), TIMEOUT)
-            while not box.empty():
-                data = box.next().data
+            for message in box.all():
+                data = message.data
                 assert (data == data[:4] * (LARGE // 4)) is True
 
 

@@ -92,11 +92,6 @@ class Mailbox:
         """Return all messages so far, also those that were taken."""
         return list(self._messages)
 
-    def empty(self) -> bool:
-        """True if all messages were taken."""
-        return self._new_messages.empty()
-
-
 @pytest.fixture
 def master(monkeypatch: pytest.MonkeyPatch) -> Iterator[Master]:
     """An embedded master for one test. The test must leave no node, registration or thread."""

@@ -1,7 +1,6 @@
 """The command ``pharos``, which runs the commands of this package without rosrun.
 
 usage: pharos COMMAND [ARGUMENT ...]
-       pharos --version
 
   workspace       a session in IPython, with the live graph at hand
   compose         run the Python nodes of a launch file in one process
@@ -41,9 +40,6 @@ COMMANDS = {
 def main() -> int:
     """Run the command that the first argument names, and return the exit status."""
     name = sys.argv[1] if sys.argv[1:] else '--help'
-    if name == '--version':
-        print(f'pharos {pharos.__version__}')
-        return 0
     if name not in COMMANDS:
         print(__doc__)
         return 0 if name.startswith('-') else 1

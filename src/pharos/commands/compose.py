@@ -5,6 +5,8 @@ import contextlib
 import faulthandler
 import os
 import sys
+import urllib.parse
+from typing import Any
 
 import rospkg
 
@@ -68,7 +70,7 @@ def _run(stack, options, mappings):
     """Run as the options say, and return the exit status; the stack ends all."""
     master = Master()
     if not master.is_reachable():
-        port = int(master.url.rstrip('/').rpartition(':')[2])
+        port: Any = urllib.parse.urlsplit(master.url).port
         print(f'no ROS master at {master.url}: it is started here', file=sys.stderr)
         os.environ['ROS_MASTER_URI'] = stack.enter_context(Master.embedded(port)).url
     composition = stack.enter_context(Composition(master, owns_process=True))

@@ -11,17 +11,16 @@ def graph(arguments: list[str]) -> None:
 
     graph                            as text
     graph --output graph.svg         as a picture: .svg, .png, .pdf (by graphviz) or .dot
-    graph --rates 2 --only '^(?!/tf)'    with messages a second, counted for 2 s, without /tf
+    graph --rates 2                  with messages a second, counted for 2 s
     watch -n1 rosrun pharos graph    again and again
     """
     parser = argument_parser(graph)
     parser.add_argument('-o', '--output', metavar='FILE', help='save a picture')
-    parser.add_argument('--only', default='', metavar='REGEX', help='show only names that match')
     parser.add_argument(
         '--rates', type=float, default=0, metavar='S', help='count messages for S s'
     )
     options = parser.parse_args(arguments)
-    ros_graph = graph_of(Master(), options.rates, only=options.only)
+    ros_graph = graph_of(Master(), options.rates)
     if options.output:
         ros_graph.save(options.output)
     else:

@@ -178,10 +178,7 @@ class ScriptRun(Run):
     def print_error(self, error_class, error, trace, title=''):
         """Stand in for ``sys.excepthook``: print a traceback, without the frames of pharos."""
         summary = traceback.TracebackException(error_class, error, trace)
-        cause = summary
-        while cause:
-            cause.stack[:] = [each for each in cause.stack if not each.filename.startswith(_HIDDEN)]
-            cause = cause.__cause__ or cause.__context__
+        summary.stack[:] = [each for each in summary.stack if not each.filename.startswith(_HIDDEN)]
         self.stderr.write(title + ''.join(summary.format()))
 
     def _print_thread_error(self, args):

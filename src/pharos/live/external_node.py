@@ -91,12 +91,6 @@ class ExternalNode:
         """The names of the services that the node offers."""
         return list(self._names_in_state(2))
 
-    def describe(self, seconds: float = 1.0) -> str:
-        """Return the node's topics, services, peers and rates as text; count for some seconds."""
-        from pharos.live.graph import describe
-
-        return describe(self.master, self.name, seconds)
-
     def shutdown(self) -> None:
         """Ask the node to end, as rosnode kill does.
 

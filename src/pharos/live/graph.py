@@ -80,34 +80,23 @@ class Graph:
     :ivar rates: ``{topic: messages a second}``, empty if they were not measured
     """
 
-    def __init__(
-        self,
-        snapshot: Snapshot,
-        rates: dict[str, float],
-        only: str = '',
-    ):
+    def __init__(self, snapshot: Snapshot, rates: dict[str, float]):
         def is_visible(name):
-            return not COMMON_NAMES.fullmatch(name) and re.search(only, name)
+            return not COMMON_NAMES.fullmatch(name)
 
         self.snapshot = snapshot
         self.rates = rates
         self.nodes = {name: node for name, node in snapshot.nodes.items() if is_visible(name)}
         self.edges: list[Edge] = []
         for name, node in self.nodes.items():
-            for topic in filter(is_visible, node.publishes):
-                links = [
-                    link
-                    for link in snapshot.links
-                    if link.topic == topic and link.publisher == name
-                ]
-                self.edges.append(Edge(name, topic, False, links))
-            for topic in filter(is_visible, node.subscribes):
-                links = [
-                    link
-                    for link in snapshot.links
-                    if link.topic == topic and link.subscriber == name
-                ]
-                self.edges.append(Edge(name, topic, True, links))
+            for topics, role in (node.publishes, 'publisher'), (node.subscribes, 'subscriber'):
+                for topic in filter(is_visible, topics):
+                    links = [
+                        link
+                        for link in snapshot.links
+                        if link.topic == topic and getattr(link, role) == name
+                    ]
+                    self.edges.append(Edge(name, topic, role == 'subscriber', links))
         edge_topics = {edge.topic for edge in self.edges}
         types = snapshot.topic_types
         self.topics = {name: types.get(name, '*') for name in sorted(edge_topics)}
@@ -242,22 +231,21 @@ def _dot_box(prefix, name, caption, style):
     return f'{_dot_id(prefix, name)} [{style}, label=<{label}>]'
 
 
-def graph_of(master: Master, seconds: float = 0, only: str = '') -> Graph:
+def graph_of(master: Master, seconds: float = 0) -> Graph:
     """Return the graph of :meth:`Master.graph`.
 
     :param seconds: how long messages are counted, for rates; 0: no rates
-    :param only: a regular expression; names of nodes and topics that lack it are left out
     :raises MasterUnreachableError: if the master does not answer
     """
     start = take_snapshot(master)
     if not seconds:
-        return Graph(start, {}, only)
+        return Graph(start, {})
     time.sleep(seconds)
     snapshot = take_snapshot(master)
     topic_rates: dict[str, float] = collections.defaultdict(float)
     for (topic, _), rate in publisher_rates(snapshot.rates_since(start)).items():
         topic_rates[topic] += rate
-    return Graph(snapshot, topic_rates, only)
+    return Graph(snapshot, topic_rates)
 
 
 def describe(master: Master, node_name: str, seconds: float) -> str:
