@@ -298,5 +298,5 @@ def test_namesake_from_elsewhere_stops_the_node(master):
     node = create(master, '/peer')
     with Peer(master.url) as peer:
         until(lambda: not node.is_running)
-        assert rosnode.rosnode_ping('/peer', max_count=1)
+        until(lambda: rosnode.rosnode_ping('/peer', max_count=1))
         assert peer.value('rospy.is_shutdown()') is False

@@ -4,7 +4,6 @@ from __future__ import annotations
 import functools
 import pathlib
 import re
-import threading
 from contextlib import suppress
 from typing import Any, Callable
 
@@ -18,8 +17,8 @@ from genpy.dynamic import generate_dynamic
 from genpy.message import Message, get_message_class, get_service_class
 
 from pharos.errors import MessageTypeError, UnknownTypeError
+from pharos.private_rospy.loader import process_lock
 
-_lock = threading.RLock()  # genpy's generator is not thread-safe
 _TYPE = re.compile(r'[A-Za-z][A-Za-z0-9_]{0,127}/[A-Za-z][A-Za-z0-9_]{0,127}')
 #: turtlesim's types as in ROS Fuerte, which the report uses; Debian has none
 _TURTLESIM = '''
@@ -235,7 +234,7 @@ def _once(make_class):
 
     def make_once(type_name, text):
         try:
-            with _lock:
+            with process_lock:  # genpy's generator is not thread-safe, and imports
                 return cached_function(type_name, text)
         except Exception as error:
             raise UnknownTypeError(f'{type_name}: no class can be made of it: {error}') from error

@@ -92,6 +92,7 @@ class Mailbox:
         """Return all messages so far, also those that were taken."""
         return list(self._messages)
 
+
 @pytest.fixture
 def master(monkeypatch: pytest.MonkeyPatch) -> Iterator[Master]:
     """An embedded master for one test. The test must leave no node, registration or thread."""
@@ -161,6 +162,22 @@ def create_node(master: Master) -> Iterator[Callable[..., Any]]:
         lines = ['blocks of its nodes failed (or say expect_failures()):']
         lines += [f'{failure}\n{failure.traceback}' for failure in failures]
         pytest.fail('\n'.join(lines), False)
+
+
+@pytest.fixture
+def simulation(master: Master) -> Iterator[Any]:
+    """Virtual time for the nodes of the test: a :class:`pharos.simulation.Simulation`.
+
+    The test fails if a thread waits for something else than time and threads, unless it says
+    ``simulation.allow_waits()``. A failed test shows the seed and the time.
+    """
+    from pharos.simulation import Simulation
+
+    with Simulation(master) as simulation:
+        yield simulation
+    print(f'simulation: seed {simulation.seed_number}, {simulation.now:.9f} s')
+    if simulation.lost and not simulation.allows_waits:
+        pytest.fail(f'threads waited for something else: {simulation.lost}', False)
 
 
 @pytest.fixture(name='expect_failures')

@@ -61,8 +61,7 @@ class ScriptRun(Run):
     this order.
 
     :ivar is_end_requested: True: the stop has begun
-    :ivar pending_signal: a signal waits for the main thread
-    :ivar signal_accepted: the program's handlers run
+    :ivar pending_signal: a signal waits for the main thread; clear while the program's handlers run
     :ivar has_run_hooks: True: the hooks of rospy.on_shutdown() run, or have run
     :ivar stopping: ``is_shutdown()`` is True
     :ivar main_has_ended: True: the program and its exit functions have ended
@@ -87,7 +86,6 @@ class ScriptRun(Run):
         self.handlers = {}  # number of a signal -> the program's handler
         self.created_nodes = []  # the nodes that the program has created with pharos
         self.pending_signal = threading.Event()
-        self.signal_accepted = threading.Event()
         self.handler_lock = threading.RLock()  # held while a signal is handled
         super().__init__(node, settings)
         self.main = self.Thread(target=self.run_main, name=self.name)
@@ -382,7 +380,6 @@ class ScriptRun(Run):
             if not self.pending_signal.is_set():
                 return
             self.pending_signal.clear()
-            self.signal_accepted.set()
             for number in self._signal_numbers():
                 handler = self._handler_of(number)
                 if handler is signal.default_int_handler:
@@ -473,7 +470,7 @@ class ScriptRun(Run):
         if not self.main_has_ended:
             self.pending_signal.set()
             threads = [self.main]
-            is_accepted = self.signal_accepted.wait(SIGNAL_LIMIT)
+            is_accepted = wait(lambda: not self.pending_signal.is_set(), SIGNAL_LIMIT)
             if not is_accepted:
                 thread = self.start_thread(self.handle_signal_for_main)
                 if thread:

@@ -1,0 +1,367 @@
+"""Virtual time: the nodes of this process run as fast as the processor allows, in one order each time.
+
+One thread has the turn. A thread gives the turn back when it sleeps, waits or ends. Then the thread
+whose wait ends first gets the turn, and the time jumps to that end. The threads of servers take no
+part: they wait as usual, and answer the thread that has the turn.
+
+For the time of a simulation, Python's modules threading and time get other functions. All locks made
+then are a Lock of this module; Python's events, conditions, semaphores and queues are made of locks.
+"""
+from __future__ import annotations
+
+import contextlib
+import functools
+import itertools
+import math
+import queue
+import random
+import sys
+import threading
+import time
+import traceback
+from _queue import Empty, SimpleQueue
+from _thread import allocate_lock
+from typing import Any, Callable
+from unittest import mock
+
+import numpy
+import rosbag
+
+from pharos.compose import composition
+from pharos.errors import PharosError
+from pharos.intraprocess import callback_queues
+from pharos.node import BlockNode
+from pharos.private_rospy import run, xmlrpc
+from pharos.private_rospy.patches import patch
+from pharos.waiting import wait
+
+LOOK_PERIOD = 0.5  # seconds between two looks at the thread with the turn
+IDLE_TIME = 0.01  # seconds of CPU time between two looks; if it is less, that thread waits
+MAX_LOOKS = 120  # at one thread, which may compute without end
+SHORT_SLEEP = 1e-4  # seconds that a sleep takes at least: else sleep(0) would stop the time
+LAST = math.inf  # the order of a wait that ends after all others that end at the same time
+#: the functions of servers' threads are in these modules
+SERVERS = (
+    'rospy.impl',
+    'rosgraph',
+    'socketserver',
+    'pharos.private_rospy',
+    'pharos.shared_memory',
+    'pharos.compose.child_process',
+    'pharos.compose.control',
+)
+
+_sleep = time.sleep
+_start = threading.Thread.start
+_join = threading.Thread.join
+_simulation: Any = None  # the Simulation that goes on, or None
+
+
+class _Local(threading.local):
+    thread: Any = None  # the Thread, if it has taken part in a simulation
+
+
+_local = _Local()
+
+
+def takes_part():
+    """True if this thread takes part in the simulation that goes on."""
+    thread = _local.thread
+    return thread and thread.simulation is _simulation
+
+
+class Lock:
+    """A lock. A thread that takes part waits for others that do in virtual time.
+
+    It keeps its turn if a server holds the lock, which does not do so for long.
+    """
+
+    def __init__(self):
+        self._lock = allocate_lock()
+        self.locked = self._lock.locked
+        self._is_held_by_member = False
+
+    def acquire(self, blocking=True, timeout=-1):
+        simulation = _simulation
+        end = math.inf
+        if simulation and timeout >= 0:
+            end = simulation.time_after(timeout)
+        while not self._lock.acquire(False):
+            if blocking and takes_part() and self._is_held_by_member:
+                if simulation.nanoseconds >= end:
+                    return False
+                simulation.wait(end, lock=self)
+            elif self._lock.acquire(blocking, timeout):
+                break
+            else:
+                return False
+        self._is_held_by_member = takes_part()
+        return True
+
+    def release(self):
+        self._is_held_by_member = False
+        self._lock.release()
+        if _simulation and not takes_part():
+            _simulation.give_free_turn()
+
+    def __enter__(self):
+        self.acquire()
+
+    def __exit__(self, *error):
+        self.release()
+
+    _at_fork_reinit = __init__
+
+
+def start_thread(thread):
+    """Stand in for ``Thread.start``: the thread takes part, unless it is a server's."""
+    block = getattr(thread, '_target', None) or type(thread).run
+    module = str(getattr(block, 'func', block).__module__)
+    starter = _local.thread
+    _local.thread = None  # it keeps its turn while it waits until the thread has begun
+    if module.startswith(SERVERS):
+        _start(thread)
+    else:
+        _simulation.prepare(thread)
+        thread.run = functools.partial(_simulation.run_thread, thread, thread.run)
+        _start(thread)
+        _simulation.add_wait(thread, _simulation.nanoseconds)
+    _local.thread = starter
+
+
+def join_thread(thread, timeout=None):
+    """Stand in for ``Thread.join``: wait in virtual time."""
+    if wait(lambda: getattr(thread, 'has_ended', True), timeout):
+        _join(thread, timeout)
+
+
+@patch('rospy.rostime', 'get_rostime')
+def get_rostime(original, run):
+    """rospy makes the time from a float, which is not exact. Virtual time has whole nanoseconds."""
+    if not _simulation:
+        return original()
+    return run.modules.by_name['rospy.rostime'].Time(0, _simulation.nanoseconds)
+
+
+@patch('rospy.impl.simtime', '_is_use_simtime')
+def is_use_simtime(original, run):
+    """rospy waits for /clock if /use_sim_time is set. Virtual time needs no /clock."""
+    return not _simulation and original()
+
+
+class Simulation:
+    """Virtual time, in a ``with``, for this thread and for all nodes that the process starts there.
+
+    :ivar nanoseconds: the ROS time
+    :ivar lost: the names of threads that waited for something else than time and threads, or computed
+        without end, and lost the turn by that: what follows may come in another order another time
+    """
+
+    def __init__(self, master):
+        self.master = master
+        self.nanoseconds = 10**18  # a time with as many digits as those of today
+        self.lost: list[str] = []
+        self.allows_waits = False
+        self._owner: Any = threading.current_thread()
+        self._holder: Any = self._owner  # the thread with the turn
+        self._lock = allocate_lock()  # held while the turn changes
+        self._waits: dict[Any, Any] = {}  # thread -> its wait: (end, order, Lock or None)
+        self._orders = itertools.count()
+        self._looks = 0  # at the thread with the turn
+        self._cpu_time = 0.0
+        self._stack = contextlib.ExitStack()
+        self.seed(0)
+
+    def seed(self, number: int) -> None:
+        """Choose another order of what is due at one time, and other random numbers.
+
+        :param number: 0: what began to wait first comes first
+        """
+        self.seed_number = number
+        self._random = random.Random(number)
+        random.seed(number)
+        numpy.random.seed(number)
+
+    @property
+    def now(self) -> float:
+        """The ROS time, in seconds."""
+        return self.nanoseconds / 1e9
+
+    def allow_waits(self) -> None:
+        """Let threads wait for something else than time and threads."""
+        self.allows_waits = True
+
+    def run(self, seconds: float) -> None:
+        """Let so many seconds of ROS time go by."""
+        self.wait(self.time_after(seconds), LAST)
+
+    def run_until(self, predicate: Callable[[], Any], limit: float) -> Any:
+        """Let the time go on until ``predicate()`` is true, for ``limit`` seconds at most.
+
+        :returns: the last value of ``predicate()``, which is called every 20 ms at least
+        """
+        return wait(predicate, limit)
+
+    def play(self, bag: str, topics: list[str] | None = None) -> None:
+        """Publish the messages of a bag, each when all before it is done; return at its end.
+
+        The time jumps to the begin of the bag, unless that has passed.
+        """
+        with rosbag.Bag(bag) as file, self.master.create(BlockNode, 'player') as player:
+            self.nanoseconds = max(self.nanoseconds, round(file.get_start_time() * 10**9))
+            for topic, message, stamp in file.read_messages(topics):
+                self.wait(stamp.to_nsec(), LAST)
+                player.send_to(topic, message, typed_as=type(message))
+            self.run(0)
+
+    # -- the turn
+
+    def time_after(self, seconds):
+        """Return the time in so many seconds, in nanoseconds."""
+        return self.nanoseconds + round(seconds * 10**9)
+
+    def wait(self, end, order=None, lock=None):
+        """Give the turn back, and wait until this thread gets the turn again.
+
+        :param end: the time when the wait ends, in nanoseconds
+        :param lock: a Lock; the wait ends when the lock is free
+        """
+        thread = _local.thread
+        self.add_wait(thread, end, order, lock)
+        period = LOOK_PERIOD if thread is self._owner else None
+        while True:
+            try:
+                return thread.turns.get(timeout=period)
+            except Empty:
+                self._look()
+
+    def add_wait(self, thread, end, order=None, lock=None):
+        """Have a thread wait, as :meth:`wait` says; if it has the turn, another thread gets it."""
+        if order is None:
+            order = self._random.random() if self.seed_number else next(self._orders)
+        with self._lock:
+            self._waits[thread] = end, order, lock
+            if self._holder in (thread, None):
+                self._give_turn()
+
+    def give_free_turn(self):
+        """If nobody has the turn, give it: a thread that takes no part has released a lock."""
+        with self._lock:
+            if not self._holder:
+                self._give_turn()
+
+    def _give_turn(self):
+        """Give the turn to the thread whose wait ends first, or to nobody."""
+        self._holder = None
+        waits = []
+        for thread, (end, order, lock) in self._waits.items():
+            if lock and not lock.locked():
+                end = self.nanoseconds
+            if end < math.inf:
+                waits.append((end, order, thread))
+        if waits:
+            end, _, thread = min(waits)
+            del self._waits[thread]
+            self.nanoseconds = max(self.nanoseconds, end)
+            self._holder = thread
+            self._looks = 0
+            thread.turns.put(None)
+
+    def prepare(self, thread):
+        """Give a thread its attributes: the turn comes by a queue."""
+        thread.simulation = self
+        thread.has_ended = False
+        thread.turns = SimpleQueue()
+
+    def run_thread(self, thread, block):
+        """Run the block of a thread, once the thread has the turn."""
+        _local.thread = thread
+        thread.turns.get()
+        try:
+            block()
+        finally:
+            thread.has_ended = True
+            _local.thread = None
+            with self._lock:
+                if self._holder is thread:  # else it has lost the turn
+                    self._give_turn()
+
+    def sleep(self, seconds):
+        """Stand in for ``time.sleep``."""
+        if takes_part():
+            self.wait(self.time_after(max(seconds, SHORT_SLEEP)))
+        else:
+            _sleep(seconds)
+
+    def _look(self):
+        """Take the turn from a thread that waits for something else, or computes without end.
+
+        A call of a master or node, which may take long beside load, has a limit of its own.
+        """
+        cpu_time = time.process_time()
+        is_idle = cpu_time < self._cpu_time + IDLE_TIME
+        self._cpu_time = cpu_time
+        with self._lock:
+            self._looks += 1
+            thread = self._holder
+            if not thread or not is_idle and self._looks < MAX_LOOKS:
+                return
+            frames = traceback.walk_stack(sys._current_frames()[thread.ident])
+            if any(frame.f_code.co_filename == xmlrpc.__file__ for frame, _ in frames):
+                return
+            self.lost.append(thread.name)
+            self._give_turn()
+
+    # -- the change of this process
+
+    def __enter__(self):
+        global _simulation
+        clocks = {
+            name: functools.partial(self._time, getattr(time, name))
+            for name in ('time', 'monotonic', 'perf_counter')
+        }
+        monotonic = clocks['monotonic']
+        changes: dict[Any, dict[str, Any]] = {
+            time: {**clocks, 'sleep': self.sleep},
+            threading: {
+                'Lock': Lock,
+                '_allocate_lock': Lock,
+                '_CRLock': None,
+                '_time': monotonic,
+            },
+            threading.Thread: {'start': start_thread, 'join': join_thread},
+            queue: {'SimpleQueue': queue._PySimpleQueue, 'time': monotonic},  # type: ignore
+            callback_queues: {
+                'allocate_lock': Lock,
+                'perf_counter': monotonic,
+                'sleep': self.sleep,
+                '_no_yield_before': 0.0,
+            },
+            run: {'monotonic': monotonic},
+            composition: {'why_own_group': lambda *facts: ''},
+            composition.Composition: {'_start_part': _refuse_part},
+        }
+        for owner, values in changes.items():
+            self._stack.enter_context(mock.patch.multiple(owner, **values))
+        self.prepare(self._owner)
+        _local.thread = self._owner
+        _simulation = self
+        return self
+
+    def __exit__(self, *error):
+        global _simulation
+        _simulation = None
+        self._stack.close()
+        for thread in self._waits:
+            thread.turns.put(None)
+
+    def _time(self, clock):
+        """Return the time in seconds: virtual to threads that take part, that of a clock to others."""
+        return self.now if takes_part() else clock()
+
+
+def _refuse_part(composition, entries, *rest):
+    raise PharosError(
+        f'{", ".join(entry.name for entry in entries)}: has a process of its own, which knows no virtual'
+        ' time; leave it out'
+    )

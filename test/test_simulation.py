@@ -1,0 +1,206 @@
+"""Virtual time: unmodified programs run as fast as they can, and say the same each time."""
+import os
+import runpy
+import time
+
+import genpy
+import pytest
+import rosbag
+import sensor_msgs.msg
+
+from helpers import ROOT, TIMEOUT
+from pharos import BlockNode, PharosError, testing
+from pharos.simulation import Simulation
+from pharos.testing import Mailbox
+
+PROGRAMS = ROOT / 'test' / 'programs' / 'virtual'
+STRING = 'std_msgs/String'
+ENDLESS = 1e9
+master = testing.master  # these tests need a master of their own
+create_node = testing.create_node
+simulation = testing.simulation
+
+
+def messages_of(simulation, topics, seconds):
+    """Let the time go by, and return the messages as text, each with its topic and time."""
+    texts = []
+
+    def hear(message, channel):
+        texts.append(f'{channel.topic} {simulation.now} {message}')
+
+    with simulation.master.create(BlockNode, 'ear') as ear:
+        for topic, type_ in topics.items():
+            ear.interested_in(topic, type_, hear)
+        simulation.run(seconds)
+    assert simulation.lost == []
+    return texts
+
+
+# -- the same each time
+
+
+@pytest.mark.parametrize(
+    'names, count', [(['server', 'client'], 50), (['eyes'], 250), (['threads'], 400)]
+)
+def test_programs_say_the_same_each_time(master, names, count):
+    def run():
+        with Simulation(master) as simulation:
+            nodes = [master.load(str(PROGRAMS / name)) for name in names]
+            texts = messages_of(simulation, {'/said': STRING, '/tf': 'tf2_msgs/TFMessage'}, 15)
+            for node in nodes:
+                node.stop()
+        return texts
+
+    first = run()
+    assert len(first) > count
+    assert run() == first
+
+
+def test_robot_does_the_same_each_time(master, bench):
+    def run():
+        with Simulation(master) as simulation, master.compose('robot', 'robot.launch'):
+            topics = {'/rover/sonar/front': None, '/cmd_vel': None, '/rover/state': None}
+            return messages_of(simulation, topics, 20)
+
+    first = run()
+    assert len(first) > 1000
+    assert run() == first
+
+
+def write_bag(path, count):
+    with rosbag.Bag(str(path), 'w') as bag:
+        for number in range(count):
+            stamp = genpy.Time(1500000000 + number // 20, number % 20 * 50_000_000)
+            scan = sensor_msgs.msg.LaserScan(ranges=[number])
+            scan.header.stamp = stamp
+            bag.write('/scan', scan, stamp)
+
+
+def test_bag_gives_the_same_each_time(master, tmp_path):
+    """A callback with queue_size=1 that takes longer than a message misses none."""
+    write_bag(tmp_path / 'drive.bag', 300)
+
+    def run():
+        with Simulation(master) as simulation, master.create(BlockNode, 'ear') as ear:
+            said = Mailbox(ear, '/said', STRING)
+            with master.load(str(PROGRAMS / 'tracker')):
+                simulation.play(str(tmp_path / 'drive.bag'))
+            assert simulation.lost == []
+        return [message.data for message in said.all()]
+
+    first = run()
+    tracked = [text for text in first if text[0].isdigit()]
+    assert len(tracked) == 300 and tracked[-1] == '300 1500000014950000000'
+    assert run() == first
+
+
+def test_seeds_show_a_race(master):
+    """If two nodes send at one time, a seed decides which of them is first."""
+
+    def winner(seed):
+        with Simulation(master) as simulation, master.create(BlockNode, 'judge') as judge:
+            simulation.seed(seed)
+            words = Mailbox(judge, '/word', STRING)
+
+            def say(me):
+                for _ in me.every(1):
+                    me.send_to('/word', typed_as=STRING, data=me.name)
+
+            nodes = [master.create(BlockNode, name, soul=say) for name in ('left', 'right')]
+            for node in nodes:
+                node.fork()
+            simulation.run(5)
+            for node in nodes:
+                node.stop()
+        return ''.join(message.data for message in words.all())
+
+    winners = [winner(seed) for seed in range(1, 6)]
+    assert len(set(winners)) > 1
+    assert [winner(seed) for seed in range(1, 6)] == winners
+
+
+# -- in a test
+
+
+class Docker(BlockNode):
+    docked = False
+
+    def start(self):
+        super().start()
+        self.fork(Docker.dock)
+
+    def dock(self):
+        self.sleep(500)
+        self.docked = True
+
+
+def test_ten_minutes_go_by_at_once(simulation, create_node):
+    robot = create_node(Docker)
+    simulation.run(499)
+    assert not robot.docked
+    simulation.run(2)
+    assert robot.docked
+
+
+def test_time_goes_on_until_something_is_true(simulation, create_node):
+    robot = create_node(Docker)
+    start = simulation.now
+    assert not simulation.run_until(lambda: robot.docked, 100)
+    assert simulation.now - start == pytest.approx(100, abs=0.1)
+    assert simulation.run_until(lambda: robot.docked, ENDLESS)
+    assert simulation.now - start == pytest.approx(500, abs=0.1)
+
+
+def test_robot_of_the_example_docks(simulation, create_node):
+    example = runpy.run_path(str(ROOT / 'examples' / 'docking.py'))
+    create_node(example['World'])
+    robot = create_node(example['Robot'])
+    assert simulation.run_until(lambda: robot.docked, 3600)
+
+
+def test_bag_is_played_to_a_node(simulation, create_node, tmp_path):
+    write_bag(tmp_path / 'drive.bag', 100)
+    scans = Mailbox(create_node(BlockNode), '/scan', 'sensor_msgs/LaserScan')
+    simulation.play(str(tmp_path / 'drive.bag'), topics=['/scan'])
+    assert [message.ranges for message in scans.all()] == [(number,) for number in range(100)]
+    assert simulation.now == pytest.approx(1500000004.95, abs=0.01)
+
+
+def test_real_time_is_back_after_the_end(master):
+    clocks = time.time, time.monotonic, time.sleep
+    before = time.time()
+    with Simulation(master) as simulation:
+        simulation.run(ENDLESS)
+        assert time.time() == pytest.approx(simulation.now, abs=1e-6)
+    assert (time.time, time.monotonic, time.sleep) == clocks
+    assert before <= time.time() < before + ENDLESS
+
+
+def test_node_goes_on_in_real_time(master):
+    node = master.create(BlockNode, 'node')
+    with Simulation(master):
+        robot = master.create(Docker, 'robot')
+    robot.stop()
+    node.stop()
+    assert not robot.errors
+
+
+# -- what takes no part
+
+
+def test_thread_that_waits_for_something_else_is_named(simulation, create_node):
+    readable, writable = os.pipe()
+    simulation.allow_waits()
+    node = create_node(BlockNode, soul=lambda me: os.read(readable, 1))
+    thread = node.fork(name='reader')
+    simulation.run(1)
+    assert simulation.lost == ['reader']
+    os.write(writable, b'x')
+    thread.join(TIMEOUT)
+    os.close(readable)
+    os.close(writable)
+
+
+def test_program_of_another_process_is_refused(simulation, bench):
+    with pytest.raises(PharosError, match='/rover/avoider: has a process of its own'):
+        simulation.master.compose('robot', 'robot.launch', apart=['avoider'])
