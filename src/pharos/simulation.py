@@ -35,9 +35,6 @@ from pharos.private_rospy import run, xmlrpc
 from pharos.private_rospy.patches import patch
 from pharos.waiting import wait
 
-LOOK_PERIOD = 0.5  # seconds between two looks at the thread with the turn
-IDLE_TIME = 0.01  # seconds of CPU time between two looks; if it is less, that thread waits
-MAX_LOOKS = 120  # at one thread, which may compute without end
 SHORT_SLEEP = 1e-4  # seconds that a sleep takes at least: else sleep(0) would stop the time
 LAST = math.inf  # the order of a wait that ends after all others that end at the same time
 #: the functions of servers' threads are in these modules
@@ -115,7 +112,7 @@ class Lock:
 
 def start_thread(thread):
     """Stand in for ``Thread.start``: the thread takes part, unless it is a server's."""
-    block = getattr(thread, '_target', None) or type(thread).run
+    block = thread._target or type(thread).run
     module = str(getattr(block, 'func', block).__module__)
     starter = _local.thread
     _local.thread = None  # it keeps its turn while it waits until the thread has begun
@@ -131,8 +128,12 @@ def start_thread(thread):
 
 def join_thread(thread, timeout=None):
     """Stand in for ``Thread.join``: wait in virtual time."""
-    if wait(lambda: getattr(thread, 'has_ended', True), timeout):
-        _join(thread, timeout)
+    deadline = math.inf if timeout is None else time.monotonic() + timeout
+    while not getattr(thread, 'has_ended', True):
+        if time.monotonic() >= deadline:
+            return
+        time.sleep(0.01)
+    _join(thread, timeout)
 
 
 @patch('rospy.rostime', 'get_rostime')
@@ -157,18 +158,19 @@ class Simulation:
         without end, and lost the turn by that: what follows may come in another order another time
     """
 
+    allows_waits = False
+    _looks = 0  # at the thread with the turn
+    _cpu_time = 0.0
+
     def __init__(self, master):
         self.master = master
-        self.nanoseconds = 10**18  # a time with as many digits as those of today
+        self.nanoseconds = 1_000_000_000_000_000_000  # a time with as many digits as those of today
         self.lost: list[str] = []
-        self.allows_waits = False
         self._owner: Any = threading.current_thread()
         self._holder: Any = self._owner  # the thread with the turn
         self._lock = allocate_lock()  # held while the turn changes
         self._waits: dict[Any, Any] = {}  # thread -> its wait: (end, order, Lock or None)
         self._orders = itertools.count()
-        self._looks = 0  # at the thread with the turn
-        self._cpu_time = 0.0
         self._stack = contextlib.ExitStack()
         self.seed(0)
 
@@ -228,7 +230,7 @@ class Simulation:
         """
         thread = _local.thread
         self.add_wait(thread, end, order, lock)
-        period = LOOK_PERIOD if thread is self._owner else None
+        period = 0.5 if thread is self._owner else None  # seconds between two looks
         while True:
             try:
                 return thread.turns.get(timeout=period)
@@ -299,12 +301,14 @@ class Simulation:
         A call of a master or node, which may take long beside load, has a limit of its own.
         """
         cpu_time = time.process_time()
-        is_idle = cpu_time < self._cpu_time + IDLE_TIME
+        is_idle = (
+            cpu_time < self._cpu_time + 0.01
+        )  # seconds: since the last look no thread computes
         self._cpu_time = cpu_time
         with self._lock:
             self._looks += 1
             thread = self._holder
-            if not thread or not is_idle and self._looks < MAX_LOOKS:
+            if thread in (None, self._owner) or not is_idle and self._looks < 120:
                 return
             frames = traceback.walk_stack(sys._current_frames()[thread.ident])
             if any(frame.f_code.co_filename == xmlrpc.__file__ for frame, _ in frames):
