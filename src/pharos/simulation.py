@@ -115,7 +115,8 @@ def start_thread(thread):
     block = thread._target or type(thread).run
     module = str(getattr(block, 'func', block).__module__)
     starter = _local.thread
-    _local.thread = None  # it keeps its turn while it waits until the thread has begun
+    # as one that takes part it would give the turn away while _start() waits for the thread to begin
+    _local.thread = None
     if module.startswith(SERVERS):
         _start(thread)
     else:
@@ -207,7 +208,7 @@ class Simulation:
     def play(self, bag: str, topics: list[str] | None = None) -> None:
         """Publish the messages of a bag, each when all before it is done; return at its end.
 
-        The time jumps to the begin of the bag, unless that has passed.
+        The time jumps to the begin of the bag. It begins in 2001: earlier messages come at once.
         """
         with rosbag.Bag(bag) as file, self.master.create(BlockNode, 'player') as player:
             self.nanoseconds = max(self.nanoseconds, round(file.get_start_time() * 10**9))
@@ -289,9 +290,9 @@ class Simulation:
                     self._give_turn()
 
     def sleep(self, seconds):
-        """Stand in for ``time.sleep``."""
+        """Stand in for ``time.sleep``; a module may keep the function for a later simulation."""
         if takes_part():
-            self.wait(self.time_after(max(seconds, SHORT_SLEEP)))
+            _simulation.wait(_simulation.time_after(max(seconds, SHORT_SLEEP)))
         else:
             _sleep(seconds)
 
@@ -361,7 +362,7 @@ class Simulation:
 
     def _time(self, clock):
         """Return the time in seconds: virtual to threads that take part, that of a clock to others."""
-        return self.now if takes_part() else clock()
+        return _simulation.now if takes_part() else clock()
 
 
 def _refuse_part(composition, entries, *rest):
