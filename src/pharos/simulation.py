@@ -70,7 +70,8 @@ def takes_part():
 class Lock:
     """A lock. A thread that takes part waits for others that do in virtual time.
 
-    It keeps its turn if a server holds the lock, which does not do so for long.
+    It keeps its turn if a server holds the lock, which does not do so for long. "Member" is short for
+    a thread that takes part.
     """
 
     def __init__(self):
@@ -201,7 +202,8 @@ class Simulation:
     def run_until(self, predicate: Callable[[], Any], limit: float) -> Any:
         """Let the time go on until ``predicate()`` is true, for ``limit`` seconds at most.
 
-        :returns: the last value of ``predicate()``, which is called every 20 ms at least
+        :returns: the last value of ``predicate()``, which is called every 20 ms at least, in turn with
+            the other threads
         """
         return wait(predicate, limit)
 
@@ -299,7 +301,8 @@ class Simulation:
     def _look(self):
         """Take the turn from a thread that waits for something else, or computes without end.
 
-        A call of a master or node, which may take long beside load, has a limit of its own.
+        A thread in a call of XML-RPC keeps the turn: the master may take long beside load, and the call
+        has a limit of its own.
         """
         cpu_time = time.process_time()
         is_idle = (
@@ -331,7 +334,7 @@ class Simulation:
             threading: {
                 'Lock': Lock,
                 '_allocate_lock': Lock,
-                '_CRLock': None,
+                '_CRLock': None,  # then threading makes its RLocks in Python, of Locks
                 '_time': monotonic,
             },
             threading.Thread: {'start': start_thread, 'join': join_thread},
@@ -340,10 +343,10 @@ class Simulation:
                 'allocate_lock': Lock,
                 'perf_counter': monotonic,
                 'sleep': self.sleep,
-                '_no_yield_before': 0.0,
+                '_no_yield_before': 0.0,  # a virtual time is too late for the real clock
             },
             run: {'monotonic': monotonic},
-            composition: {'why_own_group': lambda *facts: ''},
+            composition: {'why_own_group': lambda *facts: ''},  # all programs run here
             composition.Composition: {'_start_part': _refuse_part},
         }
         for owner, values in changes.items():
