@@ -1,6 +1,5 @@
 """Behaviour whose loss would hurt a robot; each test fails with exactly one change of the source."""
 import contextlib
-import functools
 import gc
 import http.client
 import os
@@ -134,11 +133,19 @@ def test_stop_ends_call_of_soul(master, node, peer):
 def test_ended_soul_leaves_its_name_alone(node):
     blocks = weakref.WeakSet()
     for number in range(30):
-        block = functools.partial(print, end='')
+
+        def block(me):
+            pass
+
         blocks.add(block)
         node.fork(block, name=f'job {number}').join(TIMEOUT)
     del block
-    until(lambda: gc.collect() >= 0 and not blocks)
+
+    def are_gone():
+        gc.collect()
+        return not blocks
+
+    until(are_gone)
     assert node.health().ended_souls == [f'job {number}' for number in range(20, 30)]
 
 

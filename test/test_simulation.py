@@ -7,6 +7,7 @@ import genpy
 import pytest
 import rosbag
 import sensor_msgs.msg
+import std_msgs.msg
 
 from helpers import ROOT, TIMEOUT
 from pharos import BlockNode, PharosError, testing
@@ -164,6 +165,37 @@ def test_bag_is_played_to_a_node(simulation, create_node, tmp_path):
     simulation.play(str(tmp_path / 'drive.bag'), topics=['/scan'])
     assert [message.ranges for message in scans.all()] == [(number,) for number in range(100)]
     assert simulation.now == pytest.approx(1500000004.95, abs=0.01)
+
+
+def test_old_bag_is_played_from_now_on(simulation, create_node, tmp_path):
+    """A bag that was recorded in a simulator begins at second 0."""
+    with rosbag.Bag(str(tmp_path / 'old.bag'), 'w') as bag:
+        for second in 1, 3:
+            bag.write('/word', std_msgs.msg.String(str(second)), genpy.Time(second))
+    ear, times = create_node(BlockNode), []
+    ear.interested_in('/word', STRING, lambda message: times.append(simulation.now))
+    simulation.play(str(tmp_path / 'old.bag'))
+    assert times[1] - times[0] == pytest.approx(2, abs=0.01)
+
+
+def test_parameter_of_another_node_comes_at_once(simulation, create_node):
+    reader, times = create_node(BlockNode, 'reader'), []
+    speed = reader.parameter('/speed', initialized=1)
+    speed.on_change(lambda value: times.append(simulation.now))
+    writer = create_node(BlockNode, 'writer', soul=lambda me: (me.sleep(1), other.set(2)))
+    other = writer.parameter('/speed')
+    start = simulation.now
+    writer.fork()
+    simulation.run(5)
+    assert speed.value == 2 and times == [pytest.approx(start + 1, abs=0.01)]
+
+
+def test_service_with_timeout_takes_virtual_time(simulation, create_node):
+    arm, hand = create_node(BlockNode, 'arm'), create_node(BlockNode, 'hand')
+    arm.serve('/grip', 'std_srvs/Trigger', lambda request: (arm.sleep(2) is None, ''))
+    start = simulation.now
+    assert hand.lookup_service('/grip').call(timeout=5).success
+    assert simulation.now - start == pytest.approx(2, abs=0.01)
 
 
 def test_real_time_is_back_after_the_end(master):

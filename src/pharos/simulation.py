@@ -27,12 +27,15 @@ from unittest import mock
 import numpy
 import rosbag
 
+from pharos import service
 from pharos.compose import composition
 from pharos.errors import PharosError
 from pharos.intraprocess import callback_queues
+from pharos.intraprocess.links import runs
 from pharos.node import BlockNode
-from pharos.private_rospy import run, xmlrpc
+from pharos.private_rospy import run, tcpros, xmlrpc
 from pharos.private_rospy.patches import patch
+from pharos.shared_memory import sending
 from pharos.waiting import wait
 
 SHORT_SLEEP = 1e-4  # seconds that a sleep takes at least: else sleep(0) would stop the time
@@ -51,6 +54,7 @@ SERVERS = (
 _sleep = time.sleep
 _start = threading.Thread.start
 _join = threading.Thread.join
+_let_servers_run = functools.partial(_sleep, 1e-6)
 _simulation: Any = None  # the Simulation that goes on, or None
 
 
@@ -138,6 +142,13 @@ def join_thread(thread, timeout=None):
     _join(thread, timeout)
 
 
+def read_all_parameters(changed_run):
+    """Stand in for ``Run.read_parameters``: the master tells other nodes at no fixed time."""
+    for each in list(runs.values()):
+        for parameter in each.node._parameters:
+            parameter.read()
+
+
 @patch('rospy.rostime', 'get_rostime')
 def get_rostime(original, run):
     """rospy makes the time from a float, which is not exact. Virtual time has whole nanoseconds."""
@@ -210,12 +221,15 @@ class Simulation:
     def play(self, bag: str, topics: list[str] | None = None) -> None:
         """Publish the messages of a bag, each when all before it is done; return at its end.
 
-        The time jumps to the begin of the bag. It begins in 2001: earlier messages come at once.
+        The time jumps to the begin of the bag. If that has passed, the bag is played from now on; the
+        stamps in its messages stay.
         """
         with rosbag.Bag(bag) as file, self.master.create(BlockNode, 'player') as player:
-            self.nanoseconds = max(self.nanoseconds, round(file.get_start_time() * 10**9))
+            start = round(file.get_start_time() * 10**9)
+            delay = max(0, self.nanoseconds - start)
+            self.nanoseconds = start + delay
             for topic, message, stamp in file.read_messages(topics):
-                self.wait(stamp.to_nsec(), LAST)
+                self.wait(stamp.to_nsec() + delay, LAST)
                 player.send_to(topic, message, typed_as=type(message))
             self.run(0)
 
@@ -305,14 +319,13 @@ class Simulation:
         has a limit of its own.
         """
         cpu_time = time.process_time()
-        is_idle = (
-            cpu_time < self._cpu_time + 0.01
-        )  # seconds: since the last look no thread computes
+        is_idle = cpu_time < self._cpu_time + 0.01  # seconds of all threads since the last look
         self._cpu_time = cpu_time
         with self._lock:
             self._looks += 1
             thread = self._holder
-            if thread in (None, self._owner) or not is_idle and self._looks < 120:
+            may_compute = not is_idle and self._looks < 120
+            if may_compute or thread in (None, self._owner):
                 return
             frames = traceback.walk_stack(sys._current_frames()[thread.ident])
             if any(frame.f_code.co_filename == xmlrpc.__file__ for frame, _ in frames):
@@ -346,6 +359,11 @@ class Simulation:
                 '_no_yield_before': 0.0,  # a virtual time is too late for the real clock
             },
             run: {'monotonic': monotonic},
+            run.Run: {'read_parameters': read_all_parameters},
+            # senders' threads are real ones
+            sending: {'let_others_run': _let_servers_run},
+            tcpros: {'let_others_run': _let_servers_run},
+            service: {'ignores_timeout': True},
             composition: {'why_own_group': lambda *facts: ''},  # all programs run here
             composition.Composition: {'_start_part': _refuse_part},
         }
@@ -371,5 +389,5 @@ class Simulation:
 def _refuse_part(composition, entries, *rest):
     raise PharosError(
         f'{", ".join(entry.name for entry in entries)}: has a process of its own, which knows no virtual'
-        ' time; leave it out'
+        ' time; leave it out, or name it in here= if that is for a window alone'
     )

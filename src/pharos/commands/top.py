@@ -17,7 +17,7 @@ FILE_WIDTH = 10000  # columns of the table if it is not for a terminal, so that 
 def top(arguments: list[str]) -> None:
     """Show the nodes of the ROS master in a live table.
 
-    The columns are messages and bytes a second, transports, dropped messages, failures and
+    The columns are messages a second, transports, dropped messages, failures and
     CPU of nodes made with pharos. The command subscribes to nothing.
 
     Other commands: compose, graph, workspace, restart, stop, start, reload.

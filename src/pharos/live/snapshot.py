@@ -1,4 +1,4 @@
-"""Take a snapshot of a master and its nodes: topics, services, links and their traffic."""
+"""Take a snapshot of a master and its nodes: topics, services, links and their messages."""
 from __future__ import annotations
 
 import concurrent.futures
@@ -30,13 +30,6 @@ class Link(NamedTuple):
     transport: str  # 'INTRAPROCESS', 'SHARED_MEMORY', 'TCPROS' or 'UDPROS'
 
 
-class Traffic(NamedTuple):
-    """The messages and bytes of a link: in all, or as rates in one second."""
-
-    messages: float = 0
-    bytes: float = 0
-
-
 @dataclass
 class NodeReport:
     """A node, as the master and the node itself report it."""
@@ -46,7 +39,7 @@ class NodeReport:
     host: str = ''
     pid: int | None = None  # None: unknown
     problem: str = ''  # the reason why the node does not answer
-    links: dict[Link, Traffic] = field(default_factory=dict)  # publishers are URIs
+    links: dict[Link, int] = field(default_factory=dict)  # link -> messages; publishers are URIs
     health: dict[str, Any] = field(default_factory=dict)  # empty: no node of pharos
     publishes: list[str] = field(default_factory=list)
     subscribes: list[str] = field(default_factory=list)
@@ -61,19 +54,16 @@ class Snapshot:
     time: float  # seconds, as of time.time()
     nodes: dict[str, NodeReport]
     topic_types: dict[str, str]  # '*' for a topic that has only subscribers, of any type
-    links: dict[Link, Traffic]  # traffic since the links began
+    links: dict[Link, int]  # link -> messages since it began
 
-    def rates_since(self, start: Snapshot) -> dict[Link, Traffic]:
-        """Return the messages and bytes in one second of the links that both snapshots have."""
+    def rates_since(self, start: Snapshot) -> dict[Link, float]:
+        """Return the messages in one second of the links that both snapshots have."""
         seconds = self.time - start.time
         rates = {}
-        for link, traffic in self.links.items():
-            old_traffic = start.links.get(link)
-            # A link that counts fewer messages than before is a new one.
-            if old_traffic and traffic.messages >= old_traffic.messages:
-                message_count = traffic.messages - old_traffic.messages
-                byte_count = (traffic.bytes - old_traffic.bytes) % 2**32  # XML-RPC has 32 bits
-                rates[link] = Traffic(message_count / seconds, byte_count / seconds)
+        for link, count in self.links.items():
+            # a link that counts fewer messages than before is a new one
+            if link in start.links and count >= start.links[link]:
+                rates[link] = (count - start.links[link]) / seconds
         return rates
 
 
@@ -104,54 +94,54 @@ def _ask_node(master, node):
             node.host = LOCAL_HOST
         proxy: Any = ServerProxy(node.uri, NODE_TIMEOUT)
         node.pid = int(proxy.getPid(CALLER_ID)[2])
-        traffic = _traffic_counts(proxy.getBusStats(CALLER_ID))
+        counts = _message_counts(proxy.getBusStats(CALLER_ID))
         for number, peer, direction, transport, topic, *_ in proxy.getBusInfo(CALLER_ID)[2]:
             is_incoming = direction == 'i'
             if is_incoming:
                 link = Link(topic, peer, node.name, transport)
             else:
                 link = Link(topic, node.name, peer, transport)
-            node.links[link] = traffic.get((is_incoming, topic, number), Traffic())
+            node.links[link] = counts.get((is_incoming, topic, number), 0)
         node.health = proxy.pharosHealth(CALLER_ID)[2]
     except Exception as error:  # a node with a problem must not hide the others
         if 'pharosHealth' not in str(error):  # only nodes of pharos have this method
             node.problem = str(error)
 
 
-def _traffic_counts(answer):
-    """Return ``{(is incoming, topic, number of the connection): Traffic}`` from getBusStats."""
+def _message_counts(answer):
+    """Return ``{(is incoming, topic, number of the connection): messages}`` from getBusStats."""
     has_code = answer[0] == 1  # roscpp leaves out code and message
     publications, subscriptions, *_ = answer[2] if has_code else answer
     counts = {}
     for topic, *_, rows in publications:  # rospy has the sum of bytes before the rows
         for row in rows:  # the count of messages is third in rospy's rows, fourth in roscpp's
-            counts[False, topic, row[0]] = Traffic(row[-2], row[1])
+            counts[False, topic, row[0]] = row[-2]
     for topic, rows in subscriptions:
-        for number, byte_count, message_count, *_ in rows:
-            counts[True, topic, number] = Traffic(message_count, byte_count)
+        for number, _, message_count, *_ in rows:
+            counts[True, topic, number] = message_count
     return counts
 
 
 def _merge_links(nodes):
-    """Return the links that one end at least reports, with the greater traffic of both.
+    """Return the links that one end at least reports, with the greater count of both.
 
     A publisher reports the name of the other end, a subscriber the URI.
     """
     names = {node.uri: node.name for node in nodes}
-    links: dict[Link, Traffic] = {}
+    links: dict[Link, int] = {}
     for node in nodes:
-        for link, traffic in node.links.items():
+        for link, count in node.links.items():
             publisher = names.get(link.publisher, link.publisher)
             subscriber = names.get(link.subscriber, link.subscriber)
             merged_link = Link(link.topic, publisher, subscriber, link.transport)
-            links[merged_link] = max(links.get(merged_link, Traffic()), traffic)
+            links[merged_link] = max(links.get(merged_link, 0), count)
     return links
 
 
-def publisher_rates(link_rates: dict[Link, Traffic]) -> dict[tuple[str, str], float]:
+def publisher_rates(link_rates: dict[Link, float]) -> dict[tuple[str, str], float]:
     """Return ``{(topic, publisher): messages in one second}``, those of the fastest link."""
     rates: dict[tuple[str, str], float] = {}
-    for link, traffic in link_rates.items():
+    for link, rate in link_rates.items():
         key = link.topic, link.publisher
-        rates[key] = max(rates.get(key, 0.0), traffic.messages)
+        rates[key] = max(rates.get(key, 0.0), rate)
     return rates

@@ -62,8 +62,7 @@ def _node_rows(snapshot, start):
     link_rates = snapshot.rates_since(start)
     message_rates = publisher_rates(link_rates)
     for name, node in snapshot.nodes.items():
-        input_traffic = [rate for link, rate in link_rates.items() if link.subscriber == name]
-        output_traffic = [rate for link, rate in link_rates.items() if link.publisher == name]
+        input_rates = [rate for link, rate in link_rates.items() if link.subscriber == name]
         output_rates = [rate for (_, sender), rate in message_rates.items() if sender == name]
         own_links = [link for link in snapshot.links if name in (link.publisher, link.subscriber)]
         transports = [link.transport for link in own_links]
@@ -73,10 +72,8 @@ def _node_rows(snapshot, start):
             'HOST': node.host,
             'PID': node.pid,
             'CPU%': _cpu_percent(name, snapshot, start),
-            'IN/S': sum(rate.messages for rate in input_traffic),
+            'IN/S': sum(input_rates),
             'OUT/S': sum(output_rates),  # a message counts once, however many nodes receive it
-            'IN B/S': sum(rate.bytes for rate in input_traffic),
-            'OUT B/S': sum(rate.bytes for rate in output_traffic),
             'LOCAL': transports.count('INTRAPROCESS'),
             'SHM': transports.count('SHARED_MEMORY'),
             'TCP': transports.count('TCPROS'),
