@@ -255,7 +255,7 @@ def program(command, url):
 
 def test_frozen_node_delays_graph_little(master, mixed):
     os.kill(mixed.pid, signal.SIGSTOP)
-    with program('top --once', master.url) as top:
+    with program('top', master.url) as top:
         graph = master.graph()
         assert top.wait() == 0
     os.kill(mixed.pid, signal.SIGCONT)
@@ -269,7 +269,7 @@ def test_frozen_master_ends_questions(mortal):
     pid = mortal.pid
     os.kill(pid, signal.SIGSTOP)
     url = mortal.url
-    with program('top --once', url) as top, program('graph', url) as graph:
+    with program('top', url) as top, program('graph', url) as graph:
         with pytest.raises(MasterUnreachableError):
             mortal.master.graph()
         assert (graph.wait(), top.wait()) == (1, 1)
@@ -283,8 +283,7 @@ def test_frozen_master_ends_questions(mortal):
 COMMANDS = {
     'graph': 'graph',
     'rates': 'graph --rates 0.5',
-    'top': 'top --once',
-    'top json': 'top --json',
+    'top': 'top',
 }
 
 
@@ -321,21 +320,11 @@ class Scene:
         peer.hear('/traffic', STRING)
         assert sender.channels[0].wait_for_subscribers(2, TIMEOUT)
 
-    def row(self, name, key='top'):
-        """The words of a line of the table of top, by the titles of its columns."""
-        titles = []
-        for line in self.output[key].splitlines():
-            words = line.split()
-            if words and words[0] == 'NODE':
-                titles = words
-            elif words and words[0] == name:
-                return dict(zip(titles, words))
-        raise AssertionError(f'no {name} in {self.output[key]}')
 
-    def json_row(self, name):
-        """A row of what top --json prints: the one that has the name among its values."""
-        rows = json.loads(self.output['top json'])['nodes']
-        return next(row for row in rows if name in row.values())
+def row_of(name, output):
+    """The words of a line of the table of top, by the titles of its columns."""
+    titles, *rows = [line.split() for line in output.splitlines()]
+    return next(dict(zip(titles, row)) for row in rows if row[0] == name)
 
 
 @pytest.fixture(scope='module')
@@ -366,15 +355,14 @@ def test_graph_program_saves_picture(scene):
     assert all(name in texts for name in ('/sender', '/hearer', '/peer', '/traffic'))
 
 
-def test_top_json_tells_of_nodes(scene):
-    assert {scene.pids['own'], 'BlockNode'} <= {*scene.json_row('/sender').values()}
-    assert scene.pids['peer'] in scene.json_row('/peer').values()
-    assert scene.row('/peer')
+def test_top_tells_of_nodes(scene):
+    sender = row_of('/sender', scene.output['top'])
+    assert (sender['PID'], sender['CLASS']) == (str(scene.pids['own']), 'BlockNode')
+    assert row_of('/peer', scene.output['top'])['PID'] == str(scene.pids['peer'])
 
 
-def test_top_json_counts_failures(scene):
-    row = scene.json_row('/hearer')
-    assert [value for key, value in row.items() if key.lower().startswith('fail')] == [1]
+def test_top_counts_failures(scene):
+    assert row_of('/hearer', scene.output['top'])['FAIL'] == '1'
 
 
 def test_top_tells_cpu_of_nodes(master):
@@ -384,10 +372,10 @@ def test_top_tells_cpu_of_nodes(master):
 
     create(master, '/computing', soul=compute).fork()
     create(master, '/idle').interested_in('/topic', STRING)
-    with Program(['rosrun', 'pharos', 'top', '--json'], master.url) as top:
+    with program('top', master.url) as top:
         assert top.wait() == 0
-        rows = {row['NODE']: row['CPU%'] for row in json.loads(top.output)['nodes']}
-    assert rows['/computing'] > 10 * rows['/idle']
+        computing, idle = row_of('/computing', top.output), row_of('/idle', top.output)
+    assert float(computing['CPU%']) > 10 * float(idle['CPU%'])
 
 
 def test_keys_of_top_restart_a_node(master, tmp_path):
@@ -506,12 +494,11 @@ def test_node_describes_itself(master, traffic):
 def test_messages_are_shown_in_short(master, transcript):
     for type_, fields, text in [
         ('geometry_msgs/Twist', {'linear': {'x': 2.5}}, 'x: 2.5'),
-        ('std_msgs/String', {'data': 'x' * 10**6}, 'xxxxxxxx'),
-        ('sensor_msgs/Image', {'data': bytes(10**6)}, '1000000'),
-        ('sensor_msgs/LaserScan', {'ranges': [1.5] * 720}, '720'),
-        ('sensor_msgs/JointState', {'name': ['joint'] * 500}, '500'),
-        ('nav_msgs/OccupancyGrid', {'data': [7] * 10**4}, '10000'),
-        ('sensor_msgs/PointCloud', {'points': [{'x': 1}] * 300}, '300'),
+        ('std_msgs/String', {'data': 'x' * 10**6}, 'x ... 1000008 characters'),
+        ('sensor_msgs/Image', {'data': bytes(10**6)}, '0 ... 3000006 characters'),
+        ('sensor_msgs/LaserScan', {'ranges': [1.5] * 720}, ' characters\nintensities: []'),
+        ('sensor_msgs/JointState', {'name': ['joint'] * 500}, '- joint\n... 510 lines'),
+        ('sensor_msgs/PointCloud', {'points': [{'x': 1}] * 300}, '... 1208 lines'),
     ]:
         topic = master.topic(f'/shown/{type_}')
         with create(master) as node:

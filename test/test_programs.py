@@ -17,7 +17,7 @@ VELOCITY = 'turtlesim/Velocity'
 STRING = 'std_msgs/String'
 NEED_MASTER = [
     *('turtle_driver', 'block_subscriber', 'clear_turtle', 'turtle_simulator', 'graph'),
-    'top --once',
+    'top',
 ]
 NOWHERE = 'http://127.0.0.1:1/'  # no master is there
 

@@ -9,7 +9,7 @@ import rosbag
 import sensor_msgs.msg
 import std_msgs.msg
 
-from helpers import ROOT, TIMEOUT
+from helpers import COMPOSE, ROOT, TIMEOUT, Program
 from pharos import BlockNode, PharosError, testing
 from pharos.simulation import Simulation
 from pharos.testing import Mailbox
@@ -93,6 +93,37 @@ def test_bag_gives_the_same_each_time(master, tmp_path):
     tracked = [text for text in first if text[0].isdigit()]
     assert len(tracked) == 300 and tracked[-1] == '300 1500000014950000000'
     assert run() == first
+
+
+def test_command_records_the_same_bytes_each_time(master, tmp_path):
+    write_bag(tmp_path / 'drive.bag', 100)
+
+    def run(*options):
+        record = tmp_path / 'out.bag'
+        arguments = ['--record', str(record), '--script', str(PROGRAMS / 'tracker')]
+        with Program([*COMPOSE, *options, *arguments], master.url) as composed:
+            assert composed.wait() == 0, composed.output
+        assert 's of ROS time took' in composed.output
+        return record.read_bytes()
+
+    bag_options = '--bag', str(tmp_path / 'drive.bag'), '--topics', '/scan'
+    first = run(*bag_options)
+    with rosbag.Bag(str(tmp_path / 'out.bag')) as bag:
+        messages = list(bag.read_messages())
+    assert {topic for topic, _, _ in messages} == {'/said'}
+    tracked = [(text.data, stamp) for _, text, stamp in messages if text.data[0].isdigit()]
+    assert tracked[-1] == ('100 1500000004950000000', genpy.Time(1500000004, 950_000_000))
+    assert len(tracked) == 100 and run(*bag_options) == first
+    assert run('--for', '20') == run('--for', '20')
+
+
+@pytest.mark.parametrize('name', ['no.bag', 'wrong.bag'])
+def test_command_tells_of_a_bag_that_cannot_be_read(master, tmp_path, name):
+    (tmp_path / 'wrong.bag').write_text('no bag')
+    arguments = ['--bag', str(tmp_path / name), '--script', str(PROGRAMS / 'tracker')]
+    with Program([*COMPOSE, *arguments], master.url) as composed:
+        assert composed.wait() == 1
+    assert name in composed.output and 'Traceback' not in composed.output
 
 
 def test_seeds_show_a_race(master):

@@ -26,6 +26,7 @@ from unittest import mock
 
 import numpy
 import rosbag
+from genpy import Time
 
 from pharos import service
 from pharos.compose import composition
@@ -35,10 +36,12 @@ from pharos.intraprocess.links import runs
 from pharos.node import BlockNode
 from pharos.private_rospy import run, tcpros, xmlrpc
 from pharos.private_rospy.patches import patch
+from pharos.private_rospy.topics import ROSOUT
 from pharos.shared_memory import sending
 from pharos.waiting import wait
 
 SHORT_SLEEP = 1e-4  # seconds that a sleep takes at least: else sleep(0) would stop the time
+PLAYER = '/bag_player'  # the node that plays bags
 LAST = math.inf  # the order of a wait that ends after all others that end at the same time
 #: the functions of servers' threads are in these modules
 SERVERS = (
@@ -163,15 +166,26 @@ def is_use_simtime(original, run):
     return not _simulation and original()
 
 
+@patch('rospy.topics', '_PublisherImpl.publish')
+def publish(original, run, publisher, message, *options):
+    """rospy only sends. This also records what a node sends, if the simulation shall."""
+    original(publisher, message, *options)
+    is_own = run.name != PLAYER and publisher.name != ROSOUT
+    if _simulation and _simulation.record and is_own:
+        _simulation.record(publisher.name, message, Time(0, _simulation.nanoseconds))
+
+
 class Simulation:
     """Virtual time, in a ``with``, for this thread and for all nodes that the process starts there.
 
     :ivar nanoseconds: the ROS time
     :ivar lost: the names of threads that waited for something else than time and threads, or computed
         without end, and lost the turn by that: what follows may come in another order another time
+    :ivar record: None, or ``record(topic, message, time)``, called with what the nodes publish
     """
 
     allows_waits = False
+    record: Any = None
     _looks = 0  # at the thread with the turn
     _cpu_time = 0.0
 
@@ -224,7 +238,7 @@ class Simulation:
         The time jumps to the begin of the bag. If that has passed, the bag is played from now on; the
         stamps in its messages stay.
         """
-        with rosbag.Bag(bag) as file, self.master.create(BlockNode, 'player') as player:
+        with rosbag.Bag(bag) as file, self.master.create(BlockNode, PLAYER) as player:
             start = round(file.get_start_time() * 10**9)
             delay = max(0, self.nanoseconds - start)
             self.nanoseconds = start + delay

@@ -5,20 +5,25 @@ import contextlib
 import faulthandler
 import os
 import sys
+import time
 import urllib.parse
 from typing import Any
 
 import rospkg
 
 from pharos import Master
-from pharos.commands import argument_parser, run_command
-from pharos.compose.composition import SWITCH_INTERVAL, Composition, leave
+from pharos.commands import argument_parser
+from pharos.compose.composition import SWITCH_INTERVAL, Composition
 from pharos.compose.launch_file import LaunchFile
 
-
-def main() -> int:
-    """Run the command, and return the exit status."""
-    return leave(run_command('compose'))
+#: options that take names -> help
+NAMES = {
+    'script': 'programs to run',
+    'only': 'of the file, these nodes alone',
+    'apart': 'these as plain processes',
+    'here': 'these here, though they show windows',
+    'topics': 'of the bag, these topics alone',
+}
 
 
 def compose(arguments: list[str]) -> int:
@@ -28,6 +33,7 @@ def compose(arguments: list[str]) -> int:
       compose FILE.launch [arg:=value ...]         the same, by its path
       compose --script PKG/EXECUTABLE ... [_rate:=5 old:=new ...]    programs, as rosrun runs them
       compose talker.py ...                        the same, by paths
+      compose --bag drive.bag --record out.bag PKG FILE.launch    in virtual time, as fast as it goes
 
     Programs with windows, and those with a state that a process has but once, run as plain processes; a line
     says which and why. It ends when all nodes have ended, or by Ctrl-C.
@@ -44,16 +50,16 @@ def compose(arguments: list[str]) -> int:
 def _parse(arguments):
     parser = argument_parser(compose)
     parser.add_argument('file', nargs='*', help='PKG FILE.launch, or its path alone')
-    parser.add_argument('--script', nargs='+', default=[], help='programs to run')
-    parser.add_argument('--only', nargs='+', default=[], help='of the file, these nodes alone')
-    parser.add_argument('--apart', nargs='+', default=[], help='these as plain processes')
-    parser.add_argument(
-        '--here', nargs='+', default=[], help='these here, though they show windows'
-    )
+    for name, text in NAMES.items():
+        parser.add_argument(f'--{name}', nargs='+', default=[], help=text)
     parser.add_argument(
         '--group', nargs='+', action='append', default=[], help='these in one other process'
     )
     parser.add_argument('--screen', action='store_true', help="all nodes have output='screen'")
+    parser.add_argument('--bag', help='play this bag in virtual time, and end with it')
+    parser.add_argument('--for', type=float, dest='seconds', help='so long in virtual time, no bag')
+    parser.add_argument('--record', help='in virtual time: write what nodes publish to this bag')
+    parser.add_argument('--seed', type=int, default=0, help='in virtual time: another order')
     options = parser.parse_args(arguments)
     if options.file and options.file[0].endswith('.py'):
         options.script = options.file
@@ -72,13 +78,54 @@ def _run(stack, options, mappings):
     if not master.is_reachable():
         port: Any = urllib.parse.urlsplit(master.url).port
         print(f'no ROS master at {master.url}: it is started here', file=sys.stderr)
-        os.environ['ROS_MASTER_URI'] = stack.enter_context(Master.embedded(port)).url
+        stack.enter_context(Master.embedded(port))
+    simulation = None
+    if options.bag or options.seconds:
+        simulation = _begin_simulation(stack, master, options)
     composition = stack.enter_context(Composition(master, owns_process=True))
     if options.file:
         composition.launch(_read_launch_file(master.url, options, mappings))
     else:
         composition.run_scripts(options.script, mappings, options.here)
+    if simulation:
+        _simulate(simulation, options)
+        composition.stopping.set()  # ends its wait()
     return composition.wait()
+
+
+def _begin_simulation(stack, master, options):
+    """Make the time virtual, and return the Simulation.
+
+    The time begins about a second before the bag, so that the programs start before.
+    """
+    import rosbag
+
+    from pharos.simulation import Simulation
+
+    simulation = stack.enter_context(Simulation(master))
+    simulation.seed(options.seed)
+    if options.bag:
+        try:
+            with rosbag.Bag(options.bag) as bag:
+                simulation.nanoseconds = round(bag.get_start_time() - 1) * 10**9
+        except rosbag.ROSBagException as error:
+            raise ValueError(f'{options.bag}: {error}; rosbag info says more') from error
+    if options.record:
+        simulation.record = stack.enter_context(rosbag.Bag(options.record, 'w')).write
+    return simulation
+
+
+def _simulate(simulation, options):
+    """Play the bag, or let the time go by; show how fast that went."""
+    start = simulation.now
+    if options.bag:
+        simulation.play(options.bag, options.topics)
+    else:
+        simulation.run(options.seconds)
+    seconds = simulation.now - start
+    print(f'{seconds:.1f} s of ROS time took {time.process_time():.1f} s of the processor')
+    if simulation.lost:
+        print(f'threads that waited for something else: {simulation.lost}', file=sys.stderr)
 
 
 def _read_launch_file(url, options, mappings):

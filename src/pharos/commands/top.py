@@ -1,7 +1,6 @@
 """The command top."""
 from __future__ import annotations
 
-import json
 import sys
 import time
 
@@ -11,11 +10,11 @@ from pharos.commands import argument_parser
 from pharos.live.top import Meter, show, table
 from pharos.master import Master
 
-FILE_WIDTH = 10000  # columns of the table if it is not for a terminal, so that nothing is cut
+FILE_WIDTH = 10000  # columns of the printed table, so that nothing is cut
 
 
 def top(arguments: list[str]) -> None:
-    """Show the nodes of the ROS master in a live table.
+    """Show the nodes of the ROS master in a live table; in a pipe, as `top | cat`, print it once.
 
     The columns are messages a second, transports, dropped messages, failures and
     CPU of nodes made with pharos. The command subscribes to nothing.
@@ -23,20 +22,13 @@ def top(arguments: list[str]) -> None:
     Other commands: compose, graph, workspace, restart, stop, start, reload.
     """
     parser = argument_parser(top)
-    parser.add_argument('--once', action='store_true', help='print the table once')
-    parser.add_argument('--json', action='store_true', help='print JSON once')
     parser.add_argument(
         '--interval', type=float, default=1, metavar='S', help='seconds between measurements'
     )
     options = parser.parse_args(arguments)
     meter = Meter(Master())
-    if sys.stdin.isatty() and sys.stdout.isatty() and not (options.once or options.json):
+    if sys.stdin.isatty() and sys.stdout.isatty():
         show(meter, options.interval)
-        return
-    time.sleep(options.interval)
-    rows = meter.measure()
-    if options.json:
-        print(json.dumps({'nodes': rows}))
-        return
-    console = Console(width=None if sys.stdout.isatty() else FILE_WIDTH)
-    console.print(table(rows))
+    else:
+        time.sleep(options.interval)
+        Console(width=FILE_WIDTH).print(table(meter.measure()))

@@ -69,12 +69,12 @@ def control(action: str, name: str, master: Master) -> str:
     """Restart, stop, start or reload a node of any composition of this user on this host, at a master.
 
     :param action: 'restart', 'stop', 'start' or 'reload'
+    :param name: the full name
     :returns: the name of the node of the program, which may have created the node with pharos; of a
         reload, what :meth:`Node.reload` returns
     :raises UnknownNodeError: if no such composition has the node
     :raises PharosError: if the node does not start
     """
-    name = '/' + name.lstrip('/')
     with open('/proc/net/unix') as file:
         socket_names = set(re.findall(f'@({_PREFIX}\\d+)', file.read()))
     for socket_name in socket_names:

@@ -17,7 +17,6 @@ from pharos.live.text_format import short_number
 if TYPE_CHECKING:
     from pharos.master import Master
 
-SUFFIXES = '.svg', '.png', '.pdf', '.dot'
 DRAW_TIMEOUT = 60  # seconds that graphviz has for a picture
 #: the topics and services that every node has
 COMMON_NAMES = re.compile(
@@ -153,8 +152,7 @@ class Graph:
         yield f'label="{self.snapshot.master}\\n{LEGEND}"; labeljust=l; fontsize=10'
         frames = collections.defaultdict(list)  # (host, process id) -> ids of nodes and topics
         for name, node in self.nodes.items():
-            caption = 'does not answer' if node.problem else ''
-            yield _dot_box('n', name, caption, NODE_STYLE)
+            yield _dot_box('n', name, node.problem, NODE_STYLE)
             frames[self._process_of(name)].append(_dot_id('n', name))
         for topic in self.topics:
             yield _dot_box('t', topic, self._topic_label(topic), TOPIC_STYLE)
@@ -187,14 +185,9 @@ class Graph:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a picture to a file; the suffix tells the format: .svg, .png, .pdf or .dot.
 
-        :raises ValueError: if the suffix is another one
-        :raises PharosError: if graphviz is not installed, or fails
+        :raises PharosError: if graphviz is not installed, knows no such format, or fails
         """
         file = pathlib.Path(path)
-        if file.suffix not in SUFFIXES:
-            raise ValueError(
-                f'{file} is not a picture: its name ends in one of {", ".join(SUFFIXES)}'
-            )
         if file.suffix == '.dot':
             file.write_bytes(self.dot().encode())
         else:

@@ -1,8 +1,8 @@
 """Format numbers and messages as text."""
 import genpy
 
-MAX_ITEMS = 12  # items of an array, and lines of a text, that are shown
-LINE_LENGTH = 80
+MAX_LINES = 50  # of a message that are shown
+MAX_LENGTH = 200  # characters of a line
 
 
 def short_number(value: float) -> str:
@@ -17,31 +17,15 @@ def short_number(value: float) -> str:
 
 
 def message_text(message: genpy.Message) -> str:
-    """Return a message as ``rostopic echo`` prints it, with long arrays and texts cut."""
-    return genpy.message.strify_message(_short_value(message))
+    """Return a message as ``rostopic echo`` prints it, with long lines and long messages cut."""
+    lines = genpy.message.strify_message(message).splitlines()
+    texts = [_short_line(line) for line in lines[:MAX_LINES]]
+    if len(lines) > MAX_LINES:
+        texts.append(f'... {len(lines)} lines')
+    return '\n'.join(texts)
 
 
-def _short_value(value):
-    """Return a copy of a message, or of a value in one, that is short enough to be shown."""
-    if isinstance(value, genpy.Message):
-        message = object.__new__(type(value))  # skips the default values of __init__
-        for field in value.__slots__:
-            setattr(message, field, _short_value(getattr(value, field)))
-        return message
-    max_length = MAX_ITEMS * LINE_LENGTH
-    if isinstance(value, str) and len(value) > max_length:
-        return f'{value[:max_length]} ... {len(value)} in all'
-    if isinstance(value, (bytes, list, tuple)) and len(value) > MAX_ITEMS:
-        first_items = ', '.join(str(_short_value(item)) for item in value[:3])
-        return _PlainText(f'[{first_items}, ... {len(value)} in all]')
-    return value
-
-
-class _PlainText:
-    """A text that genpy writes without quotes, since it is not a str."""
-
-    def __init__(self, text):
-        self._text = text
-
-    def __str__(self):
-        return self._text
+def _short_line(line):
+    if len(line) <= MAX_LENGTH:
+        return line
+    return f'{line[:MAX_LENGTH]} ... {len(line)} characters'

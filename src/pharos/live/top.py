@@ -110,7 +110,7 @@ def table(rows: list[dict[str, Any]], chosen_node: str = '') -> Table:
 
 
 def _cell_text(column, value):
-    if value is None or value == '':
+    if value in (None, ''):
         return '-'
     if isinstance(value, str) or column == 'PID':
         text = str(value)
