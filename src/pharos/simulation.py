@@ -40,8 +40,9 @@ from pharos.private_rospy.topics import ROSOUT
 from pharos.shared_memory import sending
 from pharos.waiting import wait
 
-SHORT_SLEEP = 1e-4  # seconds that a sleep takes at least: else sleep(0) would stop the time
+READ_TIME = 1000  # nanoseconds that each look at the clock takes: programs divide by such a time
 PLAYER = '/bag_player'  # the node that plays bags
+MAX_DELAY = 10**6  # nanoseconds; with a seed, a wait ends by so much later at most
 LAST = math.inf  # the order of a wait that ends after all others that end at the same time
 #: the functions of servers' threads are in these modules
 SERVERS = (
@@ -157,6 +158,7 @@ def get_rostime(original, run):
     """rospy makes the time from a float, which is not exact. Virtual time has whole nanoseconds."""
     if not _simulation:
         return original()
+    time.time()  # takes some time
     return run.modules.by_name['rospy.rostime'].Time(0, _simulation.nanoseconds)
 
 
@@ -170,9 +172,9 @@ def is_use_simtime(original, run):
 def publish(original, run, publisher, message, *options):
     """rospy only sends. This also records what a node sends, if the simulation shall."""
     original(publisher, message, *options)
-    is_own = run.name != PLAYER and publisher.name != ROSOUT
-    if _simulation and _simulation.record and is_own:
-        _simulation.record(publisher.name, message, Time(0, _simulation.nanoseconds))
+    record = _simulation and _simulation.record
+    if record and run.name != PLAYER and publisher.name != ROSOUT:
+        record(publisher.name, message, Time(0, _simulation.nanoseconds))
 
 
 class Simulation:
@@ -202,9 +204,9 @@ class Simulation:
         self.seed(0)
 
     def seed(self, number: int) -> None:
-        """Choose another order of what is due at one time, and other random numbers.
+        """Choose by chance how much later than due each wait ends, and other random numbers.
 
-        :param number: 0: what began to wait first comes first
+        :param number: 0: each wait ends when due; what began to wait first comes first
         """
         self.seed_number = number
         self._random = random.Random(number)
@@ -271,7 +273,9 @@ class Simulation:
     def add_wait(self, thread, end, order=None, lock=None):
         """Have a thread wait, as :meth:`wait` says; if it has the turn, another thread gets it."""
         if order is None:
-            order = self._random.random() if self.seed_number else next(self._orders)
+            order = next(self._orders)
+            if self.seed_number:
+                end += self._random.randrange(MAX_DELAY)
         with self._lock:
             self._waits[thread] = end, order, lock
             if self._holder in (thread, None):
@@ -322,7 +326,8 @@ class Simulation:
     def sleep(self, seconds):
         """Stand in for ``time.sleep``; a module may keep the function for a later simulation."""
         if takes_part():
-            _simulation.wait(_simulation.time_after(max(seconds, SHORT_SLEEP)))
+            # sleep(0) takes some time, too, or it would stop the time
+            _simulation.wait(_simulation.time_after(max(seconds, 1e-4)))
         else:
             _sleep(seconds)
 
@@ -397,7 +402,10 @@ class Simulation:
 
     def _time(self, clock):
         """Return the time in seconds: virtual to threads that take part, that of a clock to others."""
-        return _simulation.now if takes_part() else clock()
+        if not takes_part():
+            return clock()
+        _simulation.nanoseconds += READ_TIME
+        return _simulation.now
 
 
 def _refuse_part(composition, entries, *rest):

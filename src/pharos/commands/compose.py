@@ -59,15 +59,16 @@ def _parse(arguments):
     parser.add_argument('--bag', help='play this bag in virtual time, and end with it')
     parser.add_argument('--for', type=float, dest='seconds', help='so long in virtual time, no bag')
     parser.add_argument('--record', help='in virtual time: write what nodes publish to this bag')
-    parser.add_argument('--seed', type=int, default=0, help='in virtual time: another order')
+    parser.add_argument(
+        '--seed', type=int, default=0, help='in virtual time: other delays, by chance'
+    )
     options = parser.parse_args(arguments)
     if options.file and options.file[0].endswith('.py'):
         options.script = options.file
         options.file = []
-    if not (options.file or options.script):
-        parser.error('give a launch file, or programs')
     names_nodes = options.only or options.apart or options.group
-    if options.script and (options.file or names_nodes) or len(options.file) > 2:
+    has_both = options.script and (options.file or names_nodes)
+    if has_both or len(options.file) > 2 or not (options.file or options.script):
         parser.error('give one launch file, by package and name or by its path, first; or --script')
     return options
 

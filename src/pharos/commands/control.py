@@ -33,7 +33,7 @@ def reload(arguments: list[str]) -> None:
 
 def _control(command, arguments):
     parser = argument_parser(command)
-    parser.add_argument('node', metavar='NODE', help='the full name of the node')
+    parser.add_argument('node', help='the full name of the node')
     name = '/' + parser.parse_args(arguments).node.lstrip('/')
     program = control(command.__name__, name, Master())
     if command is reload:

@@ -22,9 +22,7 @@ def top(arguments: list[str]) -> None:
     Other commands: compose, graph, workspace, restart, stop, start, reload.
     """
     parser = argument_parser(top)
-    parser.add_argument(
-        '--interval', type=float, default=1, metavar='S', help='seconds between measurements'
-    )
+    parser.add_argument('--interval', type=float, default=1, help='seconds between measurements')
     options = parser.parse_args(arguments)
     meter = Meter(Master())
     if sys.stdin.isatty() and sys.stdout.isatty():
