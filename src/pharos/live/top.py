@@ -139,12 +139,12 @@ def show(meter: Meter, interval: float) -> None:
 def _show_nodes(screen, meter, interval, keyboard):
     rows = meter.measure()
     chosen_node = ''
-    line = ''
+    problem = answer = ''
     deadline = time.monotonic() + interval
     while True:
         page = Table.grid()
         page.add_row(HELP)
-        page.add_row(line)
+        page.add_row(problem or answer)
         page.add_row(table(rows, chosen_node))
         screen.update(page, refresh=True)
         timeout = max(0, deadline - time.monotonic())
@@ -153,17 +153,16 @@ def _show_nodes(screen, meter, interval, keyboard):
             if key == 'q':
                 return
             if key in 'jk':
-                step = 1 if key == 'j' else -1
-                chosen_node = _next_node(rows, chosen_node, step)
+                chosen_node = _next_node(rows, chosen_node, 1 if key == 'j' else -1)
             elif key in ACTIONS and chosen_node:
-                line = _control(ACTIONS[key], chosen_node, meter.master)
+                answer = _control(ACTIONS[key], chosen_node, meter.master)
         else:
             deadline = time.monotonic() + interval
             try:
                 rows = meter.measure()
-                line = ''
+                problem = ''
             except MasterUnreachableError as error:
-                line = str(error)
+                problem = str(error)
 
 
 def _next_node(rows, chosen_node, step):
