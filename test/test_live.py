@@ -108,7 +108,10 @@ class Terminal:
         return self
 
     def __exit__(self, *error):
-        self._process.close(force=True)
+        try:
+            self._process.close(force=True)
+        except pexpect.ExceptionPexpect:  # it was killed; beside load, its end takes a moment
+            self._process.wait()
         self._folder.cleanup()
 
 

@@ -1,10 +1,13 @@
 """How nodes and their programs end: by a signal, by themselves, killed, forked or spawned."""
 import signal
+import threading
 
 import pytest
+import rosgraph
 import rosnode
 
-from helpers import PYTHON, Peer, Program, create, registrations
+from helpers import PYTHON, TIMEOUT, Peer, Program, create, registrations
+from pharos import BlockNode
 from pharos.testing import Mailbox, until
 
 # seconds; make it 3600 when a second Ctrl-C ends at once (API.md): now, the stop goes on
@@ -300,3 +303,24 @@ def test_namesake_from_elsewhere_stops_the_node(master):
         until(lambda: not node.is_running)
         until(lambda: rosnode.rosnode_ping('/peer', max_count=1))
         assert peer.value('rospy.is_shutdown()') is False
+
+
+def test_namesake_keeps_the_name_while_the_node_stops(master):
+    """A node that stops slowly does not register again what the namesake has taken."""
+    free = threading.Event()
+    uri = 'http://127.0.0.1:1/'  # of the namesake
+
+    class Slow(BlockNode):
+        def stop(self):
+            free.wait(TIMEOUT)
+            super().stop()
+
+    create(master, '/node', node_class=Slow)
+    other = create(master, '/other')
+    other.output_channel('/topic', 'std_msgs/String')
+    rosgraph.Master('/node', master.url).registerService('/service', 'rosrpc://127.0.0.1:1', uri)
+    rosgraph.Master('/other', master.url).unregisterPublisher('/topic', other.uri)
+    until(lambda: master.topic('/topic').publishers == ['/other'])  # it is registered again
+    assert master.call('lookupNode', '/node') == uri
+    rosgraph.Master('/node', master.url).unregisterService('/service', 'rosrpc://127.0.0.1:1')
+    free.set()

@@ -1,6 +1,5 @@
 """Parameters of the parameter server, bound both ways."""
 import collections
-import difflib
 import functools
 import threading
 from copy import deepcopy
@@ -25,8 +24,7 @@ class Parameter(Endpoint):
         self._blocks_lock = threading.Lock()  # held by the thread that runs the blocks
         self.open()
         if self._value is None:
-            near = difflib.get_close_matches(name, self._run.master.parameters)
-            node.log(f'the server has no parameter {name}; near names: {near}', 'warning')
+            node.log(f'the server has no parameter {name}: see rosparam list', 'warning')
 
     def restore(self):
         """Set the node's value if the server has none."""

@@ -481,7 +481,7 @@ class ScriptRun(Run):
                 self.ros.logwarn(f'left behind, since it did not end in time: {self.node.path}')
                 self.raise_in_main(SystemExit())
                 end_reads(self.main)
-                self.souls.pop(self.main)
+                self.souls.pop(self.main, None)  # it may end at this moment
                 self.threads.discard(self.main)
         self.signal_shutdown('stop')
         self.stop_created_nodes()

@@ -193,16 +193,16 @@ def _look_after(run):
 
 def _ask_masters():
     """Ask each master for its system state, and have the runs register again what is missing."""
-    all_runs = list(runs.values())
-    for url in {run.master.url for run in all_runs}:
-        url_runs = [run for run in all_runs if run.master.url == url and not run.stopping.is_set()]
+    live_runs = [run for run in list(runs.values()) if not run.stopping.is_set()]
+    for url in {run.master.url for run in live_runs}:
+        url_runs = [run for run in live_runs if run.master.url == url]
         try:
             state = ServerProxy(url).getSystemState(CALLER_ID)[2]  # type: ignore[index]
             for run in url_runs:
                 _register_missing(run, state)  # type: ignore[arg-type]
         except (*UNREACHABLE, PharosError) as error:
-            for run in url_runs[:1]:  # one line is enough
-                run.troubles.add(f'no master answers at {url}, it is asked again: {error}')
+            # one line is enough
+            url_runs[0].troubles.add(f'no master answers at {url}, it is asked again: {error}')
 
 
 def _register_missing(run, state):
@@ -212,17 +212,22 @@ def _register_missing(run, state):
 
     :param state: lists of (name, nodes) for publishers, subscribers and services
     """
-    registered = set()
-    for registry, entries in zip(_REGISTER_METHODS, state):
-        registered.update((registry, name) for name, nodes in entries if run.name in nodes)
+    registered = {
+        (registry, name)
+        for registry, entries in zip(_REGISTER_METHODS, state)
+        for name, nodes in entries
+        if run.name in nodes
+    }
     topics = run.topic_manager
     services = run.service_manager
     getters = topics.get_publications, topics.get_subscriptions, services.get_services
     with topics.lock, services.lock:  # or a topic closed meanwhile would be registered again
         for registry, get_entries in zip(_REGISTER_METHODS, getters):
             for name, data in get_entries():
-                is_known = (registry, name) in registered
-                if not is_known and not run.stopping.is_set():
+                if (registry, name) in registered or run.stopping.is_set():
+                    continue
+                # not if a namesake of another process has the name now: the master ends this node
+                if run.master.call('lookupNode', run.name) in (None, run.uri):
                     register(run, registry, name, data)
                     connect_all(run, name)
     if not registered and not run.stopping.is_set():  # this is a new master
