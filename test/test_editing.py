@@ -1,5 +1,6 @@
 """Edit a running node: new code takes effect, state and connections stay."""
 import importlib
+import os
 import re
 
 import pytest
@@ -12,6 +13,8 @@ INT = 'std_msgs/Int32'
 PROGRAM = '''
 import functools
 import helper
+from collections import deque
+from posixpath import join
 GAIN = 1
 def logged(function):
     @functools.wraps(function)
@@ -44,6 +47,8 @@ EDITS = {
     'callback': ('+ shape', '+ 2 * shape', 2),
     'decorated function': ('return value', 'return value + 2', 3),
     'new import': ('import functools', 'import math, functools\nGAIN = 4', 4),
+    'more of an import': ('import deque', 'import deque, defaultdict\nGAIN = 4', 4),
+    'import from elsewhere': ('from posixpath', 'GAIN = 4\nfrom ntpath', 4),
     'method': ('    def see', '    bias = 6\n    def more(self): pass\n    def see', 7),
     'renamed function': ('shape(', 'form(', 1),
     'slots': ('bias = 0', '__slots__ = "a",\n    bias = 7', 8),
@@ -72,6 +77,7 @@ def test_edit_takes_effect_and_state_stays(bench, program, ask, old, new, value)
     bench.write('def more(): return 100', 'helper.py', '')
     assert program.reload().startswith('more takes effect')
     assert ask() == 3100 + value
+    assert os.path.join('a', 'b') == 'a/b'  # what other modules define stays as it is
 
 
 def test_reload_loses_no_message(bench, master, program):

@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 import time
+from time import monotonic
 
 import rospy
 
@@ -112,11 +113,11 @@ def _handle_signal(number, frame):
     """
     global _signal_time
     if _signal_time is not None:
-        if time.monotonic() - _signal_time > SAME_SIGNAL:  # pragma: no cover: it ends the process
+        if monotonic() - _signal_time > SAME_SIGNAL:  # pragma: no cover: it ends the process
             signal.signal(number, signal.SIG_DFL)
             signal.raise_signal(number)  # ends the program at once
         return
-    _signal_time = time.monotonic()
+    _signal_time = monotonic()
     if _is_exiting:  # _stop_at_exit() stops the nodes already
         return
     threading.Thread(target=stop_all, name='pharos end').start()

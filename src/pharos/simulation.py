@@ -40,7 +40,9 @@ from pharos.private_rospy.topics import ROSOUT
 from pharos.shared_memory import sending
 from pharos.waiting import wait
 
-READ_TIME = 1000  # nanoseconds that each look at the clock takes: programs divide by such a time
+#: clock -> nanoseconds that a look takes: programs divide by the time since their last look; our own
+#: waits for servers look at the last clock, more or less often
+READ_TIMES = {'time': 1000, 'perf_counter': 1000, 'monotonic': 0}
 PLAYER = '/bag_player'  # the node that plays bags
 MAX_DELAY = 10**6  # nanoseconds; with a seed, a wait ends by so much later at most
 LAST = math.inf  # the order of a wait that ends after all others that end at the same time
@@ -79,7 +81,7 @@ class Lock:
     """A lock. A thread that takes part waits for others that do in virtual time.
 
     It keeps its turn if a server holds the lock, which does not do so for long. "Member" is short for
-    a thread that takes part.
+    a thread that takes part: only such a thread keeps a lock while it waits for the time.
     """
 
     def __init__(self):
@@ -137,7 +139,7 @@ def start_thread(thread):
 
 
 def join_thread(thread, timeout=None):
-    """Stand in for ``Thread.join``: wait in virtual time."""
+    """Stand in for ``Thread.join``: wait in virtual time, as the module time now does."""
     deadline = math.inf if timeout is None else time.monotonic() + timeout
     while not getattr(thread, 'has_ended', True):
         if time.monotonic() >= deadline:
@@ -147,7 +149,10 @@ def join_thread(thread, timeout=None):
 
 
 def read_all_parameters(changed_run):
-    """Stand in for ``Run.read_parameters``: the master tells other nodes at no fixed time."""
+    """Stand in for ``Run.read_parameters``: have the parameters of all nodes read.
+
+    The master would tell the other nodes at no fixed time.
+    """
     for each in list(runs.values()):
         for parameter in each.node._parameters:
             parameter.read()
@@ -158,7 +163,7 @@ def get_rostime(original, run):
     """rospy makes the time from a float, which is not exact. Virtual time has whole nanoseconds."""
     if not _simulation:
         return original()
-    time.time()  # takes some time
+    time.time()  # this look at the clock takes some time
     return run.modules.by_name['rospy.rostime'].Time(0, _simulation.nanoseconds)
 
 
@@ -169,9 +174,9 @@ def is_use_simtime(original, run):
 
 
 @patch('rospy.topics', '_PublisherImpl.publish')
-def publish(original, run, publisher, message, *options):
+def publish(original, run, publisher, message, *options, **more):
     """rospy only sends. This also records what a node sends, if the simulation shall."""
-    original(publisher, message, *options)
+    original(publisher, message, *options, **more)
     record = _simulation and _simulation.record
     if record and run.name != PLAYER and publisher.name != ROSOUT:
         record(publisher.name, message, Time(0, _simulation.nanoseconds))
@@ -182,7 +187,7 @@ class Simulation:
 
     :ivar nanoseconds: the ROS time
     :ivar lost: the names of threads that waited for something else than time and threads, or computed
-        without end, and lost the turn by that: what follows may come in another order another time
+        without end, and so lost the turn: what follows may come in another order another time
     :ivar record: None, or ``record(topic, message, time)``, called with what the nodes publish
     """
 
@@ -204,9 +209,9 @@ class Simulation:
         self.seed(0)
 
     def seed(self, number: int) -> None:
-        """Choose by chance how much later than due each wait ends, and other random numbers.
+        """Have each sleep last a little longer, by chance, and programs get other random numbers.
 
-        :param number: 0: each wait ends when due; what began to wait first comes first
+        :param number: 0: each sleep ends when due; of those due at one time, the first to begin is first
         """
         self.seed_number = number
         self._random = random.Random(number)
@@ -263,7 +268,8 @@ class Simulation:
         """
         thread = _local.thread
         self.add_wait(thread, end, order, lock)
-        period = 0.5 if thread is self._owner else None  # seconds between two looks
+        # seconds between two looks for a thread that keeps the turn; the owner alone looks
+        period = 0.5 if thread is self._owner else None
         while True:
             try:
                 return thread.turns.get(timeout=period)
@@ -357,8 +363,8 @@ class Simulation:
     def __enter__(self):
         global _simulation
         clocks = {
-            name: functools.partial(self._time, getattr(time, name))
-            for name in ('time', 'monotonic', 'perf_counter')
+            name: functools.partial(self._time, getattr(time, name), read_time)
+            for name, read_time in READ_TIMES.items()
         }
         monotonic = clocks['monotonic']
         changes: dict[Any, dict[str, Any]] = {
@@ -400,16 +406,16 @@ class Simulation:
         for thread in self._waits:
             thread.turns.put(None)
 
-    def _time(self, clock):
+    def _time(self, clock, read_time):
         """Return the time in seconds: virtual to threads that take part, that of a clock to others."""
         if not takes_part():
             return clock()
-        _simulation.nanoseconds += READ_TIME
+        _simulation.nanoseconds += read_time
         return _simulation.now
 
 
 def _refuse_part(composition, entries, *rest):
     raise PharosError(
         f'{", ".join(entry.name for entry in entries)}: has a process of its own, which knows no virtual'
-        ' time; leave it out, or name it in here= if that is for a window alone'
+        ' time; leave it out, or name it in here= or --here, if that is for a window alone'
     )

@@ -168,8 +168,8 @@ def create_node(master: Master) -> Iterator[Callable[..., Any]]:
 def simulation(master: Master) -> Iterator[Any]:
     """Virtual time for the nodes of the test: a :class:`pharos.simulation.Simulation`.
 
-    The test fails if a thread waits for something else than time and threads, unless it says
-    ``simulation.allow_waits()``. A failed test shows the seed and the time.
+    The test fails if a thread waits for something else than time and threads, unless the
+    test says ``simulation.allow_waits()``. A failed test shows the seed and the time.
     """
     from pharos.simulation import Simulation
 

@@ -32,7 +32,7 @@ def compose(arguments: list[str]) -> int:
       compose PKG FILE.launch [arg:=value ...]     as roslaunch; nodes that are not Python run apart
       compose FILE.launch [arg:=value ...]         the same, by its path
       compose --script PKG/EXECUTABLE ... [_rate:=5 old:=new ...]    programs, as rosrun runs them
-      compose talker.py ...                        the same, by paths
+      compose --script talker.py ...               the same, by paths
       compose --bag drive.bag --record out.bag PKG FILE.launch    in virtual time, as fast as it goes
 
     Programs with windows, and those with a state that a process has but once, run as plain processes; a line
@@ -56,16 +56,14 @@ def _parse(arguments):
         '--group', nargs='+', action='append', default=[], help='these in one other process'
     )
     parser.add_argument('--screen', action='store_true', help="all nodes have output='screen'")
-    parser.add_argument('--bag', help='play this bag in virtual time, and end with it')
+    bag_help = 'play this bag in virtual time, and end with it'
+    parser.add_argument('--bag', type=os.path.abspath, help=bag_help)  # type: ignore[arg-type]
     parser.add_argument('--for', type=float, dest='seconds', help='so long in virtual time, no bag')
     parser.add_argument('--record', help='in virtual time: write what nodes publish to this bag')
     parser.add_argument(
         '--seed', type=int, default=0, help='in virtual time: other delays, by chance'
     )
     options = parser.parse_args(arguments)
-    if options.file and options.file[0].endswith('.py'):
-        options.script = options.file
-        options.file = []
     names_nodes = options.only or options.apart or options.group
     has_both = options.script and (options.file or names_nodes)
     if has_both or len(options.file) > 2 or not (options.file or options.script):
@@ -80,9 +78,12 @@ def _run(stack, options, mappings):
         port: Any = urllib.parse.urlsplit(master.url).port
         print(f'no ROS master at {master.url}: it is started here', file=sys.stderr)
         stack.enter_context(Master.embedded(port))
+    # before the composition, whose locks are to be virtual, too
     simulation = None
     if options.bag or options.seconds:
         simulation = _begin_simulation(stack, master, options)
+    elif options.record or options.seed:
+        raise ValueError('--record and --seed go with --bag or --for')
     composition = stack.enter_context(Composition(master, owns_process=True))
     if options.file:
         composition.launch(_read_launch_file(master.url, options, mappings))
@@ -97,7 +98,8 @@ def _run(stack, options, mappings):
 def _begin_simulation(stack, master, options):
     """Make the time virtual, and return the Simulation.
 
-    The time begins about a second before the bag, so that the programs start before.
+    The time begins a second before the bag, or a little more or less, for whole seconds are easier to
+    read: the programs have started at its first message.
     """
     import rosbag
 
@@ -108,7 +110,7 @@ def _begin_simulation(stack, master, options):
     if options.bag:
         try:
             with rosbag.Bag(options.bag) as bag:
-                simulation.nanoseconds = round(bag.get_start_time() - 1) * 10**9
+                simulation.nanoseconds = round(max(2, bag.get_start_time()) - 1) * 10**9
         except rosbag.ROSBagException as error:
             raise ValueError(f'{options.bag}: {error}; rosbag info says more') from error
     if options.record:
@@ -117,16 +119,16 @@ def _begin_simulation(stack, master, options):
 
 
 def _simulate(simulation, options):
-    """Play the bag, or let the time go by; show how fast that went."""
+    """Play the bag, or let the time go by; show how long the command has computed."""
     start = simulation.now
     if options.bag:
         simulation.play(options.bag, options.topics)
     else:
         simulation.run(options.seconds)
-    seconds = simulation.now - start
-    print(f'{seconds:.1f} s of ROS time took {time.process_time():.1f} s of the processor')
-    if simulation.lost:
-        print(f'threads that waited for something else: {simulation.lost}', file=sys.stderr)
+    print(
+        f'{simulation.now - start:.1f} s of ROS time took {time.process_time():.1f} s of the processor;'
+        f' threads that lost their turn: {simulation.lost}'
+    )
 
 
 def _read_launch_file(url, options, mappings):

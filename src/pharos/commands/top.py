@@ -10,8 +10,6 @@ from pharos.commands import argument_parser
 from pharos.live.top import Meter, show, table
 from pharos.master import Master
 
-FILE_WIDTH = 10000  # columns of the printed table, so that nothing is cut
-
 
 def top(arguments: list[str]) -> None:
     """Show the nodes of the ROS master in a live table; in a pipe, as `top | cat`, print it once.
@@ -29,4 +27,4 @@ def top(arguments: list[str]) -> None:
         show(meter, options.interval)
     else:
         time.sleep(options.interval)
-        Console(width=FILE_WIDTH).print(table(meter.measure()))
+        Console(width=10_000).print(table(meter.measure()))

@@ -10,7 +10,7 @@ from types import FunctionType, MethodType
 from pharos.errors import PharosError
 from pharos.names import check_node_class
 
-CHANGE_LIMIT = 0.05  # seconds that no other thread runs at most, while a change is made
+CHANGE_LIMIT = 0.05  # seconds: for so long at most, a change keeps all other threads from running
 DEFINITIONS = ast.FunctionDef, ast.ClassDef, ast.Import, ast.ImportFrom
 
 
@@ -46,7 +46,10 @@ def _rebind(block, node, node_class):
 
 
 def reload(node):
-    """Do the work of :meth:`Node.reload`."""
+    """Do the work of :meth:`Node.reload`.
+
+    A module that can be reloaded has ``__text__``, by remember_text() of the loader.
+    """
     modules = [sys.modules.get(type(node).__module__), *node._current_run.modules.by_name.values()]
     notes = []
     edits = [
@@ -119,7 +122,10 @@ def _is_definition(item):
 def _change(owner, name, new, notes):
     """Change a name of a module or class, functions and classes in place; add to the notes."""
     former = vars(owner).get(name)
-    if isinstance(former, type) and isinstance(new, type):
+    if former is new:  # imported once more
+        return
+    is_class = isinstance(former, type) and isinstance(new, type)
+    if is_class and former.__module__ == new.__module__:
         if type(former) is not type:  # members of an Enum would not equal the former ones
             notes.append(f'{name}: only at a restart')
             return
@@ -133,7 +139,12 @@ def _change(owner, name, new, notes):
         inspect.unwrap(getattr(value, '__func__', value)) for value in (former, new)
     )
     code, new_code = (getattr(each, '__code__', None) for each in (function, new_function))
-    if code and new_code and code.co_freevars == new_code.co_freevars in ((), ('__class__',)):
+    if (
+        code
+        and new_code
+        and code.co_filename == new_code.co_filename  # else it is imported
+        and code.co_freevars == new_code.co_freevars in ((), ('__class__',))
+    ):
         for part in '__code__', '__defaults__', '__kwdefaults__':
             setattr(function, part, getattr(new_function, part))
         return

@@ -97,6 +97,3 @@ class ExternalNode:
         :raises UnknownNodeError: if the node does not answer
         """
         self._call('shutdown', 'asked by pharos')
-
-    def __repr__(self):
-        return f'<ExternalNode {self.name} of {self.master.url}>'

@@ -20,7 +20,7 @@ from pharos.live.snapshot import publisher_rates, take_snapshot
 from pharos.live.text_format import short_number
 from pharos.master import Master
 
-HELP = 'q quit  j k choose a node of a composition  r restart  x stop  a start  l reload'
+HELP = 'q quit  j k choose a node; if it is of a composition: r restart  x stop  a start  l reload'
 ACTIONS = {'r': 'restart', 'x': 'stop', 'a': 'start', 'l': 'reload'}  # key -> action
 WIDE_COLUMNS = 'NODE', 'PID'  # are never cut, however narrow the terminal is
 ALARM_COLUMNS = 'DROP', 'FAIL', 'PROBLEM'  # are red unless the value is 0 or empty

@@ -13,7 +13,7 @@ from genpy import Message
 
 from pharos.blocks import Block
 from pharos.errors import UnknownTopicError
-from pharos.live.text_format import message_text, short_number
+from pharos.live.text_format import message_text
 from pharos.node import BlockNode
 from pharos.transcript import Transcript
 from pharos.waiting import wait
@@ -32,10 +32,6 @@ class Rate(NamedTuple):
     rate: float  # messages in one second
     bandwidth: float  # bytes in one second
     window: int  # messages that were counted
-
-    def __repr__(self):
-        bandwidth = f'{short_number(self.bandwidth)}B/s'
-        return f'{self.rate:.4g} Hz, {bandwidth}, {self.window} messages'
 
 
 @contextlib.contextmanager

@@ -16,7 +16,7 @@ import select
 import socket
 import struct
 import threading
-import time
+from time import monotonic
 from typing import NamedTuple
 
 import genpy
@@ -118,9 +118,9 @@ class MessageMemory:
             file = self._free_file(size)
             file.map[:size] = value
             file.number = next(self._numbers)
-            entry = Entry(file, slot, size, rest, time.monotonic())
+            entry = Entry(file, slot, size, rest, monotonic())
         else:
-            entry = Entry(None, WHOLE, 0, value, time.monotonic())
+            entry = Entry(None, WHOLE, 0, value, monotonic())
         for sender in senders:
             sender.put(entry)
 
