@@ -32,7 +32,7 @@ def compose(arguments: list[str]) -> int:
       compose PKG FILE.launch [arg:=value ...]     as roslaunch; nodes that are not Python run apart
       compose FILE.launch [arg:=value ...]         the same, by its path
       compose --script PKG/EXECUTABLE ... [_rate:=5 old:=new ...]    programs, as rosrun runs them
-      compose --script talker.py ...               the same, by paths
+      compose talker.py ...                        the same, by paths
       compose --bag drive.bag --record out.bag PKG FILE.launch    in virtual time, as fast as it goes
 
     Programs with windows, and those with a state that a process has but once, run as plain processes; a line
@@ -64,6 +64,9 @@ def _parse(arguments):
         '--seed', type=int, default=0, help='in virtual time: other delays, by chance'
     )
     options = parser.parse_args(arguments)
+    if options.file and options.file[0].endswith('.py'):
+        options.script = options.file
+        options.file = []
     names_nodes = options.only or options.apart or options.group
     has_both = options.script and (options.file or names_nodes)
     if has_both or len(options.file) > 2 or not (options.file or options.script):

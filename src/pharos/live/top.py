@@ -99,9 +99,7 @@ def table(rows: list[dict[str, Any]], chosen_node: str = '') -> Table:
     columns = list(rows[0]) if rows else ['nothing there']
     rich_table = Table(box=None, padding=(0, 1, 0, 0))
     for column in columns:
-        has_text = any(isinstance(row[column], str) for row in rows)
-        justify: Any = 'left' if has_text else 'right'
-        rich_table.add_column(column, justify=justify, no_wrap=column in WIDE_COLUMNS)
+        rich_table.add_column(column, no_wrap=column in WIDE_COLUMNS)
     for row in rows:
         style = 'reverse' if row.get('NODE') == chosen_node else None
         cells = [_cell_text(column, value) for column, value in row.items()]
