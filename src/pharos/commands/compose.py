@@ -79,7 +79,7 @@ def _run(stack, options, mappings):
     master = Master()
     if not master.is_reachable():
         port: Any = urllib.parse.urlsplit(master.url).port
-        print(f'no ROS master at {master.url}: it is started here', file=sys.stderr)
+        print(f'no ROS master at {master.url}: it is started here')
         stack.enter_context(Master.embedded(port))
     # before the composition, whose locks are to be virtual, too
     simulation = None
@@ -129,8 +129,7 @@ def _simulate(simulation, options):
     else:
         simulation.run(options.seconds)
     print(
-        f'{simulation.now - start:.1f} s of ROS time took {time.process_time():.1f} s of the processor;'
-        f' threads that lost their turn: {simulation.lost}'
+        f'{simulation.now - start:.1f} s of ROS time took {time.process_time():.1f} s of CPU; lost: {simulation.lost}'
     )
 
 
