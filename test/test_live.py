@@ -326,7 +326,7 @@ class Scene:
 
 def row_of(name, output):
     """The words of a line of the table of top, by the titles of its columns."""
-    titles, *rows = [line.split() for line in output.splitlines()]
+    titles, *rows = [line.split() for line in output[output.index('NODE ') :].splitlines()]
     return next(dict(zip(titles, row)) for row in rows if row[0] == name)
 
 

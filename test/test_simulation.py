@@ -119,13 +119,19 @@ def test_command_records_the_same_bytes_each_time(master, tmp_path):
     assert run('--for', '20') == run('--for', '20')
 
 
-@pytest.mark.parametrize('name', ['no.bag', 'wrong.bag'])
-def test_command_tells_of_a_bag_that_cannot_be_read(master, tmp_path, name):
-    (tmp_path / 'wrong.bag').write_text('no bag')
-    arguments = ['--bag', str(tmp_path / name), '--script', str(PROGRAMS / 'tracker')]
+@pytest.mark.parametrize(
+    'options', ['no.bag', 'a.text', 'a.bag --topics nix', 'a.bag --record a.bag']
+)
+def test_command_tells_of_a_bag_that_it_cannot_play(master, tmp_path, monkeypatch, options):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'a.text').write_text('no bag')
+    write_bag(tmp_path / 'a.bag', 9)
+    before = (tmp_path / 'a.bag').read_bytes()
+    arguments = ['--bag', *options.split(), '--script', str(PROGRAMS / 'tracker')]
     with Program([*COMPOSE, *arguments], master.url) as composed:
         assert composed.wait() == 1
-    assert name in composed.output and 'Traceback' not in composed.output
+    assert options.split()[0] in composed.output and 'Traceback' not in composed.output
+    assert (tmp_path / 'a.bag').read_bytes() == before
 
 
 def test_seeds_show_a_race(master):

@@ -241,13 +241,17 @@ class Simulation:
     def play(self, bag: str, topics: list[str] | None = None) -> None:
         """Publish the messages of a bag, each when all before it is done; return at its end.
 
-        The time jumps to the begin of the bag. If that has passed, the bag is played from now on; the
-        stamps in its messages stay.
+        The time jumps to one second before the begin of the bag. If that has passed, the bag is played
+        from now on; the stamps in its messages stay.
+
+        :raises PharosError: if the bag has no message of these topics
         """
         with rosbag.Bag(bag) as file, self.master.create(BlockNode, PLAYER) as player:
+            if not file.get_message_count(topics or None):
+                raise PharosError(f'{bag} has no messages of {topics}: see rosbag info')
             start = round(file.get_start_time() * 10**9)
             delay = max(0, self.nanoseconds - start)
-            self.nanoseconds = start + delay
+            self.nanoseconds = max(self.nanoseconds, start - 10**9)
             for topic, message, stamp in file.read_messages(topics):
                 self.wait(stamp.to_nsec() + delay, LAST)
                 player.send_to(topic, message, typed_as=type(message))
@@ -418,5 +422,5 @@ class Simulation:
 def _refuse_part(composition, entries, *rest):
     raise PharosError(
         f'{", ".join(entry.name for entry in entries)}: has a process of its own, which knows no virtual'
-        ' time; leave it out, or name it in here= or --here, if that is for a window alone'
+        ' time; leave it out by only= or --only; if it has a window alone, name it in here= or --here'
     )

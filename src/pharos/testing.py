@@ -104,7 +104,7 @@ def master(monkeypatch: pytest.MonkeyPatch) -> Iterator[Master]:
         nodes = embedded.own_nodes()
         for node in nodes:
             node.stop()
-        assert not nodes, f'left running: {nodes}; stop() them, or make them by create_node()'
+        assert not nodes, f'left running: {nodes}; stop() them, or start them in a with'
         _check_gone(lambda: _registrations(embedded) - registrations)
         _check_gone(lambda: set(threading.enumerate()) - threads)
 

@@ -56,8 +56,11 @@ def _parse(arguments):
         '--group', nargs='+', action='append', default=[], help='these in one other process'
     )
     parser.add_argument('--screen', action='store_true', help="all nodes have output='screen'")
-    bag_help = 'play this bag in virtual time, and end with it'
-    parser.add_argument('--bag', type=os.path.abspath, help=bag_help)  # type: ignore[arg-type]
+    parser.add_argument(
+        '--bag',
+        type=os.path.abspath,  # type: ignore[arg-type]
+        help='play this bag in virtual time, and end with it',
+    )
     parser.add_argument('--for', type=float, dest='seconds', help='so long in virtual time, no bag')
     parser.add_argument('--record', help='in virtual time: write what nodes publish to this bag')
     parser.add_argument(
@@ -77,16 +80,19 @@ def _parse(arguments):
 def _run(stack, options, mappings):
     """Run as the options say, and return the exit status; the stack ends all."""
     master = Master()
-    if not master.is_reachable():
-        port: Any = urllib.parse.urlsplit(master.url).port
-        print(f'no ROS master at {master.url}: it is started here')
-        stack.enter_context(Master.embedded(port))
-    # before the composition, whose locks are to be virtual, too
     simulation = None
     if options.bag or options.seconds:
+        # at a master of its own: a robot that runs at the usual one must not hear this
+        master = stack.enter_context(Master.embedded())
+        os.environ['ROS_MASTER_URI'] = master.url
+        # before the composition, whose locks are to be virtual, too
         simulation = _begin_simulation(stack, master, options)
     elif options.record or options.seed:
         raise ValueError('--record and --seed go with --bag or --for')
+    elif not master.is_reachable():
+        port: Any = urllib.parse.urlsplit(master.url).port
+        print(f'no ROS master at {master.url}: it is started here')
+        stack.enter_context(Master.embedded(port))
     composition = stack.enter_context(Composition(master, owns_process=True))
     if options.file:
         composition.launch(_read_launch_file(master.url, options, mappings))
@@ -101,8 +107,7 @@ def _run(stack, options, mappings):
 def _begin_simulation(stack, master, options):
     """Make the time virtual, and return the Simulation.
 
-    The time begins a second before the bag, or a little more or less, for whole seconds are easier to
-    read: the programs have started at its first message.
+    The time begins a second before the bag: the programs have started at its first message.
     """
     import rosbag
 
@@ -113,10 +118,12 @@ def _begin_simulation(stack, master, options):
     if options.bag:
         try:
             with rosbag.Bag(options.bag) as bag:
-                simulation.nanoseconds = round(max(2, bag.get_start_time()) - 1) * 10**9
+                simulation.nanoseconds = round((max(2, bag.get_start_time()) - 1) * 10**9)
         except rosbag.ROSBagException as error:
-            raise ValueError(f'{options.bag}: {error}; rosbag info says more') from error
+            raise ValueError(f'{options.bag}: {error}; rosbag info says more')
     if options.record:
+        if os.path.abspath(options.record) == options.bag:
+            raise ValueError(f'{options.bag} is played: record to another file')
         simulation.record = stack.enter_context(rosbag.Bag(options.record, 'w')).write
     return simulation
 

@@ -15,7 +15,7 @@ def graph(arguments: list[str]) -> None:
     watch -n1 rosrun pharos graph    again and again
     """
     parser = argument_parser(graph)
-    parser.add_argument('-o', '--output', help='save a picture')
+    parser.add_argument('--output', help='save a picture')
     parser.add_argument('--rates', type=float, default=0, help='count messages for so many s')
     options = parser.parse_args(arguments)
     ros_graph = graph_of(Master(), options.rates)

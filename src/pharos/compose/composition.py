@@ -232,10 +232,7 @@ class Composition:
 
     def _watch(self):
         """Show ends, start again nodes that respawn, and end all if a required node has ended."""
-        while not self.is_over:
-            is_stopping = self.stopping.wait(POLL_PERIOD)
-            if is_stopping:
-                break
+        while not (self.is_over or self.stopping.wait(POLL_PERIOD)):
             self._look()
         self._look()
 
@@ -354,7 +351,6 @@ class Composition:
 
         The Transcript names what does not end within SLOW_END.
         """
-        is_first = not self.stopping.is_set()
         self.stopping.set()
         if self._listener:
             shutdown_socket(self._listener)
@@ -367,7 +363,7 @@ class Composition:
         for thread in threads:
             thread.start()
         late_threads = join(threads, SLOW_END)
-        if late_threads and is_first:
+        if late_threads:
             names = ', '.join(threads[thread] for thread in late_threads)
             Transcript.show(f'the end waits for {names}; a further Ctrl-C ends all at once')
         for thread in late_threads:

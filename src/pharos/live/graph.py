@@ -217,8 +217,6 @@ def _dot_id(prefix, name):
 def _dot_box(prefix, name, caption, style):
     """Return the box of a node or topic, with a caption in small letters."""
     label = escape(name)
-    if prefix == 'n':
-        label = f'<b>{label}</b>'
     if caption:
         label += f'<br/><font point-size="9" color="#505050">{escape(caption)}</font>'
     return f'{_dot_id(prefix, name)} [{style}, label=<{label}>]'

@@ -59,12 +59,12 @@ class Snapshot:
     def rates_since(self, start: Snapshot) -> dict[Link, float]:
         """Return the messages in one second of the links that both snapshots have."""
         seconds = self.time - start.time
-        rates = {}
-        for link, count in self.links.items():
+        return {
+            link: (count - start.links[link]) / seconds
+            for link, count in self.links.items()
             # a link that counts fewer messages than before is a new one
-            if link in start.links and count >= start.links[link]:
-                rates[link] = (count - start.links[link]) / seconds
-        return rates
+            if count >= start.links.get(link, count + 1)
+        }
 
 
 def take_snapshot(master: Master) -> Snapshot:

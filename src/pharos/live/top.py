@@ -4,6 +4,7 @@ Nodes count their messages anyway. Two snapshots give rates, so top subscribes t
 """
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import sys
@@ -49,31 +50,29 @@ class Meter:
 
 def _cpu_percent(name, snapshot, start):
     """Return the load of a node of pharos since the snapshot before, None if it is unknown."""
-    if name not in start.nodes:
-        return None
-    end_seconds = snapshot.nodes[name].health.get('cpu_seconds')
-    start_seconds = start.nodes[name].health.get('cpu_seconds')
-    if end_seconds is None or start_seconds is None:
-        return None
-    return max(0.0, 100 * (end_seconds - start_seconds) / (snapshot.time - start.time))
+    with contextlib.suppress(KeyError):
+        end_seconds = snapshot.nodes[name].health['cpu_seconds']
+        seconds = end_seconds - start.nodes[name].health['cpu_seconds']
+        return max(0.0, 100 * seconds / (snapshot.time - start.time))
+    return None
 
 
 def _node_rows(snapshot, start):
     link_rates = snapshot.rates_since(start)
     message_rates = publisher_rates(link_rates)
     for name, node in snapshot.nodes.items():
-        input_rates = [rate for link, rate in link_rates.items() if link.subscriber == name]
-        output_rates = [rate for (_, sender), rate in message_rates.items() if sender == name]
-        own_links = [link for link in snapshot.links if name in (link.publisher, link.subscriber)]
-        transports = [link.transport for link in own_links]
+        transports = [
+            link.transport for link in snapshot.links if name in (link.publisher, link.subscriber)
+        ]
         yield {
             'NODE': name,
             'CLASS': node.health.get('kind'),
             'HOST': node.host,
             'PID': node.pid,
             'CPU%': _cpu_percent(name, snapshot, start),
-            'IN/S': sum(input_rates),
-            'OUT/S': sum(output_rates),  # a message counts once, however many nodes receive it
+            'IN/S': sum(rate for link, rate in link_rates.items() if link.subscriber == name),
+            # a message counts once, however many nodes receive it
+            'OUT/S': sum(rate for (_, sender), rate in message_rates.items() if sender == name),
             'LOCAL': transports.count('INTRAPROCESS'),
             'SHM': transports.count('SHARED_MEMORY'),
             'TCP': transports.count('TCPROS'),
