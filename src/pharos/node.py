@@ -21,11 +21,7 @@ from pharos.channels import (
     find_to_send,
     wait_subscribed,
 )
-from pharos.errors import (
-    MasterUnreachableError,
-    NodeStoppedError,
-    PharosError,
-)
+from pharos.errors import MasterUnreachableError, NodeStoppedError, PharosError
 from pharos.failures import Failures
 from pharos.names import legal_name, node_name
 from pharos.parameter import Parameter
