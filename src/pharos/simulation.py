@@ -352,8 +352,9 @@ class Simulation:
         with self._lock:
             self._looks += 1
             thread = self._holder
-            may_compute = not is_idle and self._looks < 120
-            if may_compute or thread in (None, self._owner):
+            # three: beside load, a process may get no processor for the time of one look
+            limit = 3 if is_idle else 120
+            if self._looks < limit or thread in (None, self._owner):
                 return
             frames = traceback.walk_stack(sys._current_frames()[thread.ident])
             if any(frame.f_code.co_filename == xmlrpc.__file__ for frame, _ in frames):
