@@ -56,11 +56,7 @@ def _parse(arguments):
         '--group', nargs='+', action='append', default=[], help='these in one other process'
     )
     parser.add_argument('--screen', action='store_true', help="all nodes have output='screen'")
-    parser.add_argument(
-        '--bag',
-        type=os.path.abspath,  # type: ignore[arg-type]
-        help='play this bag in virtual time, and end with it',
-    )
+    parser.add_argument('--bag', type=os.path.abspath, help='virtual time: play this')  # type: ignore
     parser.add_argument('--for', type=float, dest='seconds', help='so long in virtual time, no bag')
     parser.add_argument('--record', help='in virtual time: write what nodes publish to this bag')
     parser.add_argument(
@@ -71,8 +67,9 @@ def _parse(arguments):
         options.script = options.file
         options.file = []
     names_nodes = options.only or options.apart or options.group
-    has_both = options.script and (options.file or names_nodes)
-    if has_both or len(options.file) > 2 or not (options.file or options.script):
+    if not (options.file or options.script):
+        parser.error('give a launch file, or programs')
+    if options.script and (options.file or names_nodes) or len(options.file) > 2:
         parser.error('give one launch file, by package and name or by its path, first; or --script')
     return options
 
