@@ -393,7 +393,7 @@ class Node(DelegateHolder):
         self._check_active()
         run = current.run if current.node is self else self._current_run
         if not run.stopping.is_set():
-            with signals.quiet_wait():
+            with signals.QuietWait():
                 run.callback_queue.release_before_sleep()
                 run.ros.sleep(seconds)
         if current.node is self and run.stopping.is_set():
@@ -418,7 +418,7 @@ class Node(DelegateHolder):
                 yield turn
                 turn += 1
                 run.callback_queue.release_before_sleep()
-                with signals.quiet_wait():
+                with signals.QuietWait():
                     rate.sleep()
 
         return turns()

@@ -38,18 +38,20 @@ def live_nodes():
     return [node for node in started_nodes if not node._current_run.stopping.is_set()]
 
 
-@contextlib.contextmanager
-def quiet_wait():
-    """End a wait without an exception if a node stops or a signal stops all nodes.
+class QuietWait:
+    """Ends the wait in a ``with`` without an exception if a node stops or a signal stops all nodes.
 
-    Other KeyboardInterrupts and SystemExits go on.
+    Other KeyboardInterrupts and SystemExits go on. (contextlib.contextmanager would raise a
+    RuntimeError for a signal that comes before its ``yield``.)
     """
-    try:
-        with contextlib.suppress(rospy.ROSInterruptException):
-            yield
-    except (KeyboardInterrupt, SystemExit):
-        if not is_ending():
-            raise
+
+    def __enter__(self):
+        pass
+
+    def __exit__(self, error_class, error, trace):
+        if isinstance(error, (KeyboardInterrupt, SystemExit)):
+            return is_ending()
+        return isinstance(error, rospy.ROSInterruptException)
 
 
 def stop_all():
@@ -64,8 +66,8 @@ def spin() -> None:
     :raises SystemExit: with status 1, as soon as a required soul has ended
     """
     handle_signals()
-    # quiet_wait() lets a KeyboardInterrupt of the program's own handler through
-    with contextlib.suppress(KeyboardInterrupt), quiet_wait():
+    # QuietWait() lets a KeyboardInterrupt of the program's own handler through
+    with contextlib.suppress(KeyboardInterrupt), QuietWait():
         # a program may have called rospy.init_node(): then a signal is rospy's
         while own_nodes() and not (lost_names or rospy.core.is_shutdown_requested()):
             time.sleep(_SPIN_PERIOD)

@@ -67,7 +67,7 @@ def wait_for_end(predicate, timeout, name):
     :param name: the name of the thing that must end, for the error
     :raises TimeoutError: if ``predicate()`` is not true within ``timeout`` seconds
     """
-    with signals.quiet_wait():
+    with signals.QuietWait():
         has_ended = wait(predicate, timeout)
         if not has_ended:
             raise TimeoutError(f'{name} has not ended within {timeout:g} s: stop() it')
