@@ -13,7 +13,7 @@ import pytest
 
 import helpers
 import pharos
-from helpers import DEFAULT_SIGNALS, TIMEOUT, Program, create
+from helpers import COMPOSE, DEFAULT_SIGNALS, TIMEOUT, Program, create
 from pharos import BlockNode, MasterUnreachableError, UnknownTopicError
 from pharos.testing import until
 
@@ -382,10 +382,10 @@ def test_top_tells_cpu_of_nodes(master):
     assert float(computing['CPU%']) > float(idle['CPU%'])
 
 
-def test_keys_of_top_restart_a_node(master, tmp_path):
+def test_keys_of_top_restart_a_node_and_a_save_reloads_it(master, tmp_path):
     path = tmp_path / 'clock'
-    path.write_text('import rospy\nrospy.init_node("clock")\nrospy.spin()\n')
-    with Program(['rosrun', 'pharos', 'compose', '--script', str(path)], master.url) as composed:
+    path.write_text('import rospy\nPACE = 1\nrospy.init_node("clock")\nrospy.spin()\n')
+    with Program([*COMPOSE, '--reload', '--script', str(path)], master.url) as composed:
         uri = master.wait_for_node('/clock', TIMEOUT).uri
         with Terminal(master.url, 'rosrun', 'pharos', 'top', '--interval', '0.2') as top:
             top.wait_for('/clock')
@@ -394,6 +394,8 @@ def test_keys_of_top_restart_a_node(master, tmp_path):
             assert not master.call('lookupNode', '/clock')
             top.press('a', 'start done: /clock')
             assert master.node('/clock').uri != uri
+        path.write_text(path.read_text().replace('1', '2'))
+        until(lambda: '/clock done: PACE takes effect' in composed.output)
         composed.signal(signal.SIGINT)
         composed.wait()
 

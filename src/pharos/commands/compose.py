@@ -2,9 +2,9 @@
 from __future__ import annotations
 
 import contextlib
-import faulthandler
 import os
 import sys
+import threading
 import time
 import urllib.parse
 from typing import Any
@@ -13,7 +13,8 @@ import rospkg
 
 from pharos import Master
 from pharos.commands import argument_parser
-from pharos.compose.composition import SWITCH_INTERVAL, Composition
+from pharos.compose.composition import Composition
+from pharos.compose.control import reload_on_save
 from pharos.compose.launch_file import LaunchFile
 
 #: options that take names -> help
@@ -38,8 +39,6 @@ def compose(arguments: list[str]) -> int:
     Programs with windows, and those with a state that a process has but once, run as plain processes; a line
     says which and why. It ends when all nodes have ended, or by Ctrl-C.
     """
-    faulthandler.enable(all_threads=False)  # a crash in C says where in Python it was
-    sys.setswitchinterval(SWITCH_INTERVAL)
     options = _parse(arguments)
     mappings = [each for each in sys.argv if ':=' in each]
     with contextlib.ExitStack() as stack:
@@ -55,6 +54,7 @@ def _parse(arguments):
     parser.add_argument(
         '--group', nargs='+', action='append', default=[], help='these in one other process'
     )
+    parser.add_argument('--reload', action='store_true', help='saved files take effect at once')
     parser.add_argument('--screen', action='store_true', help="all nodes have output='screen'")
     parser.add_argument('--bag', type=os.path.abspath, help='virtual time: play this')  # type: ignore
     parser.add_argument('--for', type=float, dest='seconds', help='so long in virtual time, no bag')
@@ -95,6 +95,8 @@ def _run(stack, options, mappings):
         composition.launch(_read_launch_file(master.url, options, mappings))
     else:
         composition.run_scripts(options.script, mappings, options.here)
+    if options.reload:
+        threading.Thread(target=reload_on_save, args=[composition], daemon=True).start()
     if simulation:
         _simulate(simulation, options)
         composition.stopping.set()  # ends its wait()

@@ -7,7 +7,8 @@ import time
 from rich.console import Console
 
 from pharos.commands import argument_parser
-from pharos.live.top import Meter, show, table
+from pharos.live.snapshot import take_snapshot
+from pharos.live.top import node_rows, show, table
 from pharos.master import Master
 
 
@@ -22,9 +23,10 @@ def top(arguments: list[str]) -> None:
     parser = argument_parser(top)
     parser.add_argument('--interval', type=float, default=1, help='seconds between measurements')
     options = parser.parse_args(arguments)
-    meter = Meter(Master())
+    master = Master()
     if sys.stdin.isatty() and sys.stdout.isatty():
-        show(meter, options.interval)
+        show(master, options.interval)
     else:
+        start = take_snapshot(master)
         time.sleep(options.interval)
-        Console(width=10_000).print(table(meter.measure()))
+        Console(width=10_000).print(table(node_rows(take_snapshot(master), start)))

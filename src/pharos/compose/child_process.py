@@ -122,10 +122,15 @@ def start_master(port):
     # rospy prefers ROS_HOSTNAME to ROS_IP
     address = environ.pop('ROS_IP', '127.0.0.1')
     environ.setdefault('ROS_HOSTNAME', address)
-    pipes = {'stdin': subprocess.PIPE, 'stdout': subprocess.PIPE, 'text': True}
-    command = [sys.executable, '-m', 'pharos.commands.embedded_master', str(port)]
-    process = subprocess.Popen(command, env=environ, start_new_session=True, **pipes)  # type: ignore
-    url = process.stdout.readline().strip()
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'pharos.commands.embedded_master', str(port)],
+        env=environ,
+        start_new_session=True,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    url = process.stdout.readline().strip()  # type: ignore
     if not url:
         process.communicate()
         raise PortInUseError(

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import collections
 import contextlib
+import faulthandler
 import os
 import pickle
 import signal
@@ -77,6 +78,9 @@ class Composition:
         self._watcher = threading.Thread(target=self._watch, name='composition', daemon=True)
         self._has_started = False  # True if one node was started
         self._has_failed = False  # True if a required node has ended, or a process by a signal
+        if owns_process:
+            faulthandler.enable(all_threads=False)  # a crash in C says where in Python it was
+            sys.setswitchinterval(SWITCH_INTERVAL)
 
     def launch(self, launch_file):
         """Set the parameters of a launch file, and start its nodes.
@@ -255,7 +259,7 @@ class Composition:
         if code is None or part.is_over:
             return
         names = part.names
-        has_required = part.has_required
+        has_required = any(entry.roslaunch_node.required for entry in part.entries)
         if code < 0:
             self._has_failed = True
             Transcript.show(f'{names}: {signal.Signals(-code).name} has ended their process')
@@ -407,11 +411,6 @@ class _Part:
     def names(self):
         """The names of the nodes, as text."""
         return ', '.join(entry.name for entry in self.entries)
-
-    @property
-    def has_required(self):
-        """True if the process has a required node."""
-        return any(entry.roslaunch_node.required for entry in self.entries)
 
     def forget_nodes(self):
         """Unregister the nodes after a crash of the process; keep the entries that respawn.

@@ -1,4 +1,4 @@
-"""Stop, start and restart the nodes of a composition from another process of the same user.
+"""Stop, start, restart and reload nodes of a composition: for other processes of the same user, or on a save.
 
 Each composition listens on a socket that is not in a file system; its name has the process's number.
 """
@@ -9,10 +9,13 @@ import os
 import re
 import socket
 import threading
+import time
 from typing import TYPE_CHECKING
 
 from pharos.errors import PharosError, UnknownNodeError
+from pharos.live.editing import editable_modules
 from pharos.private_rospy.tcpros import check_user
+from pharos.transcript import Transcript
 
 if TYPE_CHECKING:
     from pharos.master import Master
@@ -20,6 +23,9 @@ if TYPE_CHECKING:
 ANSWER_LIMIT = 60.0  # seconds
 MAX_TEXT = 4096  # bytes
 ACCEPT_PAUSE = 0.5  # seconds until the next attempt
+SAVE_PERIOD = (
+    0.05  # seconds between two looks at the files; a file younger than that may be half written
+)
 _PREFIX = 'pharos-compose-'
 DONE = 'done: '
 
@@ -63,6 +69,22 @@ def _answer(composition, action, name):
             except PharosError as error:
                 return str(error)
     return ''
+
+
+def reload_on_save(composition):
+    """Reload the nodes of this process whose files are saved, until the composition stops."""
+    save_times = {}  # node -> time of the last save of one of its files
+    while not composition.stopping.wait(SAVE_PERIOD):
+        for node in composition.nodes:
+            with contextlib.suppress(OSError):  # an editor is about to replace the file
+                last_time = max(
+                    (os.path.getmtime(module.__file__) for module in editable_modules(node)),
+                    default=0.0,
+                )
+                if save_times.setdefault(node, last_time) < last_time < time.time() - SAVE_PERIOD:
+                    save_times[node] = last_time
+                    name = node._settings.name
+                    Transcript.show(name, _answer(composition, 'reload', name))
 
 
 def control(action: str, name: str, master: Master) -> str:

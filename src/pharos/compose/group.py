@@ -4,18 +4,15 @@ A composition starts this program for each of its groups. FILE has the pickled l
 environment names the master. The program ends when its programs have ended, when a required one has,
 and when the process PARENT has ended.
 """
-import faulthandler
 import sys
 
-from pharos.compose.composition import SWITCH_INTERVAL, Composition, leave
+from pharos.compose.composition import Composition, leave
 from pharos.compose.roslaunch_parent import receive
 from pharos.master import Master
 
 
 def main(path: str, parent: int) -> int:
     """Run the group in a file, and return the exit status of its composition."""
-    faulthandler.enable(all_threads=False)
-    sys.setswitchinterval(SWITCH_INTERVAL)
     try:
         master = Master()
         entries = receive(path, parent)

@@ -27,8 +27,9 @@ from pharos.blocks import block_name
 from pharos.compose.child_process import interrupt
 from pharos.compose.sources import compile_program
 from pharos.errors import PharosError
+from pharos.live.editing import editable_modules
 from pharos.private_rospy import loader
-from pharos.private_rospy.loader import SYSTEM_FOLDERS, Shim, remember_text
+from pharos.private_rospy.loader import Shim, remember_text
 from pharos.private_rospy.patches import patch
 from pharos.private_rospy.plain import guide
 from pharos.private_rospy.run import STOP_LIMIT, Lifecycle, Run, join
@@ -323,9 +324,8 @@ class ScriptRun(Run):
         if os.getpid() != self.process_id:
             os._exit(status)  # a child by os.fork()
         self.exit_request = SystemExit(status)
-        hooks = self.core._client_shutdown_hooks
         for functions in (
-            hooks,
+            self.core._client_shutdown_hooks,
             self.exit_functions,
             self.thread_exit_functions,
             self.threads_to_join,
@@ -425,10 +425,8 @@ class ScriptRun(Run):
         :raises PharosError: if one cannot be read as Python 3
         """
         compile_program(self.node.path)
-        for module in list(self.modules.by_name.values()):
-            path = getattr(module, '__file__', None) or '/usr/'
-            if path.endswith('.py') and not path.startswith(SYSTEM_FOLDERS):
-                compile_program(path)
+        for module in editable_modules(self.node):
+            compile_program(module.__file__)
 
     def signal_shutdown(self, reason):
         """Stand in for ``rospy.signal_shutdown``: run the program's hooks, and close rospy.
@@ -594,8 +592,11 @@ class _Pharos(Shim):
                 return full_name
 
             def _live_nodes(self):
-                nodes = signals.live_nodes()
-                return [node for node in nodes if type(node._settings.master) is type(self)]
+                return [
+                    node
+                    for node in signals.live_nodes()
+                    if type(node._settings.master) is type(self)
+                ]
 
             def create(self, *args, **kwargs):
                 if not run.created_nodes:

@@ -19,44 +19,36 @@ def become(node, node_class, base):
     check_node_class(node_class, base)
     run = node._current_run
 
+    def rebound(block):
+        """Return a block, None or a list of blocks; a method of the node is that of the new class."""
+        if isinstance(block, list):
+            return [*map(rebound, block)]
+        if getattr(block, '__self__', None) is not node:
+            return block
+        return MethodType(getattr(node_class, block.__name__), node)
+
     def change():
-        receivers = [node, *run.endpoints]
         # find all blocks before the first change: the new class may lack one
-        soul = _rebind(node.soul, node, node_class)
-        delegates = [_rebind(receiver.delegate, node, node_class) for receiver in receivers]
+        soul = rebound(node.soul)
+        delegates = {each: rebound(each.delegate) for each in (node, *run.endpoints)}
         node.__class__ = node_class
         node.soul = soul
-        for receiver, delegate in zip(receivers, delegates):
+        for receiver, delegate in delegates.items():
             receiver.delegate = delegate
 
     run.callback_queue.run_exclusively(change)
 
 
-def _rebind(block, node, node_class):
-    """Return a block; a method of the node is replaced by the method of that name in a class.
-
-    :param block: a block, None, or a list of blocks, which gives a list
-    :raises AttributeError: if the class lacks the method
-    """
-    if isinstance(block, list):
-        return [_rebind(item, node, node_class) for item in block]
-    if getattr(block, '__self__', None) is not node:
-        return block
-    return MethodType(getattr(node_class, block.__name__), node)
+def editable_modules(node):
+    """Return the modules of a node with a ``__text__``, by remember_text() of the loader."""
+    modules = [sys.modules.get(type(node).__module__), *node._current_run.modules.by_name.values()]
+    return [module for module in modules if hasattr(module, '__text__')]
 
 
 def reload(node):
-    """Do the work of :meth:`Node.reload`.
-
-    A module that can be reloaded has ``__text__``, by remember_text() of the loader.
-    """
-    modules = [sys.modules.get(type(node).__module__), *node._current_run.modules.by_name.values()]
+    """Do the work of :meth:`Node.reload`."""
     notes = []
-    edits = [
-        (module, *_read(module, notes))
-        for module in modules
-        if '__text__' in getattr(module, '__dict__', ())
-    ]
+    edits = [(module, *_read(module, notes)) for module in editable_modules(node)]
     interval = sys.getswitchinterval()
     sys.setswitchinterval(CHANGE_LIMIT)  # no thread shall see a half of the change
     try:
@@ -124,22 +116,19 @@ def _change(owner, name, new, notes):
     former = vars(owner).get(name)
     if former is new:  # imported once more
         return
-    is_class = isinstance(former, type) and isinstance(new, type)
-    if is_class and former.__module__ == new.__module__:
-        if type(former) is not type:  # members of an Enum would not equal the former ones
-            notes.append(f'{name}: only at a restart')
-            return
-        for member, value in vars(new).items():
-            is_own = isinstance(value, FunctionType) or not member.startswith('__')
-            if is_own and not inspect.ismemberdescriptor(value):  # a slot reads its own class alone
-                _change(former, member, value, notes)
-        return
+    are_classes = isinstance(former, type) and isinstance(new, type)
+    is_same_class = are_classes and former.__module__ == new.__module__
     # those in decorators, staticmethods and classmethods
     function, new_function = (
         inspect.unwrap(getattr(value, '__func__', value)) for value in (former, new)
     )
     code, new_code = (getattr(each, '__code__', None) for each in (function, new_function))
-    if (
+    if is_same_class and type(former) is type:
+        for member, value in vars(new).items():
+            is_own = isinstance(value, FunctionType) or not member.startswith('__')
+            if is_own and not inspect.ismemberdescriptor(value):  # a slot reads its own class alone
+                _change(former, member, value, notes)
+    elif (
         code
         and new_code
         and code.co_filename == new_code.co_filename  # else it is imported
@@ -147,8 +136,8 @@ def _change(owner, name, new, notes):
     ):
         for part in '__code__', '__defaults__', '__kwdefaults__':
             setattr(function, part, getattr(new_function, part))
-        return
-    if new_code and (code or '__class__' in new_code.co_freevars):  # super() needs the class
+    # members of an Enum would not equal the former ones; super() needs the class
+    elif is_same_class or new_code and (code or '__class__' in new_code.co_freevars):
         notes.append(f'{name}: only at a restart')
-        return
-    setattr(owner, name, new)
+    else:
+        setattr(owner, name, new)

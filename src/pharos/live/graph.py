@@ -47,16 +47,8 @@ class Edge(NamedTuple):
     topic: str
     is_incoming: bool  # True if the arrow ends at the node
     links: list[Link]  # empty if nothing is connected
-
-    @property
-    def start(self) -> str:
-        """The name of the node or topic where the arrow begins."""
-        return self.topic if self.is_incoming else self.node
-
-    @property
-    def end(self) -> str:
-        """The name of the node or topic where the arrow ends."""
-        return self.node if self.is_incoming else self.topic
+    start: str  # the name of the node or topic where the arrow begins
+    end: str
 
     @property
     def transports(self) -> tuple[str, ...]:
@@ -89,13 +81,15 @@ class Graph:
         self.edges: list[Edge] = []
         for name, node in self.nodes.items():
             for topics, role in (node.publishes, 'publisher'), (node.subscribes, 'subscriber'):
+                is_incoming = role == 'subscriber'
                 for topic in filter(is_visible, topics):
                     links = [
                         link
                         for link in snapshot.links
                         if link.topic == topic and getattr(link, role) == name
                     ]
-                    self.edges.append(Edge(name, topic, role == 'subscriber', links))
+                    ends = (topic, name) if is_incoming else (name, topic)
+                    self.edges.append(Edge(name, topic, is_incoming, links, *ends))
         edge_topics = {edge.topic for edge in self.edges}
         types = snapshot.topic_types
         self.topics = {name: types.get(name, '*') for name in sorted(edge_topics)}
@@ -103,9 +97,7 @@ class Graph:
     def _process_of(self, name):
         """Return ``(host, process id)``; a node that does not tell it counts as a process."""
         node = self.nodes[name]
-        if node.pid is None:
-            return node.host, f'of {name}'
-        return node.host, node.pid
+        return node.host, node.pid or f'of {name}'
 
     def _topic_label(self, topic):
         """Return the type of a topic, and the rate if one was measured."""
@@ -158,9 +150,8 @@ class Graph:
             yield _dot_box('t', topic, self._topic_label(topic), TOPIC_STYLE)
             frames[self._topic_process(topic)].append(_dot_id('t', topic))
         frames.pop(None, None)  # topics of several processes have no frame
-        for process, ids in frames.items():
-            host, process_id = process
-            frame_id = _dot_id('cluster', str(process))
+        for (host, process_id), ids in frames.items():
+            frame_id = _dot_id('cluster', f'{process_id} {host}')
             yield f'subgraph {frame_id} {{ label="process {process_id}, {host}"'
             yield f'labeljust=l; fontsize=10; {FRAME_STYLE}'
             yield from ids
@@ -169,10 +160,8 @@ class Graph:
             node_id = _dot_id('n', edge.node)
             topic_id = _dot_id('t', edge.topic)
             arrow = f'{topic_id} -> {node_id}' if edge.is_incoming else f'{node_id} -> {topic_id}'
-            for transport in edge.transports:
-                yield f'{arrow} [{ARROW_STYLES[transport]}]'
-            if not edge.transports:
-                yield f'{arrow} [{LOOSE_STYLE}]'
+            for transport in edge.transports or ['none']:
+                yield f'{arrow} [{ARROW_STYLES.get(transport, LOOSE_STYLE)}]'
         yield '}'
 
     def _topic_process(self, topic):
@@ -188,17 +177,15 @@ class Graph:
         :raises PharosError: if graphviz is not installed, knows no such format, or fails
         """
         file = pathlib.Path(path)
-        if file.suffix == '.dot':
-            file.write_bytes(self.dot().encode())
-        else:
-            file.write_bytes(self._draw(file.suffix[1:]))
+        suffix = file.suffix[1:]
+        file.write_bytes(self.dot().encode() if suffix == 'dot' else self._draw(suffix))
 
     def _draw(self, picture_format):
         """Return the bytes of a picture that graphviz draws."""
-        command = ['dot', f'-T{picture_format}']
-        source = self.dot().encode()
         try:
-            return subprocess.check_output(command, input=source, timeout=DRAW_TIMEOUT)
+            return subprocess.check_output(
+                ['dot', f'-T{picture_format}'], input=self.dot().encode(), timeout=DRAW_TIMEOUT
+            )
         except (OSError, subprocess.SubprocessError) as error:
             raise PharosError(f'{error}: apt install graphviz, or leave out nodes') from error
 
@@ -206,7 +193,7 @@ class Graph:
         return self._draw('svg').decode()
 
     def __repr__(self):
-        return f'<Graph of {len(self.nodes)} nodes: see text() and save()>'
+        return self.text()
 
 
 def _dot_id(prefix, name):
@@ -249,8 +236,7 @@ def describe(master: Master, node_name: str, seconds: float) -> str:
     if not node:
         raise UnknownNodeError(f'no node {node_name} is known at {master.url}: see rosnode list')
     health = ', '.join(f'{fact} {value}' for fact, value in node.health.items())
-    lines = [f'{node_name}: pid {node.pid} at {node.host}, {node.uri} {node.problem}']
-    lines.append(f'    {health}')
+    lines = [f'{node_name}: pid {node.pid} at {node.host}, {node.uri} {node.problem}\n    {health}']
     lines += graph.edge_lines(node_name)
     lines += [f'    offers {service}' for service in node.offers]
     return '\n'.join(lines)

@@ -9,7 +9,6 @@ import os
 import select
 import sys
 import termios
-import time
 import tty
 from typing import Any
 
@@ -17,7 +16,7 @@ from rich.live import Live
 from rich.table import Table
 
 from pharos.errors import MasterUnreachableError, PharosError
-from pharos.live.snapshot import publisher_rates, take_snapshot
+from pharos.live.snapshot import Snapshot, publisher_rates, take_snapshot
 from pharos.live.text_format import short_number
 from pharos.master import Master
 
@@ -26,26 +25,6 @@ ACTIONS = {'r': 'restart', 'x': 'stop', 'a': 'start', 'l': 'reload'}  # key -> a
 WIDE_COLUMNS = 'NODE', 'PID'  # are never cut, however narrow the terminal is
 ALARM_COLUMNS = 'DROP', 'FAIL', 'PROBLEM'  # are red unless the value is 0 or empty
 HANG = 3.0  # seconds of a callback that are a problem
-
-
-class Meter:
-    """Measures a master: each measurement tells the rates since the one before.
-
-    :raises MasterUnreachableError: if the master does not answer
-    """
-
-    def __init__(self, master: Master):
-        self.master = master
-        self._snapshot = take_snapshot(master)
-
-    def measure(self) -> list[dict[str, Any]]:
-        """Return a row ``{column: value}`` for each node; a value is None if it is unknown.
-
-        :raises MasterUnreachableError: if the master does not answer
-        """
-        start = self._snapshot
-        self._snapshot = take_snapshot(self.master)
-        return list(_node_rows(self._snapshot, start))
 
 
 def _cpu_percent(name, snapshot, start):
@@ -57,18 +36,23 @@ def _cpu_percent(name, snapshot, start):
     return None
 
 
-def _node_rows(snapshot, start):
+def node_rows(snapshot: Snapshot, start: Snapshot) -> list[dict[str, Any]]:
+    """Return a row ``{column: value}`` for each node; a value is None if it is unknown.
+
+    :param start: an earlier snapshot: the rates are those since then
+    """
+    rows = []
     link_rates = snapshot.rates_since(start)
     message_rates = publisher_rates(link_rates)
     for name, node in snapshot.nodes.items():
         transports = [
             link.transport for link in snapshot.links if name in (link.publisher, link.subscriber)
         ]
-        yield {
+        row = {
             'NODE': name,
             'CLASS': node.health.get('kind'),
             'HOST': node.host,
-            'PID': node.pid,
+            'PID': node.pid and str(node.pid),
             'CPU%': _cpu_percent(name, snapshot, start),
             'IN/S': sum(rate for link, rate in link_rates.items() if link.subscriber == name),
             # a message counts once, however many nodes receive it
@@ -80,14 +64,16 @@ def _node_rows(snapshot, start):
             'FAIL': node.health.get('errors'),
             'PROBLEM': node.problem or _hang(node.health),
         }
+        rows.append(row)
+    return rows
 
 
 def _hang(health):
-    """Return a text if a callback of a node of pharos has run for long, else ''."""
+    """Return a text if a callback of a node of pharos has run for long, else None."""
     seconds = health.get('callback_seconds', 0)
-    if seconds < HANG:
-        return ''
-    return f'delegate for {seconds:.0f} s, {health["waiting"]} wait'
+    if seconds >= HANG:
+        return f'delegate for {seconds:.0f} s, {health["waiting"]} wait'
+    return None
 
 
 def table(rows: list[dict[str, Any]], chosen_node: str = '') -> Table:
@@ -95,9 +81,8 @@ def table(rows: list[dict[str, Any]], chosen_node: str = '') -> Table:
 
     :param chosen_node: the row of this node is marked
     """
-    columns = list(rows[0]) if rows else ['nothing there']
     rich_table = Table(box=None, padding=(0, 1, 0, 0))
-    for column in columns:
+    for column in rows[0] if rows else ['nothing there']:
         rich_table.add_column(column, no_wrap=column in WIDE_COLUMNS)
     for row in rows:
         style = 'reverse' if row.get('NODE') == chosen_node else None
@@ -109,54 +94,51 @@ def table(rows: list[dict[str, Any]], chosen_node: str = '') -> Table:
 def _cell_text(column, value):
     if value in (None, ''):
         return '-'
-    if isinstance(value, str) or column == 'PID':
-        text = str(value)
-    else:
-        text = short_number(value)
+    text = value if isinstance(value, str) else short_number(value)
     if column in ALARM_COLUMNS and value:
         return f'[bold red]{text}[/]'
     return text
 
 
-def show(meter: Meter, interval: float) -> None:
+def show(master: Master, interval: float) -> None:
     """Show the table in the terminal until the key q or Ctrl-C.
 
-    :param interval: seconds between two measurements
+    :param interval: seconds between two snapshots; a key begins them anew
     """
     keyboard = sys.stdin.fileno()
     terminal_settings = termios.tcgetattr(keyboard)
     tty.setcbreak(keyboard)
     try:
         with Live(screen=True, auto_refresh=False) as screen:
-            _show_nodes(screen, meter, interval, keyboard)
+            _show_nodes(screen, master, interval, keyboard)
     finally:
         termios.tcsetattr(keyboard, termios.TCSADRAIN, terminal_settings)
 
 
-def _show_nodes(screen, meter, interval, keyboard):
-    rows = meter.measure()
+def _show_nodes(screen, master, interval, keyboard):
+    start = take_snapshot(master)
+    rows = node_rows(take_snapshot(master), start)
     chosen_node = ''
     problem = answer = ''
-    deadline = time.monotonic() + interval
     while True:
         page = Table.grid()
         page.add_row(HELP)
         page.add_row(problem or answer)
         page.add_row(table(rows, chosen_node))
         screen.update(page, refresh=True)
-        timeout = max(0, deadline - time.monotonic())
-        if select.select([keyboard], [], [], timeout)[0]:
+        if select.select([keyboard], [], [], interval)[0]:
             key = os.read(keyboard, 1).decode('latin-1')
             if key == 'q':
                 return
             if key in 'jk':
                 chosen_node = _next_node(rows, chosen_node, 1 if key == 'j' else -1)
             elif key in ACTIONS and chosen_node:
-                answer = _control(ACTIONS[key], chosen_node, meter.master)
+                answer = _control(ACTIONS[key], chosen_node, master)
         else:
-            deadline = time.monotonic() + interval
             try:
-                rows = meter.measure()
+                snapshot = take_snapshot(master)
+                rows = node_rows(snapshot, start)
+                start = snapshot
                 problem = ''
             except MasterUnreachableError as error:
                 problem = str(error)
@@ -175,7 +157,6 @@ def _control(action, name, master):
     from pharos.compose.control import control
 
     try:
-        answer = control(action, name, master)
+        return f'{action} done: {control(action, name, master)}'
     except PharosError as error:
         return str(error)
-    return f'{action} done: {answer}'

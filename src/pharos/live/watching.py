@@ -76,7 +76,6 @@ def watch(topic: Topic, count: int | None, block: Block | None) -> None:
     :param count: the number of messages; None: until Ctrl-C, which ends the call in any case
     """
     show_message = block or _show_message
-    numbers = itertools.count() if count is None else range(count)
     messages: queue.Queue = queue.Queue(MAX_WAITING)
 
     def keep_message(message):
@@ -85,7 +84,7 @@ def watch(topic: Topic, count: int | None, block: Block | None) -> None:
 
     with looking_node(topic) as node, contextlib.suppress(KeyboardInterrupt):
         node.interested_in(topic.name, delegate=keep_message)
-        for _ in numbers:
+        for _ in itertools.islice(itertools.count(), count):
             show_message(messages.get())
 
 

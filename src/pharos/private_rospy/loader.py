@@ -279,12 +279,12 @@ class PrivateModules:
             if code is None and spec.loader and spec.has_location:  # an extension in C
                 spec.loader.exec_module(module)
             else:
+                remember_text(module)
                 exec(code or '', vars(module))
         except BaseException:
             del self.by_name[name]
             raise
         self._patch(module)
-        remember_text(module)
 
     def _import_module(self, name, package=None):
         return self.load(resolve_name(name, package))
