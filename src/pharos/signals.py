@@ -19,7 +19,7 @@ _SPIN_PERIOD = 0.01  # seconds
 started_nodes = []
 #: the names of nodes that a required soul has ended
 lost_names = set()
-#: the nodes between the stop and the start of a restart()
+#: the nodes in a restart()
 restarting_nodes = []
 
 #: the time of the first signal that ends the program, as of time.monotonic()
@@ -29,8 +29,7 @@ _is_exiting = False
 
 def own_nodes():
     """Return the nodes of this process that start, run, stop or restart."""
-    between = [node for node in restarting_nodes if node not in started_nodes]
-    return [*started_nodes, *between]
+    return [*dict.fromkeys(started_nodes + restarting_nodes)]
 
 
 def live_nodes():

@@ -36,7 +36,6 @@ from pharos.intraprocess.links import runs
 from pharos.node import BlockNode
 from pharos.private_rospy import run, tcpros, xmlrpc
 from pharos.private_rospy.patches import patch
-from pharos.private_rospy.topics import ROSOUT
 from pharos.shared_memory import sending
 from pharos.waiting import wait
 
@@ -79,7 +78,7 @@ def takes_part():
 class Lock:
     """A lock. A thread that takes part waits for others that do in virtual time.
 
-    It keeps its turn if a server holds the lock, which does not do so for long. "Member" is short for
+    If a server holds the lock, the thread keeps its turn: servers hold locks briefly. "Member" is short for
     a thread that takes part: only such a thread keeps a lock while it waits for the time.
     """
 
@@ -177,7 +176,7 @@ def publish(original, run, publisher, message, *options, **more):
     """rospy only sends. This also records what a node sends, if the simulation shall."""
     original(publisher, message, *options, **more)
     record = _simulation and _simulation.record
-    if record and run.name != PLAYER and publisher.name != ROSOUT:
+    if record and run.name != PLAYER and publisher.name != '/rosout':
         record(publisher.name, message, Time(0, _simulation.nanoseconds))
 
 
@@ -192,7 +191,7 @@ class Simulation:
 
     allows_waits = False
     record: Any = None
-    _looks = 0  # at the thread with the turn
+    _looks = 0  # at the thread with the turn, since it got the turn
     _cpu_time = 0.0
 
     def __init__(self, master):
@@ -252,9 +251,16 @@ class Simulation:
             start = round(file.get_start_time() * 10**9)
             delay = max(0, self.nanoseconds - start)
             self.nanoseconds = max(self.nanoseconds, start - 10**9)
-            for topic, message, stamp in file.read_messages(topics):
+            channels = {}
+            for topic, message, stamp, header in file.read_messages(
+                topics, return_connection_header=True
+            ):
                 self.wait(stamp.to_nsec() + delay, LAST)
-                player.send_to(topic, message, typed_as=type(message))
+                key = topic, header.get('callerid')  # several nodes may latch a message each
+                if key not in channels:
+                    is_latched = header.get('latching') == '1'
+                    channels[key] = player.output_channel(topic, type(message), is_latched)
+                channels[key].send(message)
             self.run(0)
 
     # -- the turn

@@ -91,12 +91,12 @@ def _run(stack, options, mappings):
         print(f'no ROS master at {master.url}: it is started here')
         stack.enter_context(Master.embedded(port))
     composition = stack.enter_context(Composition(master, owns_process=True))
+    if options.reload:  # also what is saved while the programs start
+        threading.Thread(target=reload_on_save, args=[composition], daemon=True).start()
     if options.file:
         composition.launch(_read_launch_file(master.url, options, mappings))
     else:
         composition.run_scripts(options.script, mappings, options.here)
-    if options.reload:
-        threading.Thread(target=reload_on_save, args=[composition], daemon=True).start()
     if simulation:
         _simulate(simulation, options)
         composition.stopping.set()  # ends its wait()

@@ -24,7 +24,7 @@ def start(arguments: list[str]) -> None:
 def reload(arguments: list[str]) -> None:
     """Have the edited program of a node of a composition take effect, while the node runs.
 
-    Functions, classes, imports and literal values that are new or differ change in place. Objects,
+    Functions, members of classes, imports and values that are new or differ change in place. Objects,
     subscriptions and connections stay. Other statements take effect at a restart; the answer has their
     lines.
     """
@@ -35,8 +35,8 @@ def _control(command, arguments):
     parser = argument_parser(command)
     parser.add_argument('node', help='the full name of the node')
     name = '/' + parser.parse_args(arguments).node.lstrip('/')
-    program = control(command.__name__, name, Master())
+    answer = control(command.__name__, name, Master())
     if command is reload:
-        print(program)
-    elif program != name:
-        print(f'{name} is a node of the program {program}: {command.__name__} of all its nodes')
+        print(answer)
+    elif answer != name:
+        print(f'{name} is a node of the program {answer}: {command.__name__} of all its nodes')

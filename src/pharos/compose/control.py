@@ -1,4 +1,4 @@
-"""Stop, start, restart and reload nodes of a composition: for other processes of the same user, or on a save.
+"""Stop, start, restart and reload nodes of a composition, for other processes of the user, or on a save.
 
 Each composition listens on a socket that is not in a file system; its name has the process's number.
 """
@@ -9,11 +9,10 @@ import os
 import re
 import socket
 import threading
-import time
 from typing import TYPE_CHECKING
 
 from pharos.errors import PharosError, UnknownNodeError
-from pharos.live.editing import editable_modules
+from pharos.live.editing import NO_CHANGE, editable_modules
 from pharos.private_rospy.tcpros import check_user
 from pharos.transcript import Transcript
 
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
     from pharos.master import Master
 
 ANSWER_LIMIT = 60.0  # seconds
-MAX_TEXT = 4096  # bytes
+MAX_TEXT = 65536  # bytes
 ACCEPT_PAUSE = 0.5  # seconds until the next attempt
 SAVE_PERIOD = (
     0.05  # seconds between two looks at the files; a file younger than that may be half written
@@ -73,18 +72,18 @@ def _answer(composition, action, name):
 
 def reload_on_save(composition):
     """Reload the nodes of this process whose files are saved, until the composition stops."""
-    save_times = {}  # node -> time of the last save of one of its files
+    save_times = {}  # node -> the times of its files
     while not composition.stopping.wait(SAVE_PERIOD):
         for node in composition.nodes:
-            with contextlib.suppress(OSError):  # an editor is about to replace the file
-                last_time = max(
-                    (os.path.getmtime(module.__file__) for module in editable_modules(node)),
-                    default=0.0,
-                )
-                if save_times.setdefault(node, last_time) < last_time < time.time() - SAVE_PERIOD:
-                    save_times[node] = last_time
+            with contextlib.suppress(OSError):  # an editor is about to replace a file
+                times = [os.path.getmtime(module.__file__) for module in editable_modules(node)]
+                if save_times.setdefault(node, times) != times:
+                    save_times[node] = times
+                    composition.stopping.wait(SAVE_PERIOD)  # the editor may still write
                     name = node._settings.name
-                    Transcript.show(name, _answer(composition, 'reload', name))
+                    answer = _answer(composition, 'reload', name)
+                    if answer != f'{DONE}{NO_CHANGE}':  # as when the program has imported one more
+                        Transcript.show(name, answer)
 
 
 def control(action: str, name: str, master: Master) -> str:

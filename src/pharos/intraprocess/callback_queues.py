@@ -19,7 +19,8 @@ from typing import Any, Callable
 BURST = 100e-6  # seconds; a publisher that woke a thread less than this ago does not wait for one
 YIELD_LIMIT = 1e-3  # seconds that a publisher waits at most until the receiver's thread runs
 YIELD_PAUSE = 0.02  # seconds without such a wait after one that reached its limit
-SLOW = 1e-3  # seconds; the callbacks on later messages do not wait longer for one that runs
+SLOW = 3e-3  # seconds; the callbacks on later messages do not wait longer for one that runs
+TURN_PERIOD = 1e-3  # seconds between two looks whether it is a queue's turn
 TURN_LIMIT = 0.05  # seconds that a callback waits at most, also for those that have not begun
 
 _no_yield_before = 0.0
@@ -153,7 +154,7 @@ class CallbackQueue:
         while not self.order.has_turn(self, self.next_number()) and not self.closed:
             if perf_counter() > deadline:
                 break
-            self._wake_lock.acquire(True, SLOW)
+            self._wake_lock.acquire(True, TURN_PERIOD)
         self.waits_for_turn = False
 
     # -- running

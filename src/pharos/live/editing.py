@@ -3,15 +3,18 @@ from __future__ import annotations
 
 import ast
 import inspect
+import os
 import pathlib
 import sys
-from types import FunctionType, MethodType
+from types import MethodType
 
 from pharos.errors import PharosError
 from pharos.names import check_node_class
 
 CHANGE_LIMIT = 0.05  # seconds: for so long at most, a change keeps all other threads from running
-DEFINITIONS = ast.FunctionDef, ast.ClassDef, ast.Import, ast.ImportFrom
+NO_CHANGE = 'nothing has changed'
+TAKES_EFFECT = 'takes effect, functions at their next call'
+AT_RESTART = 'takes effect at a restart'
 
 
 def become(node, node_class, base):
@@ -40,9 +43,13 @@ def become(node, node_class, base):
 
 
 def editable_modules(node):
-    """Return the modules of a node with a ``__text__``, by remember_text() of the loader."""
+    """Return the modules of a node that remember_text() gave a ``__text__``, the imported ones first."""
     modules = [sys.modules.get(type(node).__module__), *node._current_run.modules.by_name.values()]
-    return [module for module in modules if hasattr(module, '__text__')]
+    return [
+        module
+        for module in reversed(modules)
+        if hasattr(module, '__text__') and os.path.exists(module.__file__)
+    ]
 
 
 def reload(node):
@@ -52,46 +59,62 @@ def reload(node):
     interval = sys.getswitchinterval()
     sys.setswitchinterval(CHANGE_LIMIT)  # no thread shall see a half of the change
     try:
-        for module, text, values in edits:
+        for module, text, changes in edits:
             module.__text__ = text
-            for name, value in values.items():
-                notes.append(f'{name} takes effect, functions at their next call')
-                _change(module, name, value, notes)
+            for owner, name, *rest in changes:
+                notes.append(f'{owner.__name__}.{name} {_change(owner, name, *rest)}')
     finally:
         sys.setswitchinterval(interval)
-    return '\n'.join(notes) or 'nothing has changed'
+    return '\n'.join(notes) or NO_CHANGE
 
 
 def _read(module, notes):
-    """Run the definitions in a module's file that are new; the module stays as it is.
+    """Run the definitions in a module's file that are new; add to the notes the lines of other statements.
 
-    Of a class that is there, run the members that are new. Add to the notes the places of other
-    statements that are new.
+    The module stays as it is, but gets the names that it lacks: other definitions may use them.
 
-    :returns: the text of the file, and ``{name: value}``
+    :returns: the text of the file, and the changes: arguments of _change()
     :raises PharosError: if the text is not valid, or a definition raises an exception
     """
     file = module.__file__
-    values, line = {}, 1
+    changes, line = [], 1
+
+    def code_of(item):
+        return compile(ast.Module([item], []), file, 'exec', 0, True)
+
     try:
         text = pathlib.Path(file).read_bytes()
         former_items = ast.parse(module.__text__).body
-        members = {item.name: item.body for item in former_items if isinstance(item, ast.ClassDef)}
+        bodies = {item.name: item.body for item in former_items if isinstance(item, ast.ClassDef)}
         for item in _new_items(former_items, ast.parse(text).body):
             line = item.lineno
-            if not _is_definition(item):
-                notes.append(f'{file}:{line}: takes effect at a restart')
+            former_body = bodies.get(getattr(item, 'name', ''))  # of a class that is there
+            new_body = former_body and _new_items(former_body, item.body)
+            if new_body == [] or not _is_definition(item):
+                notes.append(f'{file}:{line}: {AT_RESTART}')
                 continue
-            if isinstance(item, ast.ClassDef) and item.name in members:
-                item.body = _new_items(members[item.name], item.body) or [ast.Pass()]
+            owner, found = module, {}
+            if new_body:
                 item.decorator_list = []
-            code = compile(ast.fix_missing_locations(ast.Module([item], [])), file, 'exec', 0, True)
-            exec(code, vars(module), values)
+            exec(code_of(item), vars(module), found)
+            for name, new in found.items():
+                vars(module).setdefault(name, new)
+            if new_body:
+                # the whole body has run, since its statements need each other; the new ones take effect
+                owner = vars(module)[item.name]
+                item.body = new_body
+                names = code_of(item).co_consts[0].co_names
+                found = {
+                    name: new
+                    for name, new in vars(found[item.name]).items()
+                    if name in names and (callable(new) or not name.startswith('__'))
+                }
+            changes += [(owner, *each, hasattr(item, 'names')) for each in found.items()]
     except Exception as error:
         raise PharosError(
-            f'{file}:{getattr(error, "lineno", line)}: {error!r}; nothing has changed'
+            f'{file}:{getattr(error, "lineno", line)}: {error!r}; {NO_CHANGE}'
         ) from error
-    return text, values
+    return text, changes
 
 
 def _new_items(former_items, items):
@@ -101,43 +124,36 @@ def _new_items(former_items, items):
 
 
 def _is_definition(item):
-    """True for functions, classes, imports, and a name with a literal value."""
+    """True for functions, classes, imports, and a name with a value that calls nothing."""
     if not isinstance(item, ast.Assign):
-        return isinstance(item, DEFINITIONS)
-    try:
-        ast.literal_eval(item.value)
-    except ValueError:
-        return False
-    return isinstance(item.targets[0], ast.Name)
+        return isinstance(item, (ast.FunctionDef, ast.ClassDef, ast.Import, ast.ImportFrom))
+    return isinstance(item.targets[0], ast.Name) and 'Call(' not in ast.dump(item)
 
 
-def _change(owner, name, new, notes):
-    """Change a name of a module or class, functions and classes in place; add to the notes."""
+def _change(owner, name, new, is_import):
+    """Change a name of a module or class, functions in place; return what to say of that."""
     former = vars(owner).get(name)
-    if former is new:  # imported once more
-        return
-    are_classes = isinstance(former, type) and isinstance(new, type)
-    is_same_class = are_classes and former.__module__ == new.__module__
-    # those in decorators, staticmethods and classmethods
-    function, new_function = (
-        inspect.unwrap(getattr(value, '__func__', value)) for value in (former, new)
-    )
-    code, new_code = (getattr(each, '__code__', None) for each in (function, new_function))
-    if is_same_class and type(former) is type:
-        for member, value in vars(new).items():
-            is_own = isinstance(value, FunctionType) or not member.startswith('__')
-            if is_own and not inspect.ismemberdescriptor(value):  # a slot reads its own class alone
-                _change(former, member, value, notes)
-    elif (
-        code
-        and new_code
-        and code.co_filename == new_code.co_filename  # else it is imported
-        and code.co_freevars == new_code.co_freevars in ((), ('__class__',))
-    ):
-        for part in '__code__', '__defaults__', '__kwdefaults__':
-            setattr(function, part, getattr(new_function, part))
-    # members of an Enum would not equal the former ones; super() needs the class
-    elif is_same_class or new_code and (code or '__class__' in new_code.co_freevars):
-        notes.append(f'{name}: only at a restart')
-    else:
-        setattr(owner, name, new)
+    if not (is_import or new is former):
+        # the functions in decorators, staticmethods and classmethods
+        function, new_function = (
+            inspect.unwrap(getattr(value, '__func__', value)) for value in (former, new)
+        )
+        code, new_code = (getattr(each, '__code__', None) for each in (function, new_function))
+        if (
+            code
+            and new_code
+            and (function is former) is (new_function is new)  # both have a decorator, or none has
+            and code.co_freevars == new_code.co_freevars in ((), ('__class__',))
+        ):
+            for part in '__code__', '__defaults__', '__kwdefaults__':
+                setattr(function, part, getattr(new_function, part))
+            return TAKES_EFFECT
+        if (
+            type(owner).__module__ == 'enum'  # its members would not equal the former ones
+            or isinstance(former, type)
+            or new_code
+            and (code or '__class__' in new_code.co_freevars)  # super() needs the class
+        ):
+            return AT_RESTART
+    setattr(owner, name, new)
+    return TAKES_EFFECT

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pharos.master import Master
 
 DRAW_TIMEOUT = 60  # seconds that graphviz has for a picture
-#: the topics and services that every node has
+#: nodes and topics that a graph leaves out
 COMMON_NAMES = re.compile(
     r'/(rosout|rosout_agg|statistics|clock)|.*/(parameter_updates|parameter_descriptions|get_loggers'
     r'|set_logger_level|set_parameters|pharos_looks_.*)'
@@ -90,12 +90,11 @@ class Graph:
                     ]
                     ends = (topic, name) if is_incoming else (name, topic)
                     self.edges.append(Edge(name, topic, is_incoming, links, *ends))
-        edge_topics = {edge.topic for edge in self.edges}
-        types = snapshot.topic_types
-        self.topics = {name: types.get(name, '*') for name in sorted(edge_topics)}
+        names = sorted({edge.topic for edge in self.edges})
+        self.topics = {name: snapshot.topic_types.get(name, '*') for name in names}
 
     def _process_of(self, name):
-        """Return ``(host, process id)``; a node that does not tell it counts as a process."""
+        """Return ``(host, process id)``; a node without a known id is a process of its own."""
         node = self.nodes[name]
         return node.host, node.pid or f'of {name}'
 

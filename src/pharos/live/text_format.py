@@ -6,14 +6,8 @@ MAX_LENGTH = 200  # characters of a line
 
 
 def short_number(value: float) -> str:
-    """Return a number in at most five characters: 9.9, 120, 1.2k, 35M."""
-    for unit in '', 'k', 'M':
-        if abs(value) < 999.5:
-            if value > 99 or value == int(value):
-                return f'{value:.0f}{unit}'
-            return f'{value:.1f}{unit}'
-        value /= 1000
-    return f'{value:.1f}G'
+    """Return a number with one digit after the point, if that is not 0: 9.9, 120, 12345.7."""
+    return f'{round(value, 1):g}'
 
 
 def message_text(message: genpy.Message) -> str:

@@ -23,7 +23,6 @@ from pharos.master import Master
 HELP = 'q quit  j k choose a node; if it is of a composition: r restart  x stop  a start  l reload'
 ACTIONS = {'r': 'restart', 'x': 'stop', 'a': 'start', 'l': 'reload'}  # key -> action
 WIDE_COLUMNS = 'NODE', 'PID'  # are never cut, however narrow the terminal is
-ALARM_COLUMNS = 'DROP', 'FAIL', 'PROBLEM'  # are red unless the value is 0 or empty
 HANG = 3.0  # seconds of a callback that are a problem
 
 
@@ -48,23 +47,24 @@ def node_rows(snapshot: Snapshot, start: Snapshot) -> list[dict[str, Any]]:
         transports = [
             link.transport for link in snapshot.links if name in (link.publisher, link.subscriber)
         ]
-        row = {
-            'NODE': name,
-            'CLASS': node.health.get('kind'),
-            'HOST': node.host,
-            'PID': node.pid and str(node.pid),
-            'CPU%': _cpu_percent(name, snapshot, start),
-            'IN/S': sum(rate for link, rate in link_rates.items() if link.subscriber == name),
-            # a message counts once, however many nodes receive it
-            'OUT/S': sum(rate for (_, sender), rate in message_rates.items() if sender == name),
-            'LOCAL': transports.count('INTRAPROCESS'),
-            'SHM': transports.count('SHARED_MEMORY'),
-            'TCP': transports.count('TCPROS'),
-            'DROP': node.health.get('dropped'),
-            'FAIL': node.health.get('errors'),
-            'PROBLEM': node.problem or _hang(node.health),
-        }
-        rows.append(row)
+        rows.append(
+            {
+                'NODE': name,
+                'CLASS': node.health.get('kind'),
+                'HOST': node.host,
+                'PID': node.pid and str(node.pid),
+                'CPU%': _cpu_percent(name, snapshot, start),
+                'IN/S': sum(rate for link, rate in link_rates.items() if link.subscriber == name),
+                # a message counts once, however many nodes receive it
+                'OUT/S': sum(rate for (_, sender), rate in message_rates.items() if sender == name),
+                'LOCAL': transports.count('INTRAPROCESS'),
+                'SHM': transports.count('SHARED_MEMORY'),
+                'TCP': transports.count('TCPROS'),
+                'DROP': node.health.get('dropped'),
+                'FAIL': node.health.get('errors'),
+                'PROBLEM': node.problem or _hang(node.health),
+            }
+        )
     return rows
 
 
@@ -86,24 +86,20 @@ def table(rows: list[dict[str, Any]], chosen_node: str = '') -> Table:
         rich_table.add_column(column, no_wrap=column in WIDE_COLUMNS)
     for row in rows:
         style = 'reverse' if row.get('NODE') == chosen_node else None
-        cells = [_cell_text(column, value) for column, value in row.items()]
-        rich_table.add_row(*cells, style=style)
+        rich_table.add_row(*map(_cell_text, row.values()), style=style)
     return rich_table
 
 
-def _cell_text(column, value):
+def _cell_text(value):
     if value in (None, ''):
         return '-'
-    text = value if isinstance(value, str) else short_number(value)
-    if column in ALARM_COLUMNS and value:
-        return f'[bold red]{text}[/]'
-    return text
+    return value if isinstance(value, str) else short_number(value)
 
 
 def show(master: Master, interval: float) -> None:
     """Show the table in the terminal until the key q or Ctrl-C.
 
-    :param interval: seconds between two snapshots; a key begins them anew
+    :param interval: seconds without a key until the next snapshot
     """
     keyboard = sys.stdin.fileno()
     terminal_settings = termios.tcgetattr(keyboard)
@@ -153,7 +149,7 @@ def _next_node(rows, chosen_node, step):
 
 
 def _control(action, name, master):
-    """Restart, stop or start a node, and return a line that says how that went."""
+    """Restart, stop, start or reload a node, and return a line that says how that went."""
     from pharos.compose.control import control
 
     try:

@@ -1,5 +1,6 @@
 """Plain rospy in a program whose nodes are made with pharos: it says what to write instead."""
 import sys
+import warnings
 
 from pharos.private_rospy.loader import SYSTEM_FOLDERS
 
@@ -12,14 +13,13 @@ CLASSES = 'Publisher Subscriber Service ServiceProxy Rate Timer'.split()
 
 
 def guide(rospy, nodes):
-    """Have functions and classes of rospy say once what to write, if rospy has no node.
+    """Have functions and classes of rospy say what to write, if rospy has no node.
 
     ``rospy.is_shutdown()`` is then True when all nodes have stopped.
 
     :param rospy: the process's own rospy, or that of a composed program
     :param nodes: ``nodes()`` returns the nodes of pharos that start or run
     """
-    advices = set()  # that have been given
     had_nodes = False
 
     def watch(owner, attribute, name):
@@ -29,7 +29,7 @@ def guide(rospy, nodes):
             if rospy.core.is_initialized():
                 setattr(owner, attribute, original)  # or the log would name this file
             elif nodes():
-                _advise(name, advices)
+                _advise(name)
             return original(*args, **kwargs)
 
         setattr(owner, attribute, call)
@@ -49,8 +49,8 @@ def guide(rospy, nodes):
         watch(getattr(rospy, name), '__init__', name)
 
 
-def _advise(name, advices):
-    """Print what to write instead of a call of rospy, unless that has been printed."""
+def _advise(name):
+    """Say what to write instead of a call of rospy, once for each place of such a call."""
     caller = sys._getframe(2)
     module = caller.f_globals['__name__'].partition('.')[0]
     if module == 'rospy':  # it was called itself, and has been told of
@@ -58,9 +58,8 @@ def _advise(name, advices):
     advice = f'node.ros.{name}'
     if caller.f_code.co_filename.startswith(SYSTEM_FOLDERS):  # a library on rospy
         advice = f"node.ros_import('{module}')"
-    if advice not in advices:
-        advices.add(advice)
-        print(
-            f'rospy.{name} has no node, since nobody calls rospy.init_node(): write {advice}',
-            file=sys.stderr,
-        )
+    warnings.warn(
+        f'rospy.{name} has no node, since nobody calls rospy.init_node(): write {advice}',
+        RuntimeWarning,
+        stacklevel=3,
+    )

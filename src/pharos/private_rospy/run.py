@@ -209,7 +209,8 @@ class Run:
     def checkpoint(self) -> None:
         """Do nothing: a run of a script handles its signals here.
 
-        publish() and is_shutdown() call this, and so all loops of rospy programs do.
+        is_shutdown() calls this, as do a script's sleeps; not publish(), since the caller may hold a lock
+        that a hook of the program takes. A thread of its own handles a signal for a loop without both.
         """
 
     def signal_shutdown(self, reason: str) -> None:

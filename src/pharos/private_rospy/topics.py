@@ -24,7 +24,6 @@ FLUSH_PERIOD = 0.001  # seconds between two looks
 #: seconds until the first callback of a subscription: a connection between processes takes so long,
 #: and many constructors subscribe before they have set all that their callback uses
 FIRST_PAUSE = 0.05
-ROSOUT = '/rosout'
 
 
 class PublisherOverlay:
@@ -55,13 +54,10 @@ class PublisherOverlay:
         self.cached_connections = None
 
     def acquire(self) -> None:
-        """Take no lock, but handle a pending signal of a script.
+        """Take no lock: rospy locks here for the whole of a publish().
 
-        rospy locks here for the whole of a publish(). Our publish() has a lock of its own, and
-        frees it before inline delegates run.
+        Our publish() has a lock of its own, and frees it before inline delegates run.
         """
-        if self.resolved_name != ROSOUT:  # this thread holds the log's lock
-            self.run.checkpoint()
 
     def release(self) -> None:
         """Do nothing: rospy unlocks here after a publish()."""
