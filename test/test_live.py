@@ -481,9 +481,6 @@ def test_node_describes_itself(master, traffic):
         assert text in told
 
 
-# -- messages as text, and numbers over time
-
-
 def test_messages_are_shown_in_short(master, transcript):
     for type_, fields, text in [
         ('geometry_msgs/Twist', {'linear': {'x': 2.5}}, 'x: 2.5'),

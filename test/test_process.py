@@ -323,14 +323,16 @@ def assert_ends_within(bench, seconds, text):
     pytest.fail(f'it ends after {duration} s')
 
 
-def test_end_waits_for_no_thread_that_blocks(bench):
+def test_end_waits_for_no_thread_that_blocks_and_for_no_lock_of_the_main_loop(bench):
     text = '''
         import queue
+        lock = threading.Lock()
         rospy.init_node('program')
+        rospy.on_shutdown(lambda: [lock.acquire(), lock.release()])
         threading.Thread(target=queue.Queue().get, daemon=True).start()
         rospy.loginfo('begins')
         say('ready')
-        rospy.spin()
+        while not [lock.acquire(), rospy.is_shutdown(), lock.release()][1]: sum(range(10**5))
         '''
     output = assert_ends_within(bench, 10, text)
     (line,) = [line for line in output.splitlines() if 'begins' in line]

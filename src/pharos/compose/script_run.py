@@ -36,7 +36,7 @@ from pharos.private_rospy.run import STOP_LIMIT, Lifecycle, Run, join
 from pharos.transcript import Transcript
 from pharos.waiting import current, wait
 
-SIGNAL_LIMIT = 0.2  # seconds that a signal waits for the main thread
+SIGNAL_LIMIT = 0.2  # seconds that a signal waits for the main thread to sleep
 BLOCK_LIMIT = 1.0  # seconds that a thread has to end after an exception in it
 JOIN_PERIOD = 0.02  # seconds between two looks for a signal
 SPIN_PERIOD = 0.01  # seconds
@@ -206,8 +206,7 @@ class ScriptRun(Run):
         error, self.error = self.error, None
         if error:
             error_class = type(error) if isinstance(error, PharosError) else PharosError
-            text = f'{node.path} ended before it was a node: {error!r}'
-            raise error_class(text) from error
+            raise error_class(f'{node.path} ended before it was a node: {error!r}') from error
 
     @property
     def is_known(self):
@@ -338,7 +337,7 @@ class ScriptRun(Run):
         """Wait for the threads that are not daemons; a signal ends the wait, as in Python."""
         with contextlib.suppress(KeyboardInterrupt, SystemExit):
             while self.threads_to_join and not self.finished.is_set():
-                self.checkpoint()
+                self.handle_signal()
                 join(list(self.threads_to_join), JOIN_PERIOD)
 
     def _status_of(self, exit_request):
@@ -367,15 +366,22 @@ class ScriptRun(Run):
             time.sleep(seconds)
         else:
             self.pending_signal.wait(seconds)
-            self.checkpoint()
-
-    def checkpoint(self):
-        """Handle a pending signal if this is the main thread; wait if another thread handles it."""
-        if self.is_end_requested and threading.current_thread() is self.main:
             self.handle_signal()
 
+    def checkpoint(self):
+        """Have the main thread wait while another thread handles a signal, for STOP_LIMIT at most.
+
+        The caller may hold a lock that a hook takes, as smach does.
+        """
+        if threading.current_thread() is self.main:
+            if self.handler_lock.acquire(timeout=STOP_LIMIT):
+                self.handler_lock.release()
+
     def handle_signal(self):
-        """Call the program's handlers for a stop, once; they may raise an exception."""
+        """Call the program's handlers for a stop, once; they may raise an exception.
+
+        Wait while another thread does so.
+        """
         with self.handler_lock:
             if not self.pending_signal.is_set():
                 return

@@ -204,7 +204,7 @@ def signal_shutdown(original, run):
 def is_shutdown(original, run):
     """rospy is shut down only at the end of a stop, which waits for loops that ask this.
 
-    This is True once the stop has begun. A script handles its signals here, too.
+    This is True once the stop has begun.
     """
     run.checkpoint()
     if run.stopping.is_set():

@@ -207,11 +207,7 @@ class Run:
             let_others_run()
 
     def checkpoint(self) -> None:
-        """Do nothing: a run of a script handles its signals here.
-
-        is_shutdown() calls this, as do a script's sleeps; not publish(), since the caller may hold a lock
-        that a hook of the program takes. A thread of its own handles a signal for a loop without both.
-        """
+        """Do nothing: is_shutdown() calls this, and a script waits here for its handlers."""
 
     def signal_shutdown(self, reason: str) -> None:
         """Stand in for ``rospy.signal_shutdown``: stop the node in another thread."""
