@@ -155,6 +155,7 @@ def drive():
             until(lambda: 'linear: 1.5' in ''.join(process.output), TIMEOUT)
             spawned = master.lookup_service('/spawn').call(x=1.0, y=2.0, theta=0.0, name='leo')
             leo = ear.wait_for_message('/leo/pose', 'turtlesim/Pose', TIMEOUT)
+            master.wait_for_node('/turtle_logger', TIMEOUT)
             names = {node.name for node in master.nodes()}
     return {'poses': [first, driven], 'spawned': spawned, 'leo': leo, 'names': names}
 

@@ -19,7 +19,7 @@ import sys
 import threading
 import time
 import traceback
-from _queue import Empty, SimpleQueue
+from _queue import Empty, SimpleQueue  # in C: real ones, also in a simulation
 from _thread import allocate_lock
 from typing import Any, Callable
 from unittest import mock
@@ -40,7 +40,7 @@ from pharos.shared_memory import sending
 from pharos.waiting import wait
 
 #: clock -> nanoseconds that a look takes: programs divide by the time since their last look; our own
-#: waits for servers look at the last clock, more or less often
+#: waits for servers look at monotonic, more or less often
 READ_TIMES = {'time': 1000, 'perf_counter': 1000, 'monotonic': 0}
 PLAYER = '/bag_player'  # the node that plays bags
 LAST = math.inf  # the order of a wait that ends after all others that end at the same time
@@ -124,7 +124,7 @@ def start_thread(thread):
     block = thread._target or type(thread).run
     module = str(getattr(block, 'func', block).__module__)
     starter = _local.thread
-    # as one that takes part it would give the turn away while _start() waits for the thread to begin
+    # while it takes part, the starter would give its turn away when _start() waits for the new thread
     _local.thread = None
     if module.startswith(SERVERS):
         _start(thread)

@@ -99,7 +99,7 @@ def _run(stack, options, mappings):
         composition.run_scripts(options.script, mappings, options.here)
     if simulation:
         _simulate(simulation, options)
-        composition.stopping.set()  # ends its wait()
+        composition.stopping.set()  # its wait() returns at once, with the status
     return composition.wait()
 
 
@@ -117,6 +117,7 @@ def _begin_simulation(stack, master, options):
     if options.bag:
         try:
             with rosbag.Bag(options.bag) as bag:
+                # at least 1 s: a ROS time of 0 is one that is not set
                 simulation.nanoseconds = round((max(2, bag.get_start_time()) - 1) * 10**9)
         except rosbag.ROSBagException as error:
             raise ValueError(f'{options.bag}: {error}; rosbag info says more')

@@ -304,7 +304,7 @@ class Composition:
         """Restart, stop or start a node, or reload its program; a required one may stop, too.
 
         :returns: the node's name, or the answer of the reload
-        :raises PharosError: if the node does not start
+        :raises PharosError: if the node does not start, or its program cannot be read
         """
         if action == 'reload':
             return node.reload()

@@ -94,7 +94,7 @@ def control(action: str, name: str, master: Master) -> str:
     :returns: the name of the node of the program, which may have created the node with pharos; of a
         reload, what :meth:`Node.reload` returns
     :raises UnknownNodeError: if no such composition has the node
-    :raises PharosError: if the node does not start
+    :raises PharosError: if the node does not start, or its program cannot be read
     """
     with open('/proc/net/unix') as file:
         socket_names = set(re.findall(f'@({_PREFIX}\\d+)', file.read()))

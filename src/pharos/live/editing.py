@@ -23,7 +23,7 @@ def become(node, node_class, base):
     run = node._current_run
 
     def rebound(block):
-        """Return a block, None or a list of blocks; a method of the node is that of the new class."""
+        """Return the block or blocks, with methods of the node taken from the new class."""
         if isinstance(block, list):
             return [*map(rebound, block)]
         if getattr(block, '__self__', None) is not node:
@@ -134,7 +134,7 @@ def _change(owner, name, new, is_import):
     """Change a name of a module or class, functions in place; return what to say of that."""
     former = vars(owner).get(name)
     if not (is_import or new is former):
-        # the functions in decorators, staticmethods and classmethods
+        # the functions inside of decorators, staticmethods and classmethods
         function, new_function = (
             inspect.unwrap(getattr(value, '__func__', value)) for value in (former, new)
         )
