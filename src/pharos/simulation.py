@@ -248,6 +248,7 @@ class Simulation:
         with rosbag.Bag(bag) as file, self.master.create(BlockNode, PLAYER) as player:
             if not file.get_message_count(topics or None):
                 raise PharosError(f'{bag} has no messages of {topics}: see rosbag info')
+            player.connect_timeout = 0  # by a socket, it would take another time each time
             start = round(file.get_start_time() * 10**9)
             delay = max(0, self.nanoseconds - start)
             self.nanoseconds = max(self.nanoseconds, start - 10**9)
@@ -258,8 +259,9 @@ class Simulation:
                 self.wait(stamp.to_nsec() + delay, LAST)
                 key = topic, header.get('callerid')  # several nodes may latch a message each
                 if key not in channels:
-                    is_latched = header.get('latching') == '1'
-                    channels[key] = player.output_channel(topic, type(message), is_latched)
+                    channels[key] = player.output_channel(
+                        topic, type(message), header.get('latching') == '1'
+                    )
                 channels[key].send(message)
             self.run(0)
 

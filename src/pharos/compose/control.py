@@ -75,15 +75,16 @@ def reload_on_save(composition):
     save_times = {}  # node -> the times of its files
     while not composition.stopping.wait(SAVE_PERIOD):
         for node in composition.nodes:
-            with contextlib.suppress(OSError):  # an editor is about to replace a file
-                times = [os.path.getmtime(module.__file__) for module in editable_modules(node)]
-                if save_times.setdefault(node, times) != times:
-                    save_times[node] = times
-                    composition.stopping.wait(SAVE_PERIOD)  # the editor may still write
-                    name = node._settings.name
-                    answer = _answer(composition, 'reload', name)
-                    if answer != f'{DONE}{NO_CHANGE}':  # as when the program has imported one more
-                        Transcript.show(name, answer)
+            if node.is_running:
+                with contextlib.suppress(OSError):  # an editor is about to replace a file
+                    times = [os.path.getmtime(each.__file__) for each in editable_modules(node)]
+                    if save_times.setdefault(node, times) != times:
+                        save_times[node] = times
+                        composition.stopping.wait(SAVE_PERIOD)  # the editor may still write
+                        answer = _answer(composition, 'reload', node.name)
+                        # nothing: as when the program has imported one more module
+                        if answer != f'{DONE}{NO_CHANGE}':
+                            Transcript.show(node.name, answer)
 
 
 def control(action: str, name: str, master: Master) -> str:

@@ -112,6 +112,8 @@ class Graph:
         """Return the graph for a terminal: each node with its topics and peers."""
         return '\n'.join(self._text_lines())
 
+    __repr__ = text
+
     def _text_lines(self):
         yield f'{self.snapshot.master}: {len(self.nodes)} nodes, {len(self.topics)} topics'
         processes = collections.defaultdict(list)
@@ -190,9 +192,6 @@ class Graph:
 
     def _repr_svg_(self):
         return self._draw('svg').decode()
-
-    def __repr__(self):
-        return self.text()
 
 
 def _dot_id(prefix, name):

@@ -73,7 +73,6 @@ def _hang(health):
     seconds = health.get('callback_seconds', 0)
     if seconds >= HANG:
         return f'delegate for {seconds:.0f} s, {health["waiting"]} wait'
-    return None
 
 
 def table(rows: list[dict[str, Any]], chosen_node: str = '') -> Table:
