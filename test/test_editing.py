@@ -60,7 +60,6 @@ EDITS = {
     'class constant in a default': ('LEAST): return', 'LEAST): self.bias = 2; return', 3),
     'first decorator': ('    def see', '    @logged\n    @logged\n    def see', 1),
     'renamed function': ('shape(', 'form(', 1),
-    'slots': ('bias = 0', '__slots__ = "a",\n    bias = 7', 8),
 }
 
 

@@ -140,9 +140,6 @@ def test_listing_follows_remappings(master):
         assert speeds(mailbox) == (2.0, 1.0)
 
 
-# -- the turtle of this package
-
-
 @pytest.fixture(scope='module')
 def drive():
     """The outcome of turtle.launch without a window, and of a second turtle."""

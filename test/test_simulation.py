@@ -206,14 +206,18 @@ def test_bag_is_played_to_a_node(simulation, create_node, tmp_path):
     assert simulation.now == pytest.approx(1500000004.95, abs=0.01)
 
 
-def test_old_bag_is_played_from_now_on(simulation, create_node, tmp_path):
-    """A bag that was recorded in a simulator begins at second 0."""
+def test_old_bag_is_played_from_now_on_and_latches(simulation, create_node, tmp_path):
+    header = {'topic': '/map', 'type': STRING, 'message_definition': 'string data'}
+    header.update(latching='1', md5sum=std_msgs.msg.String._md5sum)
     with rosbag.Bag(str(tmp_path / 'old.bag'), 'w') as bag:
         for second in 1, 3:
             bag.write('/word', std_msgs.msg.String(str(second)), genpy.Time(second))
+        bag.write('/map', std_msgs.msg.String('big'), genpy.Time(1), connection_header=header)
     ear, times = create_node(BlockNode), []
     ear.interested_in('/word', STRING, lambda message: times.append(simulation.now))
+    words = [ear.fork(lambda me: [me.sleep(1), words.append(me.wait_for_message('/map', STRING))])]
     simulation.play(str(tmp_path / 'old.bag'))
+    assert words[1].data == 'big'
     assert times[1] - times[0] == pytest.approx(2, abs=0.01)
 
 

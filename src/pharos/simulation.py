@@ -243,11 +243,11 @@ class Simulation:
         The time jumps to one second before the begin of the bag. If that has passed, the bag is played
         from now on; the stamps in its messages stay.
 
-        :raises PharosError: if the bag has no message of these topics
+        :raises PharosError: if the bag has no message of one of these topics
         """
         with rosbag.Bag(bag) as file, self.master.create(BlockNode, PLAYER) as player:
-            if not file.get_message_count(topics or None):
-                raise PharosError(f'{bag} has no messages of {topics}: see rosbag info')
+            if not all(map(file.get_message_count, topics or [None])):
+                raise PharosError(f'{bag} has no messages of one of {topics}: see rosbag info')
             player.connect_timeout = 0  # by a socket, it would take another time each time
             start = round(file.get_start_time() * 10**9)
             delay = max(0, self.nanoseconds - start)
@@ -260,7 +260,7 @@ class Simulation:
                 key = topic, header.get('callerid')  # several nodes may latch a message each
                 if key not in channels:
                     channels[key] = player.output_channel(
-                        topic, type(message), header.get('latching') == '1'
+                        topic, type(message), header.get('latching') == b'1'
                     )
                 channels[key].send(message)
             self.run(0)
