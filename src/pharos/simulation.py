@@ -246,7 +246,7 @@ class Simulation:
         :raises PharosError: if the bag has no message of one of these topics
         """
         with rosbag.Bag(bag) as file, self.master.create(BlockNode, PLAYER) as player:
-            if not all(map(file.get_message_count, topics or [None])):
+            if not all(map(file.get_message_count, topics or [None])):  # type: ignore
                 raise PharosError(f'{bag} has no messages of one of {topics}: see rosbag info')
             player.connect_timeout = 0  # by a socket, it would take another time each time
             start = round(file.get_start_time() * 10**9)
