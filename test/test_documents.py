@@ -250,5 +250,5 @@ def test_tutorial_does_what_it_says(tmp_path):
 @pytest.mark.parametrize('example', EXAMPLES, ids=lambda path: path.name)
 def test_example_starts_and_ends(example, master):
     output = run([PYTHON, str(example)], master)
-    # a failure of a block, which may be wanted, has the node's name before each line
-    assert not re.search('^Traceback', output, re.MULTILINE), output
+    # a failure of a block has the node's name before each line; Python ignores a Ctrl-C in its exit
+    assert not re.search('^Traceback', output.partition('Exception ign')[0], re.MULTILINE), output
