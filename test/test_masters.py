@@ -9,7 +9,7 @@ import xmlrpc.client
 import psutil
 import pytest
 
-from helpers import TIMEOUT, InProcessMaster, Program, create, stop_nodes
+from helpers import TIMEOUT, InProcessMaster, Program, create, free_port, stop_nodes
 import pharos
 from pharos import BlockNode, ExternalNode, Master, Node, RosProcess
 from pharos.testing import Mailbox, until
@@ -334,8 +334,7 @@ def test_embedded_master_serves_real_nodes():
 
 
 def test_embedded_master_has_wanted_port():
-    with Master.embedded() as master:
-        port = port_of(master)
+    port = free_port()
     with Master.embedded(port=port) as master:
         assert port_of(master) == port
         assert master.is_reachable()
