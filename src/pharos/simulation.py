@@ -58,6 +58,7 @@ SERVERS = (
 _sleep = time.sleep
 _start = threading.Thread.start
 _join = threading.Thread.join
+_is_alive = threading.Thread.is_alive
 _let_servers_run = functools.partial(_sleep, 1e-6)
 _simulation: Any = None  # the Simulation that goes on, or None
 
@@ -144,6 +145,11 @@ def join_thread(thread, timeout=None):
             return
         time.sleep(0.01)
     _join(thread, timeout)
+
+
+def is_alive(thread):
+    """Stand in for ``Thread.is_alive``: a thread that has given its last turn away is not alive."""
+    return not getattr(thread, 'has_ended', not _is_alive(thread))
 
 
 def read_all_parameters(changed_run):
@@ -387,7 +393,11 @@ class Simulation:
                 '_CRLock': None,  # then threading makes its RLocks in Python, of Locks
                 '_time': monotonic,
             },
-            threading.Thread: {'start': start_thread, 'join': join_thread},
+            threading.Thread: {
+                'start': start_thread,
+                'join': join_thread,
+                'is_alive': is_alive,
+            },
             queue: {'SimpleQueue': queue._PySimpleQueue, 'time': monotonic},  # type: ignore
             callback_queues: {
                 'allocate_lock': Lock,

@@ -12,7 +12,6 @@ from xml.sax.saxutils import escape
 
 from pharos.errors import PharosError, UnknownNodeError
 from pharos.live.snapshot import Link, Snapshot, publisher_rates, take_snapshot
-from pharos.live.text_format import short_number
 
 if TYPE_CHECKING:
     from pharos.master import Master
@@ -103,7 +102,7 @@ class Graph:
         label = self.topics[topic]
         rate = self.rates.get(topic)
         if rate:
-            label += f', {short_number(rate)} Hz'
+            label += f', {round(rate, 1):g} Hz'
         return label
 
     # -- as text

@@ -1,13 +1,8 @@
-"""Format numbers and messages as text."""
+"""Format messages as text."""
 import genpy
 
 MAX_LINES = 50  # of a message that are shown
 MAX_LENGTH = 200  # characters of a line
-
-
-def short_number(value: float) -> str:
-    """Return a number with one digit after the point, if that is not 0: 9.9, 120, 12345.7."""
-    return f'{round(value, 1):g}'
 
 
 def message_text(message: genpy.Message) -> str:
@@ -20,6 +15,4 @@ def message_text(message: genpy.Message) -> str:
 
 
 def _short_line(line):
-    if len(line) <= MAX_LENGTH:
-        return line
-    return f'{line[:MAX_LENGTH]} ... {len(line)} characters'
+    return line if len(line) <= MAX_LENGTH else f'{line[:MAX_LENGTH]} ... {len(line)} characters'

@@ -17,7 +17,6 @@ from rich.table import Table
 
 from pharos.errors import MasterUnreachableError, PharosError
 from pharos.live.snapshot import Snapshot, publisher_rates, take_snapshot
-from pharos.live.text_format import short_number
 from pharos.master import Master
 
 HELP = 'q quit  j k choose a node; if it is of a composition: r restart  x stop  a start  l reload'
@@ -92,7 +91,7 @@ def table(rows: list[dict[str, Any]], chosen_node: str = '') -> Table:
 def _cell_text(value):
     if value in (None, ''):
         return '-'
-    return value if isinstance(value, str) else short_number(value)
+    return value if isinstance(value, str) else f'{round(value, 1):g}'
 
 
 def show(master: Master, interval: float) -> None:
@@ -113,8 +112,7 @@ def show(master: Master, interval: float) -> None:
 def _show_nodes(screen, master, interval, keyboard):
     start = take_snapshot(master)
     rows = node_rows(take_snapshot(master), start)
-    chosen_node = ''
-    problem = answer = ''
+    chosen_node = problem = answer = ''
     while True:
         page = Table.grid()
         page.add_row(HELP)
