@@ -254,7 +254,7 @@ class Simulation:
         with rosbag.Bag(bag) as file, self.master.create(BlockNode, PLAYER) as player:
             if not all(map(file.get_message_count, topics or [None])):  # type: ignore
                 raise PharosError(f'{bag} has no messages of one of {topics}: see rosbag info')
-            player.connect_timeout = 0  # by a socket, it would take another time each time
+            player.connect_timeout = 0  # a wait for a socket would take another time in each run
             start = round(file.get_start_time() * 10**9)
             delay = max(0, self.nanoseconds - start)
             self.nanoseconds = max(self.nanoseconds, start - 10**9)

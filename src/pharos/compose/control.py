@@ -1,5 +1,6 @@
-"""Stop, start, restart and reload nodes of a composition, for other processes of the user, or on a save.
+"""Stop, start, restart and reload the nodes of a composition.
 
+Other processes of the same user may ask for it; a saved file may, too.
 Each composition listens on a socket that is not in a file system; its name has the process's number.
 """
 from __future__ import annotations
@@ -22,9 +23,7 @@ if TYPE_CHECKING:
 ANSWER_LIMIT = 60.0  # seconds
 MAX_TEXT = 65536  # bytes
 ACCEPT_PAUSE = 0.5  # seconds until the next attempt
-SAVE_PERIOD = (
-    0.05  # seconds between two looks at the files; a file younger than that may be half written
-)
+SAVE_PERIOD = 0.05  # seconds between two looks at the files
 _PREFIX = 'pharos-compose-'
 DONE = 'done: '
 

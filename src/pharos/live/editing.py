@@ -148,12 +148,10 @@ def _change(owner, name, new, is_import):
             for part in '__code__', '__defaults__', '__kwdefaults__':
                 setattr(function, part, getattr(new_function, part))
             return TAKES_EFFECT
-        if (
-            type(owner).__module__ == 'enum'  # its members would not equal the former ones
-            or isinstance(former, type)
-            or new_code
-            and (code or '__class__' in new_code.co_freevars)  # super() needs the class
-        ):
+        # super() needs the class
+        is_bound = new_code and (code or '__class__' in new_code.co_freevars)
+        # members of an Enum would not equal the former ones
+        if is_bound or isinstance(former, type) or type(owner).__module__ == 'enum':
             return AT_RESTART
     setattr(owner, name, new)
     return TAKES_EFFECT
