@@ -715,7 +715,7 @@ def test_subscription_connects_after_lack_of_threads(master, peer, monkeypatch):
 
 @pytest.mark.parametrize('queue_size', [None, 10])
 def test_handler_that_raises_in_publish(master, peer, queue_size):
-    """The next publish() sends the rest of a message that a signal has cut, and then its own."""
+    """The next publish() sends the rest of a message that signals have cut, and then its own."""
     peer.hear('/t', STRING)
     text = f'''
 import signal
@@ -730,12 +730,11 @@ signal.signal(signal.SIGALRM, handle)
 publisher = rospy.Publisher('/t', message_class('std_msgs/String'), queue_size={queue_size})
 
 def publish_until_alarm():
-    # again and again: one in a __del__() would be ignored
-    signal.setitimer(signal.ITIMER_REAL, 0.2, 0.2)
+    signal.setitimer(signal.ITIMER_REAL, 0.003, 0.1)  # again: one in a __del__() is ignored
     try:
         while True:
             publisher.publish('x' * 100_000)
-    finally:
+    except Alarm:
         signal.setitimer(signal.ITIMER_REAL, 0)
 '''
     with PharosPeer(master.url, 'mouth') as mouth:  # its main thread; a test may have another one
@@ -743,8 +742,7 @@ def publish_until_alarm():
         until(lambda: mouth.value('publisher.get_num_connections()'))
         os.kill(peer.pid, signal.SIGSTOP)
         try:
-            with pytest.raises(RuntimeError, match='Alarm'):
-                mouth.run('publish_until_alarm()')
+            mouth.run('for _ in range(300): publish_until_alarm()')
         finally:
             os.kill(peer.pid, signal.SIGCONT)
         mouth.run("publisher.publish('whole')")

@@ -38,8 +38,7 @@ def wait(predicate, timeout=None, node=None):
         if value or time.monotonic() >= deadline:
             return value
         if node:
-            is_stopping = node._current_run.stopping.wait(pause)
-            if is_stopping:
+            if node._current_run.stopping.wait(pause):  # a stop has begun
                 return value
         else:
             time.sleep(pause)

@@ -135,7 +135,7 @@ class MessageParts(list):
         return parts, size + _LENGTH.size
 
 
-class Sender:
+class Sender(BoundedQueue):
     """A connection to a subscriber, with a bounded queue for messages that must wait.
 
     Stands in for rospy's QueuedConnection. rospy's thread writes everything, and takes all messages
@@ -153,12 +153,13 @@ class Sender:
     def __init__(self, connection, publication):
         self._connection = connection
         self._publication = publication
-        self._bounded_queue = BoundedQueue()
-        self._bounded_queue.queue_bytes = publication.run.node.queue_bytes
-        self._queue = self._bounded_queue.messages  # lists of parts
+        super().__init__()  # its messages are lists of parts
+        self.queue_bytes = publication.run.node.queue_bytes
         # the parts of a message, and the numbers of bytes sent of them; while is_busy, the thread's alone
         self._unsent = [], []
-        self._condition = threading.Condition()  # notified to wake the thread
+        # for `with`: a condition enters and leaves in Python, where the handler of a signal may raise
+        self._lock = threading.RLock()
+        self._condition = threading.Condition(self._lock)  # notified to wake the thread
 
     def __getattr__(self, name):
         return getattr(self._connection, name)
@@ -169,21 +170,20 @@ class Sender:
         :param parts: the bytes of the message, with their length in front
         :param size: the number of bytes
         """
-        with self._condition:
+        with self._lock:
             self._write(parts, size)
-            is_waiting = self.is_busy
-        if is_waiting:
+        if self.is_busy:
             let_others_run()
 
     def _write(self, parts, size):
-        self._bounded_queue.queue_size = self._publication.queue_size
+        self.queue_size = self._publication.queue_size
         if self._publication.queue_size is None:
             self._unsent = self._unsent_parts() + parts, []
             while self._unsent_parts():
                 self._send()
             return
-        if self.is_busy or self._queue or size > MAX_DIRECT:
-            self._bounded_queue.add(parts, size)
+        if self.is_busy or self.messages or size > MAX_DIRECT:
+            self.add(parts, size)
         else:
             self._unsent = self._unsent_parts() + parts, []
             with contextlib.suppress(BlockingIOError):
@@ -229,7 +229,7 @@ class Sender:
         connection = self._connection
         while True:
             with self._condition:
-                if not self._unsent_parts() and not self._queue:
+                if not self._unsent_parts() and not self.messages:
                     self.is_busy = False
                     self._condition.wait(THREAD_REST)
                 if connection.done or not self.is_busy:
@@ -237,7 +237,7 @@ class Sender:
                     self._has_thread = False
                     return
                 if not self._unsent_parts():
-                    self._unsent = self._queue.popleft(), []
+                    self._unsent = self.messages.popleft(), []
             try:
                 self._send()
             except CLOSED:
