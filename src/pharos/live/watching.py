@@ -84,8 +84,8 @@ def watch(topic: Topic, count: int | None, block: Block | None) -> None:
 
     with looking_node(topic) as node, contextlib.suppress(KeyboardInterrupt):
         node.interested_in(topic.name, delegate=keep_message)
-        for _ in itertools.islice(itertools.count(), count):
-            show_message(messages.get())
+        for message in itertools.islice(iter(messages.get, None), count):
+            show_message(message)
 
 
 def _show_message(message):

@@ -197,9 +197,8 @@ class Sender(BoundedQueue):
         """Wake or start the thread; return False if the system has no thread left."""
         if self._has_thread:
             self._condition.notify()
-        else:
-            self._has_thread = self._publication.run.start_thread(self._send_queue) is not None
-        return self._has_thread
+            return True
+        return self._publication.run.start_thread(self._send_queue) is not None
 
     def _unsent_parts(self):
         """Return the parts that the socket has not taken yet."""
@@ -226,13 +225,16 @@ class Sender(BoundedQueue):
         self._connection.stat_num_msg += not self._unsent_parts()
 
     def _send_queue(self):
-        connection = self._connection
+        with self._lock:
+            if self._has_thread:  # a handler raised when that one had just been started
+                return
+            self._has_thread = True
         while True:
             with self._condition:
                 if not self._unsent_parts() and not self.messages:
                     self.is_busy = False
                     self._condition.wait(THREAD_REST)
-                if connection.done or not self.is_busy:
+                if self._connection.done or not self.is_busy:
                     self.is_busy = False
                     self._has_thread = False
                     return
@@ -241,7 +243,7 @@ class Sender(BoundedQueue):
             try:
                 self._send()
             except CLOSED:
-                connection.close()
+                self._connection.close()
 
     def close(self):
         """Close the connection, and end the thread."""
