@@ -730,8 +730,8 @@ signal.signal(signal.SIGALRM, handle)
 publisher = rospy.Publisher('/t', message_class('std_msgs/String'), queue_size={queue_size})
 
 def publish_until_alarm():
-    signal.setitimer(signal.ITIMER_REAL, 0.003, 0.1)  # again: one in a __del__() is ignored
     try:
+        signal.setitimer(signal.ITIMER_REAL, 0.003, 1)  # again: one in a __del__() is ignored
         while True:
             publisher.publish('x' * 100_000)
     except Alarm:
