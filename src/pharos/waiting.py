@@ -38,7 +38,8 @@ def wait(predicate, timeout=None, node=None):
         if value or time.monotonic() >= deadline:
             return value
         if node:
-            if node._current_run.stopping.wait(pause):  # a stop has begun
+            is_stopping = node._current_run.stopping.wait(pause)
+            if is_stopping:
                 return value
         else:
             time.sleep(pause)

@@ -7,9 +7,9 @@ import queue
 import time
 from typing import TYPE_CHECKING, Iterator, NamedTuple
 
-import rosgraph.names
 import rospy
 from genpy import Message
+from rosgraph.names import anonymous_name
 
 from pharos.blocks import Block
 from pharos.errors import UnknownTopicError
@@ -42,7 +42,7 @@ def looking_node(topic: Topic) -> Iterator[BlockNode]:
     """
     if not topic.publishers:
         raise UnknownTopicError(f'nobody publishes on {topic.name}: see master.topics()')
-    name = rosgraph.names.anonymous_name('pharos_looks')
+    name = anonymous_name('pharos_looks')
     with topic.master.create(BlockNode, named=name) as node:
         yield node
 

@@ -177,7 +177,7 @@ class Sender(BoundedQueue):
 
     def _write(self, parts, size):
         self.queue_size = self._publication.queue_size
-        if self._publication.queue_size is None:
+        if self.queue_size is None:
             self._unsent = self._unsent_parts() + parts, []
             while self._unsent_parts():
                 self._send()
@@ -230,7 +230,7 @@ class Sender(BoundedQueue):
                 return
             self._has_thread = True
         while True:
-            with self._condition:
+            with self._lock:
                 if not self._unsent_parts() and not self.messages:
                     self.is_busy = False
                     self._condition.wait(THREAD_REST)
@@ -248,5 +248,5 @@ class Sender(BoundedQueue):
     def close(self):
         """Close the connection, and end the thread."""
         self._connection.close()
-        with self._condition:
+        with self._lock:
             self._condition.notify()
