@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Iterator
 
 from genpy import Message
 import rosgraph.names
-import rospy
 
 from pharos import definitions, signals
 from pharos.blocks import Block, DelegateHolder, block_name, with_arguments
@@ -375,8 +374,7 @@ class Node(DelegateHolder):
         try:
             return with_arguments(block, 'soul', 0, 1)(self)
         except BaseException as error:
-            if not (run.stopping.is_set() and isinstance(error, rospy.ROSException)):
-                run.report_failure(error, block, 'soul', retry=retry)
+            run.report_failure(error, block, 'soul', retry=retry)
         finally:
             current.node, current.run = former
             if required and not run.stopping.is_set():
@@ -388,16 +386,21 @@ class Node(DelegateHolder):
     def sleep(self, seconds: float) -> None:
         """Sleep for some seconds of ROS time; the node's stop ends the sleep, and the soul.
 
-        A stopped soul gets a NodeStoppedError. A sleep in start() lets delegates run from now on.
+        A sleep in start() lets delegates run from now on.
+
+        :raises NodeStoppedError: if the stop has begun before; in a soul and in the block of a service
+            also if it begins meanwhile
         """
         self._check_active()
         run = current.run if current.node is self else self._current_run
-        if not run.stopping.is_set():
+        is_late = run.stopping.is_set()
+        if not is_late:
             with signals.QuietWait():
                 run.callback_queue.release_before_sleep()
                 run.ros.sleep(seconds)
-        if current.node is self and run.stopping.is_set():
-            raise NodeStoppedError(f'{self._settings.name} stops, and this soul with it')
+        is_block = current.node is self or current.service_run is run
+        if is_late or is_block and run.stopping.is_set():
+            raise NodeStoppedError(f'{self._settings.name} stops, and with it this soul or loop')
 
     def every(self, seconds: float) -> Iterator[int]:
         """Return an iterator that turns every so many seconds of ROS time, until the node stops.

@@ -137,12 +137,12 @@ class Service:
             service_class = definitions.service_class(self.type)
             request = self._build_request(service_class, block, fields)
             self._check_md5sum(service_class)
-            local = None
+            service = None
             if timeout is None or ignores_timeout:  # a timeout could not end a local call
-                local = find_service(self.name, self.master.url, self.uri)
-            if local:
+                run, service = find_service(self.name, self.master.url, self.uri)
+            if service:
                 header = {'callerid': self.caller_id, 'service': self.name}
-                self.response = call_here(local, request, header)
+                self.response = call_here(run, service, request, header)
             else:
                 self.response = self._call(service_class, serialize(request), timeout)
         except ServiceException as error:

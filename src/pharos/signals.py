@@ -22,6 +22,10 @@ lost_names = set()
 #: the nodes in a restart()
 restarting_nodes = []
 
+#: identifiers of threads whose handlers of a signal run in another thread: what they publish meanwhile
+#: is dropped, since their process would stand still. (Only compose runs handlers in another thread.)
+silenced_threads: set[int | None] = set()
+
 #: the time of the first signal that ends the program, as of time.monotonic()
 _signal_time: float | None = None
 _is_exiting = False
@@ -54,9 +58,23 @@ class QuietWait:
 
 
 def stop_all():
-    """Stop every node of this process, also if the stop() of a class raises an exception."""
+    """Stop every node of this process, side by side, also if the stop() of a class raises an exception."""
+    for thread in _start_stops():
+        thread.join()
+
+
+def _start_stops():
+    """Begin to stop every node of this process, each in a thread, and return the threads."""
+    threads = []
     for node in own_nodes():
-        node._stop_safely()
+        thread = threading.Thread(target=node._stop_safely, name='pharos end')
+        try:
+            thread.start()
+        except RuntimeError:  # no thread is left, or the interpreter ends: one after another
+            node._stop_safely()
+        else:
+            threads.append(thread)
+    return threads
 
 
 def spin() -> None:
@@ -121,7 +139,7 @@ def _handle_signal(number, frame):
     _signal_time = monotonic()
     if _is_exiting:  # _stop_at_exit() stops the nodes already
         return
-    threading.Thread(target=stop_all, name='pharos end').start()
+    _start_stops()
     if number == signal.SIGINT:
         raise KeyboardInterrupt
     raise SystemExit(128 + number)

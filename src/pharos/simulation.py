@@ -402,7 +402,6 @@ class Simulation:
             callback_queues: {
                 'allocate_lock': Lock,
                 'perf_counter': monotonic,
-                'sleep': self.sleep,
                 '_no_yield_before': 0.0,  # a virtual time is too late for the real clock
             },
             run: {'monotonic': monotonic},

@@ -1,9 +1,15 @@
 """The Transcript: where blocks show things, as in Pharo."""
 from __future__ import annotations
 
-from typing import Any
+import time
+import traceback
+from contextlib import suppress
+from typing import Any, Callable
 
 from pharos.blocks import Block
+
+ERROR_PAUSE = 0.02  # seconds after a look that has failed
+_told_places: set[tuple] = set()  # of errors: the file, the line, the class
 
 
 class _Transcript:
@@ -17,7 +23,8 @@ class _Transcript:
         if self.receiver:
             self.receiver(line)
         else:
-            print(f'{line}\n', end='', flush=True)  # in one piece: other threads print, too
+            with suppress(OSError, ValueError):  # its reader has gone, or its disk is full
+                print(f'{line}\n', end='', flush=True)  # in one piece: other threads print, too
 
     def on_show(self, receiver: Block | None) -> Block | None:
         """Have ``receiver(line)`` take the lines, and return the former receiver.
@@ -30,3 +37,25 @@ class _Transcript:
 
 
 Transcript = _Transcript()
+
+
+def attempt(function: Callable, *arguments: Any) -> Any:
+    """Call a function, and return its value; show an exception of any kind, once, and return None.
+
+    Threads that look again and again call this: one failed look must not end the looks.
+    """
+    try:
+        return function(*arguments)
+    except BaseException as error:
+        tell_once(error)
+        time.sleep(ERROR_PAUSE)
+    return None
+
+
+def tell_once(error: BaseException) -> None:
+    """Show an exception in the Transcript, unless one of its class came from its line before."""
+    *_, frame = traceback.extract_tb(error.__traceback__)
+    place = frame.filename, frame.lineno, type(error)
+    if place not in _told_places:
+        _told_places.add(place)
+        Transcript.show(f'{frame.filename}:{frame.lineno}: {error!r}; it is tried again')

@@ -9,10 +9,14 @@ from pharos.errors import PharosError
 
 
 class _Current(threading.local):
-    """The node with its soul or its program in this thread, and the run of the soul, or None."""
+    """The node with its soul or its program in this thread, and the run of the soul, or None.
+
+    :ivar service_run: the run whose service this thread answers, or None
+    """
 
     node: Any = None
     run: Any = None
+    service_run: Any = None
 
 
 current = _Current()

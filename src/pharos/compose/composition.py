@@ -34,7 +34,7 @@ from pharos.errors import PharosError
 from pharos.live.external_node import ExternalNode
 from pharos.private_rospy.run import Lifecycle, Settings, join
 from pharos.private_rospy.tcpros import shutdown_socket
-from pharos.transcript import Transcript
+from pharos.transcript import Transcript, attempt
 from pharos.waiting import wait
 
 #: seconds until the next node starts side by side with one that has not registered yet
@@ -245,10 +245,10 @@ class Composition:
             if self.stopping.is_set():
                 return
             if node.lifecycle is Lifecycle.STOPPED and node not in self._stopped_nodes:
-                self._look_at_ended(node)
+                attempt(self._look_at_ended, node)
         for part in self._parts:
             if not self.stopping.is_set():
-                self._look_at_part(part)
+                attempt(self._look_at_part, part)
 
     def _look_at_part(self, part):
         """Tell of a process that a signal has ended, and start again its nodes that respawn.

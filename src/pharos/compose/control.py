@@ -14,15 +14,14 @@ from typing import TYPE_CHECKING
 
 from pharos.errors import PharosError, UnknownNodeError
 from pharos.live.editing import NO_CHANGE, editable_modules
-from pharos.private_rospy.tcpros import check_user
-from pharos.transcript import Transcript
+from pharos.private_rospy.tcpros import accept_clients, check_user
+from pharos.transcript import Transcript, attempt
 
 if TYPE_CHECKING:
     from pharos.master import Master
 
 ANSWER_LIMIT = 60.0  # seconds
 MAX_TEXT = 65536  # bytes
-ACCEPT_PAUSE = 0.5  # seconds until the next attempt
 SAVE_PERIOD = 0.05  # seconds between two looks at the files
 _PREFIX = 'pharos-compose-'
 DONE = 'done: '
@@ -39,14 +38,11 @@ def listen(composition):
 
 
 def _serve(listener, composition):
+    def obey(client, address):
+        threading.Thread(target=_obey, args=[client, composition], daemon=True).start()
+
     with listener:
-        while not composition.stopping.is_set():
-            try:
-                client, _ = listener.accept()
-                threading.Thread(target=_obey, args=[client, composition], daemon=True).start()
-            # the composition ends, or the system has no descriptor or thread left
-            except (OSError, RuntimeError):
-                composition.stopping.wait(ACCEPT_PAUSE)
+        accept_clients(listener, composition.stopping, obey)
 
 
 def _obey(client, composition):
@@ -75,15 +71,19 @@ def reload_on_save(composition):
     while not composition.stopping.wait(SAVE_PERIOD):
         for node in composition.nodes:
             if node.is_running:
-                with contextlib.suppress(OSError):  # an editor is about to replace a file
-                    times = [os.path.getmtime(each.__file__) for each in editable_modules(node)]
-                    if save_times.setdefault(node, times) != times:
-                        save_times[node] = times
-                        composition.stopping.wait(SAVE_PERIOD)  # the editor may still write
-                        answer = _answer(composition, 'reload', node.name)
-                        # nothing: as when the program has imported one more module
-                        if answer != f'{DONE}{NO_CHANGE}':
-                            Transcript.show(node.name, answer)
+                attempt(_reload_if_saved, composition, node, save_times)
+
+
+def _reload_if_saved(composition, node, save_times):
+    with contextlib.suppress(FileNotFoundError):  # an editor is about to replace a file
+        times = [os.path.getmtime(each.__file__) for each in editable_modules(node)]
+        if save_times.setdefault(node, times) != times:
+            save_times[node] = times
+            composition.stopping.wait(SAVE_PERIOD)  # the editor may still write
+            answer = _answer(composition, 'reload', node.name)
+            # nothing: as when the program has imported one more module
+            if answer != f'{DONE}{NO_CHANGE}':
+                Transcript.show(node.name, answer)
 
 
 def control(action: str, name: str, master: Master) -> str:

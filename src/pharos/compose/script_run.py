@@ -371,7 +371,7 @@ class ScriptRun(Run):
     def checkpoint(self):
         """Have the main thread wait while another thread handles a signal, for STOP_LIMIT at most.
 
-        The caller may hold a lock that a hook takes, as smach does.
+        The caller of is_shutdown() may hold a lock that a hook takes, as smach does.
         """
         if threading.current_thread() is self.main:
             if self.handler_lock.acquire(timeout=STOP_LIMIT):
@@ -407,14 +407,18 @@ class ScriptRun(Run):
     def handle_signal_for_main(self):
         """Handle the signal in this thread: the main thread is blocked or computes.
 
-        An exception of a handler is raised in the main thread.
+        What the main thread publishes meanwhile is dropped: a process would stand still. An exception
+        of a handler is raised in the main thread, before that publishes again.
         """
+        signals.silenced_threads.add(self.main.ident)
         try:
             self.handle_signal()
         except (Exception, KeyboardInterrupt, SystemExit) as error:
             if self.created_nodes:
                 join([self.main], STOP_LIMIT)  # the main thread ends with its nodes
             self.raise_in_main(error)
+        finally:
+            signals.silenced_threads.discard(self.main.ident)
 
     def raise_in_main(self, error):
         """Raise an exception of this class in the main thread, at its next line of Python."""

@@ -13,7 +13,7 @@ import contextlib
 import itertools
 import threading
 from _thread import allocate_lock, get_ident
-from time import perf_counter, sleep
+from time import perf_counter
 from typing import Any, Callable
 
 BURST = 100e-6  # seconds; a publisher that woke a thread less than this ago does not wait for one
@@ -41,7 +41,6 @@ class CallbackOrder:
 
     def __init__(self, start_thread: Callable) -> None:
         self.start_thread = start_thread
-        self.newest_first_run_time = 0.0  # when the first pause of the newest queue ends
         self.numbers = itertools.count()
         self.queues = {}
         self.is_paused = False
@@ -70,57 +69,54 @@ class CallbackQueue:
     (a connection of SQLite, a context of CUDA) keep working, unless a channel of the node is inline.
 
     :param order: the CallbackOrder of the node
-    :param first_pause: seconds until the first callback
+    :param first_pause: seconds until the first callback, unless release() ends the pause before. A
+        queue that is made meanwhile prolongs the pause to the end of its own: a constructor may
+        subscribe to several topics before it has set all that its callbacks use
     :ivar jobs: the messages of all inboxes, as Inbox says
-    :ivar holder: the identifier of the thread that has called hold(), None after release()
-    :ivar may_begin: False while the queue is held, and after stop()
+    :ivar pause_end: the time when the first pause ends, as of perf_counter(); 0 after the pause
     :ivar running_thread: the identifier of the thread that runs callbacks, or None
     :ivar thread: the thread of the queue, from the first message on; None if the thread has ended
     :ivar begin_time: the time when the callback that runs began, as of perf_counter(), or None
-    :ivar request_lock: a signal, not a guard. request_thread() takes it, and _accept_request() frees
-        it in the queue's thread. So a publisher waits for the thread by taking it; the next
-        _accept_request() frees it again
     :ivar waits_for_turn: True while the next callback waits for those of other queues
     """
 
     closed = False
-    holder = None
-    may_begin = True
     running_thread = None
     begin_time = None
     waits_for_turn = False
     _was_slow = False  # True if the last callback took longer than SLOW
     _current_number = 0.0  # of the message whose callback runs
     thread = None
-    #: True from request_thread() until the thread looks for jobs; a second request does nothing
-    _is_requested = False
 
     def __init__(self, order: CallbackOrder, first_pause: float = 0.0) -> None:
         self.order = order
         self.jobs = collections.deque()
-        self._running_lock = allocate_lock()  # held by the thread that runs callbacks
-        self._first_run_time = perf_counter() + first_pause
-        order.newest_first_run_time = max(order.newest_first_run_time, self._first_run_time)
-        # released to wake the thread: from its rest, or from a wait for its turn. That wait may take
-        # what was meant to end the rest: so _loop() looks at _is_requested before each rest
+        self._maker = get_ident()  # the thread that has made the queue
+        now = perf_counter()
+        self.pause_end = now + first_pause if first_pause else 0.0
+        for queue in list(order.queues):
+            if now < queue.pause_end < self.pause_end:
+                queue.pause_end = self.pause_end
+        # The next two locks guard nothing. They are signals, which any thread may give: the handler of
+        # a signal may raise between any two lines of a publisher, and the next message gives them again.
+        # Locked: the thread may sleep. Unlocked: it has to look for jobs before it sleeps, and that
+        # look locks it. Only the thread takes it, in its rest, its first pause and its wait for a turn.
         self._wake_lock = allocate_lock()
         self._wake_lock.acquire()
+        # Locked: a publisher has woken the thread, which has not begun to look. The thread unlocks it:
+        # so a publisher waits for the thread by taking it.
         self.request_lock = allocate_lock()
-
-    def hold(self) -> None:
-        """Run no callback until release()."""
-        self.holder = get_ident()
-        self.may_begin = False
+        self._loop_lock = allocate_lock()  # held by the thread: there is but one
+        self._running_lock = allocate_lock()  # held by the thread that runs callbacks
 
     def release(self) -> None:
-        """End a hold, if there is one; any thread may do so."""
-        self.holder = None
-        self.may_begin = not self.closed
+        """End the first pause; any thread may do so."""
+        self.pause_end = 0.0
         self.request_thread()
 
     def release_before_sleep(self) -> None:
-        """End a hold by this thread, which would sleep while delegates wait."""
-        if self.holder == get_ident():
+        """End the first pause if this thread has made the queue: it would sleep while delegates wait."""
+        if self.pause_end and self._maker == get_ident():
             self.release()
 
     def is_current(self) -> bool:
@@ -143,7 +139,7 @@ class CallbackQueue:
             # one that was slow the last time delays nobody while it runs
             is_slow = self._was_slow or now - begin_time > SLOW
             return self._current_number < number and not is_slow
-        if self.holder or now < self._first_run_time:
+        if now < self.pause_end:
             return False
         return self.next_number() < number
 
@@ -166,18 +162,22 @@ class CallbackQueue:
         """
         jobs = self.jobs
         order = self.order
+        if self.pause_end:
+            self.request_thread()
+            return
         # the outer loop: a publisher that adds a job before the release finds the lock taken
-        while jobs and self.may_begin and self._running_lock.acquire(False):
-            self.running_thread = get_ident()
-            try:
-                while jobs and self.may_begin:
-                    if len(order.queues) > 1:
-                        self._run_in_order(waits_for_turn)
-                    else:
-                        self._run_next()
-            finally:
-                self.running_thread = None
-                self._running_lock.release()
+        while jobs and not self.closed and not self._running_lock.locked():
+            with self._running_lock:  # in C: the handler of a signal cannot raise in between
+                self.running_thread = get_ident()
+                try:
+                    while jobs and not self.closed:
+                        if len(order.queues) > 1:
+                            self._run_in_order(waits_for_turn)
+                        else:
+                            self._run_next()
+                finally:
+                    self.running_thread = None
+                    self.begin_time = None
 
     def _run_next(self) -> None:
         try:
@@ -197,7 +197,7 @@ class CallbackQueue:
         if self._was_slow:  # the next callbacks need not wait for this one
             self.order.pass_turn()
         try:
-            if self.may_begin:  # else a stop has begun
+            if not self.closed:  # else a stop has begun
                 self._run_next()
         finally:
             self._was_slow = perf_counter() - begin_time > SLOW
@@ -207,11 +207,11 @@ class CallbackQueue:
     def run_jobs_here(self) -> None:
         """Run all jobs in this thread; wait while another thread runs some of them."""
         self._wait_for_first_run()
-        while self.jobs and self.may_begin:
+        while self.jobs and not self.closed:
             self.run_jobs()
             with self._running_lock:
                 pass
-        if self._is_requested or self.closed:  # a wait for a turn here may have taken the wake
+        if self.closed:  # a wait here may have taken the wake of the queue's own thread
             self.wake()
 
     def run_exclusively(self, block: Any) -> None:
@@ -234,18 +234,16 @@ class CallbackQueue:
     # -- the thread
 
     def request_thread(self) -> bool:
-        """Have the thread run the jobs; return True if there is a thread, and this has asked it."""
-        if self._is_requested or not (self.jobs and self.may_begin):
+        """Have the thread run the jobs; return True if there is a thread, and this has woken it."""
+        if self.closed or not self.jobs:
             return False
-        self._is_requested = True
-        # two publishers may both have come here: one of them starts the thread
-        is_first = self.request_lock.acquire(False)
-        if self.thread:
+        if not self.thread:
+            # if no thread is left, the next message or the watcher tries again
+            self.order.start_thread(self._loop)
+        elif self._wake_lock.locked():
+            self.request_lock.acquire(False)
             self.wake()
             return True
-        if is_first and not self.order.start_thread(self._loop):
-            self._is_requested = False  # the next message tries again
-            self.request_lock.release()
         return False
 
     def wake(self) -> None:
@@ -254,39 +252,33 @@ class CallbackQueue:
             self._wake_lock.release()
 
     def _wait_for_first_run(self) -> None:
-        """Sleep until the first pause is over, and that of queues made meanwhile.
-
-        A constructor that subscribes to several topics may still run.
-        """
-        pause = self._first_run_time - perf_counter()
-        if pause > 0:
-            sleep(pause)
-            self._first_run_time = self.order.newest_first_run_time
-            sleep(max(0.0, self._first_run_time - perf_counter()))
+        """Wait until the first pause is over; release() and stop() wake this."""
+        while self.pause_end and not self.closed:
+            pause = self.pause_end - perf_counter()
+            if pause > 0:
+                self._wake_lock.acquire(True, pause)
+            else:
+                self.pause_end = 0.0
 
     def _loop(self) -> None:
+        if not self._loop_lock.acquire(False):  # two publishers have started a thread
+            return
         self.thread = threading.current_thread()
-        self._wait_for_first_run()
         try:
+            self._wait_for_first_run()
             while not self.closed:
-                self._accept_request()
+                with contextlib.suppress(RuntimeError):  # nobody has locked it
+                    self.request_lock.release()
                 self.run_jobs()
-                # else the wait for a turn may have taken the wake
-                if not self._is_requested and not self.closed:
+                if not self.closed:
                     self._wake_lock.acquire()
         finally:  # after an exception the next message starts another thread
             self.thread = None
-            self._accept_request()
-
-    def _accept_request(self) -> None:
-        self._is_requested = False
-        if self.request_lock.locked():
-            self.request_lock.release()
+            self._loop_lock.release()
 
     def stop(self) -> None:
         """Begin no more callbacks."""
         self.closed = True
-        self.may_begin = False
         self.order.queues.pop(self, None)
         self.wake()
 
@@ -322,7 +314,7 @@ def hand_over(callback_queues: list[CallbackQueue], last_wake: float, may_wait: 
             continue
         last_wake = now
         if waits:
-            # _accept_request() frees the lock
+            # _loop() frees the lock
             waits = callback_queue.request_lock.acquire(True, YIELD_LIMIT)
             if not waits:
                 _no_yield_before = now + YIELD_PAUSE

@@ -7,9 +7,10 @@ import threading
 from contextlib import suppress
 from time import monotonic
 
-from pharos.errors import MasterUnreachableError, NodeNameInUseError, PharosError
+from pharos.errors import MasterUnreachableError, NodeNameInUseError
 from pharos.intraprocess.links import link_topic, runs, runs_lock
 from pharos.private_rospy.xmlrpc import CALLER_ID, UNREACHABLE, ServerProxy
+from pharos.transcript import attempt
 
 NAME_LIMIT = 1.0  # seconds for the question whether another node has the name
 RETRY_DELAY = 1.0  # seconds until the next attempt to connect
@@ -111,6 +112,8 @@ def _connect(run, topic, uri):
             link_topic(publisher_run, run, topic)
         else:
             _negotiate(run, topic, uri, subscription)
+    except Exception as error:  # told by the watcher, which tries again
+        connect_later(run, topic, uri, repr(error))
     finally:
         run.connecting.discard(attempt)
 
@@ -166,43 +169,69 @@ def _watch(end):
     while not end.wait(WATCH_PERIOD):
         look_count += 1
         for run in list(runs.values()):
-            _look_after(run)
+            for look in _LOOKS:
+                attempt(look, run)
         run = None  # else a stopped run would live until the next look
         if look_count % LOOKS_PER_MASTER == 0:
             _ask_masters()
 
 
-def _look_after(run):
-    """Drop peers that have left (ros_comm #927) or are silent, and tell the log of troubles.
-
-    End an overlong hold, and connect again after failures.
-    """
+def _check_peers(run):
+    """Drop peers that have left (ros_comm #927)."""
     run.topic_manager.check_all()
-    _retry_connections(run)
-    while run.troubles:
-        run.ros.logwarn_throttle_identical(60, run.troubles.pop())
-    if monotonic() > run.hold_deadline:
-        run.callback_queue.release()  # each time: there may have been no thread for the queue
+
+
+def _start_threads(run):
+    """Start the threads of callback queues that the system had no thread for."""
+    for queue in list(run.callback_order.queues):
+        if not queue.thread:
+            queue.request_thread()
+
+
+def _check_clock(run):
+    """Tell once that a clock stands still."""
     if monotonic() > run.clock_deadline:
-        run.clock_deadline += 1e9  # it is told once
+        run.clock_deadline += 1e9
         rostime = run.ros.rostime
         if not (rostime.is_wallclock() or rostime.get_time()):
             run.troubles.add('time stands still: /use_sim_time is set, and no /clock comes')
+
+
+def _close_silent_clients(run):
     run.close_silent_clients()
+
+
+def _tell_troubles(run):
+    while run.troubles:
+        run.ros.logwarn_throttle_identical(60, run.troubles.pop())
+
+
+_LOOKS = (
+    _check_peers,
+    _retry_connections,
+    _start_threads,
+    _check_clock,
+    _tell_troubles,
+    _close_silent_clients,
+)
 
 
 def _ask_masters():
     """Ask each master for its system state, and have the runs register again what is missing."""
     live_runs = [run for run in list(runs.values()) if not run.stopping.is_set()]
     for url in {run.master.url for run in live_runs}:
-        url_runs = [run for run in live_runs if run.master.url == url]
-        try:
-            state = ServerProxy(url).getSystemState(CALLER_ID)[2]  # type: ignore[index]
-            for run in url_runs:
-                _register_missing(run, state)  # type: ignore[arg-type]
-        except (*UNREACHABLE, PharosError) as error:
-            # one line is enough
-            url_runs[0].troubles.add(f'no master answers at {url}, it is asked again: {error}')
+        attempt(_ask_master, url, [run for run in live_runs if run.master.url == url])
+
+
+def _ask_master(url, url_runs):
+    try:
+        state = ServerProxy(url).getSystemState(CALLER_ID)[2]  # type: ignore[index]
+    except UNREACHABLE as error:
+        # one line is enough
+        url_runs[0].troubles.add(f'no master answers at {url}, it is asked again: {error}')
+        return
+    for run in url_runs:
+        attempt(_register_missing, run, state)
 
 
 def _register_missing(run, state):

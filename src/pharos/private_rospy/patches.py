@@ -7,6 +7,7 @@ place. Each docstring names first the behaviour of rospy, then that of the patch
 """
 import socket
 import threading
+from contextlib import suppress
 from urllib.parse import urlsplit
 
 import rospkg
@@ -15,7 +16,7 @@ from rosgraph.network import ROSHandshakeException, decode_ros_handshake_header,
 
 from pharos.private_rospy import connections, tcpros, topics
 from pharos.private_rospy.loader import Shim
-from pharos.private_rospy.services import call_by_proxy
+from pharos.private_rospy.services import answer, call_by_proxy
 
 MAX_REQUEST = 1 << 20  # bytes of a connection header
 POLL_INTERVAL = 60  # seconds between two looks for a stop; the stop itself wakes the server
@@ -108,6 +109,12 @@ def accept(original, run, self, sock, address):
     run.sockets.add(sock)
     if not run.start_thread(shake_hands):
         sock.close()
+
+
+@patch('rospy.impl.tcpros_base', 'TCPServer.run')
+def accept_clients(original, run, self):
+    """rospy's server ends for ever if the system has no descriptor left. This tries again."""
+    tcpros.accept_clients(self.server_sock, run.stopping, self.inbound_handler)
 
 
 @patch('rospy.impl.tcpros_base', 'TCPServer.shutdown')
@@ -210,6 +217,13 @@ def is_shutdown(original, run):
     if run.stopping.is_set():
         return True
     return original()
+
+
+@patch('rosgraph.roslogging', 'RosStreamHandler.emit')
+def print_line(original, run, self, record):
+    """rospy raises an exception if the terminal has gone, or a disk is full. This prints nothing then."""
+    with suppress(OSError, ValueError):
+        original(self, record)
 
 
 @replace('rosgraph.roslogging', 'rospkg')
@@ -426,6 +440,6 @@ def call_service(original, run, self, *args, **kwargs):
 def handle_call(original, run, self, connection, header):
     """rospy's thread ends with an exception if the client has gone. This closes the connection."""
     try:
-        original(self, connection, header)
+        answer(run, original, self, connection, header)
     except (rospy.exceptions.TransportException, OSError):
         connection.close()

@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING, Any, Callable, Iterable, Sequence
 from urllib.parse import urlsplit
 from weakref import WeakSet
 
+import rospy
+
 from pharos.blocks import block_name
 from pharos.errors import MessageTypeError, PortInUseError
 from pharos.failures import Failure, Failures
@@ -31,7 +33,7 @@ from pharos.private_rospy.tcpros import shutdown_socket
 from pharos.private_rospy.xmlrpc import ServerProxy
 from pharos.signals import may_be_signal
 from pharos.transcript import Transcript
-from pharos.waiting import let_others_run
+from pharos.waiting import current, let_others_run
 
 if TYPE_CHECKING:
     from pharos.master import Master
@@ -110,9 +112,8 @@ class Run:
         self.retries = {}  # (topic, URI) -> the time to connect again, and the last error
         self.connecting = set()  # (topic, URI, id of the subscription) of attempts that go on
         self.callback_order = CallbackOrder(self.start_thread)
-        self.callback_queue = CallbackQueue(self.callback_order)
-        self.callback_queue.hold()  # until the node's start() has returned
-        self.hold_deadline = monotonic() + HOLD_LIMIT  # then the watcher ends the hold
+        # the pause ends when the node's start() has returned
+        self.callback_queue = CallbackQueue(self.callback_order, HOLD_LIMIT)
         namespace, _, self.base_name = self.name.rpartition('/')
         self.clock_deadline = monotonic() + CLOCK_LIMIT  # when a clock that stands is told
         self.environ = {
@@ -195,7 +196,8 @@ class Run:
     def sleep(self, seconds: float) -> None:
         """Stand in for ``time.sleep``: the node's stop ends the sleep.
 
-        After the stop, a sleep ends its thread.
+        After the stop, a sleep ends its thread. If the thread answers a call of a service of the node,
+        it ends at once: the caller must not hear of a success.
         """
         if self.finished.is_set():
             raise SystemExit  # in a thread that was left behind
@@ -203,8 +205,10 @@ class Run:
             let_others_run()
             return
         is_stopping = self.stopping.wait(seconds)
-        if is_stopping:  # a loop may sleep on
-            let_others_run()
+        if is_stopping:
+            if current.service_run is self:
+                raise SystemExit(f'{self.name} stops')
+            let_others_run()  # a loop may sleep on
 
     def checkpoint(self) -> None:
         """Do nothing: is_shutdown() calls this, and a script waits here for its handlers."""
@@ -277,7 +281,8 @@ class Run:
     ) -> None:
         """Keep an exception of a block; at the 1st, 10th, 100th time, log and show the exception.
 
-        An exception that may come from a signal is raised again: Ctrl-C ends the program.
+        An exception that may come from a signal is raised again: Ctrl-C ends the program. A
+        rospy.ROSException or SystemExit while the node stops is the end of a sleep, and no failure.
 
         :param role: the word for the block in the text, such as 'delegate'
         :param message: the message, request or value that the block was run on
@@ -286,6 +291,8 @@ class Run:
         """
         if isinstance(error, (KeyboardInterrupt, SystemExit)) and may_be_signal():
             raise error
+        if self.stopping.is_set() and isinstance(error, (rospy.ROSException, SystemExit)):
+            return
         failure = self.keep_failure(error, block, message, channel, retry)
         is_power_of_ten = str(failure.count).strip('0') == '1'
         if not is_power_of_ten:

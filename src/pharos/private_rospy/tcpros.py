@@ -7,6 +7,7 @@ import threading
 
 from pharos.intraprocess.inboxes import BoundedQueue
 from pharos.private_rospy.connections import connect_later
+from pharos.transcript import tell_once
 from pharos.waiting import let_others_run
 
 MAX_MESSAGE = 1_000_000_000  # bytes, as in roscpp
@@ -15,6 +16,7 @@ MAX_PARTS = 1024  # that a system call takes
 LARGE_PART = 1 << 16  # bytes
 THREAD_REST = 0.3  # seconds without a message until a sender's thread ends
 CONNECT_LIMIT = 10.0  # seconds
+ACCEPT_PAUSE = 0.5  # seconds after an error
 CLOSED = OSError, AttributeError  # a connection that rospy has closed has no socket
 _READ_BUFFER = 1 << 17  # bytes
 _CREDENTIALS = struct.Struct('3i')  # numbers of the process, the user, and the group
@@ -41,6 +43,20 @@ def check_user(sock):
     _, user, _ = _CREDENTIALS.unpack(credentials)
     if user != os.getuid():
         raise PermissionError(f'a process of user {user}')
+
+
+def accept_clients(listener, stopping, take):
+    """Accept clients, and call ``take(sock, address)`` for each; tell errors, and try again.
+
+    :param stopping: an Event that ends this; who sets it wakes accept() by shutdown_socket()
+    """
+    while not stopping.is_set():
+        try:
+            take(*listener.accept())
+        except Exception as error:  # such as that no descriptor is left
+            if not stopping.is_set():
+                tell_once(error)
+            stopping.wait(ACCEPT_PAUSE)
 
 
 # -- receiving

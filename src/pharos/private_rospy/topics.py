@@ -8,6 +8,7 @@ import collections
 import contextlib
 import functools
 import time
+from _thread import get_ident
 from typing import Any, Callable, Iterable
 
 import rospy
@@ -18,6 +19,7 @@ from pharos.intraprocess.inboxes import Inbox
 from pharos.intraprocess.links import links_of
 from pharos.private_rospy import connections
 from pharos.private_rospy.tcpros import CLOSED, MessageParts, Sender
+from pharos.signals import silenced_threads
 
 SOCKET_BYTES = 6 << 20  # bytes that the two sockets of a connection hold, roughly
 FLUSH_PERIOD = 0.001  # seconds between two looks
@@ -49,9 +51,9 @@ class PublisherOverlay:
         self.has_header = getattr(data_class, '_has_header', False)
         self.header = None
         self.memory = None  # a MessageMemory, from SharedMemoryHandler's first reader on
-        # the connections that self.receivers were found for, None: find them anew; rospy makes a new
-        # list at each change
-        self.cached_connections = None
+        # (connections, *receivers_of(connections)), None: find them anew. rospy makes a new list of
+        # connections at each change
+        self.receivers: tuple | None = None
 
     def acquire(self) -> None:
         """Take no lock: rospy locks here for the whole of a publish().
@@ -102,6 +104,9 @@ class PublisherOverlay:
         :raises rospy.ROSException: if the topic is closed; plain rospy returns if the node stops
         """
         with self.lock:
+            # looked at under the lock: so what the handler publishes to this topic comes last
+            if get_ident() in silenced_threads and self.name != '/rosout':
+                return
             if self.closed:
                 # rospy's publish() returns in this case, too
                 if channel is None and self.run.stopping.is_set():
@@ -109,18 +114,17 @@ class PublisherOverlay:
                 raise rospy.ROSException('publish() to a closed topic')
             self.seq += 1
             if connection_override is None:
-                if self.cached_connections is not self.connections:
-                    # set first: update_inboxes() sets None if the inboxes change meanwhile
-                    self.cached_connections = self.connections
-                    self.receivers = receivers_of(self.connections)
                 receivers = self.receivers
+                if receivers is None or receivers[0] is not self.connections:
+                    receivers = receivers_of(self.connections)
+                    self.receivers = receivers
                 is_latched = self.is_latch
                 if channel:
                     is_latched = channel.latch
             else:
                 receivers = receivers_of([connection_override])
                 is_latched = False
-            inboxes_by_thaw, inline_queues, thread_queues, connections = receivers
+            _, inboxes_by_thaw, inline_queues, thread_queues, connections = receivers
             if self.has_header and message._has_header:  # as serialize_message does; not AnyMsg
                 message.header.seq = self.seq
                 if message.header.frame_id is None:
@@ -277,16 +281,18 @@ class SubscriptionOverlay:
 
         A change of the callbacks calls this.
         """
-        callbacks = self.callbacks or ()
-        inboxes = [callback for callback, _ in callbacks if isinstance(callback, Inbox)]
-        if len(inboxes) < len(callbacks):
-            if not self.plain_inbox:
-                self.plain_inbox = PlainInbox(self, first_pause_for(callbacks))
-            inboxes.append(self.plain_inbox)
-        self.inboxes[:] = inboxes  # the links have this very list
-        links = links_of(self.connections)
+        with self.c_lock:  # two threads may change the callbacks at once
+            callbacks = self.callbacks or ()
+            inboxes = [callback for callback, _ in callbacks if isinstance(callback, Inbox)]
+            if len(inboxes) < len(callbacks):
+                if not self.plain_inbox:
+                    self.plain_inbox = PlainInbox(self, first_pause_for(callbacks))
+                inboxes.append(self.plain_inbox)
+            self.inboxes[:] = inboxes  # the links have this very list
+            links = links_of(self.connections)
         for link in links:
-            link.publisher.cached_connections = None
+            with link.publisher.lock:  # a publish() may find its receivers at this moment
+                link.publisher.receivers = None
         return links
 
     def deliver(self, message: Any, connection: Any, size: int) -> None:
@@ -352,8 +358,8 @@ def first_pause_for(callbacks: Iterable[tuple]) -> float:
 def receivers_of(connections: list) -> tuple:
     """Return the receivers of messages that are published to some connections.
 
-    :returns: four values: ``{thaw: inboxes}``, the callback queues of inline inboxes, the callback
-        queues of the other inboxes, and the connections that are not links
+    :returns: five values: the connections, ``{thaw: inboxes}``, the callback queues of inline
+        inboxes, the callback queues of the other inboxes, and the connections that are not links
     """
     links = links_of(connections)
     inboxes = {}
@@ -365,7 +371,7 @@ def receivers_of(connections: list) -> tuple:
         queues = inline_queues if inbox.inline else other_queues
         queues.append(inbox.callback_queue)
     others = [connection for connection in connections if connection not in links]
-    return inboxes, inline_queues, other_queues, others
+    return connections, inboxes, inline_queues, other_queues, others
 
 
 def close_topic(impl: Any) -> None:

@@ -21,7 +21,12 @@ from rosgraph.network import (
 )
 from rospy.impl.transport import ProtocolHandler
 
-from pharos.private_rospy.tcpros import check_user, end_connection, shutdown_socket
+from pharos.private_rospy.tcpros import (
+    accept_clients,
+    check_user,
+    end_connection,
+    shutdown_socket,
+)
 from pharos.private_rospy.xmlrpc import UNREACHABLE, ServerProxy
 from pharos.shared_memory.sending import (
     MAX_PACKET,
@@ -33,10 +38,10 @@ from pharos.shared_memory.sending import (
     MessageMemory,
     is_plain,
 )
+from pharos.transcript import attempt
 
 PROTOCOL = 'PHAROS-SHM-2'
 MAX_HEADER = 1 << 17  # bytes of a connection header
-ACCEPT_PAUSE = 1.0  # seconds after an error
 RECEIPT = b'\0'
 MAX_MESSAGES = 100  # that are taken before the first one is delivered
 IDLE_PERIOD = 1.0  # seconds between two looks if a connection is left
@@ -83,21 +88,16 @@ class SharedMemoryHandler(ProtocolHandler):
                 listener.bind('')  # the kernel chooses a name that is not in a file system
                 listener.listen()
                 self.run.sockets.add(listener)
-                if not self.run.start_thread(functools.partial(self._accept, listener)):
+                serve = functools.partial(accept_clients, listener, self.run.stopping, self._accept)
+                if not self.run.start_thread(serve):
                     return self._tcpros_handler.init_publisher(topic, ['TCPROS'])
                 self._listener = listener
         return 1, '', [PROTOCOL, self._listener.getsockname()[1:].decode()]
 
-    def _accept(self, listener):
-        while not self.run.stopping.is_set():
-            try:
-                sock, _ = listener.accept()
-            except OSError:  # the stop has closed it, or no descriptor is left
-                self.run.stopping.wait(ACCEPT_PAUSE)
-                continue
-            self.run.sockets.add(sock)
-            if not self.run.start_thread(functools.partial(self._add_reader, sock)):
-                sock.close()
+    def _accept(self, sock, address):
+        self.run.sockets.add(sock)
+        if not self.run.start_thread(functools.partial(self._add_reader, sock)):
+            sock.close()
 
     def _add_reader(self, sock):
         """Shake hands, and add a connection to the publisher."""
@@ -208,7 +208,7 @@ class Reader:
 
     def _read_all(self):
         while True:
-            messages = self._take_messages()
+            messages = attempt(self._take_messages) or []
             for _, connection, deliver in sorted(messages, key=operator.itemgetter(0)):
                 self.attempt(connection, deliver)
             self._last_copy = None, b''
