@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import functools
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from genpy import Message
@@ -48,7 +49,10 @@ class Endpoint:
         return self.node._current_run
 
     def _open(self):
-        """Register with the master; return True if a delegate has closed the endpoint meanwhile."""
+        """Register with the master; return True if a delegate has closed the endpoint meanwhile.
+
+        A question to the master comes first: if it does not answer, nothing is registered.
+        """
         raise NotImplementedError
 
     def open(self):
@@ -58,9 +62,8 @@ class Endpoint:
 
         :raises MasterUnreachableError: if the master does not answer
         """
-        self._run.master.call('getPid')  # raises if the master does not answer
         if not self._open():
-            self._run.endpoints = [*self._run.endpoints, self]
+            self._run.endpoints.append(self)  # in place: another thread may open or close one, too
             self.closed = False
 
     def close(self) -> None:
@@ -68,8 +71,8 @@ class Endpoint:
 
         The node's next start leaves the endpoint closed. A second call does nothing.
         """
-        run = self._run
-        run.endpoints = [endpoint for endpoint in run.endpoints if endpoint is not self]
+        with suppress(ValueError):  # a closed one
+            self._run.endpoints.remove(self)
         if not self.closed:
             self.closed = True
             self._close()
@@ -136,6 +139,7 @@ class InputChannel(DelegateHolder, Channel, Inbox):
         self._open_on(node, topic, message_class)
 
     def _open(self):
+        self._run.master.call('getPid')
         self.messages.clear()  # the stop has dropped the jobs of these messages
         self.attach(self._run.callback_queue)
         self.closed = False  # the first message may come before the Subscriber is made

@@ -6,6 +6,7 @@ import contextlib
 import inspect
 import os
 import re
+from time import monotonic
 from typing import TYPE_CHECKING, Any, Sequence, TypeVar
 from weakref import WeakValueDictionary
 from xmlrpc.client import dumps, loads
@@ -21,6 +22,7 @@ from pharos.private_rospy.run import Settings
 from pharos.private_rospy.xmlrpc import CALLER_ID, UNREACHABLE, ServerProxy
 from pharos.service import Service
 from pharos.topic import Topic
+from pharos.transcript import Transcript
 from pharos.waiting import wait_for
 
 if TYPE_CHECKING:
@@ -30,8 +32,12 @@ if TYPE_CHECKING:
     from pharos.live.external_node import ExternalNode
     from pharos.live.graph import Graph
 
+SLOW_ANSWER = 1.0  # seconds; the first that takes longer is told
 LIFE_LIMIT = 0.5  # seconds that a node has to show that the node lives
 _URL = re.compile(r'http://(\[[\w:]+\]|[\w.-]+):([1-6]?\d{1,4})/?')
+
+#: the masters whose slowness has been told
+_slow_urls: set[str] = set()
 
 N = TypeVar('N', bound=Node)
 
@@ -98,7 +104,7 @@ class Master:
             raise ValueError(
                 f"{url!r} cannot be the URL of a master: give one such as 'http://127.0.0.1:11311/'"
             )
-        host = parts[1].replace('localhost', '127.0.0.1')
+        host = '127.0.0.1' if parts[1] == 'localhost' else parts[1]
         self.url = f'http://{host}:{parts[2]}/'
         if shared_memory is None:
             shared_memory = os.environ.get('PHAROS_SHARED_MEMORY') != '0'
@@ -154,12 +160,18 @@ class Master:
         :param caller_id: the name of the node that calls
         :raises MasterUnreachableError: if the master does not answer within 5 s
         """
+        start = monotonic()
         try:
             code, _, value = getattr(ServerProxy(self.url), method)(caller_id, *args)
         except UNREACHABLE as error:
             raise MasterUnreachableError(
                 f'no ROS master answers at {self.url} ({error}): start roscore, or give the right URL'
             ) from None
+        duration = monotonic() - start
+        if duration > SLOW_ANSWER and self.url not in _slow_urls:
+            _slow_urls.add(self.url)
+            text = f'the ROS master at {self.url} is slow: an answer took {duration:.1f} s'
+            Transcript.show(text)
         return value if code == 1 else None
 
     def is_reachable(self) -> bool:

@@ -642,7 +642,7 @@ class Node(DelegateHolder):
     @property
     def _parameters(self) -> list[Parameter]:
         """The parameters that :meth:`parameter` has returned."""
-        endpoints = self._current_run.endpoints
+        endpoints = list(self._current_run.endpoints)
         return [endpoint for endpoint in endpoints if isinstance(endpoint, Parameter)]
 
 

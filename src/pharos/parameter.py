@@ -69,7 +69,7 @@ class Parameter(Endpoint):
         """
         self.node._check_active()
         self._run.master.parameters[self.name] = value
-        self._run.read_parameters()
+        self._run.read_parameters(self.name)
 
     def read(self):
         """Read the value from the server, and run the blocks if the value is another one."""

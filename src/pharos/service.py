@@ -50,6 +50,7 @@ class OfferedService(Endpoint):
         self.open()
 
     def _open(self):
+        self._run.master.call('getPid')
         try:
             self.ros_object = self.node.ros.Service(self.name, self.service_class, self._answer)
         except ServiceException as error:

@@ -152,14 +152,13 @@ def is_alive(thread):
     return not getattr(thread, 'has_ended', not _is_alive(thread))
 
 
-def read_all_parameters(changed_run):
+def read_all_parameters(changed_run, key, read_parameters=run.Run.read_parameters):
     """Stand in for ``Run.read_parameters``: have the parameters of all nodes read.
 
     The master would tell the other nodes at no fixed time.
     """
     for each in list(runs.values()):
-        for parameter in each.node._parameters:
-            parameter.read()
+        read_parameters(each, key)
 
 
 @patch('rospy.rostime', 'get_rostime')

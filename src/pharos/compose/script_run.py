@@ -118,8 +118,8 @@ class ScriptRun(Run):
 
             def __init__(self, *args, **kwargs):
                 super().__init__(*args, **kwargs)
-                # run.main is a daemon, and would pass that on; a process's main thread is not one
-                if threading.current_thread() is run.main:
+                # all threads of a run are daemons, and would pass that on; these would not be in a process
+                if threading.current_thread() in (run.main, *run.threads_to_join):
                     self.daemon = bool(kwargs.get('daemon'))
 
             def start(self):

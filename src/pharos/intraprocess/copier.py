@@ -134,7 +134,7 @@ _bytes_of_booleans = _number_converter('B')
 
 
 def _booleans(value):
-    return tuple(map(bool, _bytes_of_booleans(value)))
+    return tuple([*map(bool, _bytes_of_booleans(value))])
 
 
 _GLOBALS = {
@@ -146,7 +146,7 @@ _GLOBALS = {
 }
 _GLOBALS.update((f'{base}_array', _number_converter(code)) for base, code in CODES.items())
 _GLOBALS.update(
-    string_array=lambda value: tuple(map(_text, _sequence(value))),
+    string_array=lambda value: tuple([*map(_text, _sequence(value))]),
     bool_array=_booleans,
     uint8_array=_octets,
     char_array=_octets,
@@ -216,7 +216,8 @@ class _Source:
         new_value = variable
         if is_nested:
             freeze, thaw = map(self.name_for, _generate(nested_class(base, cls), 1))
-            self.freeze_lines.append(f'{variable} = tuple(map({freeze}, sequence({field})))')
+            # not tuple(map(...)): gc.get_objects() of another thread makes Python raise a SystemError
+            self.freeze_lines.append(f'{variable} = tuple([*map({freeze}, sequence({field}))])')
             new_value = f'list(map({thaw}, {variable}))'
         elif is_array:
             self.freeze_lines.append(f'{variable} = {base}_array({field})')

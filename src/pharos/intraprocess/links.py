@@ -93,7 +93,7 @@ def link_topic(sender, receiver, topic):
         sender_end.inboxes = subscription.inboxes
         if publisher.closed or not subscription.add_link(receiver_end):
             return
-        publisher.rospy_add_connection(sender_end)
+        publisher.add_receiver(sender_end)
         for frozen in list(publisher.latches.values()):  # a channel may close meanwhile
             for inbox in sender_end.inboxes:
                 inbox.put((frozen, thaw, publisher.header))

@@ -224,6 +224,8 @@ def _ask_masters():
 
 
 def _ask_master(url, url_runs):
+    # noted before the question: what is registered meanwhile, the answer may lack
+    entries = {run: _entries_of(run) for run in url_runs}
     try:
         state = ServerProxy(url).getSystemState(CALLER_ID)[2]  # type: ignore[index]
     except UNREACHABLE as error:
@@ -231,11 +233,22 @@ def _ask_master(url, url_runs):
         url_runs[0].troubles.add(f'no master answers at {url}, it is asked again: {error}')
         return
     for run in url_runs:
-        attempt(_register_missing, run, state)
+        attempt(_register_missing, run, entries[run], state)
 
 
-def _register_missing(run, state):
-    """Register the topics and services that the master's system state lacks.
+def _entries_of(run):
+    """Return the topics and services of a run: a set of (registry, name, data of register())."""
+    topics = run.topic_manager
+    getters = topics.get_publications, topics.get_subscriptions, run.service_manager.get_services
+    return {
+        (registry, *entry)
+        for registry, get_entries in zip(_REGISTER_METHODS, getters)
+        for entry in get_entries()
+    }
+
+
+def _register_missing(run, entries, state):
+    """Register those of a run's entries that it has still, and that the master's system state lacks.
 
     If the master knows nothing of the node, set its parameters anew, too.
 
@@ -243,22 +256,19 @@ def _register_missing(run, state):
     """
     registered = {
         (registry, name)
-        for registry, entries in zip(_REGISTER_METHODS, state)
-        for name, nodes in entries
+        for registry, rows in zip(_REGISTER_METHODS, state)
+        for name, nodes in rows
         if run.name in nodes
     }
-    topics = run.topic_manager
-    services = run.service_manager
-    getters = topics.get_publications, topics.get_subscriptions, services.get_services
-    with topics.lock, services.lock:  # or a topic closed meanwhile would be registered again
-        for registry, get_entries in zip(_REGISTER_METHODS, getters):
-            for name, data in get_entries():
-                if (registry, name) in registered or run.stopping.is_set():
-                    continue
-                # not if a namesake of another process has the name now: the master ends this node
-                if run.master.call('lookupNode', run.name) in (None, run.uri):
-                    register(run, registry, name, data)
-                    connect_all(run, name)
+    # locked, or a topic closed meanwhile would be registered again
+    with run.topic_manager.lock, run.service_manager.lock:
+        for registry, name, data in entries & _entries_of(run):
+            if (registry, name) in registered or run.stopping.is_set():
+                continue
+            # not if a namesake of another process has the name now: the master ends this node
+            if run.master.call('lookupNode', run.name) in (None, run.uri):
+                register(run, registry, name, data)
+                connect_all(run, name)
     if not registered and not run.stopping.is_set():  # this is a new master
         # all values before any is set or reported: each such time all of them are read
         for parameter in run.node._parameters:

@@ -8,6 +8,7 @@ place. Each docstring names first the behaviour of rospy, then that of the patch
 import socket
 import threading
 from contextlib import suppress
+from functools import lru_cache
 from urllib.parse import urlsplit
 
 import rospkg
@@ -390,13 +391,20 @@ def send_goal(original, run, self, *args, **kwargs):
         order.pass_turn()
 
 
+@replace('rospy.impl.statistics', 'SubscriberStatisticsLogger.is_enabled')
+def is_enabled_once(original, run):
+    """rospy asks the master for each subscription. This asks once."""
+    return lru_cache(None)(original)
+
+
 # -- parameters, log, services
 
 
 @patch('rospy.impl.masterslave', 'ROSHandler.paramUpdate')
 def parameter_changed(original, run, self, *args):
     """rospy updates its own cache alone. This updates the node's parameters, too."""
-    run.read_parameters()
+    if len(args) > 1:  # rospy refuses a call with too few arguments
+        run.read_parameters(args[1])
     return original(self, *args)
 
 
@@ -405,7 +413,7 @@ def parameter_changed(original, run, self, *args):
 def set_parameter(original, run, self, key, *value):
     """The master calls all other nodes at a change. This updates the node's own parameters, too."""
     original(self, key, *value)
-    run.read_parameters()
+    run.read_parameters(run.ros.resolve_name(key))
 
 
 @replace('rospy.impl.rosout', 'rospy')

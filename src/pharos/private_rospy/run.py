@@ -224,11 +224,17 @@ class Run:
         """True if the node runs, or its stop goes on."""
         return self.lifecycle in (Lifecycle.RUNNING, Lifecycle.STOPPING)
 
+    def health_facts(self) -> dict[str, Any]:
+        """Return the facts of Node.health(), without the master's; ``pharos top`` asks for them."""
+        from pharos.live.health import facts_of
+
+        return facts_of(self)
+
     def open_endpoints(self, endpoint_class: Any) -> list:
         """Return the endpoints of a class that are open."""
         return [
             endpoint
-            for endpoint in self.endpoints
+            for endpoint in list(self.endpoints)
             if isinstance(endpoint, endpoint_class) and not endpoint.closed
         ]
 
@@ -239,34 +245,6 @@ class Run:
         self.lifecycle = Lifecycle.STOPPED
         if runs.get(self.uri) is self:  # only in a forked child: leave() has taken it out before
             del runs[self.uri]
-
-    def health_facts(self) -> dict[str, Any]:
-        """Return the facts of Node.health(), without the master's; ``pharos top`` asks for them."""
-        queues = list(self.callback_order.queues)
-        begin_times = [queue.begin_time for queue in queues if queue.begin_time]
-        return {
-            'kind': type(self.node).__name__,
-            'connections': dict(
-                collections.Counter(row[3] for row in self.topic_manager.get_pub_sub_info())
-            ),
-            'dropped': sum(getattr(each, 'dropped', 0) for each in self.open_endpoints(object)),
-            'errors': self.failures.total,
-            'threads': len(self.threads),
-            'cpu_seconds': round(self.cpu_seconds(), 3),
-            'souls': len(self.souls),
-            'ended_souls': list(self.ended_souls),
-            'callback_seconds': time.perf_counter() - min(begin_times) if begin_times else 0.0,
-            'waiting': sum(len(queue.jobs) for queue in queues),
-        }
-
-    def cpu_seconds(self) -> float:
-        """Return the CPU time of the node's threads."""
-        seconds = self.ended_cpu_seconds
-        for thread in list(self.threads):
-            with suppress(OSError):  # the thread ends at this moment
-                if thread.is_alive():
-                    seconds += time.clock_gettime(time.pthread_getcpuclockid(thread.ident))
-        return seconds
 
     # -- failures
 
@@ -382,10 +360,13 @@ class Run:
         handler.pharosHealth = lambda caller_id: (1, '', self.health_facts())
         connections.enter(self)
 
-    def read_parameters(self) -> None:
-        """Have the node's parameters read their values from the server."""
+    def read_parameters(self, key: str) -> None:
+        """Have the node's parameters at a full name, above and below it read their values anew."""
+        changed_name = key.rstrip('/') + '/'
         for parameter in self.node._parameters:
-            parameter.read()
+            name = parameter.name + '/'
+            if name.startswith(changed_name) or changed_name.startswith(name):
+                parameter.read()
 
     def limit_silence(self, sock: socket.socket) -> None:
         """Have the watcher shut a client's socket after the node's client_timeout.
@@ -429,6 +410,8 @@ class Run:
 
     def _begin_stop(self) -> None:
         """End sleeps, waits and service calls of the node."""
+        if current.service_run is self:  # a service that stops its node goes on
+            current.service_run = None
         self.stopping.set()
         for sock in list(self.calls):
             shutdown_socket(sock)

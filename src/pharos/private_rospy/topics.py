@@ -84,14 +84,37 @@ class PublisherOverlay:
         if not getattr(connection, 'has_own_queue', False):
             connection = Sender(connection, self)
         with self.lock:
-            self.rospy_add_connection(connection)
+            self.add_receiver(connection)
             for frozen in list(self.latches.values()):
                 self.write(self.thaw(frozen), [connection])
         return True
 
+    def add_receiver(self, connection: Any) -> None:
+        """Add a connection or a link, without the messages that are latched."""
+        type(self).__base__.add_connection(self, connection)  # rospy's own calls listeners, too
+        self.call_listeners(
+            'peer_subscribe', self.publish, lambda message: self.publish(message, connection)
+        )
+
     def remove_connection(self, connection: Any) -> None:
         if not self.closed:  # rospy trips over attributes that its close() has set to None
-            self.rospy_remove_connection(connection)
+            type(self).__base__.remove_connection(self, connection)
+            self.call_listeners('peer_unsubscribe', len(self.connections))
+
+    def call_listeners(self, method: str, *arguments: Any) -> None:
+        """Have listeners called one after another, as in rospy, and in no thread that holds a lock.
+
+        The thread of the node's delegates calls them.
+        """
+        for listener in list(self.subscriber_listeners):
+            block = functools.partial(getattr(listener, method), self.resolved_name, *arguments)
+            Inbox(self.run.callback_queue, functools.partial(self._call, block)).receive(None)
+
+    def _call(self, block: Callable, message: None) -> None:
+        try:
+            block()
+        except Exception as error:
+            self.run.report_failure(error, block.func, 'listener')  # type: ignore[attr-defined]
 
     def publish(self, message: Any, connection_override: Any = None, channel: Any = None) -> None:
         """Publish to the links, then to memory files and sockets.
@@ -342,6 +365,7 @@ class SubscriptionOverlay:
 
     def close(self) -> None:
         close_topic(self)
+        self.run.publisher_uris.pop(self.resolved_name, None)
         if self.plain_inbox:
             self.plain_inbox.callback_queue.close(0)
 

@@ -275,13 +275,18 @@ class MemoryReceiver(MemoryTransport):
         packet, ancillary, flags, _ = self._socket.recvmsg(
             MAX_PACKET + PACKET.size, socket.CMSG_SPACE(_DESCRIPTOR_SIZE), socket.MSG_DONTWAIT
         )
-        if not packet:
-            raise EOFError
-        if flags & socket.MSG_CTRUNC:
-            raise OSError('this process has no descriptor left for a memory file')
-        position, slot, size, dropped, send_time = PACKET.unpack_from(packet)
-        for _, _, descriptor in ancillary:
-            self._map(position, descriptor)
+        descriptors = array.array('i', b''.join(data for _, _, data in ancillary))
+        try:
+            if not packet:
+                raise EOFError
+            if flags & socket.MSG_CTRUNC:
+                raise OSError('this process has no descriptor left for a memory file')
+            position, slot, size, dropped, send_time = PACKET.unpack_from(packet)
+            for descriptor in descriptors:
+                self._maps[position] = mmap.mmap(descriptor, 0, prot=mmap.PROT_READ)
+        finally:
+            for descriptor in descriptors:
+                os.close(descriptor)  # the map stays
         # either the message, or what is left of it without the large field in the file
         data = packet[PACKET.size :]
         value = b''
@@ -331,14 +336,6 @@ class MemoryReceiver(MemoryTransport):
         self.header = header
         self.callerid_pub = header['callerid']
         self.is_latched = header.get('latching') == '1'
-
-    def _map(self, position, descriptor):
-        """Map a file that came with a packet."""
-        number = array.array('i', descriptor)[0]
-        try:
-            self._maps[position] = mmap.mmap(number, 0, prot=mmap.PROT_READ)
-        finally:
-            os.close(number)
 
     def close(self):
         if not self.done:

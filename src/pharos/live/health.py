@@ -1,0 +1,37 @@
+"""The facts on a run that ``Node.health()`` and ``rosrun pharos top`` show."""
+from __future__ import annotations
+
+import collections
+import time
+from contextlib import suppress
+from typing import Any
+
+
+def facts_of(run: Any) -> dict[str, Any]:
+    """Return the facts of :meth:`Node.health`, but for the master's."""
+    queues = list(run.callback_order.queues)
+    begin_times = [queue.begin_time for queue in queues if queue.begin_time]
+    return {
+        'kind': type(run.node).__name__,
+        'connections': dict(
+            collections.Counter(row[3] for row in run.topic_manager.get_pub_sub_info())
+        ),
+        'dropped': sum(getattr(each, 'dropped', 0) for each in run.open_endpoints(object)),
+        'errors': run.failures.total,
+        'threads': len(run.threads),
+        'cpu_seconds': round(_cpu_seconds(run), 3),
+        'souls': len(run.souls),
+        'ended_souls': list(run.ended_souls),
+        'callback_seconds': time.perf_counter() - min(begin_times) if begin_times else 0.0,
+        'waiting': sum(len(queue.jobs) for queue in queues),
+    }
+
+
+def _cpu_seconds(run):
+    """Return the CPU time of the node's threads."""
+    seconds = run.ended_cpu_seconds
+    for thread in list(run.threads):
+        with suppress(OSError):  # the thread ends at this moment
+            if thread.is_alive():
+                seconds += time.clock_gettime(time.pthread_getcpuclockid(thread.ident))
+    return seconds
