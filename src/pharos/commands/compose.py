@@ -41,6 +41,10 @@ def compose(arguments: list[str]) -> int:
     """
     options = _parse(arguments)
     mappings = [each for each in sys.argv if ':=' in each]
+    # roslaunch has started this as a node; its programs have names and logs of their own
+    options.is_node = any(each.startswith('__log:=') for each in mappings)
+    if options.is_node:
+        mappings = [each for each in mappings if not each.startswith(('__name:=', '__log:='))]
     with contextlib.ExitStack() as stack:
         status = _run(stack, options, mappings)
     return status
@@ -145,7 +149,9 @@ def _read_launch_file(url, options, mappings):
     args = dict(each.split(':=', 1) for each in mappings if not each.startswith('_'))
     package = options.file[0] if len(options.file) == 2 else None
     names = options.only, options.apart, options.here, options.group
-    launch_file = LaunchFile(url, package, options.file[-1], args, *names, options.screen)
+    launch_file = LaunchFile(
+        url, package, options.file[-1], args, *names, options.screen, options.is_node
+    )
     home = rospkg.get_ros_home()
     os.makedirs(home, exist_ok=True)
     os.chdir(home)

@@ -30,10 +30,12 @@ DONE = 'done: '
 def listen(composition):
     """Obey other processes, in a thread, until the composition has stopped."""
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    with contextlib.suppress(OSError):  # a second composition of this process is not controlled
+    try:
         listener.bind(f'\0{_PREFIX}{os.getpid()}')
         listener.listen()
         threading.Thread(target=_serve, args=[listener, composition], daemon=True).start()
+    except OSError as error:  # such as for a second composition of this process
+        Transcript.show(f'restart, stop and reload do not reach this composition: {error}')
     return listener
 
 

@@ -58,6 +58,8 @@ class LaunchFile:
     :param here: the names of nodes that run in this process even if they show windows
     :param groups: lists of names of nodes that run in one process each
     :param screen: True: all nodes have the output 'screen'
+    :param is_node: True: roslaunch has started this process as a node; ``args`` that the file does not
+        have are remappings in its scope, which hold for all nodes of the file
     :ivar config: roslaunch's configuration
     :ivar entries: an :class:`Entry` for each node of this process and of groups
     :ivar entries_apart: one for each plain process, without its program
@@ -66,10 +68,20 @@ class LaunchFile:
     """
 
     def __init__(
-        self, url, package, file, args, only=(), apart=(), here=(), groups=(), screen=False
+        self,
+        url,
+        package,
+        file,
+        args,
+        only=(),
+        apart=(),
+        here=(),
+        groups=(),
+        screen=False,
+        is_node=False,
     ):
         self.path = find_launch_file(package, file)
-        self._read(args)
+        self._read(args, is_node)
         self.config.master.uri = url
         self.entries: list[Entry] = []
         self.entries_apart: list[Entry] = []
@@ -89,7 +101,7 @@ class LaunchFile:
                 group = self._group_of(name, short_names[name], groups)
                 self._sort(name, node, is_apart, is_here, group)
 
-    def _read(self, args):
+    def _read(self, args, is_node):
         loader = roslaunch.xmlloader.XmlLoader()
         arguments = [f'{name}:={value}' for name, value in args.items()]
         try:
@@ -98,7 +110,13 @@ class LaunchFile:
             )
         except Exception as error:  # roslaunch's own, or any other of a substitution in the file
             raise PharosError(f'{self.path}: {error}') from error
-        self._check(args, loader.root_context.resolve_dict.get('arg_doc', {}), 'arg')
+        known_args = loader.root_context.resolve_dict.get('arg_doc', {})
+        if is_node:
+            remaps = [(name, args[name]) for name in args if name not in known_args]
+            for node in self.config.nodes:
+                node.remap_args = [*node.remap_args, *remaps]
+        else:
+            self._check(args, known_args, 'arg')
 
     def _check(self, names, known_names, role):
         for name in names:

@@ -2,12 +2,15 @@
 
 These are signals, atexit, sys.argv, the output, the environment, and the main thread.
 """
+import _thread
 import asyncio
+import codecs
 import collections
 import contextlib
 import ctypes
 import functools
 import gc
+import io
 import os
 import signal
 import socket
@@ -17,7 +20,7 @@ import time
 import traceback
 import types
 from threading import ExceptHookArgs
-from weakref import WeakValueDictionary
+from weakref import WeakSet, WeakValueDictionary
 
 from rosgraph import get_master_uri
 from rosgraph.names import anonymous_name, get_ros_namespace, load_mappings, ns_join
@@ -40,8 +43,37 @@ SIGNAL_LIMIT = 0.2  # seconds that a signal waits for the main thread to sleep
 BLOCK_LIMIT = 1.0  # seconds that a thread has to end after an exception in it
 JOIN_PERIOD = 0.02  # seconds between two looks for a signal
 SPIN_PERIOD = 0.01  # seconds
+#: asyncio's policies derive from this; Python 3.14 has changed its name
+_POLICY = getattr(asyncio.events, 'BaseDefaultEventLoopPolicy', None)
+_POLICY = _POLICY or asyncio.events._BaseDefaultEventLoopPolicy
 #: files whose frames tracebacks do not show
 _HIDDEN = '<frozen importlib', loader.__file__, __file__
+
+
+def _get_event_loop(policy, original=_POLICY.get_event_loop):
+    """Return the event loop of this thread; make one in the main thread of a program.
+
+    asyncio makes one in the main thread of a process, up to Python 3.13.
+    """
+    run = current.run
+    if isinstance(run, ScriptRun) and threading.current_thread() is run.main:
+        with contextlib.suppress(RuntimeError):
+            return original(policy)
+        if sys.version_info < (3, 14):
+            policy.set_event_loop(policy.new_event_loop())
+    return original(policy)
+
+
+def _new_event_loop(policy, original=_POLICY.new_event_loop):
+    """Return a new event loop; the end of the program that has made the loop closes it."""
+    loop = original(policy)
+    if isinstance(current.run, ScriptRun):
+        current.run.event_loops.add(loop)
+    return loop
+
+
+_POLICY.get_event_loop = _get_event_loop
+_POLICY.new_event_loop = _new_event_loop
 
 
 @patch('subprocess', 'Popen.__init__')
@@ -83,6 +115,7 @@ class ScriptRun(Run):
         self.children = []  # processes, as subprocess.Popen
         self.exit_functions = []  # of atexit
         self.thread_exit_functions = []  # of threading._register_atexit, which run before
+        self.event_loops = WeakSet()  # of asyncio
         self.threads_to_join = set()  # those that are not daemons
         self.handlers = {}  # number of a signal -> the program's handler
         self.created_nodes = []  # the nodes that the program has created with pharos
@@ -140,6 +173,8 @@ class ScriptRun(Run):
         stand_ins['atexit'].unregister = lambda function: None
         stand_ins['os'].getenv = self.environ.get
         stand_ins['os']._exit = self.exit_now
+        stand_ins['os'].kill = self._kill
+        stand_ins['_thread'] = Shim(_thread, interrupt_main=lambda *signals: self.request_stop())
         stand_ins['pharos'] = _Pharos(self)
         self.stdout = NamedLines(sys.__stdout__, self)
         self.stderr = NamedLines(sys.__stderr__, self)
@@ -150,6 +185,13 @@ class ScriptRun(Run):
         stand_ins['sys'].stderr = self.stderr
         stand_ins['sys'].excepthook = self.print_error
         return stand_ins
+
+    def _kill(self, process_id, number):
+        """Stand in for ``os.kill``: a signal to its own process stops the program alone."""
+        if process_id == os.getpid() and number in (signal.SIGINT, signal.SIGTERM):
+            self.request_stop()
+        else:
+            os.kill(process_id, number)
 
     def _register_at_exit(self, function, *args, **kwargs):
         self.exit_functions.append(functools.partial(function, *args, **kwargs))
@@ -262,8 +304,6 @@ class ScriptRun(Run):
         """Run the program to its end, with its threads and exit functions; stop the node."""
         current.node = self.node
         current.run = self
-        # asyncio itself makes one in the main thread of the process alone
-        asyncio.set_event_loop(asyncio.new_event_loop())
         main_module = types.ModuleType('__main__')
         main_module.__file__ = self.node.path
         remember_text(main_module)
@@ -277,8 +317,10 @@ class ScriptRun(Run):
             # rospy's own function was the first to be registered, and comes last
             self._run_all(self.exit_functions, -1)
         finally:
-            self.stdout.flush()
-            self.stderr.flush()
+            own_sys = self.modules.by_name['sys']
+            for stream in own_sys.stdout, own_sys.stderr, self.stdout, self.stderr:
+                with contextlib.suppress(Exception):  # the program has closed it, or given it away
+                    stream.flush()
             if self.node._current_run is self:  # else the node has started again before this end
                 if self.exit_request is not None:
                     status = self._status_of(self.exit_request)
@@ -426,6 +468,11 @@ class ScriptRun(Run):
             self.exit_request = error
         if self.main.is_alive() and not self.main_has_ended:
             raise_in(self.main, type(error))
+            for loop in list(self.event_loops):
+                with contextlib.suppress(RuntimeError):  # it is closed
+                    loop.call_soon_threadsafe(
+                        int
+                    )  # the line that it comes to: one may wait for ever
 
     # -- stop
 
@@ -510,6 +557,9 @@ class ScriptRun(Run):
         super().stop(timeout)
         if not signals.is_ending():
             self._tell_left_threads()
+        for loop in list(self.event_loops):
+            with contextlib.suppress(RuntimeError):  # it runs in a thread that is left behind
+                loop.close()
         self.exit_request = None
         self.handlers.clear()
         self.created_nodes.clear()
@@ -542,23 +592,53 @@ def raise_in(thread, error_class):
     ctypes.pythonapi.PyThreadState_SetAsyncExc(thread_id, ctypes.py_object(error_class))
 
 
+class _LineBytes(io.BufferedIOBase):
+    """The bytes of NamedLines."""
+
+    def __init__(self):
+        self._decoder = codecs.getincrementaldecoder('utf-8')('replace')
+
+    def writable(self):
+        return True
+
+    def write(self, data):
+        self.lines.write(self._decoder.decode(data))
+        return len(data)
+
+
 class NamedLines:
-    """A stream that puts the node's name before each line.
+    """A stream that puts the node's name before each line; its end is not that of the stream behind it.
 
     :param stream: the stream to write to, such as the process's stdout
     :param run: the run with the name
+    :ivar buffer: takes bytes; a program may wrap it in a stream of its own
     """
+
+    closed = False
 
     def __init__(self, stream, run):
         self._stream = stream
         self._run = run
         self._partial_line = ''  # the text after the last line end, not written yet
+        self.buffer = _LineBytes()
+        self.buffer.lines = self
 
     def __getattr__(self, name):
         return getattr(self._stream, name)
 
+    def close(self):
+        """Take no more text."""
+        self.flush()
+        self.closed = True
+
+    def detach(self):
+        """Return the buffer, to be wrapped anew."""
+        return self.buffer
+
     def write(self, text):
         """Write the complete lines, keep the rest, and return the number of characters."""
+        if self.closed:
+            raise ValueError('I/O operation on closed file.')
         *lines, self._partial_line = (self._partial_line + text).split('\n')
         self._write(lines)
         return len(text)
@@ -573,7 +653,10 @@ class NamedLines:
         text = ''.join(f'[{self._run.name}] {line}\n' for line in lines)
         # the reader of a pipe may have gone: the program must go on, and stop its motors
         with contextlib.suppress(OSError, ValueError):
-            self._stream.write(text)
+            try:
+                self._stream.write(text)
+            except UnicodeEncodeError:  # the terminal is said to know ASCII alone
+                self._stream.buffer.write(text.encode())
             self._stream.flush()
 
 

@@ -20,7 +20,9 @@ _NEEDS_PROCESS = re.compile(
     r'|rqt_\w+|qt_gui|gtk|wx|pygame|turtle|pylab|matplotlib\.pyplot)\b'
     r'|^[ \t]*from[ \t]+matplotlib[ \t]+import[^\n]*\bpyplot\b'
     r'|\bgi\.require_version\(.Gtk|\bcv2\.(?:imshow|namedWindow)\(|\breactor\.run\('
-    r'|\.add_signal_handler\(|\bsignal\.(?:alarm|setitimer|pause)\(',
+    r'|\.add_signal_handler\(|\bsignal\.(?:alarm|setitimer|pause)\('
+    r'|\bSIG(?:USR[12]|HUP|CHLD|ALRM)\b|\bProcessPoolExecutor\b|\bsocket\.setdefaulttimeout\('
+    r'|\bweb\.run_app\(|\buvicorn\.run\(',
     re.MULTILINE,
 )
 #: code that sets environment variables other than ROS's

@@ -369,9 +369,13 @@ def publishers_changed(original, run, self, *args):
 
 @patch('rospy.impl.registration', 'RegManager.cleanup')
 def cleanup(original, run, self, reason):
-    """rospy closes nothing if the master does not answer in time. This closes all topics."""
+    """rospy closes nothing if the master does not answer in time. This tells it, and closes all topics."""
     try:
         original(self, reason)
+    except Exception as error:
+        run.ros.logwarn(
+            f'stays registered, since the master does not answer ({error!r}): rosnode cleanup'
+        )
     finally:
         run.topic_manager.close_all()
 
