@@ -59,7 +59,7 @@ def _completions(shell, event):
     call = FIELD_PATTERN.fullmatch(line)
     with suppress(PharosError):  # the master has gone, or the topic has no known type
         if call:
-            message_class = pharos.message_class(master.topic(call[1]).type)
+            message_class = pharos.message_class(master.topic(call[1]).type or '')
             return [f'{field}=' for field in message_class.__slots__]
         if STRING_PATTERN.fullmatch(line):
             names = {*master.parameters, *known_types('msg'), *known_types('srv')}
