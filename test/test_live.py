@@ -3,6 +3,7 @@ import contextlib
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import tempfile
@@ -62,15 +63,20 @@ def mixed(traffic, peer):
 class Terminal:
     """A program in a terminal, to type into, and what it has written since the last key."""
 
-    def __init__(self, url, *command):
+    def __init__(self, url, *command, size=(40, 160)):
         self._folder = tempfile.TemporaryDirectory()
         environ = {**os.environ, 'TERM': 'xterm', 'PROMPT_TOOLKIT_NO_CPR': '1'}
         environ.update(ROS_MASTER_URI=url, IPYTHONDIR=self._folder.name)
         first, *more = [*DEFAULT_SIGNALS, *command]
         self._process = pexpect.spawn(
-            first, more, env=environ, dimensions=(40, 160), encoding='utf-8', timeout=TIMEOUT
+            first, more, env=environ, dimensions=size, encoding='utf-8', timeout=TIMEOUT
         )
         self._written = ''
+
+    @property
+    def raw(self):
+        """The text that it has written, as it came; reads no more."""
+        return self._written
 
     @property
     def text(self):
@@ -253,7 +259,7 @@ def test_roscpp_node_is_no_problem(master):
 
 def program(command, url):
     """Start a program of the package."""
-    return helpers.Program(['rosrun', 'pharos', *command.split()], url)
+    return helpers.Program(['rosrun', 'pharos', *shlex.split(command)], url)
 
 
 def test_frozen_node_delays_graph_little(master, mixed):
@@ -286,7 +292,13 @@ def test_frozen_master_ends_questions(mortal):
 COMMANDS = {
     'graph': 'graph',
     'rates': 'graph --rates 0.5',
+    'only': "graph --only 'hearer|wrong'",
+    'hide': 'graph --hide traffic|peer',
+    'graph json': 'graph --json --rates 0.5',
     'top': 'top',
+    'once': 'top --once',
+    'json': 'top --json',
+    'version': 'top --version',
 }
 
 
@@ -345,6 +357,9 @@ def test_programs_end_well(scene):
         ('graph', ['process {own}', 'process {peer}', '/tf'], ['/lamp', ' Hz']),
         ('graph', ['/hearer (INTRAPROCESS)', '/peer (TCPROS)'], ['/rosout']),
         ('rates', ['/sender', '/tf', ' Hz'], ['/rosout']),
+        ('only', ['1 nodes, 1 topics', '<- /wrong', '/mistaken (INTRAPROCESS)'], ['/traffic']),
+        ('hide', ['3 nodes, 2 topics', '/sender', '/wrong', '/tf'], ['/traffic', '/peer']),
+        ('version', [f'pharos {pharos.__version__}\n'], ['NODE']),
     ],
 )
 def test_program_prints_what_is_asked(scene, command, there, left_out):
@@ -358,11 +373,38 @@ def test_graph_program_saves_picture(scene):
     assert all(name in texts for name in ('/sender', '/hearer', '/peer', '/traffic'))
 
 
-def test_top_tells_of_nodes(scene):
-    sender = row_of('/sender', scene.output['top'])
+def test_graph_program_prints_json(scene):
+    found = json.loads(scene.output['graph json'])
+    assert set(found['nodes']) == {'/sender', '/hearer', '/mistaken', '/peer'}
+    assert found['nodes']['/peer']['pid'] == scene.pids['peer']
+    assert found['topics']['/traffic'] == STRING
+    assert is_about(found['rates']['/traffic'])
+    edges = {(edge['start'], edge['end']): edge['transports'] for edge in found['edges']}
+    assert edges['/traffic', '/peer'] == ['TCPROS']
+    assert edges['/sender', '/tf'] == []
+
+
+def test_wrong_regular_expression_is_told(scene):
+    with program("graph --only '('", REFUSED) as graph:
+        assert graph.wait() == 1
+    assert re.fullmatch('graph: [^\n]*\n', graph.output)
+
+
+@pytest.mark.parametrize('command', ['top', 'once'])
+def test_top_tells_of_nodes(scene, command):
+    output = scene.output[command]
+    sender = row_of('/sender', output)
     assert (sender['PID'], sender['CLASS']) == (str(scene.pids['own']), 'BlockNode')
-    assert row_of('/peer', scene.output['top'])['PID'] == str(scene.pids['peer'])
-    assert row_of('/hearer', scene.output['top'])['FAIL'] == '1'
+    assert row_of('/peer', output)['PID'] == str(scene.pids['peer'])
+    assert row_of('/hearer', output)['FAIL'] == '1'
+    assert '\x1b' not in output
+
+
+def test_top_prints_json(scene):
+    rows = {row['NODE']: row for row in json.loads(scene.output['json'])['nodes']}
+    assert rows['/sender']['PID'] == scene.pids['own']
+    assert is_about(rows['/sender']['OUT/S'])
+    assert (rows['/hearer']['FAIL'], rows['/peer']['FAIL']) == (1, None)
 
 
 def test_top_tells_cpu_of_nodes(master):
@@ -395,6 +437,62 @@ def test_keys_of_top_restart_a_node_and_a_save_reloads_it(master, tmp_path):
         until(lambda: '/clock done: __main__.PACE takes effect' in composed.output)
         composed.signal(signal.SIGINT)
         composed.wait()
+
+
+SIZES = pytest.mark.parametrize('size', [(24, 80), (24, 200)], ids=['80', '200'])
+
+
+@pytest.fixture
+def faulty(traffic):
+    """A node whose delegate has failed, beside those of traffic."""
+    node = create(traffic.master, '/faulty')
+    node.interested_in('/wrong', STRING, delegate=lambda *_: 1 / 0)
+    traffic.send_to('/wrong', typed_as=STRING, data='')
+    return until(lambda: node.failures and node, TIMEOUT)
+
+
+@SIZES
+def test_keys_of_top_sort_and_filter(master, faulty, size):
+    with Terminal(master.url, 'rosrun', 'pharos', 'top', '--interval', '0.2', size=size) as top:
+        top.wait_for(r'sorted by NODE[^\n]*\n[^\n]*\nNODE [^\n]*\n/faulty ')
+        top.press('s' * 6, r'sorted by OUT/S[^\n]*\n[^\n]*\nNODE [^\n]*\n/sender ')
+        top.press('s' * 5, r'sorted by FAIL[^\n]*\n[^\n]*\nNODE [^\n]*\n/faulty ')
+        top.press(
+            '/hearq\x7f', r'1 of 3 nodes, [^\n]*filter: hear *\n[^\n]*\nNODE [^\n]*\n/hearer '
+        )
+        top.press('\r', 'filter: hear ')
+        top.press('jx', '/hearer is not a node of a composition')
+        top.press('/nobody', '0 of 3 nodes, [^\n]*filter: nobody [^~]*nothing there')
+        top.press('\x1b', '3 of 3 nodes')
+        top.press('q')
+        assert top.end() == 0
+
+
+@SIZES
+def test_top_colours_failures(master, faulty, size):
+    with Terminal(master.url, 'rosrun', 'pharos', 'top', '--once', size=size) as top:
+        assert top.end() == 0
+        assert row_of('/faulty', top.text)['FAIL'] == '1'
+        assert re.findall(r'\x1b\[1;31m(\d+)', top.raw) == ['1']
+        assert max(map(len, top.text.splitlines())) <= size[1]
+
+
+def test_narrow_top_leaves_columns_out(master, traffic):
+    for size, is_wide in [((24, 80), False), ((24, 200), True)]:
+        with Terminal(master.url, 'rosrun', 'pharos', 'top', '--once', size=size) as top:
+            assert top.end() == 0
+            titles = top.text.split('\n')[0].split()
+        assert ('CLASS' in titles, 'HOST' in titles) == (is_wide, is_wide)
+        assert 'PROBLEM' in titles
+
+
+def test_top_keeps_to_low_screen(master):
+    for number in range(30):
+        create(master, f'/many/node_{number:02}')
+    with Terminal(master.url, 'rosrun', 'pharos', 'top', '--interval', '9', size=(24, 80)) as top:
+        top.wait_for('19 of 30 nodes[^~]*/many/node_18')
+        assert '/many/node_19' not in top.text
+        top.press('/_29', '1 of 30 nodes[^~]*/many/node_29')
 
 
 def test_key_q_ends_top(master, traffic):
@@ -522,6 +620,40 @@ def test_session_has_its_names(session):
         'print(master.is_reachable(), me.is_running, Node.__name__[::-1])', 'True True edoN'
     )
     session.enter('me', r'Out\[\d+\]: <BlockNode /workspace')
+
+
+@pytest.mark.parametrize(
+    'typed, completed',
+    [
+        ("me.send_to('/tabb", 'ed_topic'),
+        ("me.send_to('/tabbed_topic', lin", 'ear='),
+        ("master.node('/tab_", 'node'),
+        ("me.parameter('/tab/par", 'ameter'),
+        ("message_class('geometry_msgs/QuaternionS", 'tamped'),
+        ("service_class('std_srvs/SetB", 'ool'),
+        ('master.wait_for_n', 'ode'),
+    ],
+)
+def test_tab_completes_names(session, session_master, typed, completed):
+    session_master.parameters['/tab/parameter'] = 1
+    with session_master.create(BlockNode, named='/tab_node') as node:
+        node.interested_in('/tabbed_topic', 'geometry_msgs/Twist')
+        session.press(typed)
+        session.wait_for(re.escape(typed[-3:]))
+        session.press('\t', completed)
+        session.press('\x03\x03')  # the first may end no more than the choice between several words
+        session.enter('60 * 7', r'Out\[\d+\]: 420')
+
+
+def test_tab_is_silent_without_master(mortal):
+    with Terminal(mortal.url, 'rosrun', 'pharos', 'workspace') as session:
+        session.wait_for(r'In \[1\]: ')
+        mortal.end()
+        session.press("master.node('/a")
+        session.press('\t')
+        session.press('\x03\x03')
+        session.enter('60 * 7', r'Out\[\d+\]: 420')
+        assert 'Traceback' not in session.text
 
 
 def test_transcript_prints_at_prompt(session, session_master):

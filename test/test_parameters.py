@@ -11,7 +11,7 @@ import rosgraph
 
 from helpers import TIMEOUT, Peer, create
 from pharos import Node, NodeStoppedError
-from pharos.testing import until
+from pharos.testing import Mailbox, until
 
 VALUES = [0, -(2**31), 0.0, 1e300, '', 'Straße 道\n<&>', False, True, [], [1, 'a', [True, 2.5]]]
 VALUES.append({'p': 1, 'limits': {'low': [0.5], 'name': 'ü'}})
@@ -368,6 +368,22 @@ def test_cached_value_follows_changes(node, server):
     assert node.ros.get_param_cached('/size') == 1
     server.setParam('/size', 2)
     until(lambda: node.ros.get_param_cached('/size') == 2)
+
+
+def test_near_parameter_is_named(master, node):
+    log = Mailbox(create(master, '/other'), '/rosout', 'rosgraph_msgs/Log')
+    node.parameter('~gain', 1.0)
+    node.parameter('~gian')
+    line = log.wait_for(lambda line: 'has no parameter' in line.msg)
+    assert '/robot/driver/gian: /robot/driver/gain? see rosparam list' in line.msg
+
+
+def test_far_parameter_is_not_named(master, node):
+    log = Mailbox(create(master, '/other'), '/rosout', 'rosgraph_msgs/Log')
+    node.parameter('~gain', 1.0)
+    node.parameter('/camera')
+    line = log.wait_for(lambda line: 'has no parameter' in line.msg)
+    assert line.msg.endswith('no parameter /camera: see rosparam list')
 
 
 def test_many_threads_set_one_parameter(master):

@@ -158,6 +158,22 @@ def test_unknown_type_error_tells_places(tmp_path, monkeypatch, find, define):
         assert said in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    'find, slip, meant',
+    [
+        (message_class, 'std_msgs/Strin', 'std_msgs/String'),
+        (message_class, 'std_msg/String', 'std_msgs/String'),
+        (message_class, 'turtlesim/Velocty', 'turtlesim/Velocity'),
+        (service_class, 'std_srvs/SetBol', 'std_srvs/SetBool'),
+    ],
+)
+def test_near_type_is_named(find, slip, meant):
+    with pytest.raises(UnknownTypeError) as caught:
+        find(slip)
+    assert f'{slip!r}: {meant}?' in str(caught.value)
+    assert 'install' not in str(caught.value)
+
+
 def test_bad_type_name_raises_its_error():
     for name in [
         '',

@@ -1,9 +1,11 @@
 """Message and service types: find their classes, or make them of definitions."""
 from __future__ import annotations
 
+import difflib
 import functools
 import pathlib
 import re
+import sys
 from contextlib import suppress
 from typing import Any, Callable
 
@@ -155,6 +157,11 @@ def _find_definition(suffix, type_name, ask=None):
     for definitions in _given_definitions, _shipped_definitions:
         if key in definitions:
             return definitions[key]
+    near_types = difflib.get_close_matches(type_name, known_types(suffix), cutoff=0.9)
+    if near_types:
+        raise UnknownTypeError(
+            f'unknown type {type_name!r}: {"? ".join(near_types)}? If not, source its workspace'
+        )
     function_name = 'define_message' if suffix == 'msg' else 'define_service'
     raise UnknownTypeError(
         f'unknown type {type_name!r}: Python has no {package}.{suffix}.{name}, there is no'
@@ -163,6 +170,18 @@ def _find_definition(suffix, type_name, ask=None):
         f' Debian python3-{package.replace("_", "-")}), source its workspace, or call'
         f' {function_name}(type, text)'
     )
+
+
+def known_types(suffix: str) -> set[str]:
+    """Return the types that Python has packages of, and turtlesim's.
+
+    :param suffix: msg or srv
+    """
+    types = {name for kind, name in _shipped_definitions if kind == suffix}
+    for folder in sys.path:
+        for file in pathlib.Path(folder).glob(f'*/{suffix}/_[!_]*.py'):
+            types.add(f'{file.parts[-3]}/{file.stem[1:]}')
+    return types
 
 
 # -- making

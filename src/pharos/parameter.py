@@ -1,5 +1,6 @@
 """Parameters of the parameter server, bound both ways."""
 import collections
+import difflib
 import functools
 import threading
 from copy import deepcopy
@@ -24,7 +25,9 @@ class Parameter(Endpoint):
         self._blocks_lock = threading.Lock()  # held by the thread that runs the blocks
         self.open()
         if self._value is None:
-            node.log(f'the server has no parameter {name}: see rosparam list', 'warning')
+            near_names = difflib.get_close_matches(name, self._run.master.parameters, cutoff=0.8)
+            advice = '? '.join([*near_names, 'see rosparam list'])
+            node.log(f'the server has no parameter {name}: {advice}', 'warning')
 
     def restore(self):
         """Set the node's value if the server has none."""

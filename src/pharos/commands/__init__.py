@@ -5,6 +5,7 @@ import argparse
 import importlib
 import inspect
 import os
+import re
 import sys
 from typing import Callable
 
@@ -15,9 +16,11 @@ import pharos
 
 def argument_parser(command: Callable[[list[str]], int | None]) -> argparse.ArgumentParser:
     """Return a parser of arguments; the docstring of the command is its help."""
-    return argparse.ArgumentParser(
+    parser = argparse.ArgumentParser(
         description=inspect.getdoc(command), formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument('--version', action='version', version=f'pharos {pharos.__version__}')
+    return parser
 
 
 def run_command(name: str, module_name: str = '') -> int:
@@ -34,7 +37,7 @@ def run_command(name: str, module_name: str = '') -> int:
         return status or 0
     except BrokenPipeError:  # by `| head`; the exit of Python flushes once more
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except (pharos.PharosError, ValueError, OSError) as error:
+    except (pharos.PharosError, ValueError, OSError, re.error) as error:
         print(f'{name}: {error}', file=sys.stderr)
         return 1
     except ModuleNotFoundError as error:

@@ -7,7 +7,7 @@ import pathlib
 import re
 import subprocess
 import time
-from typing import TYPE_CHECKING, Iterator, NamedTuple
+from typing import TYPE_CHECKING, Any, Iterator, NamedTuple
 from xml.sax.saxutils import escape
 
 from pharos.errors import PharosError, UnknownNodeError
@@ -64,15 +64,20 @@ class Edge(NamedTuple):
 class Graph:
     """The graph of a master; :meth:`Master.graph` makes one.
 
+    :param only: a regular expression; nodes and topics without it in their names are left out
+    :param hide: a regular expression; nodes and topics with it in their names are left out
     :ivar nodes: ``{name: NodeReport}``
     :ivar topics: ``{name: type}``, '*' if the master knows no type
     :ivar edges: the arrows, each an :class:`Edge`
     :ivar rates: ``{topic: messages a second}``, empty if they were not measured
     """
 
-    def __init__(self, snapshot: Snapshot, rates: dict[str, float]):
+    def __init__(
+        self, snapshot: Snapshot, rates: dict[str, float], only: str = '', hide: str = '^$'
+    ):
         def is_visible(name):
-            return not COMMON_NAMES.fullmatch(name)
+            is_hidden = COMMON_NAMES.fullmatch(name) or re.search(hide, name)
+            return re.search(only, name) and not is_hidden
 
         self.snapshot = snapshot
         self.rates = rates
@@ -131,6 +136,14 @@ class Graph:
                 arrow = '<-' if edge.is_incoming else '->'
                 peer_text = ', '.join(edge.peers()) or 'not connected'
                 yield f'    {arrow} {edge.topic}  {self._topic_label(edge.topic)}  {peer_text}'
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the graph as plain values, for JSON."""
+        nodes = {
+            name: {**vars(node), 'links': len(node.links)} for name, node in self.nodes.items()
+        }
+        edges = [{**edge._asdict(), 'transports': edge.transports} for edge in self.edges]
+        return {'nodes': nodes, 'topics': self.topics, 'edges': edges, 'rates': self.rates}
 
     # -- as a picture
 
@@ -206,21 +219,22 @@ def _dot_box(prefix, name, caption, style):
     return f'{_dot_id(prefix, name)} [{style}, label=<{label}>]'
 
 
-def graph_of(master: Master, seconds: float = 0) -> Graph:
+def graph_of(master: Master, seconds: float = 0, **names: str) -> Graph:
     """Return the graph of :meth:`Master.graph`.
 
     :param seconds: how long messages are counted, for rates; 0: no rates
+    :param names: ``only`` and ``hide`` of :class:`Graph`
     :raises MasterUnreachableError: if the master does not answer
     """
     start = take_snapshot(master)
     if not seconds:
-        return Graph(start, {})
+        return Graph(start, {}, **names)
     time.sleep(seconds)
     snapshot = take_snapshot(master)
     topic_rates: dict[str, float] = collections.defaultdict(float)
     for (topic, _), rate in publisher_rates(snapshot.rates_since(start)).items():
         topic_rates[topic] += rate
-    return Graph(snapshot, topic_rates)
+    return Graph(snapshot, topic_rates, **names)
 
 
 def describe(master: Master, node_name: str, seconds: float) -> str:

@@ -6,7 +6,9 @@ from __future__ import annotations
 
 import atexit
 import os
+import re
 import sys
+from contextlib import suppress
 from typing import Any
 
 import rosgraph.names
@@ -14,6 +16,8 @@ from genpy import Message
 
 import pharos
 from pharos import signals
+from pharos.definitions import known_types
+from pharos.errors import PharosError
 from pharos.live.text_format import message_text
 from pharos.master import Master
 from pharos.node import BlockNode
@@ -22,6 +26,10 @@ BANNER = """PhaROS {pharos.__version__}: {count} nodes are at the ROS master {ma
 master is that master, me the node {me.name} of this session; all of pharos is imported.
 Tab completes, x? explains x, Ctrl-C ends a line, Ctrl-D the session and its nodes.
 """
+#: matches a line that ends inside a string
+STRING_PATTERN = re.compile(r'.*[\'"][\w/]*')
+#: matches a line that ends in send_to('TOPIC', ... FIELD
+FIELD_PATTERN = re.compile(r'.*send_to\(\s*[\'"]([\w/]+)[\'"].*,\s*\w*')
 
 
 def namespace() -> dict[str, Any]:
@@ -44,6 +52,23 @@ def namespace() -> dict[str, Any]:
     return names
 
 
+def _completions(shell, event):
+    """Return words for a line of IPython: names and types for a string, fields for send_to()."""
+    master = Master()
+    line = event.text_until_cursor
+    call = FIELD_PATTERN.fullmatch(line)
+    with suppress(PharosError):  # the master has gone, or the topic has no known type
+        if call:
+            message_class = pharos.message_class(master.topic(call[1]).type or '')
+            return [f'{field}=' for field in message_class.__slots__]
+        if STRING_PATTERN.fullmatch(line):
+            names = {*master.parameters, *known_types('msg'), *known_types('srv')}
+            for registrations in master.system_state():
+                names.update(registrations, *registrations.values())
+            return sorted(names)
+    return []
+
+
 def load_ipython_extension(shell: Any) -> None:
     """Make a session of IPython a workspace; ``%load_ext`` calls this.
 
@@ -63,6 +88,7 @@ def load_ipython_extension(shell: Any) -> None:
         printer.text(message_text(message))
 
     shell._atexit_once = stop_nodes
+    shell.set_hook('complete_command', _completions, re_key='.*')
     formatters = shell.display_formatter.formatters
     formatters['text/plain'].for_type(Message, print_message)
     print(BANNER.format(pharos=pharos, count=len(master.nodes()), **names))
