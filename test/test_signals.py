@@ -138,6 +138,29 @@ pharos.spin()
     assert running.wait() == 0
 
 
+def test_main_loop_ends_at_its_sleep(program):
+    """While the stop waits for a soul, a loop in the main thread does not spin."""
+    running = program(
+        """
+me = create(soul=lambda me: threading.Event().wait(1))
+me.fork()
+turns = 0
+ready_when_asleep()
+try:
+    while True:
+        me.send_to('/speed', typed_as='std_msgs/Float32', data=1.0)
+        turns += not me.is_running
+        me.sleep(0.1)
+except pharos.NodeStoppedError:
+    print('turns in the stop:', turns)
+"""
+    )
+    running.signal(signal.SIGINT)
+    assert running.wait() == 0
+    turns = int(running.output.rpartition('turns in the stop: ')[2])
+    assert turns <= 2
+
+
 HANDLER = 'signal.signal(signal.SIGINT, lambda *_: asked.set())'
 
 
