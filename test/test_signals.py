@@ -1,4 +1,5 @@
 """How nodes and their programs end: by a signal, by themselves, killed, forked or spawned."""
+import re
 import signal
 import threading
 
@@ -261,6 +262,31 @@ def test_program_without_stop_unregisters(program, end):
     assert running.wait() == EXITS[end]
     assert ('Traceback' in running.output) == (end == '1 / 0')
     assert counts(running)[1] == 1
+
+
+ENDS = {
+    'spin': "ready_when_asleep()\npharos.spin()",
+    'wait': "ready_when_asleep()\nthreading.Event().wait()",
+    'end of the program': "ready()",
+}
+
+
+@pytest.mark.parametrize('end', ENDS)
+def test_nodes_stop_side_by_side(program, end):
+    """Each of them waits for its soul."""
+    running = program(
+        f"""
+for number in range(8):
+    me = create(f'/program{{number}}', Careful, soul=lambda me: threading.Event().wait())
+    me.stop_timeout = 0.5
+    me.fork()
+{ENDS[end]}
+"""
+    )
+    if end != 'end of the program':
+        running.signal(signal.SIGINT)
+    running.wait()
+    assert re.findall('begun|ended', running.output) == ['begun'] * 8 + ['ended'] * 8
 
 
 FORK = """
