@@ -569,8 +569,16 @@ def call(tell):
 '''
 
 
-@pytest.mark.parametrize('sleep', ['rospy.sleep(3600)', 'time.sleep(3600)'])
-@pytest.mark.parametrize('client', ['same process', 'other process'])
+@pytest.mark.parametrize(
+    'client, sleep',
+    [
+        ('same process', 'rospy.sleep(3600)'),
+        ('same process', 'time.sleep(3600)'),
+        ('same process', 'threading.Event().wait(1)'),
+        ('other process', 'rospy.sleep(3600)'),
+        ('other process', 'time.sleep(3600)'),
+    ],
+)
 def test_stop_in_a_call_is_no_success(master, bench, peer, client, sleep):
     script = bench.load(SLOW_SERVER.format(sleep=sleep))
     if client == 'same process':

@@ -6,9 +6,11 @@ import errno
 import functools
 import itertools
 import os
+import re
 import signal
 import socket
 import struct
+import sys
 import threading
 import time
 import xmlrpc.client
@@ -24,7 +26,7 @@ import std_srvs.srv
 from rosgraph.network import encode_ros_handshake_header
 
 import pharos
-from helpers import PYTHON, TIMEOUT, Peer, PharosPeer, Program, create, registrations
+from helpers import PYTHON, ROOT, TIMEOUT, Peer, PharosPeer, Program, create, registrations
 from pharos import BlockNode, Master
 from pharos.testing import Mailbox, until
 from programs.raw_tcpros import (
@@ -754,6 +756,17 @@ def publish_until_alarm():
         until(lambda: peer.value('heard["/t"] and heard["/t"][-1].data') == 'whole')
     heard = peer.value('{message.data for message in heard["/t"]}')
     assert set(heard) == {'whole', 'x' * 100_000}
+
+
+@pytest.mark.skipif(sys.version_info[:2] != (3, 11), reason='it knows the bytecode of 3.11')
+@pytest.mark.parametrize('scenario', ['send', 'inline', 'first'])
+def test_handler_that_raises_leaves_no_queue_asleep(master, monkeypatch, scenario):
+    """At any point of a send(), which may be the first one; the next message arrives."""
+    monkeypatch.delenv('COVERAGE_PROCESS_START', False)  # its trace function would be lost
+    path = str(ROOT / 'test' / 'programs' / 'points.py')
+    with Program([PYTHON, '-u', path, scenario], master.url) as program:
+        assert program.wait() == 0, program.output
+    assert int(re.search(r'(\d+) points', program.output)[1]) > 20
 
 
 # -- lines that cannot be printed, and looks that fail
