@@ -1,4 +1,5 @@
 """Nodes: their names, addresses and arguments, souls and time, starts, stops and changes."""
+import concurrent.futures
 import contextlib
 import socket
 import threading
@@ -273,6 +274,33 @@ def test_impossible_period_is_refused(node):
     for seconds in [0, -1, 'often', float('nan')]:
         with pytest.raises((ValueError, TypeError)):
             node.every(seconds)
+
+
+@pytest.mark.parametrize('is_main', [True, False], ids=['main thread', 'other thread'])
+def test_sleep_raises_after_stop_begins(node, is_main):
+    stopping, may_end = threading.Event(), threading.Event()
+
+    def linger(me):
+        try:
+            me.sleep(3600)
+        finally:
+            stopping.set()
+            may_end.wait(TIMEOUT)
+
+    def sleep():
+        with pytest.raises(NodeStoppedError):
+            node.sleep(0.01)
+
+    node.stop_timeout = TIMEOUT
+    node.fork(linger)
+    with concurrent.futures.ThreadPoolExecutor() as pool:
+        stop = pool.submit(node.stop)
+        assert stopping.wait(TIMEOUT)
+        try:
+            sleep() if is_main else pool.submit(sleep).result(TIMEOUT)
+        finally:
+            may_end.set()
+        stop.result(TIMEOUT)
 
 
 def test_every_and_sleep_follow_ros_time(master):

@@ -1,9 +1,12 @@
 """Programs in one process get devices, children, environments and hooks as in their own."""
+import itertools
 import os
 import pty
 import signal
 import socket
+import subprocess
 import sys
+import threading
 import time
 import tty
 
@@ -11,9 +14,12 @@ import psutil
 import pytest
 
 import pharos
-from helpers import COMPOSE, INIT, SPIN, TIMEOUT, Program, create, end
-from pharos.compose.control import control
+from helpers import COMPOSE, DEFAULT_SIGNALS, INIT, SPIN, TIMEOUT, Program, create, end
+from pharos.compose.composition import Composition
+from pharos.compose.control import control, reload_on_save
+from pharos.compose.script import ScriptNode
 from pharos.compose.sources import why_apart, why_own_group
+from pharos.live.editing import editable_modules
 from pharos.testing import Mailbox, until
 
 STRING = 'std_msgs/String'
@@ -627,3 +633,139 @@ def test_driver_of_pharos_respawns_and_opens_its_device_again(bench, port):
     launch = bench.launch_file('<node pkg="bench" type="program" name="program" respawn="true"/>')
     with bench.program(launch):
         until(lambda: bench.said().count('opened') >= 3)
+
+
+# -- looks that fail, and lines that cannot be printed
+
+RESPAWNS = '<node pkg="bench" type="program" name="{}" respawn="true"/>'
+LOOKS = {
+    'look': (Composition, '_look'),
+    'ended': (Composition, '_look_at_ended'),
+    'respawn': (Composition, '_respawn'),
+    'over': (Composition, 'is_over'),
+    'start': (ScriptNode, '_start_held'),
+    'line': (type(pharos.Transcript), 'show'),
+}
+
+
+def fail_each_second_time(monkeypatch, owner, name):
+    """Have a method or property raise an exception; the first time, too."""
+    original, count = getattr(owner, name), itertools.count()
+    is_property = isinstance(original, property)
+
+    def fail(*args, **kwargs):
+        if next(count) % 2 == 0:
+            raise RuntimeError('this look fails')
+        return (original.fget if is_property else original)(*args, **kwargs)
+
+    monkeypatch.setattr(owner, name, property(fail) if is_property else fail)
+
+
+@pytest.mark.parametrize('what', LOOKS)
+def test_failed_look_ends_no_respawn(master, bench, monkeypatch, what):
+    bench.write(INIT + "say('here')\n")
+    with master.compose(None, bench.launch_file(RESPAWNS.format('program'))):
+        with monkeypatch.context() as moment:
+            fail_each_second_time(moment, *LOOKS[what])
+            count = len(bench.said())
+            until(lambda: len(bench.said()) > count + 3)
+
+
+def test_failed_look_costs_no_other_program(master, bench, monkeypatch):
+    bench.write("rospy.init_node('program')\nsay(rospy.get_name())\n")
+    xml = RESPAWNS.format('first') + RESPAWNS.format('second')
+    look = Composition._look_at_ended
+
+    def fail_for_first(composition, node):
+        if node.name == '/first':
+            raise RuntimeError('this look fails')
+        look(composition, node)
+
+    monkeypatch.setattr(Composition, '_look_at_ended', fail_for_first)
+    with master.compose(None, bench.launch_file(xml)):
+        until(lambda: bench.said().count('/second') > 3)
+
+
+@pytest.mark.parametrize('output', ['reader gone', 'full disk'])
+def test_respawn_goes_on_without_output(master, bench, output):
+    """As with `| tee` that is killed, or a lost ssh."""
+    bench.write(INIT + "say('here')\n")
+    path = bench.launch_file(RESPAWNS.format('program'))
+    with open('/dev/full', 'w') as full:
+        stdout = full if output == 'full disk' else subprocess.PIPE
+        composed = subprocess.Popen(
+            [*DEFAULT_SIGNALS, *COMPOSE, path], stdout=stdout, stderr=subprocess.STDOUT
+        )
+    try:
+        if composed.stdout:
+            until(bench.said)
+            composed.stdout.close()
+        count = len(bench.said())
+        until(lambda: len(bench.said()) > count + 4)
+        composed.send_signal(signal.SIGINT)
+        assert composed.wait(TIMEOUT) == 0
+    finally:
+        composed.kill()
+        composed.wait()
+
+
+EDITED = '''
+def word(): return '{}'
+rospy.init_node('program')
+last = ''
+while not rospy.is_shutdown():
+    if word() != last:
+        last = word()
+        say(last)
+    time.sleep(0.01)
+'''
+
+
+@pytest.mark.parametrize('what', ['editable_modules', '_answer', 'Transcript'])
+def test_failed_look_at_files_is_made_again(master, bench, monkeypatch, what):
+    failed, may_fail = threading.Event(), threading.Event()
+
+    def failing_once(function):
+        def call(*args, **kwargs):
+            if may_fail.is_set() and not failed.is_set():
+                failed.set()
+                raise RuntimeError('this look fails')
+            return function(*args, **kwargs)
+
+        return call
+
+    module = 'pharos.compose.control'
+    if what == 'editable_modules':
+        monkeypatch.setattr(f'{module}.editable_modules', failing_once(editable_modules))
+    elif what == '_answer':
+        monkeypatch.setattr(f'{module}._answer', failing_once(pharos.compose.control._answer))
+    else:
+        monkeypatch.setattr(type(pharos.Transcript), 'show', failing_once(lambda *things: None))
+    with master.compose(None, bench.launch_file(program=EDITED.format('first'))) as composition:
+        thread = threading.Thread(target=reload_on_save, args=[composition])
+        thread.start()
+        until(lambda: bench.said() == ['first'])
+        # a save that comes before the first look is none
+        until(lambda: bench.write(EDITED.format('second')) and len(bench.said()) > 1)
+        may_fail.set()
+        bench.write(EDITED.format('the third'))
+        assert failed.wait(TIMEOUT)
+        bench.write(EDITED.format('the fourth'))
+        until(lambda: bench.said()[-1] == 'the fourth')
+    thread.join(TIMEOUT)
+
+
+def test_failed_accept_ends_no_control(master, bench, monkeypatch):
+    accept, failed = socket.socket.accept, threading.Event()
+
+    def fail_once(sock):
+        if sock.family == socket.AF_UNIX and not failed.is_set():
+            failed.set()
+            raise ValueError('odd')
+        return accept(sock)
+
+    with master.compose(None, bench.launch_file(program=SPIN)):
+        monkeypatch.setattr(socket.socket, 'accept', fail_once)
+        control('restart', '/program', master)
+        assert failed.wait(TIMEOUT)
+        assert control('restart', '/program', master) == '/program'

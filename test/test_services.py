@@ -543,3 +543,52 @@ def test_roscpp_program_calls_node(master, node, topic, code):
     with master.run('topic_tools', 'switch_mux', '/ours', topic) as client:
         assert client.wait(TIMEOUT) == code
     assert len(node.errors) == code
+
+
+# -- a stop in a call
+
+SLOW_SERVER = '''
+from std_srvs.srv import Trigger
+def serve(request):
+    say('called')
+    {sleep}
+    return True, 'done'
+rospy.init_node('program')
+rospy.Service('/slow', Trigger, serve)
+rospy.spin()
+'''
+CALLER = '''
+import threading
+from std_srvs.srv import Trigger
+def call(tell):
+    rospy.wait_for_service('/slow')
+    try:
+        tell(rospy.ServiceProxy('/slow', Trigger)().message)
+    except rospy.ServiceException:
+        tell('failed')
+'''
+
+
+@pytest.mark.parametrize(
+    'client, sleep',
+    [
+        ('same process', 'rospy.sleep(3600)'),
+        ('same process', 'time.sleep(3600)'),
+        ('same process', 'threading.Event().wait(1)'),
+        ('other process', 'rospy.sleep(3600)'),
+        ('other process', 'time.sleep(3600)'),
+    ],
+)
+def test_stop_in_a_call_is_no_success(master, bench, peer, client, sleep):
+    script = bench.load(SLOW_SERVER.format(sleep=sleep))
+    if client == 'same process':
+        begin = "rospy.init_node('client')\ncall(say)\n"
+        master.load(bench.write(f'{CALLER}{begin}', 'client'))
+    else:
+        peer.run(f'{CALLER}told = []\ndef say(text): told.append(text)\n')
+        peer.run('threading.Thread(target=call, args=[say], daemon=True).start()')
+    until(lambda: bench.said() == ['called'])
+    script.stop()
+    told = bench.said if client == 'same process' else lambda: ['called', *peer.value('told')]
+    until(lambda: len(told()) > 1)
+    assert told() == ['called', 'failed']

@@ -15,6 +15,7 @@ import pytest
 import pharos
 from helpers import TIMEOUT, InProcessMaster, Peer, PharosPeer, Program, create, stop_nodes
 from pharos import Master
+from pharos.shared_memory.receiving import MemoryReceiver, Reader
 from pharos.testing import Mailbox, until
 
 STRING = 'std_msgs/String'
@@ -466,3 +467,36 @@ def test_file_of_one_large_message_is_given_back(node, listener, topic):
     paths = [f'/proc/self/fd/{number}' for number in os.listdir('/proc/self/fd')]
     files = [path for path in paths if os.path.realpath(path).startswith('/memfd:pharos')]
     assert files and all(os.stat(path).st_size < LARGE for path in files)
+
+
+BROKEN = {
+    'round': [(Reader, '_take_messages')],
+    'attempt': [(Reader, 'attempt')],
+    'end': [(MemoryReceiver, 'read'), (MemoryReceiver, 'end')],
+}
+
+
+@pytest.mark.parametrize('what', BROKEN)
+def test_reader_outlives_an_exception(master, monkeypatch, what):
+    """One that is thrown into a call of its loop."""
+    heard = Mailbox(create(master, '/ear'), '/words', STRING)
+    failed = set()
+
+    def failing_once(function):
+        def call(*arguments):
+            if function not in failed:
+                failed.add(function)
+                raise RuntimeError('this look fails')
+            return function(*arguments)
+
+        return call
+
+    with PharosPeer(master.url, 'mouth') as mouth:
+        mouth.run(f"out = node.output_channel('/words', '{STRING}')")
+        until(lambda: mouth.value('out.connections'))
+        for owner, name in BROKEN[what]:
+            monkeypatch.setattr(owner, name, failing_once(getattr(owner, name)))
+        mouth.run("out.send(data='first')")
+        until(lambda: len(failed) == len(BROKEN[what]))
+        until(lambda: mouth.run("out.send(data='later')") or len(heard.all()) > 1)
+        assert heard.all()[-1].data == 'later'

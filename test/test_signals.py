@@ -1,4 +1,5 @@
 """How nodes and their programs end: by a signal, by themselves, killed, forked or spawned."""
+import re
 import signal
 import threading
 
@@ -138,6 +139,29 @@ pharos.spin()
     assert running.wait() == 0
 
 
+def test_main_loop_ends_at_its_sleep(program):
+    """While the stop waits for a soul, a loop in the main thread does not spin."""
+    running = program(
+        """
+me = create(soul=lambda me: threading.Event().wait(1))
+me.fork()
+turns = 0
+ready_when_asleep()
+try:
+    while True:
+        me.send_to('/speed', typed_as='std_msgs/Float32', data=1.0)
+        turns += not me.is_running
+        me.sleep(0.1)
+except pharos.NodeStoppedError:
+    print('turns in the stop:', turns)
+"""
+    )
+    running.signal(signal.SIGINT)
+    assert running.wait() == 0
+    turns = int(running.output.rpartition('turns in the stop: ')[2])
+    assert turns <= 2
+
+
 HANDLER = 'signal.signal(signal.SIGINT, lambda *_: asked.set())'
 
 
@@ -238,6 +262,31 @@ def test_program_without_stop_unregisters(program, end):
     assert running.wait() == EXITS[end]
     assert ('Traceback' in running.output) == (end == '1 / 0')
     assert counts(running)[1] == 1
+
+
+ENDS = {
+    'spin': "ready_when_asleep()\npharos.spin()",
+    'wait': "ready_when_asleep()\nthreading.Event().wait()",
+    'end of the program': "ready()",
+}
+
+
+@pytest.mark.parametrize('end', ENDS)
+def test_nodes_stop_side_by_side(program, end):
+    """Each of them waits for its soul."""
+    running = program(
+        f"""
+for number in range(8):
+    me = create(f'/program{{number}}', Careful, soul=lambda me: threading.Event().wait())
+    me.stop_timeout = 0.5
+    me.fork()
+{ENDS[end]}
+"""
+    )
+    if end != 'end of the program':
+        running.signal(signal.SIGINT)
+    running.wait()
+    assert re.findall('begun|ended', running.output) == ['begun'] * 8 + ['ended'] * 8
 
 
 FORK = """

@@ -1,14 +1,20 @@
 """Causes that end or silence a rospy node do not end or silence these nodes: doc/limits.md."""
+import collections
 import concurrent.futures
 import contextlib
+import errno
+import functools
 import itertools
 import os
+import re
 import signal
 import socket
 import struct
+import sys
 import threading
 import time
 import xmlrpc.client
+import xmlrpc.server
 
 import geometry_msgs.msg
 import psutil
@@ -20,7 +26,7 @@ import std_srvs.srv
 from rosgraph.network import encode_ros_handshake_header
 
 import pharos
-from helpers import TIMEOUT, Peer, PharosPeer, create, registrations
+from helpers import PYTHON, ROOT, TIMEOUT, Peer, PharosPeer, Program, create, registrations
 from pharos import BlockNode, Master
 from pharos.testing import Mailbox, until
 from programs.raw_tcpros import (
@@ -750,6 +756,186 @@ def publish_until_alarm():
         until(lambda: peer.value('heard["/t"] and heard["/t"][-1].data') == 'whole')
     heard = peer.value('{message.data for message in heard["/t"]}')
     assert set(heard) == {'whole', 'x' * 100_000}
+
+
+@pytest.mark.skipif(sys.version_info[:2] != (3, 11), reason='it knows the bytecode of 3.11')
+@pytest.mark.parametrize('scenario', ['send', 'inline', 'first'])
+def test_handler_that_raises_leaves_no_queue_asleep(master, monkeypatch, scenario):
+    """At any point of a send(), which may be the first one; the next message arrives."""
+    monkeypatch.delenv('COVERAGE_PROCESS_START', False)  # its trace function would be lost
+    path = str(ROOT / 'test' / 'programs' / 'points.py')
+    with Program([PYTHON, '-u', path, scenario], master.url) as program:
+        assert program.wait() == 0, program.output
+    assert int(re.search(r'(\d+) points', program.output)[1]) > 20
+
+
+# -- lines that cannot be printed, and looks that fail
+
+
+def without_output(code, where='1>/dev/full 2>/dev/full'):
+    """Return the command of a program whose lines cannot be printed."""
+    return ['sh', '-c', f'exec "$0" -u -c "$1" {where}', PYTHON, code]
+
+
+def port_of(mortal):
+    """Return the port of a MortalMaster."""
+    return int(mortal.url.rstrip('/').rpartition(':')[2])
+
+
+BEGIN = "import pharos; me = pharos.Master().create(pharos.BlockNode, '/me')\n"
+PRINTS = {
+    'log': "me.log('x'); me.log('x', level='error')",
+    'rospy': "me.ros.loginfo('x'); me.ros.logwarn('x')",
+    'Transcript': "pharos.Transcript.show('x')",
+    'soul left behind': 'import time; me.stop_timeout = 0.1; me.fork(lambda: time.sleep(1))',
+}
+
+
+@pytest.mark.parametrize('name', PRINTS)
+def test_full_disk_ends_no_program(master, name):
+    with Program(without_output(f'{BEGIN}{PRINTS[name]}\nme.stop()'), master.url) as program:
+        assert program.wait() == 0
+
+
+def test_stop_unregisters_on_a_full_disk(master):
+    text = f"{BEGIN}{PRINTS['soul left behind']}\nme.stop()\nprint(me.lifecycle.value)"
+    with Program(without_output(text, '2>/dev/full'), master.url) as program:
+        program.wait()
+        assert 'stopped' in program.output
+    assert not any(master.system_state())
+
+
+def test_watcher_outlives_a_full_disk(mortal):
+    """A line about the master that has gone cannot be printed; a new master gets all again."""
+    text = BEGIN + "me.interested_in('/t', 'std_msgs/String')\npharos.spin()"
+    with Program(without_output(text), mortal.url) as program:
+        until(lambda: '/t' in registrations(mortal.master, '/me')[1])
+        before = registrations(mortal.master, '/me')
+        mortal.end()
+        with socket.create_server(('127.0.0.1', port_of(mortal))) as silent:
+            silent.settimeout(TIMEOUT)
+            silent.accept()[0].close()  # the watcher asks, and will tell that nobody answers
+        mortal.come_back()
+        until(lambda: registrations(mortal.master, '/me') == before)
+        program.signal(signal.SIGINT)
+        program.wait()
+
+
+LOOKED_AT = {
+    'connections': ('topic_manager.check_all', lambda run: None),
+    'log': ('ros.logwarn_throttle_identical', lambda run: run.troubles.add('a trouble')),
+    'hold': ('callback_queue.release', lambda run: setattr(run, 'hold_deadline', 0)),
+    'retries': ('retries.items', lambda run: setattr(run, 'retries', collections.UserDict())),
+    'silent clients': ('close_silent_clients', lambda run: None),
+    'topics': ('topic_manager.get_publications', lambda run: None),
+    'services': ('service_manager.get_services', lambda run: None),
+}
+
+
+def break_look(monkeypatch, run, what):
+    """Have a call of the watcher's look at a run raise; return the list of those calls."""
+    path, prepare = LOOKED_AT[what]
+    prepare(run)
+    owner, _, name = path.rpartition('.')
+    calls = []
+
+    def fail(*arguments):
+        calls.append(arguments)
+        raise RuntimeError('this look fails')
+
+    monkeypatch.setattr(functools.reduce(getattr, filter(None, owner.split('.')), run), name, fail)
+    return calls
+
+
+@pytest.fixture
+def quick_watcher(monkeypatch):
+    """The watcher looks more often."""
+    monkeypatch.setattr('pharos.private_rospy.connections.WATCH_PERIOD', 0.05)
+
+
+@pytest.mark.parametrize('what', LOOKED_AT)
+def test_failed_look_costs_no_other_node(master, monkeypatch, quick_watcher, what):
+    """The watcher looks at the others, and looks again."""
+    victim, other = create(master, '/victim'), create(master, '/other')
+    other.output_channel('/topic', STRING)
+    calls = break_look(monkeypatch, victim._current_run, what)
+    until(lambda: calls)
+    rosgraph.Master('/other', master.url).unregisterPublisher('/topic', other.uri)
+    until(lambda: master.topic('/topic').publishers == ['/other'])
+    count = len(calls)
+    if what != 'log':
+        until(lambda: len(calls) > count)
+    monkeypatch.undo()
+    rosgraph.Master('/victim', master.url).unregisterPublisher('/rosout', victim.uri)
+    until(lambda: '/victim' in master.topic('/rosout').publishers)
+
+
+def test_failed_look_is_told_once(master, monkeypatch, quick_watcher, capfd):
+    calls = break_look(monkeypatch, create(master)._current_run, 'silent clients')
+    output = []
+
+    def lines():
+        output.extend(capfd.readouterr())
+        return [line for line in ''.join(output).splitlines() if 'this look fails' in line]
+
+    until(lines)
+    count = len(calls)
+    until(lambda: len(calls) > count + 10)
+    assert len(lines()) == 1
+
+
+@pytest.mark.parametrize(
+    'which, error',
+    [
+        ('tcp_port', OSError(errno.EMFILE, 'no descriptor is left')),
+        ('tcp_port', ValueError('odd')),
+        ('xmlrpc_port', ValueError('odd')),
+    ],
+    ids=str,
+)
+def test_failed_accept_ends_no_server(host, monkeypatch, which, error):
+    accept, failed = socket.socket.accept, threading.Event()
+
+    def fail_once(sock):
+        if sock.getsockname()[1] == getattr(host, which) and not failed.is_set():
+            failed.set()
+            raise error
+        return accept(sock)
+
+    monkeypatch.setattr(socket.socket, 'accept', fail_once)
+    while not failed.is_set():  # the server may wait in accept() already
+        with connect(getattr(host, which)):
+            failed.wait(0.1)
+    assert_served(host)
+
+
+NO_STATES = [5, 'nonsense', [], [1, ''], [1, '', None], [1, '', [[]]], [1, '', [1, 2, 3]], {}]
+
+
+def test_answer_without_sense_ends_no_look(mortal, quick_watcher):
+    """A program that is no master answers at its URL for a while."""
+    node = create(mortal.master)
+    node.interested_in('/t', STRING)
+    before = registrations(mortal.master, '/node')
+    mortal.end()
+    address = '127.0.0.1', port_of(mortal)
+    asked = []
+
+    def answer(method, arguments):
+        asked.append(method)
+        return NO_STATES[len(asked) % len(NO_STATES)]
+
+    with xmlrpc.server.SimpleXMLRPCServer(address, logRequests=False, allow_none=True) as server:
+        server._dispatch = answer
+        thread = threading.Thread(target=server.serve_forever, args=(0.02,))
+        thread.start()
+        try:
+            until(lambda: asked.count('getSystemState') > len(NO_STATES))
+        finally:
+            server.shutdown()
+            thread.join()
+    mortal.come_back()
+    until(lambda: registrations(mortal.master, '/node') == before)
 
 
 # -- for a while

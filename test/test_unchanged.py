@@ -9,9 +9,11 @@ import threading
 import time
 
 import pytest
+import rosnode
 
 import pharos
 from helpers import COMPOSE, HEAD, INIT, PYTHON, ROOT, SPIN, TIMEOUT, Program, create, end
+from pharos.compose.control import control
 from pharos.testing import Mailbox, until
 
 STRING = 'std_msgs/String'
@@ -30,6 +32,25 @@ DRIVES = {
     'interrupt': dict(hook='', wait='while not time.sleep(0.01): go(0.2)', disable=True),
     'busy': dict(hook='', wait=WORK, disable=False),
 }
+#: what a loop waits in, without a look at Python's signals
+LOOP_WAITS = {
+    'camera': 'select.select([silent], [], [], 0.002)',
+    'computes': 'sum(number for number in range(50_000))',
+    'serial port': 'os.read(device, 1)',
+}
+CALL = "rospy.ServiceProxy('/brake', Empty)()"
+HOOKS = [
+    ('camera', 'pass', 'Ctrl-C'),
+    ('camera', 'time.sleep(4)', 'Ctrl-C'),
+    ('serial port', 'time.sleep(0.5)', 'rosnode kill'),
+    ('computes', 'rospy.sleep(0.5)', 'restart'),
+    ('serial port', f'{CALL}; time.sleep(0.5)', 'required'),
+    ('computes', f'time.sleep(0.5); {CALL}', 'rosnode kill'),
+]
+OTHER = '''
+rospy.init_node('other')
+while not (rospy.is_shutdown() or rospy.has_param('/go')): rospy.sleep(0.01)
+'''
 STOPS = {
     'timed': (['hook True', 'main True', 'atexit True'], 0),
     'serve': (['interrupted'], 0),
@@ -111,6 +132,40 @@ def test_robot_stands_at_end(master, peer, bench, drive, way):
     assert peer.heard('/cmd_vel')[-1].linear.x == 0.0
     assert bench.said()[-1] == 'main'
     assert drive == 'busy' or bench.said()[0] == 'True'  # in the main thread
+
+
+@pytest.mark.parametrize('wait, hook, way', HOOKS)
+def test_hook_has_the_last_word(master, peer, bench, wait, hook, way):
+    """What the loop publishes beside the hook is dropped, as a process would not have sent it."""
+    peer.hear('/cmd', 'std_msgs/Float64')
+    peer.run('from std_srvs.srv import Empty; rospy.Service("/brake", Empty, lambda request: [])')
+    text = text_of('hook', wait=LOOP_WAITS[wait], hook=hook)
+    xml = '<node pkg="bench" type="other" name="other" required="true"/>'
+    bench.write(OTHER, 'other')
+    with bench.program(bench.launch_file(xml, program=text)) as composed:
+        assert len(peer.heard('/cmd', 5)) >= 5
+        if way == 'Ctrl-C':
+            composed.signal(signal.SIGINT)
+        elif way == 'rosnode kill':
+            rosnode.kill_nodes(['/program'])
+        elif way == 'restart':
+            control('restart', '/program', master)
+        else:
+            master.parameters['/go'] = True
+        until(lambda: 'hook' in bench.said())
+        until(lambda: not peer.value('subscribers[0].get_num_connections()'))
+    commands = [message.data for message in peer.heard('/cmd')]
+    assert set(commands[commands.index(0.0) :]) == {0.0}
+
+
+def test_handler_has_the_last_word(peer, bench):
+    peer.hear('/cmd', 'std_msgs/Float64')
+    with bench.program('--script', bench.write(text_of('last_handler'))) as composed:
+        assert len(peer.heard('/cmd', 5)) >= 5
+        composed.signal(signal.SIGINT)
+        until(lambda: not peer.value('subscribers[0].get_num_connections()'))
+    commands = [message.data for message in peer.heard('/cmd')]
+    assert set(commands[commands.index(0.0) :]) == {0.0}
 
 
 @pytest.mark.parametrize('name', STOPS)
