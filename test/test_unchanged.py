@@ -136,7 +136,7 @@ def test_robot_stands_at_end(master, peer, bench, drive, way):
 
 @pytest.mark.parametrize('wait, hook, way', HOOKS)
 def test_hook_has_the_last_word(master, peer, bench, wait, hook, way):
-    """What the loop publishes beside the hook is dropped, as a process would not have sent it."""
+    """The loop's messages beside the hook are dropped: a process would not have sent them."""
     peer.hear('/cmd', 'std_msgs/Float64')
     peer.run('from std_srvs.srv import Empty; rospy.Service("/brake", Empty, lambda request: [])')
     text = text_of('hook', wait=LOOP_WAITS[wait], hook=hook)

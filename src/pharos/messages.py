@@ -1,11 +1,29 @@
-"""Fill messages by name, and say why one cannot be sent."""
+"""Find the generated class of a type, fill messages by name, and say why one cannot be sent."""
 from __future__ import annotations
 
-from genmsg.msgs import parse_type
-from genpy.message import Message, check_type
+import re
 
-from pharos.errors import MessageTypeError
+from catkin_pkg.package import InvalidPackage
+from genmsg.msgs import parse_type
+from genpy.message import Message, check_type, get_message_class, get_service_class
+
+from pharos.errors import MessageTypeError, UnknownTypeError
 from pharos.intraprocess.copier import copy_of, nested_class
+
+_TYPE = re.compile(r'[A-Za-z][A-Za-z0-9_]{0,127}/[A-Za-z][A-Za-z0-9_]{0,127}')
+
+
+def generated_class(suffix, type_name):
+    """Return the class of a type that an installed Python package has, or None."""
+    if not (isinstance(type_name, str) and _TYPE.fullmatch(type_name)):
+        raise UnknownTypeError(
+            f"malformed type {type_name!r}: give 'package/Type', such as 'std_msgs/String', or a class"
+        )
+    get_class = get_message_class if suffix == 'msg' else get_service_class
+    try:
+        return get_class(type_name)
+    except InvalidPackage:  # genpy cannot read package.xml; the package may still have a .msg file
+        return None
 
 
 def fields_text(cls):

@@ -16,7 +16,7 @@ from genpy import Message
 
 import pharos
 from pharos import signals
-from pharos.definitions import known_types
+from pharos.live.made_types import known_types
 from pharos.errors import PharosError
 from pharos.live.text_format import message_text
 from pharos.master import Master
