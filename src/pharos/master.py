@@ -87,6 +87,8 @@ class Master:
     that ask the master raise MasterUnreachableError if the master does not answer.
 
     :param url: default: ROS_MASTER_URI, or else http://localhost:11311/
+    :param share_connections: True: the nodes of this process that hear one topic of one other process
+        by TCPROS share one connection. Each has its own message, queue and counts
     :param shared_memory: False: nodes use TCPROS between processes of this package on one host, too;
         default: what PHAROS_SHARED_MEMORY says, 0 or 1, else True
     :raises ValueError: if the URL is malformed
@@ -97,7 +99,12 @@ class Master:
         WeakValueDictionary()
     )  # remappings -> the first node that was created with them
 
-    def __init__(self, url: str | None = None, shared_memory: bool | None = None):
+    def __init__(
+        self,
+        url: str | None = None,
+        shared_memory: bool | None = None,
+        share_connections: bool = False,
+    ):
         url = url or os.environ.get('ROS_MASTER_URI') or 'http://localhost:11311/'
         parts = _URL.fullmatch(str(url).lower())
         if not parts:
@@ -109,6 +116,7 @@ class Master:
         if shared_memory is None:
             shared_memory = os.environ.get('PHAROS_SHARED_MEMORY') != '0'
         self.shared_memory = shared_memory and hasattr(os, 'memfd_create')
+        self.share_connections = share_connections
         self.parameters = Parameters(self.call)
         self._process = None
         signals.handle_signals()
@@ -435,6 +443,7 @@ class Master:
         apart: Sequence[str] = (),
         here: Sequence[str] = (),
         groups: Sequence[Sequence[str]] = (),
+        share_connections: bool = True,
         **args,
     ) -> Composition:
         """Run the Python nodes of a launch file in this process.
@@ -447,13 +456,15 @@ class Master:
         :param apart: the names of nodes that run in processes of their own
         :param here: the names of nodes that run in this process even if they show windows
         :param groups: lists of names; the nodes of each list run in one process
+        :param share_connections: as for :class:`Master`
         :param args: the arguments of the launch file
         :raises UnknownNodeError: if there is no such file, argument or node
         :raises PharosError: if roslaunch cannot read the file
         """
         from pharos.compose.composition import compose
 
-        return compose(self, package, file, args, only, apart, here, groups)
+        master = type(self)(self.url, self.shared_memory, share_connections)
+        return compose(master, package, file, args, only, apart, here, groups)
 
     def graph(self, seconds: float = 0) -> Graph:
         """Return the :class:`Graph` of all nodes and topics.

@@ -58,6 +58,11 @@ def _parse(arguments):
     parser.add_argument(
         '--group', nargs='+', action='append', default=[], help='these in one other process'
     )
+    parser.add_argument(
+        '--own-connections',
+        action='store_true',
+        help='nodes that hear one topic of one process have a connection each',
+    )
     parser.add_argument('--reload', action='store_true', help='saved files take effect at once')
     parser.add_argument('--screen', action='store_true', help="all nodes have output='screen'")
     parser.add_argument('--bag', type=os.path.abspath, help='virtual time: play this')  # type: ignore
@@ -80,7 +85,7 @@ def _parse(arguments):
 
 def _run(stack, options, mappings):
     """Run as the options say, and return the exit status; the stack ends all."""
-    master = Master()
+    master = Master(share_connections=not options.own_connections)
     simulation = None
     if options.bag or options.seconds:
         # at a master of its own: a robot that runs at the usual one must not hear this

@@ -168,6 +168,7 @@ class Composition:
             'env',
             f'PYTHONPATH={search_path}',
             f'PHAROS_SHARED_MEMORY={int(self.master.shared_memory)}',
+            f'PHAROS_SHARE_CONNECTIONS={int(self.master.share_connections)}',
             sys.executable,
             '-m',
             'pharos.compose.group',

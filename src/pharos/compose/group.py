@@ -4,6 +4,7 @@ A composition starts this program for each of its groups. FILE has the pickled l
 environment names the master. The program ends when its programs have ended, when a required one has,
 and when the process PARENT has ended.
 """
+import os
 import sys
 
 from pharos.compose.composition import Composition, leave
@@ -14,7 +15,7 @@ from pharos.master import Master
 def main(path: str, parent: int) -> int:
     """Run the group in a file, and return the exit status of its composition."""
     try:
-        master = Master()
+        master = Master(share_connections=os.environ['PHAROS_SHARE_CONNECTIONS'] == '1')
         entries = receive(path, parent)
         with Composition(master, owns_process=True) as composition:
             composition.start_entries(entries)

@@ -270,7 +270,7 @@ class ScriptRun(Run):
             name = anonymous_name(name)
         settings = self.settings
         url = get_master_uri(self.environ, self.argv)
-        master = type(self.master)(url, self.master.shared_memory)
+        master = type(self.master)(url, self.master.shared_memory, self.master.share_connections)
         if master != self.master:
             self.master = settings.master = self.node.master = master
         self.base_name = load_mappings(self.argv).get('__name', name)
@@ -675,8 +675,13 @@ class _Pharos(Shim):
             _environ = run.environ
             _first_nodes = WeakValueDictionary()
 
-            def __init__(self, url=None, shared_memory=run.master.shared_memory):
-                super().__init__(url or run.master.url, shared_memory)
+            def __init__(
+                self,
+                url=None,
+                shared_memory=run.master.shared_memory,
+                share_connections=run.master.share_connections,
+            ):
+                super().__init__(url or run.master.url, shared_memory, share_connections)
 
             def _remapped_name(self, node, name, mappings):
                 full_name = super()._remapped_name(node, name, mappings)

@@ -9,6 +9,7 @@ from time import monotonic
 
 from pharos.errors import MasterUnreachableError, NodeNameInUseError
 from pharos.intraprocess.links import link_topic, runs, runs_lock
+from pharos.private_rospy.sharing import share_of
 from pharos.private_rospy.xmlrpc import CALLER_ID, UNREACHABLE, ServerProxy
 from pharos.transcript import attempt
 
@@ -108,8 +109,13 @@ def _connect(run, topic, uri):
     run.connecting.add(attempt)
     try:
         publisher_run = runs.get(uri)
+        share = share_of(subscription, uri)
         if publisher_run:
             link_topic(publisher_run, run, topic)
+        elif share:
+            with share.lock:  # one connects, and the others join
+                if not share.join(subscription):
+                    _negotiate(run, topic, uri, subscription)
         else:
             _negotiate(run, topic, uri, subscription)
     except Exception as error:  # told by the watcher, which tries again
@@ -127,7 +133,7 @@ def _negotiate(run, topic, uri, subscription):
     except RuntimeError as error:  # no thread is left, but rospy has added the connection
         for connection in subscription.connections:
             if connection.endpoint_id == uri:
-                connection.close()
+                subscription.remove_connection(connection)
         connect_later(run, topic, uri, str(error))
         return
     if code != 1:

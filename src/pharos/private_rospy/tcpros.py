@@ -76,16 +76,18 @@ def receive_until_end(connection, address, port, uri, subscription):
         _receive(connection, subscription)
     except Exception as error:
         reason = str(error)
-    end_connection(subscription, connection, uri, reason)
+    connection.close()
+    for each in connection.subscriptions or [subscription]:
+        end_connection(each, connection, uri, reason)
 
 
 def end_connection(subscription, connection, uri, reason):
-    """Close a connection; connect again later, or report a refusal.
+    """Remove a connection that has ended; connect again later, or report a refusal.
 
     :param reason: the text of the error that has ended the connection, or ''
     """
     topic = subscription.resolved_name
-    connection.close()
+    subscription.remove_connection(connection)
     if 'md5sum' in reason or 'do not match' in reason:  # rospy compares the names of types, too
         subscription.run.report_refusal(topic, reason)
     elif not subscription.closed:
@@ -99,7 +101,10 @@ def _receive(connection, subscription):
     """
     sock = connection.socket
     keep_alive(sock)
-    subscription.run.sockets.add(sock)
+    if connection.share:  # it goes on after the stop of this run, if others hear it
+        subscription.run.threads.discard(threading.current_thread())
+    else:
+        subscription.run.sockets.add(sock)
     sock.settimeout(None)
     message_class = subscription.data_class
     with sock.makefile('rb', _READ_BUFFER) as stream:

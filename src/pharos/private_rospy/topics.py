@@ -18,6 +18,7 @@ from pharos.intraprocess.copier import SERIALIZE_ERRORS, copier_for, copy_of
 from pharos.intraprocess.inboxes import Inbox
 from pharos.intraprocess.links import links_of
 from pharos.private_rospy import connections
+from pharos.private_rospy.sharing import leave, share_of
 from pharos.private_rospy.tcpros import CLOSED, MessageParts, Sender
 from pharos.signals import silenced_threads
 
@@ -245,6 +246,9 @@ class PlainInbox(Inbox):
         have ended. The thread that reads a socket of TCPROS runs them.
         """
         if self.queue_size is None:
+            if connection.share:  # who reads for several must not wait for one
+                super().receive(message, size, connection)
+                return
             if connection.transport_type == 'TCPROS':
                 self.put((message, None, None), size)
                 self.callback_queue.run_jobs_here()
@@ -264,7 +268,7 @@ class PlainInbox(Inbox):
         connections = self.subscription.connections
         links = links_of(connections)
         queue_sizes = [link.publisher.queue_size for link in links]
-        if self.queue_size or not links or len(links) < len(connections):
+        if self.queue_size or links and len(links) < len(connections):
             return super().capacity_for(size)
         if not all(queue_sizes):  # a publisher without a queue_size loses no message
             return super().capacity_for(size)
@@ -319,22 +323,46 @@ class SubscriptionOverlay:
         return links
 
     def deliver(self, message: Any, connection: Any, size: int) -> None:
-        """Count a message that came by a connection, and give each inbox a message of its own.
+        """Count a message that came by a connection, and give it to all subscriptions that hear that.
 
         :param size: bytes of the message and its length
         """
         connection.stat_bytes += size
         connection.stat_num_msg += 1
-        if self.statistics_logger:
-            self.statistics_logger.callback(message, connection.callerid_pub, connection.stat_bytes)
-        inboxes = [*self.inboxes]
-        # copied before the first callback may change the message
-        copies = [copy_of(message) for _ in inboxes[1:]]
-        for own_message, inbox in zip([message, *copies], inboxes):
-            own_message._connection_header = connection.header
+        # for later subscribers: a callback may change the message
+        latch = copy_of(message) if connection.is_latched else None
+        share = connection.share
+        if share:
+            with share.lock:
+                self.give(connection.subscriptions, message, connection, size)
+                connection.latch = latch
+        else:
+            self.give([self], message, connection, size)
+            connection.latch = latch
+
+    @staticmethod
+    def give(subscriptions: Iterable, message: Any, connection: Any, size: int) -> None:
+        """Give each inbox of some subscriptions a message of its own; shared ones get one and the same."""
+        inboxes = []
+        for each in subscriptions:
+            inboxes += each.inboxes
+            if each.statistics_logger:
+                each.statistics_logger.callback(
+                    message, connection.callerid_pub, connection.stat_bytes
+                )
+        message._connection_header = connection.header
+        # copied before the first callback may change the message, which belongs to one inbox alone
+        is_taken = any(inbox.shared for inbox in inboxes)
+        own_messages = []
+        for inbox in inboxes:
+            own_message = message
+            if is_taken and not inbox.shared:
+                own_message = copy_of(message)
+                own_message._connection_header = connection.header
+            is_taken = True
+            own_messages.append(own_message)
+        for inbox, own_message in zip(inboxes, own_messages):
             inbox.receive(own_message, size, connection)
-        if connection.is_latched:
-            connection.latch = message
 
     def call_plain(self, message: Any) -> None:
         """Run the callbacks of plain rospy on a message."""
@@ -359,11 +387,20 @@ class SubscriptionOverlay:
         latch_inbox.callback_queue.request_thread()
         connections.connect_all(self.run, self.resolved_name)
 
+    def add_connection(self, connection: Any) -> bool:
+        share = share_of(self, connection.endpoint_id)
+        if not share or connection.transport_type != 'TCPROS':
+            return self.rospy_add_connection(connection)
+        connection.share = share  # _connect() has its lock
+        share.connection = connection
+        return share.add(self, connection)
+
     def remove_callback(self, callback: Any, args: Any) -> None:
         self.rospy_remove_callback(callback, args)
         self.update_inboxes()
 
     def close(self) -> None:
+        leave(self)
         close_topic(self)
         self.run.publisher_uris.pop(self.resolved_name, None)
         if self.plain_inbox:

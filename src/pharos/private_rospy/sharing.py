@@ -1,0 +1,72 @@
+"""Share a connection: subscriptions of several nodes that hear one topic of one node elsewhere, by TCPROS.
+
+rospy makes the connection of the first one. It is then in the lists of all of them, and ends when the
+last one closes.
+"""
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+from rospy.impl.transport import Transport
+
+from pharos.intraprocess.copier import copy_of
+
+#: (URL of the master, URI of the publisher, topic, message class) -> Share
+_shares: dict[tuple, Share] = {}
+# of a connection that is shared: its Share, and the subscriptions that hear it
+Transport.share = None  # type: ignore[attr-defined]
+Transport.subscriptions = ()  # type: ignore[attr-defined]
+
+
+class Share:
+    """The newest connection to a topic of a node elsewhere, or None.
+
+    :ivar lock: held while a subscription connects, joins or leaves, and while a message is delivered:
+        one that joins gets the latched message once, before the next one. No callback runs meanwhile
+    """
+
+    connection: Any = None
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+
+    def join(self, subscription: Any) -> bool:
+        """Have a subscription hear the connection; return False if there is none."""
+        connection = self.connection
+        if not connection or connection.done:
+            return False
+        if self.add(subscription, connection) and connection.latch is not None:
+            subscription.give([subscription], copy_of(connection.latch), connection, 0)
+        return True
+
+    def add(self, subscription: Any, connection: Any) -> bool:
+        """Add the connection to a subscription; return False if that is closed."""
+        is_added = subscription.rospy_add_connection(connection)
+        if is_added:
+            connection.subscriptions = [*connection.subscriptions, subscription]
+            # the thread that reads takes it out of all lists; rospy's callback is that of one list
+            connection.set_cleanup_callback(None)
+        return is_added
+
+
+def share_of(subscription: Any, uri: str) -> Share | None:
+    """Return the Share of a topic of the publisher at a URI, None if the node's Master has none."""
+    master = subscription.run.master
+    if not master.share_connections:
+        return None
+    key = master.url, uri, subscription.resolved_name, subscription.data_class
+    return _shares.setdefault(key, Share())
+
+
+def leave(subscription: Any) -> None:
+    """Take a subscription, which closes, out of connections that others hear, too."""
+    for connection in subscription.connections:
+        if connection.share:
+            with connection.share.lock:
+                others = [each for each in connection.subscriptions if each is not subscription]
+                if others:
+                    connection.subscriptions = others
+                    subscription.connections = [
+                        each for each in subscription.connections if each is not connection
+                    ]
