@@ -24,7 +24,7 @@ class Server(Node):
 
     def count_down(self, goal):
         for left in range(goal.goal, 0, -1):
-            if self.action.is_preempt_requested():
+            if self.action.is_preempt_requested() or not self.is_running:
                 self.action.set_preempted(TestResult(left))
                 return
             self.action.publish_feedback(TestFeedback(left))

@@ -58,4 +58,5 @@ def tell_once(error: BaseException) -> None:
     place = frame.filename, frame.lineno, type(error)
     if place not in _told_places:
         _told_places.add(place)
-        Transcript.show(f'{frame.filename}:{frame.lineno}: {error!r}; it is tried again')
+        with suppress(Exception):  # of the Transcript's receiver
+            Transcript.show(f'{frame.filename}:{frame.lineno}: {error!r}; it is tried again')

@@ -237,9 +237,9 @@ class Composition:
 
     def _watch(self):
         """Show ends, start again nodes that respawn, and end all if a required node has ended."""
-        while not (self.is_over or self.stopping.wait(POLL_PERIOD)):
-            self._look()
-        self._look()
+        while not (attempt(lambda: self.is_over) or self.stopping.wait(POLL_PERIOD)):
+            attempt(self._look)
+        attempt(self._look)
 
     def _look(self):
         for node in self.nodes:

@@ -289,8 +289,6 @@ class ScriptRun(Run):
         """Run the target of a thread; show and keep its exception."""
         try:
             super().run_thread(thread, target)
-        except SystemExit:  # ends the thread, not the program
-            pass
         except Exception as error:
             if self.lifecycle is Lifecycle.STOPPED:
                 return  # the hook is gone with the program

@@ -18,6 +18,7 @@ from rosgraph.network import ROSHandshakeException, decode_ros_handshake_header,
 from pharos.private_rospy import connections, tcpros, topics
 from pharos.private_rospy.loader import Shim
 from pharos.private_rospy.services import answer, call_by_proxy
+from pharos.transcript import attempt
 
 MAX_REQUEST = 1 << 20  # bytes of a connection header
 POLL_INTERVAL = 60  # seconds between two looks for a stop; the stop itself wakes the server
@@ -147,7 +148,8 @@ def start_xmlrpc(original, run, self):
 
     def serve():
         with server:  # closes the server's socket at the end
-            server.serve_forever(poll_interval=POLL_INTERVAL)
+            while not self.is_shutdown:
+                attempt(server.serve_forever, POLL_INTERVAL)
 
     if not run.start_thread(serve):
         raise RuntimeError(f'{run.name} cannot start: the system has no thread left, see ulimit -u')
@@ -281,17 +283,6 @@ def shut_down_from_outside(original, run, self, caller_id, msg=''):
     else:
         run.ros.logwarn(f'does not stop for {caller_id} at {host}: {msg}')
     return int(obeys), '' if obeys else 'only this host and the master may do that', 0
-
-
-@patch('rospy.timer', 'Timer.__init__')
-def start_timer(original, run, self, period, callback, *args, **kwargs):
-    """rospy calls the callback once more if a stop ends the timer's sleep. This does not."""
-
-    def call_unless_stopping(event):
-        if not run.stopping.is_set():
-            callback(event)
-
-    original(self, period, call_unless_stopping, *args, **kwargs)
 
 
 # -- topics

@@ -167,9 +167,10 @@ class Run:
         }
 
     def run_thread(self, thread: threading.Thread, target: Callable) -> None:
-        """Run the target of a thread of the node, in this thread."""
+        """Run the target of a thread of the node, in this thread. A SystemExit ends the thread alone."""
         try:
-            target()
+            with suppress(SystemExit):
+                target()
         finally:
             self.ended_cpu_seconds += time.thread_time()
             self.threads.discard(thread)
@@ -196,8 +197,8 @@ class Run:
     def sleep(self, seconds: float) -> None:
         """Stand in for ``time.sleep``: the node's stop ends the sleep.
 
-        After the stop, a sleep ends its thread. If the thread answers a call of a service of the node,
-        it ends at once: the caller must not hear of a success.
+        After the stop, a sleep ends its thread. A thread that answers a call of a service of the node ends
+        at once: the caller must not hear of a success. So does a timer's: it would call once more.
         """
         if self.finished.is_set():
             raise SystemExit  # in a thread that was left behind
@@ -206,7 +207,8 @@ class Run:
             return
         is_stopping = self.stopping.wait(seconds)
         if is_stopping:
-            if current.service_run is self:
+            is_timer = isinstance(threading.current_thread(), self.ros.Timer)
+            if is_timer or current.service_run is self:
                 raise SystemExit(f'{self.name} stops')
             let_others_run()  # a loop may sleep on
 

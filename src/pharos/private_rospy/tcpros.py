@@ -1,6 +1,7 @@
 """Send messages to sockets, and receive messages from sockets."""
 import contextlib
 import os
+import select
 import socket
 import struct
 import threading
@@ -14,10 +15,10 @@ MAX_MESSAGE = 1_000_000_000  # bytes, as in roscpp
 MAX_DIRECT = 2 << 20  # bytes; the write of a larger message would hold up the publisher
 MAX_PARTS = 1024  # that a system call takes
 LARGE_PART = 1 << 16  # bytes
-THREAD_REST = 0.3  # seconds without a message until a sender's thread ends
+POLL_LIMIT = 1000  # milliseconds between two looks if the connection is closed
 CONNECT_LIMIT = 10.0  # seconds
 ACCEPT_PAUSE = 0.5  # seconds after an error
-CLOSED = OSError, AttributeError  # a connection that rospy has closed has no socket
+CLOSED = OSError, AttributeError, TypeError  # a connection that rospy has closed has no socket
 _READ_BUFFER = 1 << 17  # bytes
 _CREDENTIALS = struct.Struct('3i')  # numbers of the process, the user, and the group
 _LENGTH = struct.Struct('<I')
@@ -160,30 +161,32 @@ class Sender(BoundedQueue):
     """A connection to a subscriber, with a bounded queue for messages that must wait.
 
     Stands in for rospy's QueuedConnection. rospy's thread writes everything, and takes all messages
-    out of the queue at once: the queue is neither bounded nor flushed. Here the publisher writes,
-    and a thread writes the rest. The thread rests between messages: to start one takes long.
+    out of the queue at once: the queue is neither bounded nor flushed. Here the publisher writes, and
+    while messages wait, a thread writes when the socket takes more. Each write takes the lock and never
+    waits, so it does no harm if two threads write.
 
     :param publication: the PublisherOverlay; BoundedQueue says what its queue_size means. rospy sets
         that after the first connections may have been made.
-    :ivar is_busy: True while a thread writes the queue
     """
 
-    is_busy = False
-    _has_thread = False
+    _has_thread = False  # True while a thread writes the queue
 
     def __init__(self, connection, publication):
         self._connection = connection
         self._publication = publication
         super().__init__()  # its messages are lists of parts
         self.queue_bytes = publication.run.node.queue_bytes
-        # the parts of a message, and the numbers of bytes sent of them; while is_busy, the thread's alone
-        self._unsent = [], []
-        # for `with`: a condition enters and leaves in Python, where the handler of a signal may raise
+        self._unsent = [], []  # the parts of a message, and the numbers of bytes sent of them
+        # for `with`: in C, since the handler of a signal may raise between any two lines of Python
         self._lock = threading.RLock()
-        self._condition = threading.Condition(self._lock)  # notified to wake the thread
 
     def __getattr__(self, name):
         return getattr(self._connection, name)
+
+    @property
+    def is_busy(self):
+        """True while something waits for the socket."""
+        return bool(self.messages or self._unsent_parts())
 
     def write_data(self, parts, size):
         """Send a message, or queue the rest if the socket is full.
@@ -193,7 +196,7 @@ class Sender(BoundedQueue):
         """
         with self._lock:
             self._write(parts, size)
-        if self.is_busy:
+        if self._has_thread:
             let_others_run()
 
     def _write(self, parts, size):
@@ -203,23 +206,20 @@ class Sender(BoundedQueue):
             while self._unsent_parts():
                 self._send()
             return
-        if self.is_busy or self.messages or size > MAX_DIRECT:
-            self.add(parts, size)
-        else:
-            self._unsent = self._unsent_parts() + parts, []
-            with contextlib.suppress(BlockingIOError):
-                self._send(socket.MSG_DONTWAIT)
-            if not self._unsent_parts():
-                return
-        if not self.is_busy:
-            self.is_busy = self._wake_thread()
+        is_large = size > MAX_DIRECT
+        self.add(parts, size)
+        if not (self._has_thread or is_large):
+            self._send_ready()
+        if self.is_busy and not self._has_thread:
+            self._has_thread = self._publication.run.start_thread(self._send_queue) is not None
 
-    def _wake_thread(self):
-        """Wake or start the thread; return False if the system has no thread left."""
-        if self._has_thread:
-            self._condition.notify()
-            return True
-        return self._publication.run.start_thread(self._send_queue) is not None
+    def _send_ready(self):
+        """Send what the socket takes."""
+        with contextlib.suppress(BlockingIOError):
+            while self.is_busy:
+                if not self._unsent_parts():
+                    self._unsent = self.messages.popleft(), []
+                self._send(socket.MSG_DONTWAIT)
 
     def _unsent_parts(self):
         """Return the parts that the socket has not taken yet."""
@@ -246,28 +246,21 @@ class Sender(BoundedQueue):
         self._connection.stat_num_msg += not self._unsent_parts()
 
     def _send_queue(self):
+        poller = select.poll()
+        with contextlib.suppress(*CLOSED):
+            poller.register(self._connection.socket, select.POLLOUT)
+            while self._send_rest():
+                poller.poll(POLL_LIMIT)
+            return
+        self._connection.close()
+
+    def _send_rest(self):
+        """Send what the socket takes; return False if that is all: then the thread must end."""
         with self._lock:
-            if self._has_thread:  # a handler raised when that one had just been started
-                return
-            self._has_thread = True
-        while True:
-            with self._lock:
-                if not self._unsent_parts() and not self.messages:
-                    self.is_busy = False
-                    self._condition.wait(THREAD_REST)
-                if self._connection.done or not self.is_busy:
-                    self.is_busy = False
-                    self._has_thread = False
-                    return
-                if not self._unsent_parts():
-                    self._unsent = self.messages.popleft(), []
-            try:
-                self._send()
-            except CLOSED:
-                self._connection.close()
+            self._send_ready()
+            self._has_thread = self.is_busy
+            return self._has_thread
 
     def close(self):
-        """Close the connection, and end the thread."""
+        """Close the connection, which ends the thread."""
         self._connection.close()
-        with self._lock:
-            self._condition.notify()
