@@ -1,6 +1,7 @@
 """Topics and channels: what a node sends, and what another one hears."""
 import concurrent.futures
 import threading
+import time
 
 import numpy
 import pytest
@@ -8,7 +9,7 @@ import rospy
 from geometry_msgs.msg import Twist, Vector3
 from std_msgs.msg import Int32, String
 
-from helpers import TIMEOUT, create, registrations
+from helpers import TIMEOUT, Peer, PharosPeer, create, registrations
 import pharos
 from pharos import (
     MessageTypeError,
@@ -531,3 +532,94 @@ def test_delegate_waits_for_message(node, other):
     other.interested_in('/chatter', STRING, delegate=look)
     node.send_to('/chatter', data='look')
     assert take(got, 1) == ['old']
+
+
+# -- a rospy.SubscribeListener
+
+
+class Greeter(rospy.SubscribeListener):
+    """It takes a lock under which its node publishes, too."""
+
+    def __init__(self):
+        self.lock = threading.Lock()
+        self.begun = threading.Semaphore(0)
+
+    def peer_subscribe(self, topic, publish, peer_publish):
+        self.begun.release()
+        with self.lock:
+            peer_publish(String('welcome'))
+
+
+def subscribe_here(master):
+    create(master, '/ear').interested_in('/words', STRING)
+
+
+def subscribe_by(library):
+    """Return a function that has a peer subscribe to /words, and then end."""
+
+    def subscribe(master):
+        with library(master.url) as peer:
+            peer.hear('/words', STRING)
+            assert peer.heard('/words')
+
+    return subscribe
+
+
+SUBSCRIBERS = {
+    'INTRAPROCESS': subscribe_here,
+    'TCPROS': subscribe_by(Peer),
+    'SHARED_MEMORY': subscribe_by(PharosPeer),
+}
+
+
+@pytest.mark.parametrize('kind', SUBSCRIBERS)
+def test_listener_may_wait_for_a_publisher(master, pool, kind):
+    """Its calls hold no lock that a publish() needs."""
+    node, greeter = create(master), Greeter()
+    out = node.ros.Publisher('/words', String, queue_size=1, subscriber_listener=greeter)
+    with greeter.lock:
+        subscriber = pool.submit(SUBSCRIBERS[kind], master)
+        assert greeter.begun.acquire(timeout=TIMEOUT)
+        pool.submit(out.publish, 'a state').result(TIMEOUT)
+    subscriber.result(TIMEOUT)
+
+
+class Slow(rospy.SubscribeListener):
+    """It notes of each call whether no other one ran beside it."""
+
+    def __init__(self):
+        self.turn, self.were_alone = threading.Lock(), []
+
+    def peer_subscribe(self, *arguments):
+        is_alone = self.turn.acquire(blocking=False)
+        time.sleep(0.1)  # as rospy.Subscriber() may take
+        if is_alone:
+            self.turn.release()
+        self.were_alone.append(is_alone)
+
+    peer_unsubscribe = peer_subscribe
+
+
+@pytest.mark.parametrize('library', [Peer, PharosPeer])
+def test_listener_hears_one_subscriber_at_a_time(master, library):
+    """Else a node that subscribes for its first subscriber alone would do so twice."""
+    node, slow = create(master), Slow()
+    for number in range(3):
+        node.ros.Publisher(f'/words{number}', String, queue_size=1, subscriber_listener=slow)
+    with library(master.url) as peer:
+        subscribe = f"rospy.Subscriber(topic, message_class('{STRING}'))"
+        peer.run(f"ears = [{subscribe} for topic in ('/words0', '/words1', '/words2')]")
+        until(lambda: len(slow.were_alone) == 3)
+        peer.run('for ear in ears: ear.unregister()')
+        until(lambda: len(slow.were_alone) == 6)
+    assert slow.were_alone == [True] * 6
+
+
+def test_closed_topic_is_forgotten(master, node, other):
+    """Else the node would connect anew to publishers of long ago."""
+    node.output_channel('/words', STRING)
+    channels = [other.interested_in('/words', STRING) for _ in range(2)]
+    until(lambda: '/words' in other._current_run.publisher_uris)
+    for channel in channels:
+        channel.close()
+    assert '/words' not in other._current_run.publisher_uris

@@ -1,12 +1,14 @@
 """Copies made in process: equal in value and type to what the wire would have delivered."""
 import array
 import collections
+import gc
 import importlib
 import inspect
 import io
 import pathlib
 import random
 import struct
+import sys
 import types
 
 import genpy.dynamic
@@ -14,8 +16,9 @@ import numpy
 import pytest
 import std_msgs.msg
 from genmsg.msgs import parse_type
-from geometry_msgs.msg import Point, Polygon, Twist, Vector3
+from geometry_msgs.msg import Point, Point32, Polygon, Twist, Vector3
 from rospy.numpy_msg import numpy_msg
+from sensor_msgs.msg import JointState
 from tf2_msgs.msg import TFMessage
 
 pytestmark = pytest.mark.filterwarnings('ignore')
@@ -218,3 +221,20 @@ def test_subclass_arrives_as_publishers_class():
     freeze, thaw = copier(std_msgs.msg.String)
     received = thaw(freeze(Shouted('text')))
     assert (type(received), received.data) == (std_msgs.msg.String, 'TEXT')
+
+
+@pytest.mark.parametrize(
+    'message',
+    [Polygon([Point32(1, 2, 3)] * 12), JointState(name=['a', 'b', 'c'] * 4)],
+    ids=['messages', 'strings'],
+)
+def test_profiler_disturbs_no_copy(message):
+    """It looks at all objects, and holds some that a copy is about to make."""
+    freeze, thaw = copier(type(message))
+    held = []
+    sys.setprofile(lambda *event: held.__setitem__(slice(None), gc.get_objects(0)))
+    try:
+        frozen = freeze(message)
+    finally:
+        sys.setprofile(None)
+    assert thaw(frozen) == message

@@ -119,6 +119,11 @@ def test_malformed_url_raises_value_error():
             Master(url)
 
 
+def test_name_that_begins_as_localhost_is_kept():
+    url = 'http://localhost.localdomain:11311/'
+    assert pharos.Master(url).url == url
+
+
 def test_malformed_environment_raises_value_error(monkeypatch):
     monkeypatch.setenv('ROS_MASTER_URI', 'robot')
     with pytest.raises(ValueError):

@@ -10,7 +10,7 @@ import pytest
 import rosgraph
 
 from helpers import TIMEOUT, Peer, create
-from pharos import Node, NodeStoppedError
+from pharos import Master, Node, NodeStoppedError
 from pharos.testing import Mailbox, until
 
 VALUES = [0, -(2**31), 0.0, 1e300, '', 'Straße 道\n<&>', False, True, [], [1, 'a', [True, 2.5]]]
@@ -399,3 +399,31 @@ def test_many_threads_set_one_parameter(master):
         list(pool.map(work, range(3)))
     last = master.parameters['/rate']
     until(lambda: [rate.value for rate in rates] == 3 * [last])
+
+
+@pytest.fixture
+def reads(monkeypatch):
+    """The names that the nodes of this process read from the server."""
+    names, call = [], Master.call
+
+    def count(master, method, *args, **kwargs):
+        if method.startswith('getParam'):
+            names.append(args)
+        return call(master, method, *args, **kwargs)
+
+    monkeypatch.setattr(Master, 'call', count)
+    return names
+
+
+@pytest.mark.parametrize('who', ['other', 'node'])
+def test_change_costs_one_read(reads, node, server, who):
+    """However many parameters the node has."""
+    parameters = [node.parameter(f'~rate{number}', number) for number in range(20)]
+    last = parameters[-1]
+    reads.clear()
+    if who == 'node':
+        last.set(-1)
+    else:
+        server.setParam(last.name, -1)
+    until(lambda: last.value == -1)
+    assert len(reads) <= 1

@@ -509,6 +509,17 @@ def test_hanging_master_ends_no_wait(mortal):
     node.send_to('/goes_on', typed_as=STRING, data='x')
 
 
+def test_silent_master_is_told_in_one_line(mortal, capfd):
+    """A node that stops meanwhile cannot unregister."""
+    node = create(Master(mortal.url))
+    node.interested_in('/t', STRING)
+    capfd.readouterr()
+    with stopped(mortal.pid):
+        node.stop()
+    (line,) = ''.join(capfd.readouterr()).splitlines()
+    assert mortal.url in line
+
+
 # -- peers that die
 
 

@@ -1,5 +1,6 @@
 """Programs in one process do what each of them does in a process of its own."""
 import contextlib
+import gc
 import io
 import itertools
 import os
@@ -106,6 +107,8 @@ WINDOWS = [
     ('cv2.imshow("x", image)', '', 'imshow'),
     ('from tkinter import Tk', '', 'tkinter'),
     ('loop.add_signal_handler(2, end)', '', 'add_signal_handler'),
+    ('web.run_app(app)', '', 'run_app'),
+    ('uvicorn.run(app)', '', 'uvicorn'),
     ('pass  # cv2.imshow("x", image)', '', ''),
     ('import os, helper', 'def show(x):\n    cv2.imshow("x", x)\n', 'imshow'),
     ('from helper import (\n    show,\n)', 'def show(x):\n    cv2.imshow("x", x)\n', 'imshow'),
@@ -474,3 +477,111 @@ def test_launched_program_creates_nodes(master, bench):
             assert master.node('/rig/boss').pid == composed.pid
             channel.wait_for_subscribers(1, TIMEOUT)
             channel.send(data='') if runs == 1 else end(composed)
+
+
+# -- threads
+
+
+def test_chain_of_timers_keeps_its_program(bench):
+    """Its main thread has ended; each timer is made by the one before."""
+    text = '''
+        def tick(count):
+            say(f'{count} {rospy.is_shutdown()}')
+            if count < 5: threading.Timer(0.05, tick, [count + 1]).start()
+        rospy.init_node('program')
+        tick(1)
+        '''
+    assert bench.load(text).wait(TIMEOUT) == 0
+    assert bench.said() == [f'{count} False' for count in range(1, 6)]
+
+
+@pytest.mark.parametrize('daemon', [True, False])
+def test_thread_of_a_thread_is_daemon_like_it(bench, daemon):
+    text = f'''
+        def work():
+            inner = threading.Thread(target=lambda: None)
+            say(inner.daemon)
+            inner.start()
+        rospy.init_node('program')
+        outer = threading.Thread(target=work, daemon={daemon})
+        outer.start()
+        outer.join()
+        '''
+    assert bench.load(text).wait(TIMEOUT) == 0
+    assert bench.said() == [str(daemon)]
+
+
+# -- asyncio
+
+
+ASYNC = '''
+import asyncio
+async def serve():
+    loop = asyncio.get_running_loop()
+    server = await asyncio.start_server(lambda reader, writer: writer.close(), '127.0.0.1', 0)
+    say('up')
+    try:
+        async with server: await server.serve_forever()
+    finally:
+        say('cleaned')
+rospy.init_node('program', disable_signals=True)
+try:
+    {}
+except KeyboardInterrupt:
+    say('interrupted')
+'''
+FOREVER = "loop = asyncio.new_event_loop(); loop.call_soon(say, 'up'); loop.run_forever()"
+
+
+@pytest.mark.parametrize(
+    'run, said',
+    [('asyncio.run(serve())', ['up', 'cleaned', 'interrupted']), (FOREVER, ['up', 'interrupted'])],
+    ids=['run', 'run_forever'],
+)
+def test_idle_loop_of_asyncio_is_interrupted(bench, run, said):
+    with bench.program('--script', bench.write(ASYNC.format(run))) as composed:
+        until(bench.said)
+        end(composed)
+    assert bench.said() == said
+    assert 'the end waits' not in composed.output
+
+
+def test_further_start_prints_no_traceback(master, bench):
+    text = '''
+import pharos
+for _ in range(4):
+    script = pharos.Master().load({!r})
+    script.stop()
+'''
+    path = bench.write("import rospy\nrospy.init_node('program')\nrospy.spin()\n", head='')
+    with Program(text.format(path), master.url) as program:
+        assert program.wait() == 0
+    assert 'Exception ignored' not in program.output
+
+
+def descriptors():
+    """Return the number of open files of this process."""
+    return len(os.listdir('/proc/self/fd'))
+
+
+def test_program_without_asyncio_has_no_loop(bench):
+    bench.load(
+        "say(len(os.listdir('/proc/self/fd')))"
+    )  # a process has some of its own from then on
+    count = descriptors()
+    bench.load("say(len(os.listdir('/proc/self/fd')))")
+    assert int(bench.said()[-1]) == count
+
+
+def test_loop_that_was_asked_for_is_closed(bench):
+    text = (
+        f'loop = asyncio.get_event_loop()\n{INIT}say(loop.run_until_complete(asyncio.sleep(0, 7)))'
+    )
+    bench.load(INIT).wait(TIMEOUT)
+    gc.collect()
+    count = descriptors()
+    script = bench.load(text)
+    assert script.wait(TIMEOUT) == 0
+    script.stop()
+    assert bench.said() == ['7']
+    until(lambda: descriptors() == count)
