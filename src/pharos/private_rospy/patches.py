@@ -365,7 +365,8 @@ def cleanup(original, run, self, reason):
         original(self, reason)
     except Exception as error:
         run.ros.logwarn(
-            f'stays registered, since the master does not answer ({error!r}): rosnode cleanup'
+            f'the master at {run.master.url} does not answer: this node stays registered until'
+            f' rosnode cleanup ({error!r})'
         )
     finally:
         run.topic_manager.close_all()
