@@ -18,7 +18,7 @@ from helpers import COMPOSE, DEFAULT_SIGNALS, INIT, SPIN, TIMEOUT, Program, crea
 from pharos.compose.composition import Composition
 from pharos.compose.control import control, reload_on_save
 from pharos.compose.script import ScriptNode
-from pharos.compose.sources import why_apart, why_own_group
+from pharos.compose.sources import sets_environment, why_apart
 from pharos.live.editing import editable_modules
 from pharos.testing import Mailbox, until
 
@@ -177,9 +177,9 @@ def test_program_may_need_an_environment(tmp_path):
     sets = "os.environ['GPU'] = '1'|os.environ.setdefault('OMP_NUM_THREADS', '1')|env = os.environ"
     sets += "|os.environ.update(TZ='UTC')|os.putenv('TZ', 'UTC')|os.environ[name] = value"
     sets += "|os.environ.pop('TZ')|del os.environ['TZ']"
-    check(tmp_path, why_own_group, sets, 'it has')
+    check(tmp_path, sets_environment, sets, 'env')
     reads = "os.environ['ROS_NAMESPACE'] = ''|os.environ['TZ'] == 'UTC'|print(os.environ['TZ'])"
-    check(tmp_path, why_own_group, f'{reads}|subprocess.run(command, env=os.environ)', '')
+    check(tmp_path, sets_environment, f'{reads}|subprocess.run(command, env=os.environ)', '')
 
 
 APART = '<node pkg="bench" type="program" name="program">{}</node>'
@@ -212,7 +212,7 @@ say(f'C {getenv(b"GPU")}')
 rospy.spin()
 '''
 ENVIRONMENTS = {
-    'launch file': ('<env name="GPU" value="1"/>', '', 'its environment has GPU'),
+    'launch file': ('<env name="GPU" value="1"/>', '', 'its environment has GPU=1'),
     'program': ('', "os.environ['GPU'] = '1'\n", 'it has "environ[\'GPU\'] ="'),
 }
 
@@ -225,6 +225,52 @@ def test_environment_reaches_c_code_and_shells(master, bench, xml, first, reason
         assert master.wait_for_node('/program', TIMEOUT).pid != composed.pid
         assert master.wait_for_node('/other', TIMEOUT).pid == composed.pid
     assert f'/program runs in a group of its own: {reason}' in composed.output
+
+
+SAYS_WHERE = '''
+rospy.init_node('program')
+variable = os.popen('echo $GPU').read()
+say(f'{rospy.get_name()} {os.getpid()} {variable}')
+rospy.spin()
+'''
+
+
+def where(bench, count):
+    """Wait until so many nodes have said where they run; return {name: (PID, $GPU of a child)}."""
+    until(lambda: len([line for line in bench.said() if line]) >= count)
+    rows = [line.split(' ') for line in bench.said() if line]
+    return {name: (int(pid), variable) for name, pid, variable in rows}
+
+
+def test_nodes_of_one_environment_share_this_process(master, bench):
+    """An <env> at the top of the file holds for all."""
+    scripts = {name: SAYS_WHERE for name in ('one', 'two', 'three')}
+    path = bench.launch_file('<env name="GPU" value="1"/>', **scripts)
+    with bench.program(path) as composed:
+        places = where(bench, 3)
+        assert set(places.values()) == {(composed.pid, '1')}
+    assert 'runs in' not in composed.output
+
+
+def test_each_environment_is_one_process(master, bench):
+    env = '<env name="GPU" value="{}"/>'
+    bench.write(SAYS_WHERE)
+    node = '<node pkg="bench" type="program" name="{}">{}</node>'
+    names = {'a': '', 'b': '', 'c': env.format(1), 'd': env.format(1), 'e': env.format(2)}
+    xml = ''.join(node.format(name, variable) for name, variable in names.items())
+    with bench.program(bench.launch_file(xml)) as composed:
+        places = where(bench, 5)
+        assert [places[f'/{name}'][1] for name in 'abcde'] == ['', '', '1', '1', '2']
+        pids = [places[f'/{name}'][0] for name in 'abcde']
+        assert pids[0] == pids[1] == composed.pid
+        assert pids[2] == pids[3] and len(set(pids)) == 3
+
+
+def test_composition_gives_the_environment_back(master, bench):
+    path = bench.launch_file('<env name="GPU" value="1"/>', one=SPIN)
+    with master.compose(None, path):
+        assert os.environ['GPU'] == '1'
+    assert 'GPU' not in os.environ
 
 
 def test_only_program_has_the_environment_of_the_process(master, bench):

@@ -409,7 +409,11 @@ class Simulation:
             sending: {'let_others_run': _let_servers_run},
             tcpros: {'let_others_run': _let_servers_run},
             service: {'ignores_timeout': True},
-            composition: {'why_own_group': lambda *facts: ''},  # all programs run here
+            # all programs run here
+            composition: {
+                'environment_of': lambda pairs: (),
+                'sets_environment': lambda path: '',
+            },
             composition.Composition: {'_start_part': _refuse_part},
         }
         for owner, values in changes.items():

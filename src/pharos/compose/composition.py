@@ -25,10 +25,11 @@ from pharos.compose.child_process import RosProcess, find_program
 from pharos.compose.launch_file import Entry, LaunchFile
 from pharos.compose.script import ScriptNode, name_of_file, wait_for_end
 from pharos.compose.sources import (
+    environment_of,
     needs_process,
+    sets_environment,
     source_of,
     why_not_this_python,
-    why_own_group,
 )
 from pharos.errors import PharosError
 from pharos.live.external_node import ExternalNode
@@ -75,6 +76,9 @@ class Composition:
         self._end_times: dict[ScriptNode, float] = {}  # as of time.monotonic()
         self._stopped_nodes: set[ScriptNode] = set()  # by control(); they do not respawn
         self._listener: socket.socket | None = None  # of control()
+        self._former_environment: dict[
+            str, str | None
+        ] = {}  # of this process, what the nodes have set
         self._watcher = threading.Thread(target=self._watch, name='composition', daemon=True)
         self._has_started = False  # True if one node was started
         self._has_failed = False  # True if a required node has ended, or a process by a signal
@@ -148,24 +152,47 @@ class Composition:
     def _start_groups(self, entries):
         """Start the groups, then the nodes of this process.
 
-        A node that needs the environment of a process is a group, unless it is the only one here.
+        Nodes with one environment share a process: code in C and shared modules see its variables. This
+        process gets the environment that most nodes have.
         """
-        groups = collections.defaultdict(list)
+        groups = collections.defaultdict(list)  # (name of the group, environment) -> entries
+        own_entries = []
         is_alone = self.owns_process and len(entries) == 1
         for entry in entries:
-            group = entry.group
-            reason = ''
-            if not (group or entry.is_here or is_alone):
-                reason = why_own_group(entry.path, entry.roslaunch_node.env_args)
-            if reason:
-                group = entry.name
-            if group:
-                Transcript.show(f'{entry.name} runs in {reason or group}')
-            groups[group].append(entry)
-        own_entries = groups.pop('', [])
+            environment = environment_of(entry.roslaunch_node.env_args)
+            code = '' if entry.group or is_alone else sets_environment(entry.path)
+            if entry.is_here:
+                own_entries.append(entry)
+            elif entry.group:
+                groups[entry.group, ()].append(entry)
+            elif code:
+                groups[f'a group of its own: it has {code!r}', environment].append(entry)
+            else:
+                groups['', environment].append(entry)
+        # of two as large, this process gets the empty one
+        sizes = {key: (len(nodes), not key[1]) for key, nodes in groups.items() if not key[0]}
+        if sizes:
+            key = max(sizes, key=sizes.__getitem__)
+            own_entries += groups.pop(key)
+            self._set_environment(dict(key[1]))
+        for (reason, environment), group_entries in groups.items():
+            variables = ', '.join(map('='.join, environment)) or 'no variables'
+            for entry in group_entries:
+                why = reason or f'a group of its own: its environment has {variables}'
+                Transcript.show(f'{entry.name} runs in {why}')
+            self._start_group(group_entries, environment)
+        self.start_entries(own_entries)
+
+    def _set_environment(self, environment):
+        """Set variables of this process; stop() gives their former values back."""
+        self._former_environment = {name: os.environ.get(name) for name in environment}
+        os.environ.update(environment)
+
+    def _start_group(self, entries, environment):
         search_path = os.pathsep.join(folder for folder in sys.path if folder)
         command = [
             'env',
+            *map('='.join, environment),
             f'PYTHONPATH={search_path}',
             f'PHAROS_SHARED_MEMORY={int(self.master.shared_memory)}',
             f'PHAROS_SHARE_CONNECTIONS={int(self.master.share_connections)}',
@@ -173,9 +200,7 @@ class Composition:
             '-m',
             'pharos.compose.group',
         ]
-        for group_entries in groups.values():
-            self._start_part(group_entries, command, list)
-        self.start_entries(own_entries)
+        self._start_part(entries, command, list)
 
     def start_entries(self, entries):
         """Start nodes in this process, side by side, in the order of the launch file."""
@@ -373,6 +398,12 @@ class Composition:
             Transcript.show(f'the end waits for {names}; a further Ctrl-C ends all at once')
         for thread in late_threads:
             thread.join()
+        while self._former_environment:
+            name, value = self._former_environment.popitem()
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
 
     def __enter__(self) -> Composition:
         return self

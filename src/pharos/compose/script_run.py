@@ -4,13 +4,11 @@ These are signals, atexit, sys.argv, the output, the environment, and the main t
 """
 import _thread
 import asyncio
-import codecs
 import collections
 import contextlib
 import ctypes
 import functools
 import gc
-import io
 import os
 import signal
 import socket
@@ -19,6 +17,7 @@ import threading
 import time
 import traceback
 import types
+from importlib.machinery import SourceFileLoader
 from threading import ExceptHookArgs
 from weakref import WeakSet, WeakValueDictionary
 
@@ -31,7 +30,7 @@ from pharos.compose.child_process import interrupt
 from pharos.compose.sources import compile_program
 from pharos.errors import PharosError
 from pharos.live.editing import editable_modules
-from pharos.private_rospy import loader
+from pharos.private_rospy import inspecting, loader
 from pharos.private_rospy.loader import Shim, remember_text
 from pharos.private_rospy.patches import patch
 from pharos.private_rospy.plain import guide
@@ -46,8 +45,10 @@ SPIN_PERIOD = 0.01  # seconds
 #: asyncio's policies derive from this; Python 3.14 has changed its name
 _POLICY = getattr(asyncio.events, 'BaseDefaultEventLoopPolicy', None)
 _POLICY = _POLICY or asyncio.events._BaseDefaultEventLoopPolicy
+#: packages whose frames are between a program and what it imports
+_IMPORTERS = 'importlib', 'imp', '_frozen_importlib', '_frozen_importlib_external'
 #: files whose frames tracebacks do not show
-_HIDDEN = '<frozen importlib', loader.__file__, __file__
+_HIDDEN = '<frozen importlib', loader.__file__, inspecting.__file__, __file__
 
 
 def _get_event_loop(policy, original=_POLICY.get_event_loop):
@@ -74,6 +75,21 @@ def _new_event_loop(policy, original=_POLICY.new_event_loop):
 
 _POLICY.get_event_loop = _get_event_loop
 _POLICY.new_event_loop = _new_event_loop
+
+
+def _exec_module(loader, module, original=SourceFileLoader.exec_module):
+    """Give the node's rospy to a module that a private one loads from a file, by importlib or imp."""
+    frame = sys._getframe(1)
+    # code in C may import in a thread without another frame
+    while frame and frame.f_globals.get('__name__', '').partition('.')[0] in _IMPORTERS:
+        frame = frame.f_back  # type: ignore[assignment]
+    owner = frame and inspecting.owner_of_builtins(frame.f_globals.get('__builtins__'))
+    if owner:
+        vars(module)['__builtins__'] = owner.builtins
+    original(loader, module)
+
+
+SourceFileLoader.exec_module = _exec_module  # type: ignore[assignment]
 
 
 @patch('subprocess', 'Popen.__init__')
@@ -590,26 +606,11 @@ def raise_in(thread, error_class):
     ctypes.pythonapi.PyThreadState_SetAsyncExc(thread_id, ctypes.py_object(error_class))
 
 
-class _LineBytes(io.BufferedIOBase):
-    """The bytes of NamedLines."""
-
-    def __init__(self):
-        self._decoder = codecs.getincrementaldecoder('utf-8')('replace')
-
-    def writable(self):
-        return True
-
-    def write(self, data):
-        self.lines.write(self._decoder.decode(data))
-        return len(data)
-
-
 class NamedLines:
     """A stream that puts the node's name before each line; its end is not that of the stream behind it.
 
     :param stream: the stream to write to, such as the process's stdout
     :param run: the run with the name
-    :ivar buffer: takes bytes; a program may wrap it in a stream of its own
     """
 
     closed = False
@@ -618,8 +619,6 @@ class NamedLines:
         self._stream = stream
         self._run = run
         self._partial_line = ''  # the text after the last line end, not written yet
-        self.buffer = _LineBytes()
-        self.buffer.lines = self
 
     def __getattr__(self, name):
         return getattr(self._stream, name)
@@ -630,8 +629,10 @@ class NamedLines:
         self.closed = True
 
     def detach(self):
-        """Return the buffer, to be wrapped anew."""
-        return self.buffer
+        """Return a stream of bytes, which a program may wrap anew, and close."""
+        return os.fdopen(os.dup(self._stream.fileno()), 'wb')
+
+    buffer = property(detach)
 
     def write(self, text):
         """Write the complete lines, keep the rest, and return the number of characters."""
@@ -651,10 +652,7 @@ class NamedLines:
         text = ''.join(f'[{self._run.name}] {line}\n' for line in lines)
         # the reader of a pipe may have gone: the program must go on, and stop its motors
         with contextlib.suppress(OSError, ValueError):
-            try:
-                self._stream.write(text)
-            except UnicodeEncodeError:  # the terminal is said to know ASCII alone
-                self._stream.buffer.write(text.encode())
+            self._stream.write(text)
             self._stream.flush()
 
 

@@ -4,6 +4,7 @@ import os
 import pathlib
 import re
 import sys
+from functools import lru_cache
 
 from pharos.errors import PharosError
 from pharos.private_rospy.loader import SYSTEM_FOLDERS, source_places
@@ -21,7 +22,7 @@ _NEEDS_PROCESS = re.compile(
     r'|^[ \t]*from[ \t]+matplotlib[ \t]+import[^\n]*\bpyplot\b'
     r'|\bgi\.require_version\(.Gtk|\bcv2\.(?:imshow|namedWindow)\(|\breactor\.run\('
     r'|\.add_signal_handler\(|\bsignal\.(?:alarm|setitimer|pause)\('
-    r'|\bSIG(?:USR[12]|HUP|CHLD|ALRM)\b|\bProcessPoolExecutor\b|\bsocket\.setdefaulttimeout\('
+    r'|\bos\.chdir\(|\bSIG(?:USR[12]|HUP|CHLD|ALRM)\b|\bProcessPoolExecutor\b|\bsocket\.setdefaulttimeout\('
     r'|\bweb\.run_app\(|\buvicorn\.run\(',
     re.MULTILINE,
 )
@@ -94,36 +95,47 @@ def needs_process(path):
     return match and f'it has {match!r}, which needs one; --here overrides this'
 
 
-def why_own_group(path, env=()):
-    """Return why a Python program needs the environment of a process, as text; else ''.
+def environment_of(pairs):
+    """Return the environment variables that a launch file sets for a node, sorted, without ROS's."""
+    return tuple(sorted((name, value) for name, value in pairs if not name.startswith('ROS')))
+
+
+def sets_environment(path):
+    """Return the code of a Python program that sets environment variables, or ''.
 
     In a process with other programs, code in C and shared modules do not see its variables.
-
-    :param env: pairs: environment variables that its launch file sets
     """
-    names = [name for name, _ in env if not name.startswith('ROS')]
-    if names:
-        return f'a group of its own: its environment has {", ".join(names)}'
-    code = _search(path, _SETS_ENVIRONMENT)
-    return code and f'a group of its own: it has {code!r}'
+    return _search(path, _SETS_ENVIRONMENT)
 
 
 def _search(path, pattern):
     """Return the first text of a program that a pattern matches, or ''.
 
-    This also reads the program's modules that lie beside the program or in a package of the user.
+    This also reads the program's modules that lie beside the program or in its own package; not those
+    of libraries, which may have such code for others.
     """
-    files = [pathlib.Path(source_of(path))]
+    program = pathlib.Path(source_of(path)).resolve()
+    packages = [folder for folder in program.parents if (folder / 'package.xml').is_file()]
+    own_folder = str(packages[0] if packages else program.parent)
+    files = [program]
     for file in files:  # the list grows meanwhile
-        text = re.sub('#.*', '', file.read_text(errors='replace'))
-        match = pattern.search(text)
-        if match:
-            return match[0].strip()
-        for name in _imported_names(text):
-            imported_file = _user_file(name, file.parent)
-            if imported_file and imported_file not in files:
+        code, names = _read(file, file.stat().st_mtime_ns, pattern)
+        if code:
+            return code
+        for name in names:
+            imported_file = _user_file(name, file.parent, tuple(sys.path))
+            is_own = imported_file and str(imported_file.resolve()).startswith(own_folder)
+            if is_own and imported_file not in files:
                 files.append(imported_file)
     return ''
+
+
+@lru_cache(None)
+def _read(file, change_time, pattern):
+    """Return the first text of a file that a pattern matches, or '', and the names that it imports."""
+    text = re.sub('#.*', '', file.read_text(errors='replace'))
+    match = pattern.search(text)
+    return match[0].strip() if match else '', set(_imported_names(text))
 
 
 def _imported_names(text):
@@ -135,7 +147,8 @@ def _imported_names(text):
             yield f'{package}.{name}'
 
 
-def _user_file(module, folder):
+@lru_cache(None)
+def _user_file(module, folder, search_path):
     """Return the file of a module in a folder, or in a package outside of the system's, or None."""
     top_name, *rest = module.lstrip('.').split('.')  # a relative one is sought in the folder, too
     if not top_name:

@@ -22,7 +22,23 @@ def peer_of(connection):
     return connection.header and connection.header['callerid']
 
 
-class Link(Transport):
+class LocalTransport(Transport):
+    """One end of a connection that is not a socket of TCPROS.
+
+    :ivar has_own_queue: True: a publisher's end needs no Sender
+    """
+
+    has_own_queue = True
+
+    def __init__(self, direction, topic, endpoint_id):
+        super().__init__(direction, topic)
+        self.endpoint_id = endpoint_id
+
+    def get_transport_info(self):
+        return f'{self.transport_type} connection to [{self.endpoint_id}]'
+
+
+class Link(LocalTransport):
     """One end of a link, which looks like a connection of rospy's.
 
     No message passes through this object. A publisher puts messages into the inboxes of its links.
@@ -33,7 +49,6 @@ class Link(Transport):
     :ivar inboxes: those of the subscription; the publisher's end has them
     """
 
-    has_own_queue = True  # the inboxes
     latch = None  # rospy would send a latched message again; the overlay has its own latches
     header = property(lambda self: self.publisher.header)
     callerid_pub = property(peer_of)  # actionlib reads this
@@ -43,13 +58,9 @@ class Link(Transport):
     stat_num_msg = property(lambda self: self.publisher.seq, lambda self, zero: None)
 
     def __init__(self, direction, publisher, endpoint_id, thaw):
-        super().__init__(direction, publisher.name)
+        super().__init__(direction, publisher.name, endpoint_id)
         self.publisher = publisher
-        self.endpoint_id = endpoint_id
         self.thaw = thaw
-
-    def get_transport_info(self):
-        return f'{self.transport_type} connection to [{self.endpoint_id}]'
 
     def close(self):
         """Close both ends: rospy closes no connection of a publisher that has left the topic."""

@@ -1,4 +1,4 @@
-"""Have inspect, dataclasses and importlib find private modules, in the whole process.
+"""Have inspect and dataclasses find private modules, in the whole process.
 
 They look for the module of a class or function in ``sys.modules``, which has no private module.
 """
@@ -6,12 +6,9 @@ import dataclasses
 import inspect
 import linecache
 import sys
-from importlib.machinery import SourceFileLoader
 from types import ModuleType
 
 from pharos.private_rospy.loader import PrivateModules, process_lock
-
-_IMPORTERS = 'importlib', 'imp', '_frozen_importlib', '_frozen_importlib_external'
 
 
 def _private_module(thing):
@@ -24,17 +21,17 @@ def _private_module(thing):
         name = thing.__module__
         frame = sys._getframe()
         while frame and not owner:
-            owner = _owner_of_builtins(frame.f_globals.get('__builtins__'))
+            owner = owner_of_builtins(frame.f_globals.get('__builtins__'))
             frame = frame.f_back  # type: ignore[assignment]
     else:
         variables = getattr(thing, 'f_globals', None) or getattr(thing, '__globals__', None) or {}
         name = variables.get('__name__')  # type: ignore[assignment]
-        owner = _owner_of_builtins(variables.get('__builtins__'))
+        owner = owner_of_builtins(variables.get('__builtins__'))
     module = owner.by_name.get(name) if owner else None
     return module if type(module) is ModuleType else None  # not a stand-in
 
 
-def _owner_of_builtins(module_builtins):
+def owner_of_builtins(module_builtins):
     """Return the PrivateModules that a module's ``__builtins__`` belong to, or None."""
     if type(module_builtins) is not dict:  # those of __main__ are a module
         return None
@@ -84,19 +81,6 @@ def _process_class(cls, *args, original=dataclasses._process_class, **kwargs):  
                 del sys.modules[name]
 
 
-def _exec_module(loader, module, original=SourceFileLoader.exec_module):
-    """Give the node's rospy to a module that a private one loads from a file, by importlib or imp."""
-    frame = sys._getframe(1)
-    # code in C may import in a thread without another frame
-    while frame and frame.f_globals.get('__name__', '').partition('.')[0] in _IMPORTERS:
-        frame = frame.f_back  # type: ignore[assignment]
-    owner = frame and _owner_of_builtins(frame.f_globals.get('__builtins__'))
-    if owner:
-        vars(module)['__builtins__'] = owner.builtins
-    original(loader, module)
-
-
-SourceFileLoader.exec_module = _exec_module  # type: ignore[assignment]
 dataclasses._process_class = _process_class  # type: ignore[attr-defined]
 inspect.getmodule = _getmodule
 inspect.getfile = _getfile

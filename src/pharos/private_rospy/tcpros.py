@@ -157,6 +157,16 @@ class MessageParts(list):
         return parts, size + _LENGTH.size
 
 
+def send_while_waiting(sock, send):
+    """Call ``send()`` until it returns None; before each further call, wait for the event that it returns."""
+    poller = select.poll()
+    event = send()
+    while event:
+        poller.register(sock, event)
+        poller.poll(POLL_LIMIT)
+        event = send()
+
+
 class Sender(BoundedQueue):
     """A connection to a subscriber, with a bounded queue for messages that must wait.
 
@@ -246,20 +256,17 @@ class Sender(BoundedQueue):
         self._connection.stat_num_msg += not self._unsent_parts()
 
     def _send_queue(self):
-        poller = select.poll()
-        with contextlib.suppress(*CLOSED):
-            poller.register(self._connection.socket, select.POLLOUT)
-            while self._send_rest():
-                poller.poll(POLL_LIMIT)
-            return
-        self._connection.close()
+        try:
+            send_while_waiting(self._connection.socket, self._send_rest)
+        except CLOSED:
+            self._connection.close()
 
     def _send_rest(self):
-        """Send what the socket takes; return False if that is all: then the thread must end."""
+        """Send what the socket takes; return the event to wait for, None if that is all."""
         with self._lock:
             self._send_ready()
             self._has_thread = self.is_busy
-            return self._has_thread
+            return select.POLLOUT if self._has_thread else None
 
     def close(self):
         """Close the connection, which ends the thread."""

@@ -20,17 +20,16 @@ from time import monotonic
 from typing import NamedTuple
 
 import genpy
-from rospy.impl.transport import Transport
 
 from pharos.intraprocess.copier import serialize
 from pharos.intraprocess.inboxes import BoundedQueue
-from pharos.private_rospy.tcpros import shutdown_socket
+from pharos.intraprocess.links import LocalTransport
+from pharos.private_rospy.tcpros import send_while_waiting, shutdown_socket
 from pharos.waiting import let_others_run
 
 MAX_PACKET = 1 << 16  # bytes of a message, or a part of one, that the socket takes itself
 MAX_FILES = 4  # of a publisher
 MAX_EXCESS = 10  # a file so many times as large as its message is given back
-POLL_LIMIT = 1000  # milliseconds between two looks if the connection is closed
 #: position of the file, or NO_FILE; slot of the field in it, or WHOLE; its bytes; dropped messages;
 #: the time of sending, as of time.monotonic(), which is the same for all processes of a host
 PACKET = struct.Struct('<bBQId')
@@ -169,19 +168,14 @@ class Entry(NamedTuple):
     time: float  # of sending
 
 
-class MemoryTransport(Transport):
+class MemoryTransport(LocalTransport):
     """One end of a connection."""
 
     transport_type = 'SHARED_MEMORY'
-    has_own_queue = True
 
     def __init__(self, direction, topic, endpoint_id, sock):
-        super().__init__(direction, topic)
-        self.endpoint_id = endpoint_id
+        super().__init__(direction, topic, endpoint_id)
         self._socket = sock
-
-    def get_transport_info(self):
-        return f'{self.transport_type} connection to [{self.endpoint_id}]'
 
 
 class MemorySender(MemoryTransport, BoundedQueue):
@@ -303,19 +297,19 @@ class MemorySender(MemoryTransport, BoundedQueue):
             self.announced = None
 
     def _send_queue(self):
-        poller = select.poll()
-        while True:
-            with self._memory.lock:
-                self.take_receipts()
-                self._send_ready()
-                if not self.messages:
-                    self.is_sending = False
-                    break
-                waits_for_receipt = self.messages[0].file and self.announced
-                event = select.POLLIN if waits_for_receipt else select.POLLOUT
-                poller.register(self._socket, event)
-            poller.poll(POLL_LIMIT)
+        send_while_waiting(self._socket, self._send_rest)
         self.close_if_broken()
+
+    def _send_rest(self):
+        """Send what the socket takes; return the event to wait for, None if that is all."""
+        with self._memory.lock:
+            self.take_receipts()
+            self._send_ready()
+            self.is_sending = bool(self.messages)
+            if not self.messages:
+                return None
+            waits_for_receipt = self.messages[0].file and self.announced
+            return select.POLLIN if waits_for_receipt else select.POLLOUT
 
     def close_if_broken(self):
         if self.is_broken:
