@@ -43,7 +43,7 @@ nitpicky = True
 nitpick_ignore_regex = [
     # types of others, type variables, and what is internal
     ('py:(class|exc)', r'(genpy|rospy|rosgraph|threading|os|subprocess|types|_pytest)\..*'),
-    ('py:class', r'(pharos\.channels\.Channel|.*\.LaunchFile|.*Run|Block|Edge)'),
+    ('py:class', r'(pharos\.channels\.Channel|.*\.Snapshot|.*Run|Block|Edge|(.*\.)?N)'),
     # attributes that a docstring lists have no place of their own, nor has an inherited stop()
     ('py:(attr|data)', r'.*'),
     ('py:meth', r'(stop|Node\.serve)'),
@@ -64,10 +64,12 @@ def draw_flowcharts(app, name, source):
 
 def _by_graphviz(flowchart):
     label = re.compile(r'(\w+)\["(.*?)"\]')
-    nodes = '\n'.join(f'{name} [label=<{text}>]' for name, text in label.findall(flowchart[1]))
-    edges = [line for line in label.sub(r'\1', flowchart[1]).splitlines() if '-->' in line]
+    # names in quotes: a box may be called node, which dot reserves
+    nodes = '\n'.join(f'"{name}" [label=<{text}>]' for name, text in label.findall(flowchart[1]))
+    edges = re.findall(r'(\w+) --> (\w+)', label.sub(r'\1', flowchart[1]))
+    arrows = [f'"{start}" -> "{end}"' for start, end in edges]
     style = 'node [shape=box, fontname="sans-serif", fontsize=10, margin="0.2,0.1"]'
-    dot = '\n'.join([style, nodes, *edges]).replace('-->', '->')
+    dot = '\n'.join([style, nodes, *arrows])
     return f'```{{graphviz}}\ndigraph {{\n{dot}\n}}\n```'
 
 

@@ -490,7 +490,7 @@ class Node(DelegateHolder):
         :raises UnknownTopicError, UnknownTypeError: if the type is not known
         :raises MessageTypeError: if the node has the topic open with another type
         :raises MasterUnreachableError: if the master does not answer; nothing is left behind
-        :raises ValueError: if both shared and from_ are given
+        :raises ValueError: if both ``shared`` and ``from_`` are given
         """
         topic = self._resolve(topic)
         if shared and from_:

@@ -91,7 +91,7 @@ class Composition:
 
         The Transcript shows why a node does not start, or runs in another process.
 
-        :param launch_file: the :class:`LaunchFile`
+        :param launch_file: a LaunchFile, which has read the file
         :raises PharosError: if the master does not answer, or refuses a parameter
         """
         run_id = self.master.parameters.setdefault('/run_id', roslaunch.core.generate_run_id())
