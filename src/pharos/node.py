@@ -249,7 +249,8 @@ class Node(DelegateHolder):
 
         Objects, subscriptions and connections stay; doc/live.md says what changes, and what cannot.
 
-        :raises PharosError: if a file is not valid, with its name and line; nothing has changed
+        :raises PharosError: if a file is not valid, with its name and line. No function, class or value
+            has changed, but definitions before that line have run, and new names are there
         """
         from pharos.live.editing import reload
 

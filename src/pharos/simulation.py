@@ -80,7 +80,8 @@ class Lock:
     """A lock. A thread that takes part waits for others that do in virtual time.
 
     If a server holds the lock, the thread keeps its turn: servers hold locks briefly. "Member" is short for
-    a thread that takes part: only such a thread keeps a lock while it waits for the time.
+    a thread that takes part: only such a thread keeps a lock while it waits for the time. A release gives
+    no turn away, unless a thread that takes no part releases while nobody has the turn.
     """
 
     def __init__(self):

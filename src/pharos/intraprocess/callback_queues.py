@@ -302,7 +302,8 @@ def hand_over(callback_queues: list[CallbackQueue], last_wake: float, may_wait: 
     """Wake the threads of some callback queues; a publisher calls this.
 
     :param last_wake: the last time that the same publisher woke a thread, as of perf_counter()
-    :param may_wait: True: wait up to YIELD_LIMIT until each thread runs
+    :param may_wait: True: wait until each thread runs, up to YIELD_LIMIT; after one that takes so long
+        wait for no other
     :returns: the time now if a thread was woken, else ``last_wake``
     """
     global _no_yield_before

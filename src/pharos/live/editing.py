@@ -71,7 +71,8 @@ def reload(node):
 def _read(module, notes):
     """Run the definitions in a module's file that are new; add to the notes the lines of other statements.
 
-    The module stays as it is, but gets the names that it lacks: other definitions may use them.
+    Names that the module has keep their values. It gets those that it lacks, since other definitions
+    may use them; they stay if a later one raises an exception.
 
     :returns: the text of the file, and the changes: arguments of _change()
     :raises PharosError: if the text is not valid, or a definition raises an exception
