@@ -105,6 +105,7 @@ class Composition:
             )
         log_folder = os.path.join(rospkg.get_log_dir(), run_id)
         os.makedirs(log_folder, exist_ok=True)
+        Transcript.show(f'ROS master {self.master.url}, logs in {log_folder}')
         entries = []
         for number, entry in enumerate(launch_file.entries, 1):
             # as roslaunch names logs
