@@ -497,7 +497,7 @@ def test_chain_of_timers_keeps_its_program(bench):
 
 @pytest.mark.parametrize('daemon', [True, False])
 def test_thread_of_a_thread_is_a_daemon_like_it(bench, daemon):
-    """The program's end waits for one that is none."""
+    """The program's end waits for a thread that is not a daemon."""
     text = f'''
         def work():
             for _ in range(20):

@@ -149,11 +149,10 @@ class LaunchFile:
                     node, node.machine, env=os.environ
                 )
                 reason = why_apart(command[0], is_here)
-        except rospkg.ResourceNotFound:
-            Transcript.show(f'{name} is not started: {no_package(node.package)}')
-            return
         except Exception as error:  # of roslaunch, or of a program that cannot be read
-            Transcript.show(f'{name} is not started: {error}')
+            is_known = node.package in rospkg.RosPack().list()
+            reason = error if is_known else no_package(node.package)
+            Transcript.show(f'{name} is not started: {reason}')
             return
         if reason:
             Transcript.show(f'{name} runs as a plain process: {reason}')
