@@ -924,7 +924,7 @@ NO_STATES = [5, 'nonsense', [], [1, ''], [1, '', None], [1, '', [[]]], [1, '', [
 
 
 def test_answer_without_sense_ends_no_look(mortal, quick_watcher):
-    """A program that is no master answers at its URL for a while."""
+    """Another program answers at the URL of the master for a while."""
     node = create(mortal.master)
     node.interested_in('/t', STRING)
     before = registrations(mortal.master, '/node')

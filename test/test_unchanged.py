@@ -139,7 +139,7 @@ def test_robot_stands_at_end(master, peer, bench, drive, way):
 
 @pytest.mark.parametrize('wait, hook, way', HOOKS)
 def test_hook_has_the_last_word(master, peer, bench, wait, hook, way):
-    """What the loop publishes beside the hook is dropped, as a process would not have sent it."""
+    """The loop's messages beside the hook are dropped: a process would not have sent them."""
     peer.hear('/cmd', 'std_msgs/Float64')
     peer.run('from std_srvs.srv import Empty; rospy.Service("/brake", Empty, lambda request: [])')
     text = text_of('hook', wait=LOOP_WAITS[wait], hook=hook)
@@ -497,7 +497,7 @@ def test_chain_of_timers_keeps_its_program(bench):
 
 @pytest.mark.parametrize('daemon', [True, False])
 def test_thread_of_a_thread_is_a_daemon_like_it(bench, daemon):
-    """The program's end waits for one that is none."""
+    """The program's end waits for a thread that is not a daemon."""
     text = f'''
         def work():
             for _ in range(20):
@@ -567,14 +567,18 @@ def descriptors():
 
 
 def test_program_without_asyncio_has_no_loop(bench):
-    bench.load("say(len(os.listdir('/proc/self/fd')))")  # a process has some of its own from then on
+    bench.load(
+        "say(len(os.listdir('/proc/self/fd')))"
+    )  # a process has some of its own from then on
     count = descriptors()
     bench.load("say(len(os.listdir('/proc/self/fd')))")
     assert int(bench.said()[-1]) == count
 
 
 def test_loop_that_was_asked_for_is_closed(bench):
-    text = f'loop = asyncio.get_event_loop()\n{INIT}say(loop.run_until_complete(asyncio.sleep(0, 7)))'
+    text = (
+        f'loop = asyncio.get_event_loop()\n{INIT}say(loop.run_until_complete(asyncio.sleep(0, 7)))'
+    )
     bench.load(INIT).wait(TIMEOUT)
     gc.collect()
     count = descriptors()
