@@ -797,7 +797,7 @@ def test_failed_look_at_files_is_made_again(master, bench, monkeypatch, what):
         thread = threading.Thread(target=reload_on_save, args=[composition])
         thread.start()
         until(lambda: bench.said() == ['first'])
-        # the first look must come before the save
+        # nothing sees a save before the first look
         until(lambda: bench.write(EDITED.format('second')) and len(bench.said()) > 1)
         may_fail.set()
         bench.write(EDITED.format('the third'))

@@ -511,9 +511,9 @@ def test_descriptor_of_an_odd_packet_is_closed(master, tmp_path):
         mouth.run(f"out = node.output_channel('/words', '{STRING}')")
         until(lambda: mouth.value('out.connections'))
         mouth.run(f"import array, socket; odd = open({path!r}, 'w')")
-        sock = 'out._publisher.connections[0]._socket'
-        rights = "(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array('i', [odd.fileno()] * 2))"
-        mouth.run(f"{sock}.sendmsg([b'odd'], [{rights}])")
+        mouth.run("files = array.array('i', [odd.fileno()])")
+        mouth.run('rights = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, files)]')
+        mouth.run("out._publisher.connections[0]._socket.sendmsg([b'odd'], rights)")
         until(lambda: mouth.run("out.send(data='x')") or heard.all())
     files = pathlib.Path('/proc/self/fd').iterdir()
     assert path not in [os.readlink(file) for file in files if file.is_symlink()]
