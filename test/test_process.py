@@ -842,5 +842,5 @@ def test_control_name_that_another_user_has_is_told(master, bench, transcript):
         with master.compose(None, bench.launch_file(program=SPIN)):
             until(bench.said)
         thief.signal(signal.SIGKILL)
-    (line,) = [line for line in transcript if 'control' in line]
+    (line,) = [line for line in transcript if 'control name' in line]
     assert 'user' in line
