@@ -219,7 +219,7 @@ rospy.spin()
 '''
 ENVIRONMENTS = {
     'launch file': ('<env name="GPU" value="1"/>', '', 'its environment has GPU=1'),
-    'program': ('', "os.environ['GPU'] = '1'\n", 'it has "environ[\'GPU\'] ="'),
+    'program': ('', "os.environ['GPU'] = '1'\n", '/program has "environ[\'GPU\'] ="'),
 }
 
 

@@ -291,6 +291,7 @@ class ScriptRun(Run):
                     status = self._status_of(self.exit_request)
                 self.node.exit_code = status
             self.main_has_ended = True
+            signals.silenced_threads.discard(self.main.ident)  # another thread may get the number
             if not self.is_end_requested:
                 self.request_stop()
 
