@@ -18,6 +18,7 @@ from pharos import (
     UnknownTopicError,
     UnknownTypeError,
 )
+from pharos.private_rospy import topics
 from pharos.testing import Mailbox, until
 
 TWIST, STRING, INT32 = 'geometry_msgs/Twist', 'std_msgs/String', 'std_msgs/Int32'
@@ -623,3 +624,74 @@ def test_closed_topic_is_forgotten(master, node, other):
     for channel in channels:
         channel.close()
     assert '/words' not in other._current_run.publisher_uris
+
+
+# -- two threads at once
+
+
+class Meeting:
+    """Holds up the first thread that comes until another one has been here and gone on."""
+
+    def __init__(self):
+        self.turn, self.other_is_done = threading.Lock(), threading.Event()
+        self.first_is_here = threading.Event()
+
+    def hold_up(self):
+        if self.turn.acquire(blocking=False):
+            self.first_is_here.set()
+            self.other_is_done.wait(0.5)  # it may wait for this thread
+
+
+def side_by_side(pool, meeting, first, second):
+    """Run two functions, the second one while the first one is held up; return their values."""
+    held = pool.submit(first)
+    meeting.first_is_here.wait(1)
+    other = pool.submit(second)
+    other.add_done_callback(lambda done: meeting.other_is_done.set())
+    return held.result(TIMEOUT), other.result(TIMEOUT)
+
+
+@pytest.mark.parametrize('change', ['open', 'close'])
+def test_channels_of_two_threads_are_kept(node, pool, monkeypatch, change):
+    """The node opens at its next start what it has now."""
+    meeting = Meeting()
+
+    def open_channel(topic):
+        return node.output_channel(topic, STRING)
+
+    def store(run, endpoints):
+        meeting.hold_up()
+        vars(run)['endpoints'] = endpoints
+
+    kept = [open_channel('/a'), open_channel('/b')]
+    slow = property(lambda run: vars(run)['endpoints'], store)
+    monkeypatch.setattr(type(node._current_run), 'endpoints', slow, raising=False)
+    if change == 'open':
+        opens = [lambda: open_channel('/c'), lambda: open_channel('/d')]
+        kept += side_by_side(pool, meeting, *opens)
+    else:
+        side_by_side(pool, meeting, kept.pop().close, kept.pop().close)
+    node.restart()
+    assert {channel.topic for channel in node.channels} == {channel.topic for channel in kept}
+
+
+def test_subscribers_of_two_threads_both_hear(node, other, pool, monkeypatch):
+    """One of plain rospy, and a channel."""
+    meeting, heard, plain = Meeting(), Mailbox(), Mailbox()
+    pause_for = topics.first_pause_for
+
+    def hold_up(callbacks):
+        meeting.hold_up()
+        return pause_for(callbacks)
+
+    monkeypatch.setattr(topics, 'first_pause_for', hold_up)
+    side_by_side(
+        pool,
+        meeting,
+        lambda: other.ros.Subscriber('/words', String, plain),
+        lambda: other.interested_in('/words', STRING, delegate=heard),
+    )
+    out = node.output_channel('/words', STRING)
+    until(lambda: out.connections)
+    out.send(data='x')
+    assert [box.next().data for box in (heard, plain)] == ['x', 'x']

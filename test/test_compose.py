@@ -1,4 +1,5 @@
 """Unmodified rospy programs and launch files run as nodes of one process."""
+import contextlib
 import importlib
 import inspect
 import os
@@ -11,7 +12,7 @@ import pytest
 import rospy
 
 import pharos
-from helpers import ROOT, SPIN, TIMEOUT, Peer, Program, create, registrations
+from helpers import ROOT, SPIN, TIMEOUT, Peer, Program, create, end, registrations
 from pharos import ExternalNode, Master, PharosError, ScriptNode, UnknownNodeError
 from pharos.testing import Mailbox, until
 
@@ -681,3 +682,47 @@ def test_stopped_node_does_not_respawn(master, compose):
     assert not ends.is_running and master.parameters['/ends/starts'] == 1
     composition.control(ends, 'start')
     until(lambda: master.parameters['/ends/starts'] >= 3, TIMEOUT)  # it respawns again
+
+
+# -- compose as a node of roslaunch
+
+
+NAMED = '''
+rospy.init_node('{0}')
+say(rospy.get_name())
+say([each for each in sys.argv if 'robot' in each])
+rospy.spin()
+'''
+
+
+@contextlib.contextmanager
+def as_node(bench, args, inside=''):
+    """Run roslaunch with compose as its only node, named robot, in the group of a namespace."""
+    for name in 'talk', 'hear':
+        bench.write(NAMED.format(name), name)
+    node = f'<node pkg="pharos" type="compose" name="robot" args="{args}" output="screen">'
+    xml = f'<launch><group ns="rig">{inside}{node}</node></group></launch>'
+    with Program(['roslaunch', bench.write(xml, 'all.launch', '')], bench.master.url) as launched:
+        try:
+            yield launched
+        finally:
+            end(launched)
+
+
+def test_node_of_roslaunch_runs_scripts(bench):
+    """The name and the log that roslaunch gives are those of compose, not of each program."""
+    paths = f'{bench.folder}/talk {bench.folder}/hear'
+    with as_node(bench, f'--script {paths}') as launched:
+        until(lambda: len(bench.said()) == 4 or launched.poll() is not None)
+    assert sorted(bench.said()) == ['/rig/hear', '/rig/talk', '[]', '[]']
+
+
+@pytest.mark.parametrize('args', ['--script {0}/talk {0}/hear', '{0}/programs.launch'])
+def test_remap_in_scope_of_a_node_is_taken(bench, args):
+    """It holds for its programs, and is no argument of a launch file."""
+    xml = ''.join(f'<node pkg="bench" type="{name}" name="{name}"/>' for name in ('talk', 'hear'))
+    bench.write(f'<launch>{xml}</launch>', 'programs.launch', '')
+    remap = '<remap from="chatter" to="words"/>'
+    with as_node(bench, args.format(bench.folder), remap) as launched:
+        until(lambda: len(bench.said()) == 4 or launched.poll() is not None)
+    assert sorted(bench.said())[:2] == ['/rig/hear', '/rig/talk']

@@ -106,7 +106,7 @@ def test_invalid_edit_changes_nothing(bench, program, ask, new):
     text = PROGRAM.replace('GAIN = 1', f'{new}\nGAIN = 2')
     with open(bench.write(text)) as file:
         line = file.read().splitlines().index(new) + 1
-    with pytest.raises(PharosError, match=f'program:{line}: .*nothing has changed'):
+    with pytest.raises(PharosError, match=f'(?s)program:{line}: .*nothing has changed'):
         program.reload()
     assert ask() == 1001
 

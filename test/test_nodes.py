@@ -1,8 +1,10 @@
 """Nodes: their names, addresses and arguments, souls and time, starts, stops and changes."""
 import concurrent.futures
 import contextlib
+import re
 import socket
 import threading
+import time
 import urllib.parse
 
 import pytest
@@ -14,6 +16,7 @@ from hypothesis import strategies as st
 import pharos
 from helpers import TIMEOUT, Program, create, registrations
 from pharos import BlockNode, Node, NodeStoppedError, PharosError
+from pharos.private_rospy import xmlrpc
 from pharos.testing import Mailbox, until
 
 STRING = 'std_msgs/String'
@@ -537,3 +540,53 @@ def test_health_tells_about_node(master, node, peer):
     assert (health.dropped, health.errors) == (0, 0)
     assert health.threads > 0
     assert 'registered=True' in str(health)
+
+
+# -- a slow master
+
+#: questions to the master, one after another, of a node with two channels from create() to stop()
+MAX_QUESTIONS = 11  # of a start, two channels and a stop, one after another
+
+
+@pytest.fixture
+def slow_master(master, monkeypatch):
+    """A master whose answers take a while: ``delays`` has those of the next ones, in seconds."""
+
+    class Slow:
+        url = master.url
+        lock, in_flight, rounds, delays = threading.Lock(), 0, [], iter(())
+
+    request = xmlrpc._Transport.single_request
+
+    def ask(transport, host, *arguments):
+        if host not in master.url:
+            return request(transport, host, *arguments)
+        with Slow.lock:
+            if not Slow.in_flight:  # those that are asked meanwhile take no further time
+                Slow.rounds.append(re.findall('<methodName>(.*)</methodName>', str(arguments)))
+            Slow.in_flight += 1
+        try:
+            time.sleep(next(Slow.delays, 0.01))
+            return request(transport, host, *arguments)
+        finally:
+            with Slow.lock:
+                Slow.in_flight -= 1
+
+    monkeypatch.setattr(xmlrpc._Transport, 'single_request', ask)
+    return Slow
+
+
+def test_start_and_stop_ask_few_questions(master, slow_master):
+    """With a master of 2 s for an answer, each one counts."""
+    node = create(master)
+    node.interested_in('/heard', STRING)
+    node.output_channel('/sent', STRING)
+    node.stop()
+    assert len(slow_master.rounds) <= MAX_QUESTIONS, slow_master.rounds
+
+
+def test_slow_master_is_told_once(master, slow_master, capfd):
+    slow_master.delays = iter([2, 2])
+    create(master).stop()
+    lines = ''.join(capfd.readouterr()).splitlines()
+    assert len([line for line in lines if master.url in line]) == 1

@@ -2,6 +2,7 @@
 import itertools
 import os
 import pty
+import shutil
 import signal
 import socket
 import subprocess
@@ -14,7 +15,7 @@ import psutil
 import pytest
 
 import pharos
-from helpers import COMPOSE, DEFAULT_SIGNALS, INIT, SPIN, TIMEOUT, Program, create, end
+from helpers import COMPOSE, DEFAULT_SIGNALS, INIT, PYTHON, SPIN, TIMEOUT, Program, create, end
 from pharos.compose.composition import Composition
 from pharos.compose.control import control, reload_on_save
 from pharos.compose.script import ScriptNode
@@ -26,6 +27,11 @@ STRING = 'std_msgs/String'
 
 # -- drivers come back
 
+OTHER_USER = ['setpriv', '--reuid', '65534', '--clear-groups']
+needs_other_user = pytest.mark.skipif(
+    not shutil.which('setpriv') or subprocess.call([*OTHER_USER, 'true']) != 0,
+    reason='needs the right to be another user',
+)
 READERS = {
     'nobody': '',
     'loop': 'def read(device):\n    while True: time.sleep(0.01)\n',
@@ -213,7 +219,7 @@ rospy.spin()
 '''
 ENVIRONMENTS = {
     'launch file': ('<env name="GPU" value="1"/>', '', 'its environment has GPU=1'),
-    'program': ('', "os.environ['GPU'] = '1'\n", 'it has "environ[\'GPU\'] ="'),
+    'program': ('', "os.environ['GPU'] = '1'\n", '/program has "environ[\'GPU\'] ="'),
 }
 
 
@@ -791,7 +797,7 @@ def test_failed_look_at_files_is_made_again(master, bench, monkeypatch, what):
         thread = threading.Thread(target=reload_on_save, args=[composition])
         thread.start()
         until(lambda: bench.said() == ['first'])
-        # the first look must come before the save
+        # nothing sees a save before the first look
         until(lambda: bench.write(EDITED.format('second')) and len(bench.said()) > 1)
         may_fail.set()
         bench.write(EDITED.format('the third'))
@@ -815,3 +821,26 @@ def test_failed_accept_ends_no_control(master, bench, monkeypatch):
         control('restart', '/program', master)
         assert failed.wait(TIMEOUT)
         assert control('restart', '/program', master) == '/program'
+
+
+TAKES_NAME = '''
+import socket, sys, threading
+sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+sock.bind('\\0pharos-compose-' + sys.argv[1])
+sock.listen()
+print('taken', flush=True)
+threading.Event().wait()
+'''
+
+
+@needs_other_user
+def test_control_name_that_another_user_has_is_told(master, bench, transcript):
+    """The name has the number of this process: the nodes of the composition cannot be controlled."""
+    command = [*OTHER_USER, PYTHON, '-c', TAKES_NAME, str(os.getpid())]
+    with Program(command, master.url) as thief:
+        thief.expect('taken')
+        with master.compose(None, bench.launch_file(program=SPIN)):
+            until(bench.said)
+        thief.signal(signal.SIGKILL)
+    (line,) = [line for line in transcript if 'control name' in line]
+    assert 'user' in line

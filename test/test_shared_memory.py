@@ -2,6 +2,7 @@
 import contextlib
 import errno
 import os
+import pathlib
 import shutil
 import signal
 import socket
@@ -500,3 +501,19 @@ def test_reader_outlives_an_exception(master, monkeypatch, what):
         until(lambda: len(failed) == len(BROKEN[what]))
         until(lambda: mouth.run("out.send(data='later')") or len(heard.all()) > 1)
         assert heard.all()[-1].data == 'later'
+
+
+def test_descriptor_of_an_odd_packet_is_closed(master, tmp_path):
+    """The connection ends, and comes back."""
+    path = str(tmp_path / 'odd')
+    heard = Mailbox(create(master, '/ear'), '/words', STRING)
+    with PharosPeer(master.url, 'mouth') as mouth:
+        mouth.run(f"out = node.output_channel('/words', '{STRING}')")
+        until(lambda: mouth.value('out.connections'))
+        mouth.run(f"import array, socket; odd = open({path!r}, 'w')")
+        mouth.run("files = array.array('i', [odd.fileno()])")
+        mouth.run('rights = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, files)]')
+        mouth.run("out._publisher.connections[0]._socket.sendmsg([b'odd'], rights)")
+        until(lambda: mouth.run("out.send(data='x')") or heard.all())
+    files = pathlib.Path('/proc/self/fd').iterdir()
+    assert path not in [os.readlink(file) for file in files if file.is_symlink()]

@@ -836,7 +836,10 @@ LOOKED_AT = {
     'connections': ('topic_manager.check_all', lambda run: None),
     'log': ('ros.logwarn_throttle_identical', lambda run: run.troubles.add('a trouble')),
     'retries': ('retries.items', lambda run: setattr(run, 'retries', collections.UserDict())),
-    'silent clients': ('close_silent_clients', lambda run: None),
+    'silent clients': (
+        'deadlines.items',
+        lambda run: setattr(run, 'deadlines', collections.UserDict()),
+    ),
     'topics': ('topic_manager.get_publications', lambda run: None),
     'services': ('service_manager.get_services', lambda run: None),
 }

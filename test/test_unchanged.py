@@ -496,19 +496,21 @@ def test_chain_of_timers_keeps_its_program(bench):
 
 
 @pytest.mark.parametrize('daemon', [True, False])
-def test_thread_of_a_thread_is_daemon_like_it(bench, daemon):
+def test_thread_of_a_thread_is_a_daemon_like_it(bench, daemon):
+    """The program's end waits for a thread that is not a daemon."""
     text = f'''
         def work():
-            inner = threading.Thread(target=lambda: None)
-            say(inner.daemon)
-            inner.start()
+            for _ in range(20):
+                if rospy.is_shutdown(): return
+                time.sleep(0.01)
+            say('worked')
         rospy.init_node('program')
-        outer = threading.Thread(target=work, daemon={daemon})
+        outer = threading.Thread(target=lambda: threading.Thread(target=work).start(), daemon={daemon})
         outer.start()
         outer.join()
         '''
     assert bench.load(text).wait(TIMEOUT) == 0
-    assert bench.said() == [str(daemon)]
+    assert bench.said() == ([] if daemon else ['worked'])
 
 
 # -- asyncio
@@ -585,3 +587,129 @@ def test_loop_that_was_asked_for_is_closed(bench):
     script.stop()
     assert bench.said() == ['7']
     until(lambda: descriptors() == count)
+
+
+# -- what is the process's
+
+
+TIMED = '''
+import socket, urllib.request
+rospy.init_node('timed')
+socket.setdefaulttimeout(0.2)
+say(socket.getdefaulttimeout())
+say(socket.socket().gettimeout())
+device = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+device.bind(('127.0.0.1', 0))
+try:
+    device.recv(10)
+except socket.timeout:
+    say('nothing came')
+server = socket.create_server(('127.0.0.1', 0))
+try:
+    urllib.request.urlopen(f'http://127.0.0.1:{server.getsockname()[1]}/')
+except OSError as error:
+    say(error)
+rospy.set_param('/timed', True)
+rospy.spin()
+'''
+BESIDE = '''
+import socket
+rospy.init_node('beside')
+while not rospy.has_param('/timed'): time.sleep(0.01)
+say(socket.socket().gettimeout())
+rospy.spin()
+'''
+
+
+def test_default_timeout_is_the_programs_own(bench):
+    """It holds for its sockets and for libraries that it uses, and for no other program."""
+    with bench.program(bench.launch_file(timed=TIMED, beside=BESIDE)):
+        until(lambda: len(bench.said()) == 5)
+    assert bench.said() == ['0.2', '0.2', 'nothing came', 'timed out', 'None']
+
+
+POOL = '''
+import concurrent.futures, math
+def double(number): return 2 * number
+if __name__ == '__main__':
+    rospy.init_node('pool')
+    with concurrent.futures.ProcessPoolExecutor(2) as pool:
+        say(list(pool.map({}, [4, 9])))
+    say('over')
+'''
+
+
+@pytest.mark.parametrize('function, values', [('math.sqrt', '[2.0, 3.0]'), ('double', '[8, 18]')])
+def test_pool_of_processes_computes(bench, function, values):
+    """In this process, or in one of its own."""
+    with bench.program(bench.launch_file(pool=POOL.format(function), beside=SPIN)):
+        until(lambda: len(bench.said()) == 3)
+    assert sorted(bench.said()) == sorted(['ready', values, 'over'])
+
+
+RAISES = {
+    'SIGUSR1': 'os.kill(os.getpid(), signal.SIGUSR1)',
+    'SIGUSR2': 'os.kill(os.getpid(), signal.SIGUSR2)',
+    'SIGHUP': 'os.kill(os.getpid(), signal.SIGHUP)',
+    'SIGCHLD': "subprocess.call(['true'])",
+    'SIGALRM': "subprocess.call(['kill', '-ALRM', str(os.getpid())])",
+}
+HANDLED = '''
+import subprocess
+rospy.init_node('handler')
+signal.signal(signal.{}, lambda number, frame: say(signal.Signals(number).name))
+{}
+while not (rospy.is_shutdown() or rospy.has_param('/go')): time.sleep(0.01)
+say('lives')
+rospy.spin()
+'''
+
+
+@pytest.mark.parametrize('how', ['scripts', 'launch file'])
+@pytest.mark.parametrize('name', RAISES)
+def test_handler_of_a_signal_is_called(master, bench, name, how):
+    """In this process, or in one of its own; nobody else ends."""
+    text = HANDLED.format(name, RAISES[name])
+    words = ['--script', bench.write(text, 'handler'), bench.write(SPIN)]
+    if how == 'launch file':
+        words = [bench.launch_file(handler=text, program=SPIN)]
+    with bench.program(*words) as composed:
+        until(lambda: {'ready', name} <= {*bench.said()} or composed.poll() is not None)
+        master.parameters['/go'] = True
+        until(lambda: 'lives' in bench.said() or composed.poll() is not None)
+        assert master.wait_for_node('/program', TIMEOUT).is_alive()
+        end(composed)
+    assert sorted(bench.said()) == sorted(['ready', name, 'lives'])
+
+
+@pytest.mark.parametrize(
+    'line', ['sys.stdout.close()', 'sys.stdout.detach()', 'sys.stderr.close()'], ids=str
+)
+def test_closed_output_silences_no_other(master, bench, line):
+    closes = f"rospy.init_node('closes')\n{line}\nrospy.set_param('/closed', True)\nrospy.spin()"
+    waits = "while not rospy.has_param('/closed'): time.sleep(0.01)\n"
+    prints = "print('still heard')\nprint('still told', file=sys.stderr)\nrospy.logwarn('still logged')\n"
+    beside = f"rospy.init_node('beside')\n{waits}{prints}say('printed')\nrospy.spin()"
+    paths = bench.write(closes, 'closes'), bench.write(beside, 'beside')
+    with bench.program('--script', *paths) as composed:
+        until(lambda: 'printed' in bench.said() or composed.poll() is not None)
+        end(composed)
+    for text in 'still heard', 'still told', 'still logged':
+        assert text in composed.output
+
+
+def test_reopened_output_is_written(bench):
+    """A usual cure for an error of encoding, in two programs."""
+    text = '''
+        import io
+        sys.stdout = io.TextIOWrapper(sys.stdout.detach(), encoding='utf-8', line_buffering=True)
+        rospy.init_node('{0}')
+        print('{0} says ✓')
+        say('printed')
+        rospy.spin()
+        '''
+    paths = [bench.write(text.format(name), name) for name in ('one', 'two')]
+    with bench.program('--script', *paths) as composed:
+        until(lambda: len(bench.said()) == 2)
+        end(composed)
+    assert 'one says ✓' in composed.output and 'two says ✓' in composed.output

@@ -163,6 +163,8 @@ class InputChannel(DelegateHolder, Channel, Inbox):
             block = self._delegate_block or self.node._delegate_block
             if block:
                 block(message, self)
+            elif self.received == 1:
+                self._run.ros.logwarn(f'{self.topic}: messages come, but there is no delegate')
         except BaseException as error:
             delegate = self.delegate or self.node.delegate
             self._run.report_failure(error, delegate, 'delegate', message, self, self._retry)
@@ -370,11 +372,11 @@ def _ask_definition(node, topic, type_name):
     return found[0] if found else None
 
 
-def wait_subscribed(node, predicate, timeout, *arguments):
+def wait_subscribed(node, predicate, timeout, topic, *arguments):
     """Return the first true ``predicate(subscriber)`` of a new rospy.Subscriber."""
     # a channel would not do: the delegate that calls this holds up the node's callback queue
-    subscriber = node._current_run.ros.Subscriber(*arguments)
+    subscriber = node._current_run.ros.Subscriber(topic, *arguments)
     try:
-        return wait(lambda: predicate(subscriber), timeout, node)
+        return wait(lambda: predicate(subscriber), timeout, node, f'a message on {topic}')
     finally:
         subscriber.unregister()

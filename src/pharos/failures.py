@@ -1,6 +1,4 @@
 """Failures of blocks: kept, counted, and run again."""
-import importlib
-import sys
 import threading
 import time
 import traceback
@@ -73,11 +71,10 @@ class Failure:
 
         :raises PharosError: if the frames are not kept any more
         """
+        from pharos.live.debugging import open_debugger
+
         self._check_kept(self._frames)
-        module_name = 'IPython.core.debugger' if 'IPython' in sys.modules else 'pdb'
-        debugger = importlib.import_module(module_name).Pdb()
-        debugger.reset()
-        debugger.interaction(None, self._frames)
+        open_debugger(self._frames)
 
     def __repr__(self):
         times = f', {self.count} times' if self.count > 1 else ''

@@ -196,7 +196,7 @@ class Master:
         :param timeout: seconds, None: without limit
         :raises MasterUnreachableError: if the master does not answer in time
         """
-        return bool(wait_for(lambda: self.pid, timeout))
+        return bool(wait_for(lambda: self.pid, timeout, f'a ROS master at {self.url}'))
 
     @property
     def pid(self) -> int:
@@ -349,7 +349,7 @@ class Master:
         :param timeout: seconds, None: without limit
         :raises UnknownNodeError: if no such node is registered in time
         """
-        return wait_for(lambda: self.node(name), timeout)
+        return wait_for(lambda: self.node(name), timeout, f'the node {name}')
 
     # -- services
 
@@ -375,7 +375,9 @@ class Master:
         :param timeout: seconds, None: without limit
         :raises UnknownServiceError: if nobody offers the service in time
         """
-        return wait_for(lambda: self.lookup_service(name, caller_id), timeout)
+        return wait_for(
+            lambda: self.lookup_service(name, caller_id), timeout, f'the service {name}'
+        )
 
     # -- programs
 

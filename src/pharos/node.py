@@ -20,7 +20,12 @@ from pharos.channels import (
     find_to_send,
     wait_subscribed,
 )
-from pharos.errors import MasterUnreachableError, NodeStoppedError, PharosError
+from pharos.errors import (
+    MasterUnreachableError,
+    MessageTypeError,
+    NodeStoppedError,
+    PharosError,
+)
 from pharos.failures import Failures
 from pharos.names import legal_name, node_name
 from pharos.parameter import Parameter
@@ -83,6 +88,7 @@ class Node(DelegateHolder):
     _current_run: Run = None  # type: ignore[assignment]
     _settings: Settings = None  # type: ignore[assignment]
     _is_start_held = False  # True while _start_held() runs
+    _has_run_soul = False  # True once fork() or execute() was called
 
     def __init__(self, *args, **kwargs):
         """Do nothing: :meth:`Master.create` has given the node its name and settings.
@@ -200,6 +206,8 @@ class Node(DelegateHolder):
             try:
                 if self.is_running:
                     self.stop()
+                    if self.is_running:
+                        self.log(f'{type(self).__name__}.stop() must call super().stop()', 'error')
             except Exception as error:
                 self._current_run.report_failure(error, self.stop, 'method')
             finally:
@@ -360,6 +368,7 @@ class Node(DelegateHolder):
         self._check_active()
         if with_arguments(block, 'soul', 0, 1) is None:
             raise PharosError(f'{self._settings.name} has no soul: give it one, node.soul = block')
+        self._has_run_soul = True
         return block
 
     def _run_soul(self, block, required=False):
@@ -526,7 +535,7 @@ class Node(DelegateHolder):
         self,
         topic: str,
         block=None,
-        *,
+        *values,
         typed_as: str | type | None = None,
         to=None,
         **fields,
@@ -547,6 +556,11 @@ class Node(DelegateHolder):
         :raises MessageTypeError: if the message does not fit the topic, or has no such field
         :raises UnknownNodeError: if the node ``to`` is not connected
         """
+        if values:
+            raise MessageTypeError(
+                f'send_to({topic!r}, ...) takes one value: name the fields, as in data={values[-1]!r},'
+                f' and the type, as in typed_as={block!r}'
+            )
         if isinstance(block, type):
             typed_as = block
             block = None
@@ -626,7 +640,7 @@ class Node(DelegateHolder):
         :raises UnknownServiceError: if nobody offers the service in time
         """
         self._check_active()
-        return wait_for(lambda: self.lookup_service(name), timeout, self)
+        return wait_for(lambda: self.lookup_service(name), timeout, f'the service {name}', self)
 
     def parameter(self, name: str, initialized=None) -> Parameter:
         """Return a parameter of the server, bound both ways; '~rate' is private to the node.

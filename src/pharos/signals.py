@@ -83,6 +83,9 @@ def spin() -> None:
     :raises SystemExit: with status 1, as soon as a required soul has ended
     """
     handle_signals()
+    for node in live_nodes():
+        if node.soul and not node._has_run_soul:
+            node.log('nobody runs the soul of this node: write node.fork()', 'warning')
     # QuietWait() lets a KeyboardInterrupt of the program's own handler through
     with contextlib.suppress(KeyboardInterrupt), QuietWait():
         # a program may have called rospy.init_node(): then a signal is rospy's

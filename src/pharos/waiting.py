@@ -6,6 +6,9 @@ import time
 from typing import Any
 
 from pharos.errors import PharosError
+from pharos.transcript import Transcript
+
+NOTICE_DELAY = 3.0  # seconds
 
 
 class _Current(threading.local):
@@ -27,20 +30,27 @@ def let_others_run():
     time.sleep(1e-6)  # sleep(0) may end before another thread has woken
 
 
-def wait(predicate, timeout=None, node=None):
+def wait(predicate, timeout=None, node=None, subject=''):
     """Wait until ``predicate()`` is true.
 
     :param timeout: seconds; None: without limit
     :param node: the node's stop ends the wait, too; default: the node with its soul in this thread
+    :param subject: the thing that is waited for; a wait without a limit tells it after NOTICE_DELAY
     :returns: the last value of ``predicate()``, false if the wait ended otherwise
     """
     deadline = math.inf if timeout is None else time.monotonic() + timeout
     node = node or current.node
+    notice_time = math.inf
+    if subject and timeout is None:
+        notice_time = time.monotonic() + NOTICE_DELAY
     pause = 0.002  # seconds between the first two looks
     while True:
         value = predicate()
         if value or time.monotonic() >= deadline:
             return value
+        if time.monotonic() > notice_time:
+            notice_time = math.inf
+            Transcript.show(f'waits for {subject}')
         if node:
             is_stopping = node._current_run.stopping.wait(pause)
             if is_stopping:
@@ -50,7 +60,7 @@ def wait(predicate, timeout=None, node=None):
         pause = min(pause * 1.2, 0.02)
 
 
-def wait_for(find, timeout, node=None):
+def wait_for(find, timeout, subject, node=None):
     """Return ``find()``; try again for ``timeout`` seconds while ``find()`` raises a PharosError.
 
     :raises PharosError: the error of ``find()`` after that time, or after the stop of the node
@@ -60,4 +70,4 @@ def wait_for(find, timeout, node=None):
         with contextlib.suppress(PharosError):
             return find()
 
-    return wait(attempt, timeout, node) or find()  # the last attempt raises the error
+    return wait(attempt, timeout, node, subject) or find()  # the last attempt raises the error

@@ -25,6 +25,12 @@ NAMES = {
     'here': 'these here, though they show windows',
     'topics': 'of the bag, these topics alone',
 }
+#: options without a value -> help
+SWITCHES = {
+    'own-connections': 'nodes that hear one topic of one process have a connection each',
+    'reload': 'saved files take effect at once',
+    'screen': "all nodes have output='screen'",
+}
 
 
 def compose(arguments: list[str]) -> int:
@@ -58,13 +64,8 @@ def _parse(arguments):
     parser.add_argument(
         '--group', nargs='+', action='append', default=[], help='these in one other process'
     )
-    parser.add_argument(
-        '--own-connections',
-        action='store_true',
-        help='nodes that hear one topic of one process have a connection each',
-    )
-    parser.add_argument('--reload', action='store_true', help='saved files take effect at once')
-    parser.add_argument('--screen', action='store_true', help="all nodes have output='screen'")
+    for name, text in SWITCHES.items():
+        parser.add_argument(f'--{name}', action='store_true', help=text)
     parser.add_argument('--bag', type=os.path.abspath, help='virtual time: play this')  # type: ignore
     parser.add_argument('--for', type=float, dest='seconds', help='so long in virtual time, no bag')
     parser.add_argument('--record', help='in virtual time: write what nodes publish to this bag')
@@ -128,8 +129,8 @@ def _begin_simulation(stack, master, options):
             with rosbag.Bag(options.bag) as bag:
                 # at least 1 s: a ROS time of 0 is one that is not set
                 simulation.nanoseconds = round((max(2, bag.get_start_time()) - 1) * 10**9)
-        except rosbag.ROSBagException as error:
-            raise ValueError(f'{options.bag}: {error}; rosbag info says more')
+        except (OSError, rosbag.ROSBagException) as error:
+            raise ValueError(f'{options.bag} cannot be played: {error}; see ls and rosbag info')
     if options.record:
         if os.path.abspath(options.record) == options.bag:
             raise ValueError(f'{options.bag} is played: record to another file')

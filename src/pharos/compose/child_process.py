@@ -176,7 +176,7 @@ def find_program(package, executable):
     except rospkg.ResourceNotFound:  # some of Debian's packages have no package.xml
         folders = find_in_workspaces(['libexec'], project=package)
         if not folders:
-            raise _no_package(package) from None
+            raise no_package(package) from None
         found_paths = [shutil.which(executable, path=folder) for folder in folders]
         paths = [path for path in found_paths if path]
     if not paths:
@@ -200,9 +200,10 @@ def find_launch_file(package, file):
         return rlutil.resolve_launch_arguments(arguments)[0]
     except RLException as error:
         if package and package not in rospkg.RosPack().list():
-            raise _no_package(package) from None
+            raise no_package(package) from None
         raise UnknownNodeError(f'there is no launch file {file!r}: {error}') from None
 
 
-def _no_package(name):
+def no_package(name):
+    """Return the error of an unknown package."""
     return UnknownNodeError(f'no package {name!r}: is the workspace sourced?')

@@ -105,6 +105,7 @@ class Composition:
             )
         log_folder = os.path.join(rospkg.get_log_dir(), run_id)
         os.makedirs(log_folder, exist_ok=True)
+        Transcript.show(f'ROS master {self.master.url}, logs in {log_folder}')
         entries = []
         for number, entry in enumerate(launch_file.entries, 1):
             # as roslaunch names logs
@@ -159,16 +160,16 @@ class Composition:
         own_entries = []
         is_alone = self.owns_process and len(entries) == 1
         for entry in entries:
-            environment = environment_of(entry.roslaunch_node.env_args)
-            code = '' if entry.group or is_alone else sets_environment(entry.path)
             if entry.is_here:
                 own_entries.append(entry)
-            elif entry.group:
-                groups[entry.group, ()].append(entry)
-            elif code:
-                groups[f'a group of its own: it has {code!r}', environment].append(entry)
-            else:
-                groups['', environment].append(entry)
+                continue
+            reason = entry.group
+            environment = ()
+            if not reason:
+                environment = environment_of(entry.roslaunch_node.env_args)
+                code = '' if is_alone else sets_environment(entry.path)
+                reason = code and f'a group of its own: {entry.name} has {code!r}'
+            groups[reason, environment].append(entry)
         # of two as large, this process gets the empty one
         sizes = {key: (len(nodes), not key[1]) for key, nodes in groups.items() if not key[0]}
         if sizes:

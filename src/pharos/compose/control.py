@@ -35,7 +35,10 @@ def listen(composition):
         listener.listen()
         threading.Thread(target=_serve, args=[listener, composition], daemon=True).start()
     except OSError as error:  # such as for a second composition of this process
-        Transcript.show(f'restart, stop and reload do not reach this composition: {error}')
+        Transcript.show(
+            'restart, stop and reload do not reach this composition: another one of this process or'
+            f' another user has the control name ({error})'
+        )
     return listener
 
 

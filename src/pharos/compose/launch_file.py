@@ -5,6 +5,7 @@ import os
 from typing import Any, NamedTuple
 
 import rosgraph.names
+import rospkg
 import roslaunch.config
 import roslaunch.core
 import roslaunch.launch
@@ -12,7 +13,7 @@ import roslaunch.node_args
 import roslaunch.pmon
 import roslaunch.xmlloader
 
-from pharos.compose.child_process import find_launch_file
+from pharos.compose.child_process import find_launch_file, no_package
 from pharos.compose.sources import source_of, why_apart
 from pharos.errors import PharosError, UnknownNodeError
 from pharos.transcript import Transcript
@@ -149,7 +150,9 @@ class LaunchFile:
                 )
                 reason = why_apart(command[0], is_here)
         except Exception as error:  # of roslaunch, or of a program that cannot be read
-            Transcript.show(f'{name} is not started: {error}')
+            is_known = node.package in rospkg.RosPack().list()
+            reason = error if is_known else no_package(node.package)
+            Transcript.show(f'{name} is not started: {reason}')
             return
         if reason:
             Transcript.show(f'{name} runs as a plain process: {reason}')

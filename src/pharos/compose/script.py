@@ -51,6 +51,9 @@ class ScriptNode(Node):
         self.created_names = set()  # of nodes that the program has created with pharos
         self._settings.remappings = args
 
+    def __repr__(self):
+        return f'<{type(self).__name__} {self._settings.name} {self.lifecycle.value} {self.path}>'
+
     def wait(self, timeout: float | None = None) -> int | None:
         """Wait until the program has ended, or Ctrl-C, and return its :attr:`exit_code`.
 

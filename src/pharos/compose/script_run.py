@@ -2,8 +2,6 @@
 
 These are signals, atexit, sys.argv, the output, the environment, and the main thread.
 """
-import _thread
-import asyncio
 import collections
 import contextlib
 import ctypes
@@ -17,7 +15,6 @@ import threading
 import time
 import traceback
 import types
-from importlib.machinery import SourceFileLoader
 from threading import ExceptHookArgs
 from weakref import WeakSet, WeakValueDictionary
 
@@ -26,11 +23,12 @@ from rosgraph.names import anonymous_name, get_ros_namespace, load_mappings, ns_
 
 from pharos import signals
 from pharos.blocks import block_name
+from pharos.compose import python_changes
 from pharos.compose.child_process import interrupt
 from pharos.compose.sources import compile_program
 from pharos.errors import PharosError
 from pharos.live.editing import editable_modules
-from pharos.private_rospy import inspecting, loader
+from pharos.private_rospy import loader
 from pharos.private_rospy.loader import Shim, remember_text
 from pharos.private_rospy.patches import patch
 from pharos.private_rospy.plain import guide
@@ -42,54 +40,8 @@ SIGNAL_LIMIT = 0.2  # seconds that a signal waits for the main thread to sleep
 BLOCK_LIMIT = 1.0  # seconds that a thread has to end after an exception in it
 JOIN_PERIOD = 0.02  # seconds between two looks for a signal
 SPIN_PERIOD = 0.01  # seconds
-#: asyncio's policies derive from this; Python 3.14 has changed its name
-_POLICY = getattr(asyncio.events, 'BaseDefaultEventLoopPolicy', None)
-_POLICY = _POLICY or asyncio.events._BaseDefaultEventLoopPolicy
-#: packages whose frames are between a program and what it imports
-_IMPORTERS = 'importlib', 'imp', '_frozen_importlib', '_frozen_importlib_external'
 #: files whose frames tracebacks do not show
-_HIDDEN = '<frozen importlib', loader.__file__, inspecting.__file__, __file__
-
-
-def _get_event_loop(policy, original=_POLICY.get_event_loop):
-    """Return the event loop of this thread; make one in the main thread of a program.
-
-    asyncio makes one in the main thread of a process, up to Python 3.13.
-    """
-    run = current.run
-    if isinstance(run, ScriptRun) and threading.current_thread() is run.main:
-        with contextlib.suppress(RuntimeError):
-            return original(policy)
-        if sys.version_info < (3, 14):
-            policy.set_event_loop(policy.new_event_loop())
-    return original(policy)
-
-
-def _new_event_loop(policy, original=_POLICY.new_event_loop):
-    """Return a new event loop; the end of the program that has made the loop closes it."""
-    loop = original(policy)
-    if isinstance(current.run, ScriptRun):
-        current.run.event_loops.add(loop)
-    return loop
-
-
-_POLICY.get_event_loop = _get_event_loop
-_POLICY.new_event_loop = _new_event_loop
-
-
-def _exec_module(loader, module, original=SourceFileLoader.exec_module):
-    """Give the node's rospy to a module that a private one loads from a file, by importlib or imp."""
-    frame = sys._getframe(1)
-    # code in C may import in a thread without another frame
-    while frame and frame.f_globals.get('__name__', '').partition('.')[0] in _IMPORTERS:
-        frame = frame.f_back  # type: ignore[assignment]
-    owner = frame and inspecting.owner_of_builtins(frame.f_globals.get('__builtins__'))
-    if owner:
-        vars(module)['__builtins__'] = owner.builtins
-    original(loader, module)
-
-
-SourceFileLoader.exec_module = _exec_module  # type: ignore[assignment]
+_HIDDEN = '<frozen importlib', loader.__file__, python_changes.__file__, __file__
 
 
 @patch('subprocess', 'Popen.__init__')
@@ -190,7 +142,6 @@ class ScriptRun(Run):
         stand_ins['os'].getenv = self.environ.get
         stand_ins['os']._exit = self.exit_now
         stand_ins['os'].kill = self._kill
-        stand_ins['_thread'] = Shim(_thread, interrupt_main=lambda *signals: self.request_stop())
         stand_ins['pharos'] = _Pharos(self)
         self.stdout = NamedLines(sys.__stdout__, self)
         self.stderr = NamedLines(sys.__stderr__, self)
@@ -340,6 +291,7 @@ class ScriptRun(Run):
                     status = self._status_of(self.exit_request)
                 self.node.exit_code = status
             self.main_has_ended = True
+            signals.silenced_threads.discard(self.main.ident)  # another thread may get the number
             if not self.is_end_requested:
                 self.request_stop()
 

@@ -6,6 +6,7 @@ import inspect
 import os
 import pathlib
 import sys
+import traceback
 from types import MethodType
 
 from pharos.errors import PharosError
@@ -65,6 +66,9 @@ def reload(node):
                 notes.append(f'{owner.__name__}.{name} {_change(owner, name, *rest)}')
     finally:
         sys.setswitchinterval(interval)
+    for failure in node._current_run.failures:
+        if isinstance(failure.block, str) and not isinstance(failure.error, PharosError):
+            notes.append(f'{failure.block} has ended: {failure.error!r}; restart {node.name}')
     return '\n'.join(notes) or NO_CHANGE
 
 
@@ -87,7 +91,7 @@ def _read(module, notes):
         text = pathlib.Path(file).read_bytes()
         former_items = ast.parse(module.__text__).body
         bodies = {item.name: item.body for item in former_items if isinstance(item, ast.ClassDef)}
-        for item in _new_items(former_items, ast.parse(text).body):
+        for item in _new_items(former_items, ast.parse(text, file).body):
             line = item.lineno
             former_body = bodies.get(getattr(item, 'name', ''))  # of a class that is there
             new_body = former_body and _new_items(former_body, item.body)
@@ -112,8 +116,9 @@ def _read(module, notes):
                 }
             changes += [(owner, *each, hasattr(item, 'names')) for each in found.items()]
     except Exception as error:
+        error_text = ''.join(traceback.format_exception_only(type(error), error)).strip()
         raise PharosError(
-            f'{file}:{getattr(error, "lineno", line)}: {error!r}; {NO_CHANGE}'
+            f'{file}:{getattr(error, "lineno", line)}: {error_text}; {NO_CHANGE}'
         ) from error
     return text, changes
 

@@ -3,6 +3,7 @@
 One thread of this process, the watcher, looks after all runs.
 """
 import functools
+import socket
 import threading
 from contextlib import suppress
 from time import monotonic
@@ -24,6 +25,8 @@ _REGISTER_METHODS = {
     'srv': 'registerService',
 }
 _watch_end = None  # an Event, which ends the watcher
+#: (URL of the master, name) -> the run of this process that starts or runs with the name
+_names = {}
 
 
 def enter(run):
@@ -39,12 +42,21 @@ def enter(run):
 def leave(run):
     """Take a run out of ``links.runs``; the last one ends the watcher."""
     with runs_lock:
+        if _names.get((run.master.url, run.name)) is run:
+            del _names[run.master.url, run.name]
         if runs.pop(run.uri, None) and not runs:
             _watch_end.set()  # type: ignore[union-attr]
 
 
 def check_name_free(run):
-    """Raise NodeNameInUseError if a node of this name answers within NAME_LIMIT."""
+    """Raise NodeNameInUseError if a node of this name answers within NAME_LIMIT, or is of this process."""
+    with runs_lock:
+        namesake = _names.setdefault((run.master.url, run.name), run)
+    if namesake is not run:
+        raise NodeNameInUseError(
+            f'{run.name} is running already in this process: {namesake.node!r}; choose another name for'
+            f' {run.node!r}'
+        )
     uri = run.master.call('lookupNode', run.name)
     if not uri:
         return
@@ -204,7 +216,12 @@ def _check_clock(run):
 
 
 def _close_silent_clients(run):
-    run.close_silent_clients()
+    """Shut the sockets of clients whose time is over, which wakes the threads that read."""
+    for sock, deadline in list(run.deadlines.items()):
+        if monotonic() > deadline:
+            run.deadlines.pop(sock, None)
+            with suppress(OSError):
+                sock.shutdown(socket.SHUT_RDWR)
 
 
 def _tell_troubles(run):

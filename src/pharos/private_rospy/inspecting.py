@@ -1,17 +1,16 @@
-"""Have inspect and dataclasses find private modules, in the whole process.
+"""Have inspect find private modules, in the whole process.
 
-They look for the module of a class or function in ``sys.modules``, which has no private module.
+It looks for the module of a class or function in ``sys.modules``, which has no private module.
 """
-import dataclasses
 import inspect
 import linecache
 import sys
 from types import ModuleType
 
-from pharos.private_rospy.loader import PrivateModules, process_lock
+from pharos.private_rospy.loader import PrivateModules
 
 
-def _private_module(thing):
+def private_module(thing):
     """Return the private module of a class, function, method or frame, or None.
 
     That of a class is one of the node whose code has called.
@@ -41,12 +40,12 @@ def owner_of_builtins(module_builtins):
 
 def _getmodule(thing, _filename=None, original=inspect.getmodule):
     """Find private modules, too: inspect looks for them in all of sys.modules, in vain."""
-    return _private_module(thing) or original(thing, _filename)
+    return private_module(thing) or original(thing, _filename)
 
 
 def _getfile(thing, original=inspect.getfile):
     """Find the files of private modules' classes, too: inspect looks for them in sys.modules."""
-    module = _private_module(thing) if inspect.isclass(thing) else None
+    module = private_module(thing) if inspect.isclass(thing) else None
     return getattr(module, '__file__', None) or original(thing)
 
 
@@ -60,28 +59,6 @@ def _getsourcefile(thing, original=inspect.getsourcefile):
     return original(thing)
 
 
-def _process_class(cls, *args, original=dataclasses._process_class, **kwargs):  # type: ignore
-    """Have @dataclass find the module of a private class: it looks in sys.modules for ClassVar.
-
-    Another node may be importing a module of the same name.
-    """
-    module = _private_module(cls)
-    if module is None:
-        return original(cls, *args, **kwargs)
-    name = cls.__module__
-    with process_lock:
-        shown_module = sys.modules.get(name)
-        sys.modules[name] = module
-        try:
-            return original(cls, *args, **kwargs)
-        finally:
-            if shown_module:
-                sys.modules[name] = shown_module
-            else:
-                del sys.modules[name]
-
-
-dataclasses._process_class = _process_class  # type: ignore[attr-defined]
 inspect.getmodule = _getmodule
 inspect.getfile = _getfile
 inspect.getsourcefile = _getsourcefile

@@ -378,13 +378,6 @@ class Run:
         """
         self.deadlines[sock] = monotonic() + self.node.client_timeout
 
-    def close_silent_clients(self) -> None:
-        """Shut the sockets of clients whose time is over; the watcher calls this."""
-        for sock, deadline in list(self.deadlines.items()):
-            if monotonic() > deadline:
-                self.deadlines.pop(sock, None)
-                shutdown_socket(sock)
-
     # -- stop
 
     def request_stop(self) -> None:

@@ -350,18 +350,12 @@ class SubscriptionOverlay:
                 each.statistics_logger.callback(
                     message, connection.callerid_pub, connection.stat_bytes
                 )
-        message._connection_header = connection.header
-        # copied before the first callback may change the message, which belongs to one inbox alone
-        is_taken = any(inbox.shared for inbox in inboxes)
-        own_messages = []
-        for inbox in inboxes:
-            own_message = message
-            if is_taken and not inbox.shared:
-                own_message = copy_of(message)
-                own_message._connection_header = connection.header
-            is_taken = True
-            own_messages.append(own_message)
+        # copied before the first callback may change the message
+        own_messages = [
+            message if inbox.shared or len(inboxes) == 1 else copy_of(message) for inbox in inboxes
+        ]
         for inbox, own_message in zip(inboxes, own_messages):
+            own_message._connection_header = connection.header
             inbox.receive(own_message, size, connection)
 
     def call_plain(self, message: Any) -> None:
