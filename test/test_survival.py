@@ -884,7 +884,7 @@ def test_failed_look_costs_no_other_node(master, monkeypatch, quick_watcher, wha
 
 
 def test_failed_look_is_told_once(master, monkeypatch, quick_watcher, capfd):
-    monkeypatch.setattr('pharos.transcript._told_places', set())  # of other tests
+    monkeypatch.setattr('pharos.transcript._shown_keys', set())  # of other tests
     calls = break_look(monkeypatch, create(master)._current_run, 'silent clients')
     output = []
 

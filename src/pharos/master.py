@@ -22,7 +22,7 @@ from pharos.private_rospy.run import Settings
 from pharos.private_rospy.xmlrpc import CALLER_ID, UNREACHABLE, ServerProxy
 from pharos.service import Service
 from pharos.topic import Topic
-from pharos.transcript import Transcript
+from pharos.transcript import show_once
 from pharos.waiting import wait_for
 
 if TYPE_CHECKING:
@@ -35,9 +35,6 @@ if TYPE_CHECKING:
 SLOW_ANSWER = 1.0  # seconds; the first that takes longer is told
 LIFE_LIMIT = 0.5  # seconds that a node has to show that the node lives
 _URL = re.compile(r'http://(\[[\w:]+\]|[\w.-]+):([1-6]?\d{1,4})/?')
-
-#: the masters whose slowness has been told
-_slow_urls: set[str] = set()
 
 N = TypeVar('N', bound=Node)
 
@@ -176,10 +173,9 @@ class Master:
                 f'no ROS master answers at {self.url} ({error}): start roscore, or give the right URL'
             ) from None
         duration = monotonic() - start
-        if duration > SLOW_ANSWER and self.url not in _slow_urls:
-            _slow_urls.add(self.url)
+        if duration > SLOW_ANSWER:
             text = f'the ROS master at {self.url} is slow: an answer took {duration:.1f} s'
-            Transcript.show(text)
+            show_once(self.url, text)
         return value if code == 1 else None
 
     def is_reachable(self) -> bool:

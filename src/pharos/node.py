@@ -1,6 +1,7 @@
 """Nodes: real ROS nodes of this process, written with blocks."""
 from __future__ import annotations
 
+import functools
 import threading
 import types
 from contextlib import suppress
@@ -104,6 +105,19 @@ class Node(DelegateHolder):
             ' without a name'
         )
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Have the stop() of a class say so if it does not call that of Node."""
+        super().__init_subclass__(**options)
+        own_stop: Any = vars(cls).get('stop')
+        if own_stop:
+
+            def stop(self: Node) -> None:
+                own_stop(self)
+                if self.is_running:
+                    self.log(f'{cls.__name__}.stop() must call super().stop()', 'error')
+
+            cls.stop = functools.update_wrapper(stop, own_stop)  # type: ignore[assignment]
+
     def _configure(self, settings, soul, delegate):
         with_arguments(soul, 'soul', 0, 1)  # raises if the block is not a soul
         self._settings = settings
@@ -206,8 +220,6 @@ class Node(DelegateHolder):
             try:
                 if self.is_running:
                     self.stop()
-                    if self.is_running:
-                        self.log(f'{type(self).__name__}.stop() must call super().stop()', 'error')
             except Exception as error:
                 self._current_run.report_failure(error, self.stop, 'method')
             finally:

@@ -9,7 +9,7 @@ from typing import Any, Callable
 from pharos.blocks import Block
 
 ERROR_PAUSE = 0.02  # seconds after a look that has failed
-_told_places: set[tuple] = set()  # of errors: the file, the line, the class
+_shown_keys: set[Any] = set()  # of show_once()
 
 
 class _Transcript:
@@ -55,8 +55,13 @@ def attempt(function: Callable, *arguments: Any) -> Any:
 def tell_once(error: BaseException) -> None:
     """Show an exception in the Transcript, unless one of its class came from its line before."""
     *_, frame = traceback.extract_tb(error.__traceback__)
-    place = frame.filename, frame.lineno, type(error)
-    if place not in _told_places:
-        _told_places.add(place)
-        with suppress(Exception):  # of the Transcript's receiver
-            Transcript.show(f'{frame.filename}:{frame.lineno}: {error!r}; it is tried again')
+    text = f'{frame.filename}:{frame.lineno}: {error!r}; it is tried again'
+    with suppress(Exception):  # of the Transcript's receiver
+        show_once((frame.filename, frame.lineno, type(error)), text)
+
+
+def show_once(key: Any, text: str) -> None:
+    """Show a text in the Transcript, unless one with an equal key was shown before."""
+    if key not in _shown_keys:
+        _shown_keys.add(key)
+        Transcript.show(text)

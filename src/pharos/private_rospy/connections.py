@@ -248,7 +248,7 @@ def _ask_masters():
 
 def _ask_master(url, url_runs):
     # noted before the question: what is registered meanwhile, the answer may lack
-    entries = {run: attempt(_entries_of, run) for run in url_runs}
+    entries = {run: attempt(_entries_of, run) or set() for run in url_runs}
     try:
         state = ServerProxy(url).getSystemState(CALLER_ID)[2]  # type: ignore[index]
     except UNREACHABLE as error:
@@ -256,8 +256,7 @@ def _ask_master(url, url_runs):
         url_runs[0].troubles.add(f'no master answers at {url}, it is asked again: {error}')
         return
     for run in url_runs:
-        if entries[run] is not None:
-            attempt(_register_missing, run, entries[run], state)
+        attempt(_register_missing, run, entries[run], state)
 
 
 def _entries_of(run):

@@ -8,7 +8,6 @@ place. Each docstring names first the behaviour of rospy, then that of the patch
 import socket
 import threading
 from contextlib import suppress
-from functools import lru_cache
 from urllib.parse import urlsplit
 
 import rospkg
@@ -385,12 +384,6 @@ def send_goal(original, run, self, *args, **kwargs):
     finally:
         order.is_paused = False
         order.pass_turn()
-
-
-@replace('rospy.impl.statistics', 'SubscriberStatisticsLogger.is_enabled')
-def is_enabled_once(original, run):
-    """rospy asks the master for each subscription. This asks once."""
-    return lru_cache(None)(original)
 
 
 # -- parameters, log, services
