@@ -314,6 +314,8 @@ class Node(DelegateHolder):
 
     def ros_import(self, name: str) -> Any:
         """Return a private copy, for this run, of a library on rospy such as 'actionlib'."""
+        import pharos.live.private_classes  # noqa: F401: it has dataclasses work in the library
+
         self._check_active()
         return self._current_run.modules.load(name)
 

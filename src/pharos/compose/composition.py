@@ -120,6 +120,7 @@ class Composition:
         :param arguments: for each program, such as '_rate:=5'
         :param programs_here: those of them that run in this process even if they show windows
         """
+        Transcript.show(f'ROS master {self.master.url}, logs in {rospkg.get_log_dir()}')
         entries = []
         for text in programs:
             with self._show_failure(text):

@@ -23,10 +23,11 @@ from rosgraph.names import anonymous_name, get_ros_namespace, load_mappings, ns_
 
 from pharos import signals
 from pharos.blocks import block_name
-from pharos.compose import python_changes
+import pharos.compose.event_loops  # noqa: F401: it changes asyncio
 from pharos.compose.child_process import interrupt
 from pharos.compose.sources import compile_program
 from pharos.errors import PharosError
+from pharos.live import private_classes
 from pharos.live.editing import editable_modules
 from pharos.private_rospy import loader
 from pharos.private_rospy.loader import Shim, remember_text
@@ -41,7 +42,7 @@ BLOCK_LIMIT = 1.0  # seconds that a thread has to end after an exception in it
 JOIN_PERIOD = 0.02  # seconds between two looks for a signal
 SPIN_PERIOD = 0.01  # seconds
 #: files whose frames tracebacks do not show
-_HIDDEN = '<frozen importlib', loader.__file__, python_changes.__file__, __file__
+_HIDDEN = '<frozen importlib', loader.__file__, private_classes.__file__, __file__
 
 
 @patch('subprocess', 'Popen.__init__')

@@ -116,7 +116,7 @@ def _search(path, pattern):
     """
     program = pathlib.Path(source_of(path)).resolve()
     packages = [folder for folder in program.parents if (folder / 'package.xml').is_file()]
-    own_folder = str(packages[0] if packages else program.parent)
+    own_folder = f'{packages[0] if packages else program.parent}/'
     files = [program]
     for file in files:  # the list grows meanwhile
         code, names = _read(file, file.stat().st_mtime_ns, pattern)

@@ -59,6 +59,20 @@ def share_of(subscription: Any, uri: str) -> Share | None:
     return _shares.setdefault(key, Share())
 
 
+def end(connection: Any) -> tuple:
+    """Close a connection, and return the subscriptions that have shared it, perhaps none."""
+    if not connection.share:
+        connection.close()
+        return ()
+    with connection.share.lock:  # nobody joins any more
+        connection.close()
+        subscriptions = connection.subscriptions
+        connection.subscriptions = ()
+        if connection.share.connection is connection:
+            connection.share.connection = None
+        return subscriptions
+
+
 def leave(subscription: Any) -> None:
     """Take a subscription, which closes, out of connections that others hear, too."""
     for connection in subscription.connections:

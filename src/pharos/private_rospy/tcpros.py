@@ -7,6 +7,7 @@ import struct
 import threading
 
 from pharos.intraprocess.inboxes import BoundedQueue
+from pharos.private_rospy import sharing
 from pharos.private_rospy.connections import connect_later
 from pharos.transcript import tell_once
 from pharos.waiting import let_others_run
@@ -77,8 +78,7 @@ def receive_until_end(connection, address, port, uri, subscription):
         _receive(connection, subscription)
     except Exception as error:
         reason = str(error)
-    connection.close()
-    for each in connection.subscriptions or [subscription]:
+    for each in sharing.end(connection) or [subscription]:
         end_connection(each, connection, uri, reason)
 
 
@@ -216,16 +216,19 @@ class Sender(BoundedQueue):
             while self._unsent_parts():
                 self._send()
             return
-        is_large = size > MAX_DIRECT
-        self.add(parts, size)
-        if not (self._has_thread or is_large):
-            self._send_ready()
+        if self.is_busy or size > MAX_DIRECT:
+            self.add(parts, size)
+        else:
+            self._unsent = parts, []
+            with contextlib.suppress(BlockingIOError):
+                self._send(socket.MSG_DONTWAIT)
         if self.is_busy and not self._has_thread:
             self._has_thread = self._publication.run.start_thread(self._send_queue) is not None
 
     def _send_ready(self):
         """Send what the socket takes."""
-        with contextlib.suppress(BlockingIOError):
+        # IndexError: the handler of a signal has published meanwhile, and so sent all
+        with contextlib.suppress(BlockingIOError, IndexError):
             while self.is_busy:
                 if not self._unsent_parts():
                     self._unsent = self.messages.popleft(), []
