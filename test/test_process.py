@@ -272,6 +272,17 @@ def test_each_environment_is_one_process(master, bench):
         assert pids[2] == pids[3] and len(set(pids)) == 3
 
 
+def test_group_has_no_variable_of_this_process(master, bench):
+    bench.write(SAYS_WHERE)
+    node = '<node pkg="bench" type="program" name="{}">{}</node>'
+    env = '<env name="GPU" value="1"/>'
+    xml = node.format('a', env) + node.format('b', env) + node.format('c', '')
+    with bench.program(bench.launch_file(xml)) as composed:
+        places = where(bench, 3)
+        assert places['/a'] == places['/b'] == (composed.pid, '1')
+        assert places['/c'][1] == ''
+
+
 def test_composition_gives_the_environment_back(master, bench):
     path = bench.launch_file('<env name="GPU" value="1"/>', one=SPIN)
     with master.compose(None, path):

@@ -1,6 +1,7 @@
 """Shared connections: nodes of one process that hear one topic of one node elsewhere, by TCPROS."""
 import gc
 import threading
+import time
 import weakref
 
 import pytest
@@ -172,6 +173,35 @@ def test_blocked_node_does_not_hold_up_others(sharing, publisher):
         until(lambda: '9' in words(heard))
     finally:
         may_end.set()
+
+
+def test_slow_callback_without_queue_size_gets_all(sharing, publisher):
+    """Messages of 2 MB wait, as in the publisher's queue and the sockets of a process."""
+    heard = []
+
+    def hear(message):
+        heard.append(message.data[0])
+        time.sleep(0.02)
+
+    create(sharing, '/slow').ros.Subscriber('/words', message_class(STRING), hear)
+    until(lambda: publisher.value('publisher.get_num_connections()') == 1)
+    publisher.run("for letter in 'abcdefghijkl': publisher.publish(letter * 2_000_000)")
+    until(lambda: len(heard) == 12)
+    assert ''.join(heard) == 'abcdefghijkl'
+
+
+def test_subscriptions_that_come_and_go_disturb_nobody(sharing, publisher):
+    """One waits for single messages in a loop, and so joins and leaves; each wait ends."""
+    heard = []
+    create(sharing, '/steady').interested_in('/words', STRING, heard.append)
+    waiting = create(sharing, '/waiting')
+    publisher.run('threading.Thread(target=count, daemon=True).start()')
+    for _ in range(60):
+        waiting.ros.wait_for_message('/words', message_class(STRING), TIMEOUT)
+    until(lambda: heard)
+    publisher.run('ends.set()')
+    numbers = [int(message.data) for message in heard]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
 
 
 def test_from_names_the_publisher(sharing, publisher):

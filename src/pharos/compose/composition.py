@@ -6,6 +6,7 @@ import contextlib
 import faulthandler
 import os
 import pickle
+import re
 import signal
 import socket
 import sys
@@ -43,6 +44,8 @@ HEAD_START = 0.1
 SLOW_END = 2.0  # seconds; the Transcript names what takes longer to end
 INIT_LIMIT = 2.0  # seconds that a launch waits until all nodes have registered
 TERMINATE_LIMIT = 40.0  # seconds: 20 after the SIGINT, since roslaunch gives its nodes 17
+#: variables that a process reads when it starts, or a library when it is loaded
+AT_START = re.compile('LD_|PYTHON|OMP_|MKL_|OPENBLAS_|CUDA_')
 POLL_PERIOD = 0.02  # seconds between two looks at the nodes that have ended
 #: seconds; with Python's default of 5 ms, nodes wait ten times as long beside a node that computes
 SWITCH_INTERVAL = 0.3e-3
@@ -76,7 +79,7 @@ class Composition:
         self._end_times: dict[ScriptNode, float] = {}  # as of time.monotonic()
         self._stopped_nodes: set[ScriptNode] = set()  # by control(); they do not respawn
         self._listener: socket.socket | None = None  # of control()
-        self._former_environment: dict[
+        self.former_environment: dict[
             str, str | None
         ] = {}  # of this process, what the nodes have set
         self._watcher = threading.Thread(target=self._watch, name='composition', daemon=True)
@@ -172,7 +175,11 @@ class Composition:
                 reason = code and f'a group of its own: {entry.name} has {code!r}'
             groups[reason, environment].append(entry)
         # of two as large, this process gets the empty one
-        sizes = {key: (len(nodes), not key[1]) for key, nodes in groups.items() if not key[0]}
+        sizes = {
+            key: (len(nodes), not key[1])
+            for key, nodes in groups.items()
+            if not key[0] and not any(map(AT_START.match, dict(key[1])))
+        }
         if sizes:
             key = max(sizes, key=sizes.__getitem__)
             own_entries += groups.pop(key)
@@ -187,15 +194,16 @@ class Composition:
 
     def _set_environment(self, environment):
         """Set variables of this process; stop() gives their former values back."""
-        self._former_environment = {name: os.environ.get(name) for name in environment}
+        self.former_environment = {name: os.environ.get(name) for name in environment}
         os.environ.update(environment)
 
     def _start_group(self, entries, environment):
-        search_path = os.pathsep.join(folder for folder in sys.path if folder)
+        own_path = dict(environment).get('PYTHONPATH', '')
+        folders = [own_path, *sys.path]
         command = [
             'env',
             *map('='.join, environment),
-            f'PYTHONPATH={search_path}',
+            f'PYTHONPATH={os.pathsep.join(folder for folder in folders if folder)}',
             f'PHAROS_SHARED_MEMORY={int(self.master.shared_memory)}',
             f'PHAROS_SHARE_CONNECTIONS={int(self.master.share_connections)}',
             sys.executable,
@@ -214,7 +222,7 @@ class Composition:
         wait(lambda: all(map(_has_begun, self.nodes)), INIT_LIMIT)
 
     def _start_part(self, *arguments):
-        part = _Part(self.master, *arguments)
+        part = _Part(self, *arguments)
         part.start()
         self._has_started = True
         self._parts.append(part)
@@ -400,8 +408,8 @@ class Composition:
             Transcript.show(f'the end waits for {names}; a further Ctrl-C ends all at once')
         for thread in late_threads:
             thread.join()
-        while self._former_environment:
-            name, value = self._former_environment.popitem()
+        while self.former_environment:
+            name, value = self.former_environment.popitem()
             if value is None:
                 os.environ.pop(name, None)
             else:
@@ -424,16 +432,21 @@ class _Part:
     :ivar is_over: True if the process has ended, that was told, and no node respawns
     """
 
-    def __init__(self, master, entries, command, parcel_of=None):
+    def __init__(self, composition, entries, command, parcel_of=None):
         self.entries = entries
-        self._master = master
+        self._composition = composition
+        self._master = composition.master
         self._command = command
         self._parcel_of = parcel_of
         self.is_over = False
 
     def start(self):
         """Start the process with the nodes in ``entries``."""
-        command = self._command
+        # without the variables that the nodes of this process have
+        former_variables = self._composition.former_environment.items()
+        changes = [f'{name}={value}' for name, value in former_variables if value is not None]
+        unset = [f'--unset={name}' for name, value in former_variables if value is None]
+        command = ['env', *unset, *changes, *self._command]
         if self._parcel_of:
             with tempfile.NamedTemporaryFile(delete=False) as file:  # the process deletes the file
                 pickle.dump(self._parcel_of(self.entries), file)

@@ -14,7 +14,7 @@ import roslaunch.pmon
 import roslaunch.xmlloader
 
 from pharos.compose.child_process import find_launch_file, no_package
-from pharos.compose.sources import source_of, why_apart
+from pharos.compose.sources import forget_files, source_of, why_apart
 from pharos.errors import PharosError, UnknownNodeError
 from pharos.transcript import Transcript
 
@@ -81,6 +81,7 @@ class LaunchFile:
         screen=False,
         is_node=False,
     ):
+        forget_files()
         self.path = find_launch_file(package, file)
         self._read(args, is_node)
         self.config.master.uri = url

@@ -11,7 +11,7 @@ from rosgraph.names import ns_join
 from pharos import signals
 from pharos.compose.child_process import find_program
 from pharos.compose.script_run import ScriptRun
-from pharos.compose.sources import needs_process, source_of
+from pharos.compose.sources import forget_files, needs_process, source_of
 from pharos.errors import PharosError, UnknownNodeError
 from pharos.node import Node
 from pharos.private_rospy.run import Lifecycle
@@ -81,6 +81,7 @@ def load(master, package, executable, args, name, namespace, remap, params, here
     path = os.path.abspath(package) if executable is None else find_program(package, executable)
     if not os.path.isfile(path):
         raise UnknownNodeError(f'there is no file {path}: give a path, or a package and a program')
+    forget_files()
     reason = '' if here else needs_process(path)
     if reason:
         raise PharosError(

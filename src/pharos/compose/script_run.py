@@ -419,7 +419,8 @@ class ScriptRun(Run):
         What the main thread publishes meanwhile is dropped: a process would stand still. An exception
         of a handler is raised in the main thread, before that publishes again.
         """
-        signals.silenced_threads.add(self.main.ident)
+        if not self.main_has_ended:  # else another thread may have the number
+            signals.silenced_threads.add(self.main.ident)
         try:
             self.handle_signal()
         except (Exception, KeyboardInterrupt, SystemExit) as error:

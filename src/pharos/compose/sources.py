@@ -108,6 +108,11 @@ def sets_environment(path):
     return _search(path, _SETS_ENVIRONMENT)
 
 
+def forget_files():
+    """Look for the files of modules anew: a user may have moved some."""
+    _user_file.cache_clear()
+
+
 def _search(path, pattern):
     """Return the first text of a program that a pattern matches, or ''.
 

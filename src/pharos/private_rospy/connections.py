@@ -42,8 +42,8 @@ def enter(run):
 def leave(run):
     """Take a run out of ``links.runs``; the last one ends the watcher."""
     with runs_lock:
-        if _names.get((run.master.url, run.name)) is run:
-            del _names[run.master.url, run.name]
+        for key in [key for key, owner in _names.items() if owner is run]:
+            del _names[key]
         if runs.pop(run.uri, None) and not runs:
             _watch_end.set()  # type: ignore[union-attr]
 

@@ -7,21 +7,23 @@ from __future__ import annotations
 
 import threading
 from typing import Any
+from weakref import WeakValueDictionary
 
 from rospy.impl.transport import Transport
 
 from pharos.intraprocess.copier import copy_of
 
 #: (URL of the master, URI of the publisher, topic, message class) -> Share
-_shares: dict[tuple, Share] = {}
+_shares: WeakValueDictionary[tuple, Share] = WeakValueDictionary()
 # of a connection that is shared: its Share, and the subscriptions that hear it
 Transport.share = None  # type: ignore[attr-defined]
 Transport.subscriptions = ()  # type: ignore[attr-defined]
 
 
 class Share:
-    """The newest connection to a topic of a node elsewhere, or None.
+    """The place where subscriptions of one topic of a node elsewhere find their connection.
 
+    :ivar connection: the newest one, or None
     :ivar lock: held while a subscription connects, joins or leaves, and while a message is delivered:
         one that joins gets the latched message once, before the next one. No callback runs meanwhile
     """
@@ -41,13 +43,15 @@ class Share:
         return True
 
     def add(self, subscription: Any, connection: Any) -> bool:
-        """Add the connection to a subscription; return False if that is closed."""
-        is_added = subscription.rospy_add_connection(connection)
-        if is_added:
-            connection.subscriptions = [*connection.subscriptions, subscription]
-            # the thread that reads takes it out of all lists; rospy's callback is that of one list
-            connection.set_cleanup_callback(None)
-        return is_added
+        """Add the connection to a subscription; return False if that is closed, or has one."""
+        with subscription.c_lock:  # or leave() could look for connections before it is there
+            if subscription.is_leaving or subscription.has_connection(connection.endpoint_id):
+                return False
+            subscription.rospy_add_connection(connection)
+        connection.subscriptions = [*connection.subscriptions, subscription]
+        # the thread that reads takes it out of all lists; rospy's callback is that of one list
+        connection.set_cleanup_callback(None)
+        return True
 
 
 def share_of(subscription: Any, uri: str) -> Share | None:
@@ -75,7 +79,10 @@ def end(connection: Any) -> tuple:
 
 def leave(subscription: Any) -> None:
     """Take a subscription, which closes, out of connections that others hear, too."""
-    for connection in subscription.connections:
+    with subscription.c_lock:
+        subscription.is_leaving = True
+        connections = subscription.connections
+    for connection in connections:
         if connection.share:
             with connection.share.lock:
                 others = [each for each in connection.subscriptions if each is not subscription]
@@ -84,3 +91,5 @@ def leave(subscription: Any) -> None:
                     subscription.connections = [
                         each for each in subscription.connections if each is not connection
                     ]
+                else:  # before another one joins
+                    connection.close()

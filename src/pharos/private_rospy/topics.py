@@ -268,7 +268,7 @@ class PlainInbox(Inbox):
         connections = self.subscription.connections
         links = links_of(connections)
         queue_sizes = [link.publisher.queue_size for link in links]
-        if self.queue_size or links and len(links) < len(connections):
+        if self.queue_size or not links or len(links) < len(connections):
             return super().capacity_for(size)
         if not all(queue_sizes):  # a publisher without a queue_size loses no message
             return super().capacity_for(size)
@@ -290,6 +290,7 @@ class SubscriptionOverlay:
         self.rospy___init__(name, data_class)
         self.tcp_nodelay = True  # else a publisher may hold a small message back for 40 ms
         self.inboxes = []
+        self.is_leaving = False  # True once close() has begun: no shared connection may be joined
         self.plain_inbox = None  # type: Any
 
     def add_link(self, link: Any) -> bool:
@@ -386,8 +387,10 @@ class SubscriptionOverlay:
         if not share or connection.transport_type != 'TCPROS':
             return self.rospy_add_connection(connection)
         connection.share = share  # _connect() has its lock
-        share.connection = connection
-        return share.add(self, connection)
+        is_added = share.add(self, connection)
+        if is_added:
+            share.connection = connection
+        return is_added
 
     def remove_callback(self, callback: Any, args: Any) -> None:
         self.rospy_remove_callback(callback, args)
