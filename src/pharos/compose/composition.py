@@ -79,9 +79,8 @@ class Composition:
         self._end_times: dict[ScriptNode, float] = {}  # as of time.monotonic()
         self._stopped_nodes: set[ScriptNode] = set()  # by control(); they do not respawn
         self._listener: socket.socket | None = None  # of control()
-        self.former_environment: dict[
-            str, str | None
-        ] = {}  # of this process, what the nodes have set
+        # variables that this process has for its nodes -> the values before, or None
+        self.former_environment: dict[str, str | None] = {}
         self._watcher = threading.Thread(target=self._watch, name='composition', daemon=True)
         self._has_started = False  # True if one node was started
         self._has_failed = False  # True if a required node has ended, or a process by a signal

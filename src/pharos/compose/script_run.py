@@ -438,9 +438,8 @@ class ScriptRun(Run):
             raise_in(self.main, type(error))
             for loop in list(self.event_loops):
                 with contextlib.suppress(RuntimeError):  # it is closed
-                    loop.call_soon_threadsafe(
-                        int
-                    )  # the line that it comes to: one may wait for ever
+                    # an idle loop waits in C: this wakes it
+                    loop.call_soon_threadsafe(bool)
 
     # -- stop
 

@@ -3,8 +3,8 @@
 A callback queue has one thread. A node has one queue for its delegates, and one for each subscription
 of plain rospy. The thread begins a callback when those on earlier messages of the node have ended, or
 have run for SLOW; :meth:`CallbackQueue.delays` and TURN_LIMIT have more. Two other threads run
-callbacks: a publisher runs the queue of an inline channel, and a thread that reads TCPROS runs those
-of plain rospy without a queue_size.
+callbacks: a publisher runs the queue of an inline channel, and a thread that reads a TCPROS connection
+of one node runs those of plain rospy without a queue_size.
 """
 from __future__ import annotations
 
@@ -106,6 +106,7 @@ class CallbackQueue:
         # Locked: a publisher has woken the thread, which has not begun to look. The thread unlocks it:
         # so a publisher waits for the thread by taking it.
         self.request_lock = allocate_lock()
+        # These two guard, as locks do.
         self._loop_lock = allocate_lock()  # held by the thread: there is but one
         self._running_lock = allocate_lock()  # held by the thread that runs callbacks
 

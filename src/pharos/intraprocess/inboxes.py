@@ -16,7 +16,8 @@ class BoundedQueue:
     ``queue_size`` is the number of messages that wait at most. 0: as many as ``queue_bytes`` hold.
     None is the same as 0 within a process, and by shared memory. By TCPROS, None means no queue, as
     in rospy: publish() waits for the socket. A subscription of plain rospy without a queue_size
-    reads no more messages until its callbacks have ended.
+    reads no more messages until its callbacks have ended, unless its connection is shared: whoever
+    reads for several nodes waits for none.
 
     :ivar messages: the messages that wait, the oldest first
     :ivar dropped: the number of dropped messages

@@ -118,7 +118,7 @@ class PublisherOverlay:
             self.run.report_failure(error, block.func, 'listener')  # type: ignore[attr-defined]
 
     def publish(self, message: Any, connection_override: Any = None, channel: Any = None) -> None:
-        """Publish to the links, then to memory files and sockets.
+        """Publish to the links, then to memory files and sockets; drop what a silenced thread publishes.
 
         If a node has inline delegates, all its waiting jobs run in this thread, after the lock is
         free.
@@ -243,7 +243,8 @@ class PlainInbox(Inbox):
         """Take a message from a connection.
 
         Without a queue_size, messages wait in the sockets and in the publisher until the callbacks
-        have ended. The thread that reads a socket of TCPROS runs them.
+        have ended; those of a shared connection wait here. The thread that reads a socket of TCPROS
+        runs the callbacks.
         """
         if self.queue_size is None:
             if connection.share:  # who reads for several must not wait for one
