@@ -233,3 +233,14 @@ def test_first_sends_open_one_channel(sender, other):
         list(pool.map(send, ['one', 'two']))
     assert sorted(channel.topic for channel in sender.channels) == topics
     assert [sorted(box.next().data for _ in 'ab') for box in boxes] == 10 * [['one', 'two']]
+
+
+def test_stop_without_that_of_node_is_told(master, capfd):
+    class Forgetful(Node):
+        def stop(self, reason='no reason'):
+            return reason
+
+    node = create(master, '/forgetful', Forgetful)
+    assert node.stop(reason='tired') == 'tired'
+    assert 'Forgetful.stop() must call super().stop()' in ''.join(capfd.readouterr())
+    Node.stop(node)

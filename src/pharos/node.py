@@ -111,10 +111,11 @@ class Node(DelegateHolder):
         own_stop: Any = vars(cls).get('stop')
         if own_stop:
 
-            def stop(self: Node) -> None:
-                own_stop(self)
+            def stop(self: Node, *args: Any, **kwargs: Any) -> Any:
+                value = own_stop(self, *args, **kwargs)
                 if self.is_running:
                     self.log(f'{cls.__name__}.stop() must call super().stop()', 'error')
+                return value
 
             cls.stop = functools.update_wrapper(stop, own_stop)  # type: ignore[assignment]
 
