@@ -16,7 +16,7 @@ import rosmaster.master
 
 import pharos
 from pharos import BlockNode, Master, Node
-from pharos.testing import until
+from pharos.testing import Mailbox, until
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 PYTHON = '/usr/bin/python3'
@@ -116,6 +116,25 @@ def registrations(master, name):
         sorted(key for key, nodes in kind.items() if name in nodes)
         for kind in master.system_state()
     ]
+
+
+class Gate(Mailbox):
+    """A delegate that blocks at each message until the gate is opened."""
+
+    def __init__(self):
+        super().__init__()
+        self.begun = threading.Event()
+        self.open = threading.Event()
+
+    @property
+    def heard(self):
+        """The data of all messages so far."""
+        return [message.data for message in self.all()]
+
+    def __call__(self, message, channel=None):
+        super().__call__(message)
+        self.begun.set()
+        self.open.wait(TIMEOUT)
 
 
 class Peer:

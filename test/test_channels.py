@@ -1,5 +1,7 @@
 """Topics and channels: what a node sends, and what another one hears."""
 import concurrent.futures
+import os
+import signal
 import threading
 import time
 
@@ -9,7 +11,7 @@ import rospy
 from geometry_msgs.msg import Twist, Vector3
 from std_msgs.msg import Int32, String
 
-from helpers import TIMEOUT, Peer, PharosPeer, create, registrations
+from helpers import TIMEOUT, Gate, Peer, PharosPeer, create, registrations
 import pharos
 from pharos import (
     MessageTypeError,
@@ -39,18 +41,6 @@ def other(master):
 def pool(master):
     with concurrent.futures.ThreadPoolExecutor() as pool:
         yield pool
-
-
-class Gate:
-    """A delegate that keeps the first message until it is opened, while the others queue up."""
-
-    def __init__(self):
-        self.entered, self.opened, self.mailbox = threading.Event(), threading.Event(), Mailbox()
-
-    def __call__(self, message, channel):
-        self.entered.set()
-        self.opened.wait(TIMEOUT)
-        self.mailbox(message, channel)
 
 
 def take(mailbox, count):
@@ -206,6 +196,28 @@ def test_latched_message_reaches_late_subscriber(node, other):
     assert take(mailbox, 2) == ['new', 'newest']
 
 
+def test_unlatched_channel_beside_a_latched_one(node, other):
+    latched = node.output_channel('/map', STRING, latch=True)
+    unlatched = node.output_channel('/map', STRING)
+    latched.send(data='map')
+    unlatched.send(data='event')
+    mailbox = Mailbox(other, '/map', STRING)
+    unlatched.send(data='last')
+    assert take(mailbox, 2) == ['map', 'last']
+
+
+def test_latched_message_goes_to_the_new_peer_alone(master, node, peer):
+    out = node.output_channel('/map', STRING, latch=True)
+    out.send(data='map')
+    peer.hear('/map', STRING)
+    peer.heard('/map')
+    with Peer(master.url, 'late') as late:
+        late.hear('/map', STRING)
+        late.heard('/map')
+    out.send(data='end')
+    assert [message.data for message in peer.heard('/map', 2)] == ['map', 'end']
+
+
 # -- queues, and order
 
 
@@ -215,12 +227,12 @@ def test_full_queue_drops_oldest(node, other, size, count):
     channel = other.interested_in('/numbers', INT32, delegate=gate, queue_size=size)
     sender = node.output_channel('/numbers', INT32)
     sender.send(data=0)
-    assert gate.entered.wait(TIMEOUT)
+    assert gate.begun.wait(TIMEOUT)
     for number in range(1, 1 + count):
         sender.send(data=number)
-    gate.opened.set()
+    gate.open.set()
     kept = min(size, count)
-    assert take(gate.mailbox, 1 + kept) == [0, *range(1 + count - kept, 1 + count)]
+    assert take(gate, 1 + kept) == [0, *range(1 + count - kept, 1 + count)]
     assert (channel.received, channel.dropped) == (1 + kept, count - kept)
 
 
@@ -230,11 +242,11 @@ def test_queue_is_bounded_by_bytes(node, other):
     channel = other.interested_in('/large', BYTES, delegate=gate)
     sender = node.output_channel('/large', BYTES)
     sender.send(data=b'')
-    assert gate.entered.wait(TIMEOUT)
+    assert gate.begun.wait(TIMEOUT)
     for number in range(10):
         sender.send(data=bytes(MEGABYTE - 1000 + number))
-    gate.opened.set()
-    kept = [len(data) for data in take(gate.mailbox, 5)]
+    gate.open.set()
+    kept = [len(data) for data in take(gate, 5)]
     assert kept == [0, *range(MEGABYTE - 994, MEGABYTE - 990)]
     assert channel.dropped == 6
 
@@ -255,6 +267,43 @@ def test_messages_of_publisher_keep_order(master, other, peer, pool):
     came = take(mailbox, 600)
     assert [number for number in came if number < 1000] == list(range(300))
     assert [number for number in came if number >= 1000] == list(range(1000, 1300))
+
+
+def test_message_larger_than_the_queue_comes(node, other):
+    """Behind another one; the queue then holds that message alone."""
+    other.queue_bytes = 1000
+    mailbox, gate = Mailbox(other, '/words', STRING), Gate()
+    other.interested_in('/gate', STRING, gate)
+    node.send_to('/gate', data='x')
+    assert gate.begun.wait(TIMEOUT)
+    for text in 'ab':
+        node.send_to('/words', data=text * 5000)
+    gate.open.set()
+    assert mailbox.next(TIMEOUT / 3).data == 'b' * 5000
+
+
+def test_subscriber_may_be_slow_twice(node, peer):
+    """The thread that writes what waits for a socket ends, and another one starts."""
+    peer.hear('/words', STRING)
+    out = node.output_channel('/words', STRING, queue_size=2)
+    newest = "[message.data for message in heard['/words'][-1:]]"
+    for last in '1', '2':
+        os.kill(peer.pid, signal.SIGSTOP)
+        for _ in range(30):
+            out.send(data='x' * MEGABYTE)
+        os.kill(peer.pid, signal.SIGCONT)
+        out.send(data=last)
+        until(lambda last=last: peer.value(newest) == [last], TIMEOUT / 3)
+        until(lambda: 'send_queue' not in str(threading.enumerate()))
+
+
+def test_message_of_many_large_parts_is_sent(node, peer, monkeypatch):
+    """A call of the system takes 1024 parts."""
+    monkeypatch.setattr('pharos.private_rospy.tcpros.LARGE_PART', 1)
+    peer.hear('/status', 'diagnostic_msgs/DiagnosticStatus')
+    values = [{'key': 'k', 'value': 'v'}] * 1000
+    node.output_channel('/status', 'diagnostic_msgs/DiagnosticStatus').send(values=values)
+    assert len(peer.heard('/status')[0].values) == 1000
 
 
 # -- from_ and to

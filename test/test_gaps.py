@@ -16,7 +16,7 @@ import rospy
 import std_msgs.msg
 
 import pharos
-from helpers import INIT, SPIN, TIMEOUT, Peer, PharosPeer, Program, create, end, free_port
+from helpers import INIT, SPIN, TIMEOUT, Gate, Peer, PharosPeer, Program, create, end, free_port
 from pharos import Node, NodeNameInUseError, NodeStoppedError, PharosError
 from pharos.intraprocess.callback_queues import CallbackQueue
 from pharos.private_rospy.run import Run
@@ -33,20 +33,6 @@ def node(master):
 
 
 # -- what waits, and what has ended
-
-
-class Gate:
-    """A delegate that blocks at each message until the gate is opened."""
-
-    def __init__(self):
-        self.heard = []
-        self.begun = threading.Event()
-        self.open = threading.Event()
-
-    def __call__(self, message):
-        self.heard.append(message.data)
-        self.begun.set()
-        self.open.wait(TIMEOUT)
 
 
 class Hasty(pharos.BlockNode):
@@ -68,10 +54,9 @@ def test_restarted_node_hears_no_old_message(master):
     ear.stop()
     gate.open.set()
     ear.start()
-    del gate.heard[:]
     mouth.send_to('/words', data='new')
-    until(lambda: gate.heard)
-    assert gate.heard[0] == 'new'
+    gate.wait_for(lambda message: message.data == 'new')
+    assert gate.heard == ['first', 'new']
 
 
 def test_stop_drops_what_waits(master):

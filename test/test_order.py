@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from helpers import PharosPeer, create
+from helpers import TIMEOUT, Gate, PharosPeer, create
 from pharos import message_class
 from pharos.testing import Mailbox, until
 
@@ -282,3 +282,19 @@ def test_stop_ends_all_threads_of_busy_node(master):
     finally:
         is_over.set()
         thread.join()
+
+
+def test_closed_subscription_delays_no_callback(master, monkeypatch):
+    """A message for a closed subscription waits for ever: no callback waits for that one."""
+    monkeypatch.setattr('pharos.intraprocess.callback_queues.TURN_LIMIT', TIMEOUT)
+    node, mouth = create(master, '/ear'), create(master, '/mouth')
+    gate, box = Gate(), Mailbox()
+    old = node.ros.Subscriber('/old', Int32, gate)
+    node.ros.Subscriber('/new', Int32, box)
+    for number in range(3):
+        mouth.send_to('/old', typed_as=INT, data=number)
+    assert gate.begun.wait(TIMEOUT)
+    old.unregister()
+    gate.open.set()
+    mouth.send_to('/new', typed_as=INT, data=7)
+    assert box.next(TIMEOUT / 3).data == 7

@@ -3,6 +3,7 @@ import collections
 import concurrent.futures
 import functools
 import threading
+import time
 
 import pytest
 from std_msgs.msg import String
@@ -233,3 +234,19 @@ def test_first_sends_open_one_channel(sender, other):
         list(pool.map(send, ['one', 'two']))
     assert sorted(channel.topic for channel in sender.channels) == topics
     assert [sorted(box.next().data for _ in 'ab') for box in boxes] == 10 * [['one', 'two']]
+
+
+def test_sleep_in_start_lets_delegates_run(master, monkeypatch):
+    monkeypatch.setattr('pharos.private_rospy.run.HOLD_LIMIT', TIMEOUT)
+    create(master, '/maps').output_channel('/map', STRING, latch=True).send(data='map')
+
+    class Waiter(Node):
+        def start(self):
+            super().start()
+            heard = Mailbox(self, '/map', STRING)
+            while not heard.all() and time.monotonic() < end:
+                self.sleep(0.01)
+
+    end = time.monotonic() + TIMEOUT / 3
+    create(master, '/waiter', Waiter)
+    assert time.monotonic() < end

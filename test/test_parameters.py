@@ -240,6 +240,13 @@ def test_block_sets_its_parameter(node):
     until(lambda: heard == [2, 3, 4])
 
 
+def test_block_cannot_change_the_value(node):
+    gains = node.parameter('~gains', {'p': 1})
+    gains.on_change(lambda value: value.update(p=99))
+    gains.set({'p': 2})
+    assert gains.value == {'p': 2}
+
+
 # -- stop and start
 
 
