@@ -137,6 +137,28 @@ class Gate(Mailbox):
         self.open.wait(TIMEOUT)
 
 
+class Hasty(BlockNode):
+    stop_timeout = 0.05
+
+
+def fill(master):
+    """Return a node, its gate and channel, and a sender; one message is in the gate, and two wait."""
+    gate, ear, mouth = Gate(), create(master, '/ear', Hasty), create(master, '/mouth')
+    channel = ear.interested_in('/words', 'std_msgs/String', gate)
+    for word in 'first', 'old', 'older':
+        mouth.send_to('/words', typed_as='std_msgs/String', data=word)
+    assert gate.begun.wait(TIMEOUT)
+    return ear, gate, channel, mouth
+
+
+def has_come_to(thread, function):
+    """True if a thread stands in a function, or has ended."""
+    frame = sys._current_frames().get(thread.ident)
+    while frame and frame.f_code is not function.__code__:
+        frame = frame.f_back
+    return frame or not thread.is_alive()
+
+
 class Peer:
     """A rospy node in a process of its own, which runs Python as the test asks.
 

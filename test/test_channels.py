@@ -11,15 +11,17 @@ import rospy
 from geometry_msgs.msg import Twist, Vector3
 from std_msgs.msg import Int32, String
 
-from helpers import TIMEOUT, Gate, Peer, PharosPeer, create, registrations
+from helpers import TIMEOUT, Gate, Peer, PharosPeer, create, fill, has_come_to, registrations
 import pharos
 from pharos import (
     MessageTypeError,
     NodeStoppedError,
+    PharosError,
     UnknownNodeError,
     UnknownTopicError,
     UnknownTypeError,
 )
+from pharos.private_rospy.topics import PublisherOverlay
 from pharos.testing import Mailbox, until
 
 TWIST, STRING, INT32 = 'geometry_msgs/Twist', 'std_msgs/String', 'std_msgs/Int32'
@@ -218,6 +220,36 @@ def test_latched_message_goes_to_the_new_peer_alone(master, node, peer):
     assert [message.data for message in peer.heard('/map', 2)] == ['map', 'end']
 
 
+def test_latched_message_goes_to_the_new_subscriber_alone(master, node):
+    out = create(master, '/map').output_channel('/map', STRING, latch=True)
+    out.send(data='map')
+    boxes = [Mailbox(), Mailbox()]
+    for box in boxes:
+        node.ros.Subscriber('/map', String, box)
+        assert box.next().data == 'map'
+    out.send(data='end')
+    for box in boxes:
+        assert box.next().data == 'end'
+
+
+def test_closed_channel_takes_its_latched_message_along(master, node):
+    channels = [node.output_channel('/map', STRING, latch=True) for _ in range(2)]
+    for channel, text in zip(channels, ['old', 'new']):
+        channel.send(data=text)
+    channels[0].close()
+    box = Mailbox(create(master, '/late'), '/map', STRING)
+    assert box.next().data == 'new'
+    channels[1].send(data='last')
+    assert box.next().data == 'last'
+
+
+def test_delegate_may_close_its_channel_at_the_latched_message(master, node):
+    create(master, '/maps').output_channel('/map', STRING, latch=True).send(data='map')
+    channel = node.interested_in('/map', delegate=lambda message, channel: channel.close())
+    until(lambda: channel.closed or node.errors)
+    assert not node.errors and not channel.connections
+
+
 # -- queues, and order
 
 
@@ -304,6 +336,56 @@ def test_message_of_many_large_parts_is_sent(node, peer, monkeypatch):
     values = [{'key': 'k', 'value': 'v'}] * 1000
     node.output_channel('/status', 'diagnostic_msgs/DiagnosticStatus').send(values=values)
     assert len(peer.heard('/status')[0].values) == 1000
+
+
+def test_closed_channel_drops_what_waits(master):
+    ear, gate, channel, mouth = fill(master)
+    after = Mailbox(ear, '/after', STRING)
+    channel.close()
+    gate.open.set()
+    mouth.send_to('/after', typed_as=STRING, data='x')
+    after.next()  # delegates of a node run in order
+    assert gate.heard == ['first']
+
+
+@pytest.mark.parametrize('library, size', [(Peer, 1 << 20), (PharosPeer, 60_000)])
+def test_queue_to_a_standing_subscriber_is_bounded(master, node, library, size):
+    with library(master.url) as ear:
+        ear.hear('/words', STRING)
+        out = node.output_channel('/words', STRING, queue_size=2)
+        os.kill(ear.pid, signal.SIGSTOP)
+        for number in range(100):
+            out.send(data=str(number).ljust(size))
+        os.kill(ear.pid, signal.SIGCONT)
+        numbers = "[message.data[:3].strip() for message in heard['/words']]"
+        until(lambda: ear.value(numbers)[-1:] == ['99'])
+        assert len(ear.value(numbers)) < 60
+
+
+@pytest.mark.parametrize('end', ['close', 'stop'])
+def test_end_sends_what_waits(node, peer, end):
+    peer.hear('/words', STRING)
+    out = node.output_channel('/words', STRING)
+    os.kill(peer.pid, signal.SIGSTOP)
+    for number in range(10, 30):
+        out.send(data=str(number).ljust(1 << 20))
+    node.stop_timeout = TIMEOUT
+    thread = threading.Thread(target=out.close if end == 'close' else node.stop)
+    thread.start()
+    until(lambda: has_come_to(thread, PublisherOverlay.flush))
+    os.kill(peer.pid, signal.SIGCONT)
+    until(lambda: peer.value("[message.data[:2] for message in heard['/words']]")[-1:] == ['29'])
+    thread.join(TIMEOUT)
+    assert out.closed
+
+
+def test_channels_of_a_node_get_messages_of_their_own(node, peer):
+    boxes = [Mailbox(node, '/words', STRING) for _ in range(2)]
+    peer.run("out = rospy.Publisher('/words', message_class('std_msgs/String'), queue_size=1)")
+    until(lambda: peer.value('out.get_num_connections()'))
+    peer.run("out.publish('one')")
+    one, other = [box.next() for box in boxes]
+    assert one == other and one is not other
 
 
 # -- from_ and to
@@ -490,6 +572,26 @@ def test_node_hears_itself(node):
     mailbox = Mailbox(node, '/chatter', STRING)
     node.send_to('/chatter', data='hello')
     assert take(mailbox, 1) == ['hello']
+
+
+def test_sender_learns_that_its_node_stops(master):
+    """A thread of the program's own sends until the stop; rospy says that the topic is closed."""
+    for _ in range(10):
+        node, errors = create(master, '/sender'), []
+
+        def send(node=node, errors=errors):
+            try:
+                while True:
+                    node.send_to('/t', typed_as=STRING, data='x')
+            except PharosError as error:
+                errors.append(type(error))
+
+        thread = threading.Thread(target=send)
+        thread.start()
+        until(lambda: node.channels and node.channels[0].sent)
+        node.stop()
+        thread.join(TIMEOUT)
+        assert errors == [NodeStoppedError]
 
 
 # -- Topic

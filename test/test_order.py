@@ -10,6 +10,7 @@ import threading
 import time
 
 import pytest
+import std_msgs.msg
 
 from helpers import TIMEOUT, Gate, PharosPeer, create
 from pharos import BlockNode, message_class, testing
@@ -22,6 +23,11 @@ SEEDS = range(10)
 TOPICS = '/a', '/b', '/c', '/d'
 Int32 = message_class(INT)
 create_node, simulation = testing.create_node, testing.simulation
+
+
+@pytest.fixture
+def node(master):
+    return create(master)
 
 
 class Ear:
@@ -370,3 +376,21 @@ def test_closed_subscription_delays_no_callback(master, monkeypatch):
     gate.open.set()
     mouth.send_to('/new', typed_as=INT, data=7)
     assert box.next(TIMEOUT / 3).data == 7
+
+
+def test_callback_waits_for_one_on_an_earlier_message(master, node, monkeypatch):
+    for limit in 'SLOW', 'TURN_LIMIT':  # both are too short for a test
+        monkeypatch.setattr(f'pharos.intraprocess.callback_queues.{limit}', TIMEOUT)
+    order, gate, mouth = [], Gate(), create(master, '/mouth')
+    callbacks = {
+        '/first': lambda message: [gate(message), order.append('first')],
+        '/second': lambda message: order.append('second'),
+    }
+    for topic, callback in callbacks.items():
+        node.ros.Subscriber(topic, std_msgs.msg.String, callback)
+        mouth.send_to(topic, typed_as=STRING, data='x')
+    queues = node._current_run.callback_order.queues
+    until(lambda: order or gate.heard and any(queue.waits_for_turn for queue in list(queues)))
+    gate.open.set()
+    until(lambda: len(order) == 2)
+    assert order == ['first', 'second']

@@ -247,6 +247,15 @@ def test_block_cannot_change_the_value(node):
     assert gains.value == {'p': 2}
 
 
+@pytest.mark.parametrize('value', [True, 1.0])
+def test_change_of_type_is_heard(node, value):
+    rate, heard = node.parameter('~rate', 1), []
+    rate.on_change(heard.append)
+    rate.set(value)
+    until(lambda: heard)
+    assert type(heard[0]) is type(value)
+
+
 # -- stop and start
 
 

@@ -619,3 +619,17 @@ def test_stop_in_a_call_is_no_success(master, bench, peer, client, sleep):
     told = bench.said if client == 'same process' else lambda: ['called', *peer.value('told')]
     until(lambda: len(told()) > 1)
     assert told() == ['called', 'failed']
+
+
+def test_stop_ends_call_of_soul(master, node, peer):
+    peer.run(
+        'from std_srvs.srv import Empty\ncalled = []\n'
+        "hang = rospy.Service('/hang', Empty, lambda request: called.append(1) or rospy.sleep(3600))"
+    )
+    node.stop_timeout = TIMEOUT
+    thread = node.fork(lambda me: me.wait_for_service('/hang', TIMEOUT).call())
+    until(lambda: peer.value('called'))
+    stopping = threading.Thread(target=node.stop, daemon=True)
+    stopping.start()
+    stopping.join(TIMEOUT / 3)
+    assert not stopping.is_alive() and not thread.is_alive()
