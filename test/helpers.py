@@ -16,7 +16,7 @@ import rosmaster.master
 
 import pharos
 from pharos import BlockNode, Master, Node
-from pharos.testing import until
+from pharos.testing import Mailbox, until
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 PYTHON = '/usr/bin/python3'
@@ -116,6 +116,47 @@ def registrations(master, name):
         sorted(key for key, nodes in kind.items() if name in nodes)
         for kind in master.system_state()
     ]
+
+
+class Gate(Mailbox):
+    """A delegate that blocks at each message until the gate is opened."""
+
+    def __init__(self):
+        super().__init__()
+        self.begun = threading.Event()
+        self.open = threading.Event()
+
+    @property
+    def heard(self):
+        """The data of all messages so far."""
+        return [message.data for message in self.all()]
+
+    def __call__(self, message, channel=None):
+        super().__call__(message)
+        self.begun.set()
+        self.open.wait(TIMEOUT)
+
+
+class Hasty(BlockNode):
+    stop_timeout = 0.05
+
+
+def fill(master):
+    """Return a node, its gate and channel, and a sender; one message is in the gate, and two wait."""
+    gate, ear, mouth = Gate(), create(master, '/ear', Hasty), create(master, '/mouth')
+    channel = ear.interested_in('/words', 'std_msgs/String', gate)
+    for word in 'first', 'old', 'older':
+        mouth.send_to('/words', typed_as='std_msgs/String', data=word)
+    assert gate.begun.wait(TIMEOUT)
+    return ear, gate, channel, mouth
+
+
+def has_come_to(thread, function):
+    """True if a thread stands in a function, or has ended."""
+    frame = sys._current_frames().get(thread.ident)
+    while frame and frame.f_code is not function.__code__:
+        frame = frame.f_back
+    return frame or not thread.is_alive()
 
 
 class Peer:

@@ -1,5 +1,7 @@
 """Topics and channels: what a node sends, and what another one hears."""
 import concurrent.futures
+import os
+import signal
 import threading
 import time
 
@@ -9,16 +11,18 @@ import rospy
 from geometry_msgs.msg import Twist, Vector3
 from std_msgs.msg import Int32, String
 
-from helpers import TIMEOUT, Peer, PharosPeer, create, registrations
+from helpers import TIMEOUT, Gate, Peer, PharosPeer, create, fill, has_come_to, registrations
 import pharos
 from pharos import (
     MessageTypeError,
     NodeStoppedError,
+    PharosError,
     UnknownNodeError,
     UnknownTopicError,
     UnknownTypeError,
 )
 from pharos.private_rospy import topics
+from pharos.private_rospy.topics import PublisherOverlay
 from pharos.testing import Mailbox, until
 
 TWIST, STRING, INT32 = 'geometry_msgs/Twist', 'std_msgs/String', 'std_msgs/Int32'
@@ -40,18 +44,6 @@ def other(master):
 def pool(master):
     with concurrent.futures.ThreadPoolExecutor() as pool:
         yield pool
-
-
-class Gate:
-    """A delegate that keeps the first message until it is opened, while the others queue up."""
-
-    def __init__(self):
-        self.entered, self.opened, self.mailbox = threading.Event(), threading.Event(), Mailbox()
-
-    def __call__(self, message, channel):
-        self.entered.set()
-        self.opened.wait(TIMEOUT)
-        self.mailbox(message, channel)
 
 
 def take(mailbox, count):
@@ -207,6 +199,58 @@ def test_latched_message_reaches_late_subscriber(node, other):
     assert take(mailbox, 2) == ['new', 'newest']
 
 
+def test_unlatched_channel_beside_a_latched_one(node, other):
+    latched = node.output_channel('/map', STRING, latch=True)
+    unlatched = node.output_channel('/map', STRING)
+    latched.send(data='map')
+    unlatched.send(data='event')
+    mailbox = Mailbox(other, '/map', STRING)
+    unlatched.send(data='last')
+    assert take(mailbox, 2) == ['map', 'last']
+
+
+def test_latched_message_goes_to_the_new_peer_alone(master, node, peer):
+    out = node.output_channel('/map', STRING, latch=True)
+    out.send(data='map')
+    peer.hear('/map', STRING)
+    peer.heard('/map')
+    with Peer(master.url, 'late') as late:
+        late.hear('/map', STRING)
+        late.heard('/map')
+    out.send(data='end')
+    assert [message.data for message in peer.heard('/map', 2)] == ['map', 'end']
+
+
+def test_latched_message_goes_to_the_new_subscriber_alone(master, node):
+    out = create(master, '/map').output_channel('/map', STRING, latch=True)
+    out.send(data='map')
+    boxes = [Mailbox(), Mailbox()]
+    for box in boxes:
+        node.ros.Subscriber('/map', String, box)
+        assert box.next().data == 'map'
+    out.send(data='end')
+    for box in boxes:
+        assert box.next().data == 'end'
+
+
+def test_closed_channel_takes_its_latched_message_along(master, node):
+    channels = [node.output_channel('/map', STRING, latch=True) for _ in range(2)]
+    for channel, text in zip(channels, ['old', 'new']):
+        channel.send(data=text)
+    channels[0].close()
+    box = Mailbox(create(master, '/late'), '/map', STRING)
+    assert box.next().data == 'new'
+    channels[1].send(data='last')
+    assert box.next().data == 'last'
+
+
+def test_delegate_may_close_its_channel_at_the_latched_message(master, node):
+    create(master, '/maps').output_channel('/map', STRING, latch=True).send(data='map')
+    channel = node.interested_in('/map', delegate=lambda message, channel: channel.close())
+    until(lambda: channel.closed or node.errors)
+    assert not node.errors and not channel.connections
+
+
 # -- queues, and order
 
 
@@ -216,12 +260,12 @@ def test_full_queue_drops_oldest(node, other, size, count):
     channel = other.interested_in('/numbers', INT32, delegate=gate, queue_size=size)
     sender = node.output_channel('/numbers', INT32)
     sender.send(data=0)
-    assert gate.entered.wait(TIMEOUT)
+    assert gate.begun.wait(TIMEOUT)
     for number in range(1, 1 + count):
         sender.send(data=number)
-    gate.opened.set()
+    gate.open.set()
     kept = min(size, count)
-    assert take(gate.mailbox, 1 + kept) == [0, *range(1 + count - kept, 1 + count)]
+    assert take(gate, 1 + kept) == [0, *range(1 + count - kept, 1 + count)]
     assert (channel.received, channel.dropped) == (1 + kept, count - kept)
 
 
@@ -231,11 +275,11 @@ def test_queue_is_bounded_by_bytes(node, other):
     channel = other.interested_in('/large', BYTES, delegate=gate)
     sender = node.output_channel('/large', BYTES)
     sender.send(data=b'')
-    assert gate.entered.wait(TIMEOUT)
+    assert gate.begun.wait(TIMEOUT)
     for number in range(10):
         sender.send(data=bytes(MEGABYTE - 1000 + number))
-    gate.opened.set()
-    kept = [len(data) for data in take(gate.mailbox, 5)]
+    gate.open.set()
+    kept = [len(data) for data in take(gate, 5)]
     assert kept == [0, *range(MEGABYTE - 994, MEGABYTE - 990)]
     assert channel.dropped == 6
 
@@ -256,6 +300,93 @@ def test_messages_of_publisher_keep_order(master, other, peer, pool):
     came = take(mailbox, 600)
     assert [number for number in came if number < 1000] == list(range(300))
     assert [number for number in came if number >= 1000] == list(range(1000, 1300))
+
+
+def test_message_larger_than_the_queue_comes(node, other):
+    """Behind another one; the queue then holds that message alone."""
+    other.queue_bytes = 1000
+    mailbox, gate = Mailbox(other, '/words', STRING), Gate()
+    other.interested_in('/gate', STRING, gate)
+    node.send_to('/gate', data='x')
+    assert gate.begun.wait(TIMEOUT)
+    for text in 'ab':
+        node.send_to('/words', data=text * 5000)
+    gate.open.set()
+    assert mailbox.next(TIMEOUT / 3).data == 'b' * 5000
+
+
+def test_subscriber_may_be_slow_twice(node, peer):
+    """The thread that writes what waits for a socket ends, and another one starts."""
+    peer.hear('/words', STRING)
+    out = node.output_channel('/words', STRING, queue_size=2)
+    newest = "[message.data for message in heard['/words'][-1:]]"
+    for last in '1', '2':
+        os.kill(peer.pid, signal.SIGSTOP)
+        for _ in range(30):
+            out.send(data='x' * MEGABYTE)
+        os.kill(peer.pid, signal.SIGCONT)
+        out.send(data=last)
+        until(lambda last=last: peer.value(newest) == [last], TIMEOUT / 3)
+        until(lambda: 'send_queue' not in str(threading.enumerate()))
+
+
+def test_message_of_many_large_parts_is_sent(node, peer, monkeypatch):
+    """A call of the system takes 1024 parts."""
+    monkeypatch.setattr('pharos.private_rospy.tcpros.LARGE_PART', 1)
+    peer.hear('/status', 'diagnostic_msgs/DiagnosticStatus')
+    values = [{'key': 'k', 'value': 'v'}] * 1000
+    node.output_channel('/status', 'diagnostic_msgs/DiagnosticStatus').send(values=values)
+    assert len(peer.heard('/status')[0].values) == 1000
+
+
+def test_closed_channel_drops_what_waits(master):
+    ear, gate, channel, mouth = fill(master)
+    after = Mailbox(ear, '/after', STRING)
+    channel.close()
+    gate.open.set()
+    mouth.send_to('/after', typed_as=STRING, data='x')
+    after.next()  # delegates of a node run in order
+    assert gate.heard == ['first']
+
+
+@pytest.mark.parametrize('library, size', [(Peer, 1 << 20), (PharosPeer, 60_000)])
+def test_queue_to_a_standing_subscriber_is_bounded(master, node, library, size):
+    with library(master.url) as ear:
+        ear.hear('/words', STRING)
+        out = node.output_channel('/words', STRING, queue_size=2)
+        os.kill(ear.pid, signal.SIGSTOP)
+        for number in range(100):
+            out.send(data=str(number).ljust(size))
+        os.kill(ear.pid, signal.SIGCONT)
+        numbers = "[message.data[:3].strip() for message in heard['/words']]"
+        until(lambda: ear.value(numbers)[-1:] == ['99'])
+        assert len(ear.value(numbers)) < 60
+
+
+@pytest.mark.parametrize('end', ['close', 'stop'])
+def test_end_sends_what_waits(node, peer, end):
+    peer.hear('/words', STRING)
+    out = node.output_channel('/words', STRING)
+    os.kill(peer.pid, signal.SIGSTOP)
+    for number in range(10, 30):
+        out.send(data=str(number).ljust(1 << 20))
+    node.stop_timeout = TIMEOUT
+    thread = threading.Thread(target=out.close if end == 'close' else node.stop)
+    thread.start()
+    until(lambda: has_come_to(thread, PublisherOverlay.flush))
+    os.kill(peer.pid, signal.SIGCONT)
+    until(lambda: peer.value("[message.data[:2] for message in heard['/words']]")[-1:] == ['29'])
+    thread.join(TIMEOUT)
+    assert out.closed
+
+
+def test_channels_of_a_node_get_messages_of_their_own(node, peer):
+    boxes = [Mailbox(node, '/words', STRING) for _ in range(2)]
+    peer.run("out = rospy.Publisher('/words', message_class('std_msgs/String'), queue_size=1)")
+    until(lambda: peer.value('out.get_num_connections()'))
+    peer.run("out.publish('one')")
+    one, other = [box.next() for box in boxes]
+    assert one == other and one is not other
 
 
 # -- from_ and to
@@ -442,6 +573,26 @@ def test_node_hears_itself(node):
     mailbox = Mailbox(node, '/chatter', STRING)
     node.send_to('/chatter', data='hello')
     assert take(mailbox, 1) == ['hello']
+
+
+def test_sender_learns_that_its_node_stops(master):
+    """A thread of the program's own sends until the stop; rospy says that the topic is closed."""
+    for _ in range(10):
+        node, errors = create(master, '/sender'), []
+
+        def send(node=node, errors=errors):
+            try:
+                while True:
+                    node.send_to('/t', typed_as=STRING, data='x')
+            except PharosError as error:
+                errors.append(type(error))
+
+        thread = threading.Thread(target=send)
+        thread.start()
+        until(lambda: node.channels and node.channels[0].sent)
+        node.stop()
+        thread.join(TIMEOUT)
+        assert errors == [NodeStoppedError]
 
 
 # -- Topic

@@ -12,7 +12,7 @@ import pytest
 import rospy
 
 import pharos
-from helpers import ROOT, SPIN, TIMEOUT, Peer, Program, create, end, registrations
+from helpers import INIT, ROOT, SPIN, TIMEOUT, Peer, Program, create, end, free_port, registrations
 from pharos import ExternalNode, Master, PharosError, ScriptNode, UnknownNodeError
 from pharos.testing import Mailbox, until
 
@@ -262,6 +262,23 @@ def test_signal_handler_is_called_at_stop(ends, tmp_path, name):
 def test_script_waits_for_its_threads(master, ends, how):
     assert ends(how).wait(TIMEOUT) == 0
     assert master.parameters['/ends/worked'] is True
+
+
+def test_program_whose_required_soul_has_ended_runs_again(bench):
+    text = '''
+        node = pharos.Master().create(pharos.BlockNode, 'program')
+        if os.path.exists(SAID):
+            node.fork(lambda me: [say('again') for turn in me.every(0.01)])
+        else:
+            say('first')
+            node.fork(lambda me: None, required=True)
+        pharos.spin()
+        '''
+    script = bench.load(text)
+    assert script.wait(TIMEOUT) == 1
+    script.start()
+    until(lambda: bench.said().count('again') > 5 or script.exit_code is not None)
+    assert script.is_running
 
 
 # -- what is a script's own
@@ -599,6 +616,24 @@ def test_stop_ends_all_nodes(master, compose):
     assert composition.process.poll() is not None
 
 
+def test_last_node_can_be_stopped_and_started(master, bench):
+    with master.compose(None, bench.launch_file(program=SPIN)) as composition:
+        (script,) = composition.nodes
+        composition.control(script, 'stop')
+        with pytest.raises(TimeoutError):
+            composition.wait(0.2)
+        composition.control(script, 'start')
+        assert script.is_running
+
+
+def test_end_waits_for_a_slow_program(master, bench, monkeypatch):
+    monkeypatch.setattr('pharos.compose.composition.SLOW_END', 0.01)
+    text = f"{INIT}rospy.on_shutdown(lambda: [time.sleep(0.5), say('stands')])\nsay('ready')\n"
+    with master.compose(None, bench.launch_file(program=f'{text}rospy.spin()')):
+        until(bench.said)
+    assert bench.said() == ['ready', 'stands']
+
+
 # -- rosrun pharos compose
 
 
@@ -726,3 +761,39 @@ def test_remap_in_scope_of_a_node_is_taken(bench, args):
     with as_node(bench, args.format(bench.folder), remap) as launched:
         until(lambda: len(bench.said()) == 4 or launched.poll() is not None)
     assert sorted(bench.said())[:2] == ['/rig/hear', '/rig/talk']
+
+
+def test_respawn_waits_for_its_delay(bench):
+    bench.write(INIT + 'say(time.time())\n')
+    more = 'respawn="true" respawn_delay="0.5"'
+    with bench.program(bench.launch_file(f'<node pkg="bench" type="program" name="p" {more}/>')):
+        until(lambda: len(bench.said()) >= 2)
+    first, second, *_ = map(float, bench.said())
+    assert second - first >= 0.5
+
+
+def test_node_with_a_folder_runs_there(bench):
+    bench.write(INIT + 'say(os.getcwd())\nrospy.spin()\n')
+    xml = '<node pkg="bench" type="program" name="program" cwd="node"/>'
+    with bench.program(bench.launch_file(xml)):
+        until(bench.said)
+    assert bench.said() == [str(bench.folder)]
+
+
+def test_program_with_a_window_runs_here_if_asked(bench):
+    path = bench.launch_file(program=f'import tkinter\n{INIT}say(os.getpid())\nrospy.spin()\n')
+    for options in [], ['--here', 'program']:
+        with bench.program(path, *options) as composed:
+            until(lambda options=options: len(bench.said()) == 1 + len(options) // 2)
+            is_here = bench.said()[-1] == str(composed.pid)
+        assert is_here == bool(options)
+
+
+def test_master_is_started_if_there_is_none(bench, monkeypatch):
+    bench.master = pharos.Master(f'http://127.0.0.1:{free_port()}/')
+    with bench.program(bench.launch_file(program=SPIN)) as composed:
+        until(lambda: bench.said() == ['ready'])
+        assert bench.master.node('/program').pid == composed.pid
+        assert 'no ROS master at' in composed.output
+        end(composed)
+    assert not bench.master.is_reachable()

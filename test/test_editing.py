@@ -2,10 +2,11 @@
 import importlib
 import os
 import re
+import sys
 
 import pytest
 
-from helpers import create
+from helpers import INIT, SPIN, create
 from pharos import PharosError
 from pharos.testing import Mailbox, until
 
@@ -48,6 +49,17 @@ def main():
 from std_msgs.msg import Int32
 main()
 '''
+GAIN_PROGRAM = (
+    INIT
+    + """
+GAIN = {}
+def speed(value={}): return value
+say('ready')
+while not rospy.is_shutdown():
+    say(speed())
+    rospy.sleep(0.01)
+"""
+)
 EDITS = {
     'constant': ('GAIN = 1', 'GAIN = 5', 5),
     'class attribute': ('bias = 0', 'bias = 7', 8),
@@ -126,3 +138,42 @@ def test_own_class_is_edited(master, tmp_path, monkeypatch):
     wheels = create(master, '/wheels', importlib.import_module('wheels').Wheels)
     path.write_text(path.read_text().replace('return 1', 'return 2'))
     assert wheels.reload().startswith('Wheels.speed takes') and wheels.speed() == 2
+
+
+def test_reload_gives_the_switch_interval_back(bench):
+    before = sys.getswitchinterval()
+    script = bench.load(GAIN_PROGRAM.format(1, 1))
+    bench.write(GAIN_PROGRAM.format(2, 1))
+    assert 'GAIN takes effect' in script.reload()
+    assert sys.getswitchinterval() == before
+
+
+def test_second_reload_changes_nothing(bench):
+    script = bench.load(GAIN_PROGRAM.format(1, 1))
+    bench.write(GAIN_PROGRAM.format(2, 1))
+    script.reload()
+    assert script.reload() == 'nothing has changed'
+
+
+def test_new_default_takes_effect(bench):
+    script = bench.load(GAIN_PROGRAM.format(1, 1))
+    until(lambda: '1' in bench.said())
+    bench.write(GAIN_PROGRAM.format(1, 5))
+    script.reload()
+    until(lambda: '5' in bench.said())
+
+
+def test_members_of_an_enum_stay(bench):
+    """A new member would not equal a former one that the program has kept."""
+    text = 'import enum\nclass Mode(enum.Enum):\n    FAST = {}\n' + SPIN
+    script = bench.load(text.format(1))
+    bench.write(text.format(2))
+    assert 'Mode.FAST takes effect at a restart' in script.reload()
+
+
+def test_class_in_a_class_stays(bench):
+    """Its objects would be no instances of the new one."""
+    text = 'class Robot:\n    class Arm:\n        length = {}\n' + SPIN
+    script = bench.load(text.format(1))
+    bench.write(text.format(2))
+    assert 'Robot.Arm takes effect at a restart' in script.reload()

@@ -1,11 +1,13 @@
 """Nodes: their names, addresses and arguments, souls and time, starts, stops and changes."""
 import concurrent.futures
 import contextlib
+import gc
 import re
 import socket
 import threading
 import time
 import urllib.parse
+import weakref
 
 import pytest
 import rosgraph_msgs.msg
@@ -14,9 +16,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import pharos
-from helpers import TIMEOUT, Program, create, registrations
-from pharos import BlockNode, Node, NodeStoppedError, PharosError
+from helpers import TIMEOUT, Gate, Hasty, Program, create, fill, has_come_to, registrations
+from pharos import BlockNode, Node, NodeNameInUseError, NodeStoppedError, PharosError
+from pharos.intraprocess.callback_queues import CallbackQueue
 from pharos.private_rospy import xmlrpc
+from pharos.private_rospy.run import Run
 from pharos.testing import Mailbox, until
 
 STRING = 'std_msgs/String'
@@ -335,6 +339,88 @@ def test_every_and_sleep_follow_ros_time(master):
         del master.parameters['/use_sim_time']
 
 
+def test_ended_soul_is_not_run_again(node):
+    ran, begun = [], threading.Semaphore(0)
+    node.fork(lambda me: ran.append(1)).join(TIMEOUT)
+    node.fork(lambda me: (begun.release(), me.sleep(3600)))
+    assert begun.acquire(timeout=TIMEOUT)
+    node.restart()
+    assert begun.acquire(timeout=TIMEOUT)
+    assert ran == [1]
+
+
+def test_ended_soul_leaves_its_name_alone(node):
+    blocks = weakref.WeakSet()
+    for number in range(30):
+
+        def block(me):
+            pass
+
+        blocks.add(block)
+        node.fork(block, name=f'job {number}').join(TIMEOUT)
+    del block
+
+    def are_gone():
+        gc.collect()
+        return not blocks
+
+    until(are_gone)
+    assert node.health().ended_souls == [f'job {number}' for number in range(20, 30)]
+
+
+def test_soul_of_a_former_run_ends(node):
+    begun, ended = [], threading.Semaphore(0)
+
+    def watch(me):
+        begun.append(me)
+        try:
+            if len(begun) == 1:
+                me.restart()
+            me.sleep(3600)
+        except pharos.NodeStoppedError:
+            ended.release()
+            raise
+
+    node.fork(watch)
+    assert ended.acquire(timeout=TIMEOUT)
+    assert len(begun) == 2 and node.health().souls == 1
+
+
+def test_thread_that_sleeps_ends_with_its_node(node):
+    sleep = node.ros.rostime.wallsleep
+
+    def work():
+        with contextlib.suppress(SystemExit):
+            while True:
+                sleep(0.01)
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    node.stop()
+    thread.join(TIMEOUT)
+    assert not thread.is_alive()
+
+
+def test_clock_that_jumps_back_stops_no_turns(master):
+    master.parameters['/use_sim_time'] = True
+    node, turns = create(master), []
+    clock = create(master, '/clock_of_all').output_channel('/clock', 'rosgraph_msgs/Clock')
+
+    def tick(seconds):
+        clock.publish(rosgraph_msgs.msg.Clock(rospy.Time(seconds)))
+        until(lambda: node.ros.Time.now().to_sec() == seconds)
+
+    tick(100)
+    node.fork(lambda me: [turns.append(turn) for turn in me.every(1)])
+    until(lambda: turns)
+    for start in 100, 10:
+        count = len(turns)
+        for seconds in range(start + 2, start + 9, 2):
+            tick(seconds)
+        until(lambda count=count: len(turns) > count)
+    del master.parameters['/use_sim_time']
+
+
 # -- starts and stops
 
 
@@ -461,6 +547,63 @@ def test_stopped_node_refuses_use(node):
     for use in STOPPED.values():
         with pytest.raises(NodeStoppedError, match='/node'):
             use(node)
+
+
+def test_restarted_node_hears_no_old_message(master):
+    ear, gate, _, mouth = fill(master)
+    ear.stop()
+    gate.open.set()
+    ear.start()
+    mouth.send_to('/words', data='new')
+    gate.wait_for(lambda message: message.data == 'new')
+    assert gate.heard == ['first', 'new']
+
+
+def test_stop_drops_what_waits(master):
+    ear, gate, channel, _ = fill(master)
+    ear.stop_timeout = TIMEOUT
+    stopping = threading.Thread(target=ear.stop)
+    stopping.start()
+    until(lambda: channel.callback_queue.closed)
+    gate.open.set()
+    stopping.join(TIMEOUT)
+    assert gate.heard == ['first']
+
+
+def test_failed_start_keeps_channels(master, node):
+    box = Mailbox(node, '/words', STRING)
+    node.stop()
+    with create(master, '/node'):
+        with pytest.raises(NodeNameInUseError):
+            node.start()
+    node.start()
+    create(master, '/other').send_to('/words', typed_as=STRING, data='x')
+    assert box.next().data == 'x'
+
+
+def test_stop_waits_for_the_delegate(master, node):
+    words, gate, mouth = [], Gate(), create(master, '/mouth')
+    create(master, '/wheels').interested_in('/speed', STRING, lambda m: words.append(m.data))
+    speed = node.output_channel('/speed', STRING)
+    node.interested_in('/words', STRING, lambda message: [gate(message), speed.send(data='halt')])
+    mouth.send_to('/words', data='x')
+    assert gate.begun.wait(TIMEOUT)
+    node.stop_timeout = TIMEOUT
+    thread = threading.Thread(target=node.stop)
+    thread.start()
+    until(lambda: has_come_to(thread, CallbackQueue.close))
+    gate.open.set()
+    until(lambda: words or node.errors)
+    thread.join(TIMEOUT)
+    assert words == ['halt']
+
+
+def test_stop_fires_no_timer(node):
+    fired = []
+    timer = node.ros.Timer(node.ros.Duration(3600), fired.append)
+    until(lambda: has_come_to(timer, Run.sleep))
+    node.stop()
+    assert not fired
 
 
 # -- becoming another
@@ -590,3 +733,15 @@ def test_slow_master_is_told_once(master, slow_master, capfd):
     create(master).stop()
     lines = ''.join(capfd.readouterr()).splitlines()
     assert len([line for line in lines if master.url in line]) == 1
+
+
+def test_health_counts_souls_and_the_log_names_what_is_left(master):
+    node, free = create(master, node_class=Hasty), threading.Event()
+    log = Mailbox(create(master, '/ear'), '/rosout', 'rosgraph_msgs/Log')
+    node.fork(lambda me: None, name='short').join(TIMEOUT)
+    node.fork(lambda me: free.wait(TIMEOUT), name='stubborn')
+    assert (node.health().souls, node.health().ended_souls) == (1, ['short'])
+    node.stop()
+    log.wait_for(lambda line: 'left behind' in line.msg and 'stubborn' in line.msg)
+    assert '/node' not in str(master.system_state())
+    free.set()

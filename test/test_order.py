@@ -1,6 +1,8 @@
 """Callbacks of one node begin in the order in which their messages came, whatever their kind.
 
-Each test counts what is wrong in many rounds. A round sends in one go, and waits until all is heard.
+In virtual time a test has ten seeds, and nothing is wrong. Virtual time does not see how threads wake:
+a test in real time counts what is wrong in many rounds. A round sends in one go, and waits until all is
+heard.
 """
 import functools
 import sqlite3
@@ -8,16 +10,24 @@ import threading
 import time
 
 import pytest
+import std_msgs.msg
 
-from helpers import PharosPeer, create
-from pharos import message_class
+from helpers import TIMEOUT, Gate, PharosPeer, create
+from pharos import BlockNode, message_class, testing
 from pharos.testing import Mailbox, until
 
 INT, STRING = 'std_msgs/Int32', 'std_msgs/String'
 ROUNDS = 250
 TOLERATED = ROUNDS // 200  # beside load on all cores; on a quiet machine nothing is wrong
+SEEDS = range(10)
 TOPICS = '/a', '/b', '/c', '/d'
 Int32 = message_class(INT)
+create_node, simulation = testing.create_node, testing.simulation
+
+
+@pytest.fixture
+def node(master):
+    return create(master)
 
 
 class Ear:
@@ -38,10 +48,10 @@ class Ear:
     def _hear(self, topic, message):
         self.heard.append((message.data, topic))
 
-    def count_wrong(self, send, topics):
+    def count_wrong(self, send, topics, rounds=ROUNDS):
         """Send ``send(topic, number)`` for all topics in each round; count the disordered rounds."""
         wrong = 0
-        for number in range(ROUNDS):
+        for number in range(rounds):
             self.heard.clear()
             for topic in topics:
                 send(topic, number)
@@ -59,20 +69,66 @@ def publishers_of(node, topics=TOPICS):
     return publishers
 
 
-@pytest.mark.parametrize(
-    'kinds', [['rospy'] * 4, ['delegate'] * 4, ['rospy', 'delegate'] * 2, ['socket'] * 4]
-)
-def test_topics_keep_their_order(master, kinds):
-    ear = Ear(master, TOPICS, kinds)
-    publishers = publishers_of(create(master, '/mouth'))
-    assert ear.count_wrong(lambda topic, n: publishers[topic].publish(n), TOPICS) <= TOLERATED
-
-
 def test_publishers_keep_their_order(master):
     ear = Ear(master, TOPICS, ['rospy'] * 4)
     mouths = {topic: create(master, f'/mouth{topic}') for topic in TOPICS}
     publishers = {topic: publishers_of(node, [topic])[topic] for topic, node in mouths.items()}
     assert ear.count_wrong(lambda topic, n: publishers[topic].publish(n), TOPICS) <= TOLERATED
+
+
+KINDS = ['rospy'] * 4, ['delegate'] * 4, ['rospy', 'delegate'] * 2, ['socket'] * 4
+
+
+@pytest.mark.parametrize('publisher_count', [1, 4])
+@pytest.mark.parametrize('kinds', KINDS)
+def test_topics_keep_their_order(master, simulation, create_node, kinds, publisher_count):
+    ear = Ear(master, TOPICS, kinds)
+    mouths = [create_node(BlockNode, f'mouth{number}') for number in range(publisher_count)]
+    publishers = {
+        topic: mouths[number % publisher_count].ros.Publisher(topic, Int32, queue_size=10)
+        for number, topic in enumerate(TOPICS)
+    }
+    simulation.run(1)  # callbacks of plain rospy begin after a pause
+    for seed in SEEDS:
+        simulation.seed(seed)
+        assert not ear.count_wrong(lambda topic, n: publishers[topic].publish(n), TOPICS, 25), seed
+    ear.node.stop()
+
+
+def test_quick_callback_is_waited_for(simulation, create_node):
+    """By those on later messages, if it takes less than SLOW."""
+    node, mouth, order = create_node(BlockNode, 'node'), create_node(BlockNode, 'mouth'), []
+
+    def first(message):
+        time.sleep(0.002)
+        order.append('first')
+
+    node.ros.Subscriber('/first', Int32, first, queue_size=9)
+    node.ros.Subscriber('/second', Int32, lambda message: order.append('second'), queue_size=9)
+    publishers = [mouth.ros.Publisher(t, Int32, queue_size=10) for t in ('/first', '/second')]
+    simulation.run(1)
+    for seed in SEEDS:
+        simulation.seed(seed)
+        for publisher in publishers:
+            publisher.publish(1)
+        simulation.run(1)
+    assert order == ['first', 'second'] * len(SEEDS)
+
+
+def test_slow_callback_delays_others_once(simulation, create_node):
+    """The next callback on a later message waits for it no more, until it is quick again."""
+    node, mouth, delays = create_node(BlockNode, 'node'), create_node(BlockNode, 'mouth'), []
+    node.ros.Subscriber('/slow', Int32, lambda message: time.sleep(0.04), queue_size=9)
+    quick = lambda message: delays.append(simulation.now - start)  # noqa: E731
+    node.ros.Subscriber('/quick', Int32, quick, queue_size=9)
+    publishers = [mouth.ros.Publisher(t, Int32, queue_size=10) for t in ('/slow', '/quick')]
+    simulation.run(1)
+    for _ in range(3):
+        start = simulation.now
+        for publisher in publishers:
+            publisher.publish(1)
+        simulation.run(1)
+    assert 0.003 < delays[0] < 0.01 and max(delays[1:]) < 0.003
 
 
 def test_full_queue_keeps_the_order(master):
@@ -158,8 +214,9 @@ def test_synchronizer_is_done_before_next_topic(master):
     assert wrong <= TOLERATED
 
 
-def test_feedback_comes_before_result(master):
-    server_node, client_node = create(master, '/server'), create(master, '/client')
+def test_feedback_comes_before_result(simulation, create_node):
+    """Also if they come before send_goal() has stored the goal: they wait, and are not dropped."""
+    server_node, client_node = create_node(BlockNode, 'server'), create_node(BlockNode, 'client')
     actionlib = server_node.ros_import('actionlib')
     actions = __import__('actionlib.msg').msg
 
@@ -171,16 +228,20 @@ def test_feedback_comes_before_result(master):
     server.start()
     client = client_node.ros_import('actionlib').SimpleActionClient('/act', actions.TestAction)
     assert client.wait_for_server(client_node.ros.Duration(10))
-    wrong = 0
-    for number in range(100):
-        feedback = []
-        client.send_goal(
-            actions.TestGoal(number), feedback_cb=lambda m: feedback.append(m.feedback)
-        )
-        assert client.wait_for_result(client_node.ros.Duration(10))
-        assert client.get_result().result == 2 * number
-        wrong += feedback != [number + 1]
-    assert wrong <= TOLERATED
+    manager = client.action_client.manager
+    send = manager.send_goal_fn
+    manager.send_goal_fn = lambda goal: (send(goal), time.sleep(0.02))
+    simulation.run(1)
+    for seed in SEEDS:
+        simulation.seed(seed)
+        for number in range(10):
+            feedback = []
+            client.send_goal(
+                actions.TestGoal(number), feedback_cb=lambda m: feedback.append(m.feedback)
+            )
+            assert client.wait_for_result(client_node.ros.Duration(10))
+            assert client.get_result().result == 2 * number
+            assert feedback == [number + 1]
 
 
 def test_waiting_callback_lets_others_run(master):
@@ -238,24 +299,41 @@ def test_external_topics_keep_their_order(master):
     assert wrong <= TOLERATED
 
 
+def burst(publisher, count):
+    for number in range(count):
+        publisher.publish(number)
+
+
 def test_full_queue_of_two_publishers_goes_on(master):
     """Bursts of two publishers into a queue of one message: the last message always comes."""
     heard = Mailbox()
     create(master, '/ear').ros.Subscriber('/t', Int32, heard, queue_size=1)
     publishers = [publishers_of(create(master, f'/mouth{n}'), ['/t'])['/t'] for n in range(2)]
-
-    def burst(publisher):
-        for number in range(200):
-            publisher.publish(number)
-
     for number in range(1000, 1100):
-        threads = [threading.Thread(target=burst, args=[publisher]) for publisher in publishers]
+        threads = [threading.Thread(target=burst, args=[each, 200]) for each in publishers]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
         publishers[0].publish(number)
         heard.wait_for(lambda message, number=number: message.data == number)
+
+
+def test_full_queue_goes_on_in_virtual_time(simulation, create_node):
+    heard = Mailbox()
+    create_node(BlockNode, 'ear').ros.Subscriber('/t', Int32, heard, queue_size=1)
+    nodes = [create_node(BlockNode, f'mouth{number}') for number in range(2)]
+    publishers = [node.ros.Publisher('/t', Int32, queue_size=10) for node in nodes]
+    simulation.run(1)
+    for seed in SEEDS:
+        simulation.seed(seed)
+        threads = [threading.Thread(target=burst, args=[each, 20]) for each in publishers]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        publishers[0].publish(1000 + seed)
+        heard.wait_for(lambda message, number=1000 + seed: message.data == number)
 
 
 def test_stop_ends_all_threads_of_busy_node(master):
@@ -282,3 +360,37 @@ def test_stop_ends_all_threads_of_busy_node(master):
     finally:
         is_over.set()
         thread.join()
+
+
+def test_closed_subscription_delays_no_callback(master, monkeypatch):
+    """A message for a closed subscription waits for ever: no callback waits for that one."""
+    monkeypatch.setattr('pharos.intraprocess.callback_queues.TURN_LIMIT', TIMEOUT)
+    node, mouth = create(master, '/ear'), create(master, '/mouth')
+    gate, box = Gate(), Mailbox()
+    old = node.ros.Subscriber('/old', Int32, gate)
+    node.ros.Subscriber('/new', Int32, box)
+    for number in range(3):
+        mouth.send_to('/old', typed_as=INT, data=number)
+    assert gate.begun.wait(TIMEOUT)
+    old.unregister()
+    gate.open.set()
+    mouth.send_to('/new', typed_as=INT, data=7)
+    assert box.next(TIMEOUT / 3).data == 7
+
+
+def test_callback_waits_for_one_on_an_earlier_message(master, node, monkeypatch):
+    for limit in 'SLOW', 'TURN_LIMIT':  # both are too short for a test
+        monkeypatch.setattr(f'pharos.intraprocess.callback_queues.{limit}', TIMEOUT)
+    order, gate, mouth = [], Gate(), create(master, '/mouth')
+    callbacks = {
+        '/first': lambda message: [gate(message), order.append('first')],
+        '/second': lambda message: order.append('second'),
+    }
+    for topic, callback in callbacks.items():
+        node.ros.Subscriber(topic, std_msgs.msg.String, callback)
+        mouth.send_to(topic, typed_as=STRING, data='x')
+    queues = node._current_run.callback_order.queues
+    until(lambda: order or gate.heard and any(queue.waits_for_turn for queue in list(queues)))
+    gate.open.set()
+    until(lambda: len(order) == 2)
+    assert order == ['first', 'second']

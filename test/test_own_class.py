@@ -3,12 +3,15 @@ import collections
 import concurrent.futures
 import functools
 import threading
+import time
 
 import pytest
 from std_msgs.msg import String
 
-from helpers import TIMEOUT, create, registrations
+from helpers import TIMEOUT, create, fill, has_come_to, registrations
+import pharos
 from pharos import Node, NodeStoppedError, PharosError
+from pharos.intraprocess.callback_queues import CallbackQueue
 from pharos.testing import Mailbox, until
 
 STRING, TRIGGER = 'std_msgs/String', 'std_srvs/Trigger'
@@ -174,6 +177,29 @@ def test_mistake_says_what_to_write(master, use, error, said):
     assert [name for name in ('/n', '/t', '/ask') if repr(name) in state] == []
 
 
+def test_node_whose_own_stop_fails_is_stopped(master):
+    class Careless(pharos.BlockNode):
+        def stop(self):
+            assert not self.is_running, 'its motor does not answer'
+
+    node = create(master, node_class=Careless)
+    node.ros.signal_shutdown('enough')
+    until(lambda: node.lifecycle is pharos.Lifecycle.STOPPED)
+    assert [type(error) for error in node.errors] == [AssertionError]
+
+
+def test_node_becomes_another_class_after_the_delegate(master):
+    ear, gate, _, _ = fill(master)
+    former_class = type(ear)
+    thread = threading.Thread(target=ear.become, args=[pharos.BlockNode])
+    thread.start()
+    until(lambda: has_come_to(thread, CallbackQueue.run_exclusively))
+    assert type(ear) is former_class
+    gate.open.set()
+    thread.join(TIMEOUT)
+    assert type(ear) is pharos.BlockNode
+
+
 # -- the order of a start
 
 
@@ -244,3 +270,42 @@ def test_stop_without_that_of_node_is_told(master, capfd):
     assert node.stop(reason='tired') == 'tired'
     assert 'Forgetful.stop() must call super().stop()' in ''.join(capfd.readouterr())
     Node.stop(node)
+
+
+def test_sleep_in_start_lets_delegates_run(master, monkeypatch):
+    monkeypatch.setattr('pharos.private_rospy.run.HOLD_LIMIT', TIMEOUT)
+    create(master, '/maps').output_channel('/map', STRING, latch=True).send(data='map')
+
+    class Waiter(Node):
+        def start(self):
+            super().start()
+            heard = Mailbox(self, '/map', STRING)
+            while not heard.all() and time.monotonic() < end:
+                self.sleep(0.01)
+
+    end = time.monotonic() + TIMEOUT / 3
+    create(master, '/waiter', Waiter)
+    assert time.monotonic() < end
+
+
+def test_constructor_cannot_wait_for_a_service(master):
+    class Early(Node):
+        def __init__(self):
+            self.wait_for_service('/clear')
+
+    with pytest.raises(NodeStoppedError):
+        create(master, node_class=Early)
+
+
+def test_start_may_wait_for_its_delegate(master, monkeypatch):
+    monkeypatch.setattr('pharos.private_rospy.run.HOLD_LIMIT', 0.1)
+
+    class Patient(pharos.BlockNode):
+        def start(self):
+            super().start()
+            heard = threading.Event()
+            self.interested_in('/map', STRING, lambda message: heard.set())
+            self.has_heard = heard.wait(TIMEOUT)
+
+    create(master, '/maps').output_channel('/map', STRING, latch=True).send(data='map')
+    assert create(master, '/patient', Patient).has_heard

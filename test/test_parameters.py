@@ -240,6 +240,22 @@ def test_block_sets_its_parameter(node):
     until(lambda: heard == [2, 3, 4])
 
 
+def test_block_cannot_change_the_value(node):
+    gains = node.parameter('~gains', {'p': 1})
+    gains.on_change(lambda value: value.update(p=99))
+    gains.set({'p': 2})
+    assert gains.value == {'p': 2}
+
+
+@pytest.mark.parametrize('value', [True, 1.0])
+def test_change_of_type_is_heard(node, value):
+    rate, heard = node.parameter('~rate', 1), []
+    rate.on_change(heard.append)
+    rate.set(value)
+    until(lambda: heard)
+    assert type(heard[0]) is type(value)
+
+
 # -- stop and start
 
 

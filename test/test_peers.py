@@ -10,10 +10,11 @@ import genpy
 import pytest
 import rosbag
 import std_msgs.msg
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PointStamped, TransformStamped
 
 import helpers
-from helpers import TIMEOUT, Peer, Program, create
+from helpers import INIT, TIMEOUT, Gate, Peer, Program, create
 import pharos
 from pharos.testing import Mailbox, until
 
@@ -145,6 +146,235 @@ def test_other_type_is_not_delivered(peer, node):
     assert marker.next().data == 5
     create(node.master, '/second').send_to('/typed', typed_as=STRING, data='fits')
     assert box.next().data == 'fits' == box.all()[0].data
+
+
+# -- connections that nodes share
+
+
+@pytest.fixture
+def ears(master):
+    """Three nodes that share connections."""
+    sharing = pharos.Master(master.url, share_connections=True)
+    return [create(sharing, f'/ear{number}') for number in range(3)]
+
+
+def publish(peer, topic, *texts, latch=False, type_=STRING):
+    """Have a peer make its publisher ``out``, and publish texts."""
+    peer.run(
+        f'out = rospy.Publisher({topic!r}, message_class({type_!r}), queue_size=1000, latch={latch})'
+    )
+    for text in texts:
+        peer.run(f'out.publish({text!r})')
+
+
+def count(peer):
+    """The connections of the peer's publisher."""
+    return peer.value('out.get_num_connections()')
+
+
+def hear(peer, nodes, topic, type_=STRING, **options):
+    """Return a Mailbox of each node, when all of them are connected to the peer."""
+    boxes = [Mailbox() for _ in nodes]
+    for node, box in zip(nodes, boxes):
+        box.channel = node.interested_in(topic, type_, box, **options)
+    connected = [(peer.name, 'TCPROS')]
+    until(lambda: all(box.channel.connections == connected for box in boxes))
+    until(lambda: count(peer))
+    return boxes
+
+
+def texts_of(box, last):
+    """Wait for a text, and return all that came."""
+    until(lambda: last in [message.data for message in box.all()], TIMEOUT, last)
+    return [message.data for message in box.all()]
+
+
+def test_nodes_share_one_connection(peer, ears):
+    publish(peer, '/shared/one')
+    boxes = hear(peer, ears, '/shared/one')
+    assert count(peer) == 1
+    for number in range(20):
+        peer.run(f"out.publish('{number}')")
+    for box in boxes:
+        assert texts_of(box, '19') == [str(number) for number in range(20)]
+        assert box.channel.received == 20
+
+
+def test_nodes_have_own_connections_by_default(master, peer):
+    publish(peer, '/shared/not')
+    hear(peer, [create(master, f'/ear{number}') for number in range(3)], '/shared/not')
+    until(lambda: count(peer) == 3)
+
+
+def test_message_of_a_shared_connection_is_its_nodes_own(peer, ears):
+    publish(peer, '/shared/status', type_='diagnostic_msgs/DiagnosticStatus')
+    seen = []
+
+    def change(message):
+        seen.append((message.name, [value.key for value in message.values]))
+        message.name = 'changed'
+        message.values[0].key = 'changed'
+        message.values.append(None)
+
+    for ear in ears:
+        ear.interested_in('/shared/status', 'diagnostic_msgs/DiagnosticStatus', change)
+        ear.ros.Subscriber('/shared/status', DiagnosticStatus, change)
+    until(lambda: all(channel.connections for ear in ears for channel in ear.channels))
+    until(lambda: count(peer))
+    peer.run('import diagnostic_msgs.msg as diagnostics')
+    peer.run("values = [diagnostics.KeyValue('key', 'value')]")
+    peer.run("out.publish(diagnostics.DiagnosticStatus(name='motor', values=values))")
+    until(lambda: len(seen) == 6)
+    assert seen == [('motor', ['key'])] * 6
+
+
+def test_shared_channels_get_one_object(peer, ears):
+    publish(peer, '/shared/object')
+    boxes = hear(peer, ears, '/shared/object', shared=True)
+    own = Mailbox(ears[0], '/shared/object', STRING)
+    peer.run("out.publish('x')")
+    first, second, third = [box.next() for box in boxes]
+    assert first is second is third
+    assert own.next() == first and own.all()[0] is not first
+
+
+def test_shared_connection_names_its_publisher(peer, ears):
+    publish(peer, '/shared/names')
+    boxes = hear(peer, ears, '/shared/names', from_=peer.name)
+    others = hear(peer, ears, '/shared/names', from_='/somebody')
+    peer.run("out.publish('x')")
+    for box in boxes:
+        assert box.next()._connection_header['callerid'] == peer.name
+    assert not any(box.all() or box.channel.received for box in others)
+
+
+def test_late_node_of_a_shared_connection_gets_the_latched_message(peer, ears):
+    publish(peer, '/shared/map', 'old', 'map', latch=True)
+    first = []
+    ears[0].interested_in(
+        '/shared/map', STRING, lambda m: (first.append(m.data), setattr(m, 'data', 'changed'))
+    )
+    until(lambda: first == ['map'])
+    early, late = hear(peer, ears[1:2], '/shared/map'), hear(peer, ears[1:], '/shared/map')
+    for box in early + late:
+        assert box.next().data == 'map'
+    assert count(peer) == 1
+    peer.run("out.publish('end')")
+    for box in early + late:
+        assert texts_of(box, 'end') == ['map', 'end']
+    until(lambda: first == ['map', 'end'])
+
+
+PACE = '''
+import time
+def pace():
+    for number in range(400):
+        out.publish(str(number))
+        time.sleep(0.003)
+pacer = threading.Thread(target=pace)
+pacer.start()
+'''
+
+
+@pytest.mark.parametrize('latch', [False, True])
+@pytest.mark.parametrize('end', ['stop', 'close'])
+def test_node_that_leaves_takes_no_message_from_others(master, peer, ears, end, latch):
+    """The node whose connection it was, too; nor does a node that comes meanwhile."""
+    topic = f'/shared/{end}_{latch}'
+    publish(peer, topic, latch=latch)
+    boxes = hear(peer, ears, topic)
+    peer.run(PACE)
+    lates = []
+    for number, (ear, box) in enumerate(zip(ears[:2], boxes)):
+        texts_of(box, str(100 * number + 50))
+        ear.stop() if end == 'stop' else box.channel.close()
+        late = Mailbox(create(boxes[2].channel.node.master, f'/late{number}'), topic, STRING)
+        lates.append(late)
+    assert texts_of(boxes[2], '399') == [str(number) for number in range(400)]
+    assert count(peer) == 1
+    for box in lates:
+        texts = texts_of(box, '399')
+        assert texts == [str(number) for number in range(int(texts[0]), 400)]
+    for box in boxes[:2]:
+        assert [message.data for message in box.all()] == [str(n) for n in range(len(box.all()))]
+    for channel in [boxes[2].channel, *[box.channel for box in lates]]:
+        channel.close()
+    until(lambda: not count(peer))
+
+
+def lose_socket(camera):
+    """The publisher stays registered."""
+    camera.run('for connection in list(out.impl.connections): connection.close()')
+
+
+def advertise_again(camera):
+    camera.run('out.unregister()')
+    publish(camera, '/shared/film')
+
+
+@pytest.mark.parametrize('lose', [lose_socket, advertise_again, Peer.end])
+def test_publisher_that_comes_back_is_heard_by_all(master, ears, lose):
+    with contextlib.ExitStack() as stack:
+        camera = stack.enter_context(Peer(master.url, 'camera'))
+        publish(camera, '/shared/film')
+        boxes = hear(camera, ears, '/shared/film')
+        lose(camera)
+        if lose is Peer.end:
+            camera = stack.enter_context(Peer(master.url, 'camera'))
+            publish(camera, '/shared/film')
+        until(lambda: camera.run("out.publish('again')") or all(box.all() for box in boxes))
+        assert count(camera) == 1
+        camera.run("out.publish('end')")
+        for box in boxes:
+            assert texts_of(box, 'end').count('end') == 1
+
+
+BLOCKING = {
+    'delegate': lambda node, topic, gate: node.interested_in(topic, STRING, gate),
+    'callback': lambda node, topic, gate: node.ros.Subscriber(topic, std_msgs.msg.String, gate),
+    'callback with queue': lambda node, topic, gate: node.ros.Subscriber(
+        topic, std_msgs.msg.String, gate, queue_size=100
+    ),
+}
+
+
+@pytest.mark.parametrize('kind', BLOCKING)
+def test_blocking_callback_holds_up_no_other_node(peer, ears, kind):
+    topic = '/shared/' + kind.replace(' ', '_')
+    publish(peer, topic)
+    gate = Gate()
+    BLOCKING[kind](ears[0], topic, gate)
+    boxes = hear(peer, ears[1:], topic)
+    until(lambda: peer.run("out.publish('begin')") or gate.begun.is_set())
+    for number in range(20):
+        peer.run(f"out.publish('{number}')")
+    for box in boxes:
+        assert texts_of(box, '19')[-20:] == [str(number) for number in range(20)]
+    assert count(peer) == 1
+    gate.open.set()
+    until(lambda: gate.heard[-20:] == [str(number) for number in range(20)])
+
+
+def test_other_class_has_a_connection_of_its_own(peer, ears):
+    publish(peer, '/shared/any')
+    raw = Mailbox()
+    boxes = hear(peer, ears[:2], '/shared/any')
+    ears[2].ros.Subscriber('/shared/any', ears[2].ros.AnyMsg, raw)
+    until(lambda: count(peer) == 2)
+    peer.run("out.publish('x')")
+    assert raw.next()._buff[-1:] == b'x'
+    assert [box.next().data for box in boxes] == ['x', 'x']
+
+
+@pytest.mark.parametrize('options, number', [([], 1), (['--own-connections'], 3)])
+def test_composed_programs_share_connections(bench, peer, options, number):
+    topic = f'/shared/composed_{number}'
+    publish(peer, topic, 'x', latch=True)
+    text = f"{INIT}rospy.Subscriber('{topic}', String, lambda m: say('heard'))\nrospy.spin()\n"
+    path = bench.launch_file(one=text, two=text, three=text)
+    with bench.program(path, *options):
+        until(lambda: bench.said() == ['heard'] * 3)
+        assert count(peer) == number
 
 
 # -- types that are known to the other side alone

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 import tty
+import types
 
 import psutil
 import pytest
@@ -297,6 +298,15 @@ def test_only_program_has_the_environment_of_the_process(master, bench):
         assert master.node('/program').pid == composed.pid
 
 
+def test_only_program_comes_back_with_its_environment(bench):
+    bench.write(INIT + "say(os.environ.get('PATH'))\n")
+    xml = '<node pkg="bench" type="program" name="program" respawn="true"/>'
+    with bench.program(bench.launch_file(xml)):
+        until(lambda: len(bench.said()) >= 2)
+    first, second, *_ = bench.said()
+    assert first == second != 'None'
+
+
 # -- crashes are told
 
 CRASH = '''
@@ -430,6 +440,15 @@ def test_slow_end_is_told(bench):
         until(lambda: 'ready' in bench.said())
         end(composed)
     assert 'the end waits for /program; a further Ctrl-C ends all at once' in composed.output
+
+
+@pytest.mark.parametrize('option', ['--apart', '--group'])
+def test_nodes_end_with_a_killed_composition(master, bench, option):
+    path = bench.launch_file(program=INIT + "say('ready')\nrospy.spin()\n")
+    with bench.program(path, option, 'program') as composed:
+        until(bench.said)
+        os.kill(composed.pid, signal.SIGKILL)
+        until(lambda: not any(master.system_state()))
 
 
 # -- as rospy, and as Python
@@ -577,6 +596,30 @@ def test_traceback_has_the_frames_of_the_program(bench, capfd):
     assert len(lines) == 2 and all('bench/program' in line for line in lines)
 
 
+def test_failed_import_fails_again(bench):
+    bench.write('import rospy\nraise OSError("no device")', 'helper.py', '')
+    text = '''
+        rospy.init_node('program')
+        for attempt in range(2):
+            try:
+                import helper
+                say('imported')
+            except OSError as error:
+                say(error)
+        '''
+    assert bench.load(text).wait(TIMEOUT) == 0
+    assert bench.said() == ['no device'] * 2
+
+
+def test_dataclass_of_a_program_leaves_the_process_its_module(bench, monkeypatch):
+    module = types.ModuleType('wheels')
+    monkeypatch.setitem(sys.modules, 'wheels', module)
+    text = 'import dataclasses\n@dataclasses.dataclass\nclass Wheel:\n    size: int = 1\n'
+    bench.write(text, 'wheels.py', '')
+    assert bench.load(f'import wheels\n{INIT}say(wheels.Wheel().size)').wait(TIMEOUT) == 0
+    assert bench.said() == ['1'] and sys.modules['wheels'] is module
+
+
 # -- on the command line
 
 
@@ -633,8 +676,10 @@ def test_silent_client_keeps_no_other_out(master, bench):
 
 def test_name_is_free_if_another_node_has_its_uri(master):
     other = create(master, '/other')
-    master.call('registerPublisher', '/talker', '/words', STRING, other.uri)
+    master.call('registerPublisher', '/words', STRING, other.uri, caller_id='/talker')
+    assert master.call('lookupNode', '/talker') == other.uri
     assert create(master, '/talker').is_running
+    assert other.is_running
 
 
 def test_program_is_controlled_by_the_names_of_its_nodes(master, bench):

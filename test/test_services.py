@@ -353,6 +353,33 @@ def test_proxy_of_rospy_needs_no_socket(mortal, is_persistent):
         switch(1, 2)
 
 
+def test_service_here_shares_neither_request_nor_response(master, node):
+    kept = std_srvs.srv.SetBoolResponse(True, 'kept')
+
+    def answer(request):
+        request.data = False
+        return kept
+
+    node.ros.Service('/set', std_srvs.srv.SetBool, answer)
+    request = std_srvs.srv.SetBoolRequest(True)
+    response = create(master, '/caller').ros.ServiceProxy('/set', std_srvs.srv.SetBool)(request)
+    assert request.data and response == kept and response is not kept
+
+
+def test_proxy_calls_the_service_of_its_master(master):
+    answers = []
+    with pharos.Master.embedded() as other:
+        masters = {'one': master, 'other': other}
+        for text, each in masters.items():
+            create(each, '/server').serve('/set', SET, lambda request, text=text: (True, text))
+        for each in masters.values():
+            proxy = create(each, '/caller').ros.ServiceProxy('/set', std_srvs.srv.SetBool)
+            answers.append(proxy().message)
+        for each in list(other.own_nodes()):
+            each.stop()
+    assert answers == ['one', 'other']
+
+
 # -- waits and time limits
 
 
@@ -592,3 +619,17 @@ def test_stop_in_a_call_is_no_success(master, bench, peer, client, sleep):
     told = bench.said if client == 'same process' else lambda: ['called', *peer.value('told')]
     until(lambda: len(told()) > 1)
     assert told() == ['called', 'failed']
+
+
+def test_stop_ends_call_of_soul(master, node, peer):
+    peer.run(
+        'from std_srvs.srv import Empty\ncalled = []\n'
+        "hang = rospy.Service('/hang', Empty, lambda request: called.append(1) or rospy.sleep(3600))"
+    )
+    node.stop_timeout = TIMEOUT
+    thread = node.fork(lambda me: me.wait_for_service('/hang', TIMEOUT).call())
+    until(lambda: peer.value('called'))
+    stopping = threading.Thread(target=node.stop, daemon=True)
+    stopping.start()
+    stopping.join(TIMEOUT / 3)
+    assert not stopping.is_alive() and not thread.is_alive()

@@ -309,6 +309,49 @@ def test_messages_grow_and_shrink(node, listener, topic):
     assert len(set(memory_files(listener.pid))) == 1
 
 
+def test_images_flat_out_are_whole(master, node):
+    torn, heard = [], threading.Event()
+
+    def look(message):
+        if message.data.count(message.data[0]) != len(message.data):
+            torn.append(message)
+        if message.encoding == 'last':
+            heard.set()
+
+    node.interested_in('/image', 'sensor_msgs/Image', look)
+    with PharosPeer(master.url) as camera:
+        camera.run("out = node.output_channel('/image', 'sensor_msgs/Image')")
+        camera.run(
+            'images = [bytes([n]) * (3 << 20) for n in range(20)]\n'
+            'for n in range(200): out.send(data=images[n % 20])\n'
+            "out.send(data=images[0], encoding='last')"
+        )
+        assert heard.wait(TIMEOUT)
+    assert not torn
+
+
+def test_shared_memory_keeps_the_order_of_sending(master, node, monkeypatch):
+    heard, is_held, may_read = [], threading.Event(), threading.Event()
+    take = Reader._take_messages
+
+    def take_later(reader):
+        is_held.set()
+        may_read.wait(TIMEOUT)
+        return take(reader)
+
+    for topic in '/a', '/b':
+        node.interested_in(topic, STRING, lambda message: heard.append(message.data))
+    with PharosPeer(master.url) as peer:
+        peer.run("a, b = [node.output_channel(t, 'std_msgs/String') for t in ('/a', '/b')]")
+        monkeypatch.setattr(Reader, '_take_messages', take_later)
+        peer.run("a.send(data='0')")
+        assert is_held.wait(TIMEOUT)
+        peer.run("for out, text in (a, '1'), (a, '2'), (b, '3'): out.send(data=text)")
+        may_read.set()
+        until(lambda: len(heard) == 4)
+    assert heard == ['0', '1', '2', '3']
+
+
 # -- latched messages, restarts, selections
 
 

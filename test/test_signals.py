@@ -1,7 +1,9 @@
 """How nodes and their programs end: by a signal, by themselves, killed, forked or spawned."""
+import http.client
 import re
 import signal
 import threading
+import xmlrpc.client
 
 import pytest
 import rosgraph
@@ -373,3 +375,77 @@ def test_namesake_keeps_the_name_while_the_node_stops(master):
     assert master.call('lookupNode', '/node') == uri
     rosgraph.Master('/node', master.url).unregisterService('/service', 'rosrpc://127.0.0.1:1')
     free.set()
+
+
+@pytest.mark.parametrize('obeys', [False, True])
+def test_other_hosts_stop_a_node_if_it_allows_that(master, monkeypatch, obeys):
+    monkeypatch.setattr('pharos.private_rospy.patches.is_local_address', lambda host: False)
+    node = create(master)
+    node.allow_remote_shutdown = obeys
+
+    class Elsewhere(xmlrpc.client.Transport):
+        def make_connection(self, host):
+            return http.client.HTTPConnection(host, source_address=('127.0.0.2', 0))
+
+    with xmlrpc.client.ServerProxy(node.uri, Elsewhere()) as proxy:
+        code, _, _ = proxy.shutdown('/elsewhere', 'end')
+    assert code == int(obeys)
+    if obeys:
+        until(lambda: not node.is_running)
+
+
+def test_interrupted_stop_is_done_all_the_same(master):
+    text = '''
+import threading, pharos
+over = threading.Event()
+def linger(me):
+    try:
+        me.sleep(3600)
+    finally:
+        print('lingers')
+        over.wait()
+me = pharos.Master().create(pharos.BlockNode, 'me', soul=linger)
+me.stop_timeout = 3600
+me.fork()
+try:
+    me.stop()
+except KeyboardInterrupt:
+    over.set()
+'''
+    with Program(text, master.url) as running:
+        running.expect('lingers')
+        running.signal(signal.SIGINT)
+        assert running.wait() == 0
+    assert not any(master.system_state())
+
+
+def test_ctrl_c_in_a_soul_of_the_main_thread_ends_the_program(master):
+    text = '''
+import threading, pharos
+me = pharos.Master().create(pharos.BlockNode, 'me')
+me.soul = lambda me: [print('ready'), threading.Event().wait()]
+me.execute()
+print('went on')
+'''
+    with Program(text, master.url) as running:
+        running.expect('ready')
+        running.signal(signal.SIGINT)
+        assert running.wait() == -signal.SIGINT
+    assert 'went on' not in running.output
+
+
+def test_spin_lasts_while_the_only_node_restarts(master):
+    text = '''
+import threading, time, pharos
+class Slow(pharos.BlockNode):
+    def start(self):
+        time.sleep(0.2)
+        super().start()
+node = pharos.Master().create(Slow, 'me')
+threading.Thread(target=lambda: [node.restart(), print('restarted'), node.stop()]).start()
+pharos.spin()
+print('over')
+'''
+    with Program(text, master.url) as running:
+        assert running.wait() == 0
+    assert running.output.split() == ['restarted', 'over']

@@ -1,6 +1,9 @@
 """Virtual time: unmodified programs run as fast as they can, and say the same each time."""
+import contextlib
 import os
+import queue
 import runpy
+import threading
 import time
 
 import genpy
@@ -265,6 +268,27 @@ def test_node_goes_on_in_real_time(master):
     robot.stop()
     node.stop()
     assert not robot.errors
+
+
+WAITS = {
+    'lock': lambda lock, condition, thread: lock.acquire(timeout=5),
+    'queue': lambda lock, condition, thread: queue.Queue().get(timeout=5),
+    'condition': lambda lock, condition, thread: condition.wait_for(lambda: False, 5),
+    'join': lambda lock, condition, thread: thread.join(5),
+}
+
+
+@pytest.mark.parametrize('kind', WAITS)
+def test_limit_of_a_wait_is_virtual(simulation, create_node, kind):
+    lock, condition = threading.Lock(), threading.Condition()
+    holder = create_node(BlockNode, soul=lambda me: (lock.acquire(), me.sleep(100), lock.release()))
+    thread = holder.fork()
+    simulation.run(1)
+    start = simulation.now
+    with contextlib.suppress(queue.Empty), condition:
+        WAITS[kind](lock, condition, thread)
+    assert simulation.now - start == pytest.approx(5, abs=0.1)
+    simulation.run(100)
 
 
 # -- what takes no part

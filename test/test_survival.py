@@ -45,6 +45,11 @@ LOG = 'rosgraph_msgs/Log'
 LARGE = 'x' * 1_000_000
 
 
+@pytest.fixture
+def node(master):
+    return create(master)
+
+
 def sockets_of(port):
     """Return duplicates of this process's connected sockets whose own port this is."""
     return [
@@ -520,6 +525,26 @@ def test_silent_master_is_told_in_one_line(mortal, capfd):
     assert mortal.url in line
 
 
+def test_master_that_goes_away_is_told_and_keeps_its_nodes(mortal, capfd):
+    node = create(mortal.master)
+    mortal.end()
+    with pytest.raises(pharos.MasterUnreachableError):
+        node.restart()
+    assert node.is_running
+    until(lambda: 'no master answers at' in capfd.readouterr().err)
+
+
+def test_stop_at_a_hanging_master_closes_connections(mortal):
+    node, other = create(mortal.master), create(mortal.master, '/other')
+    channel = node.interested_in('/words', STRING)
+    other.output_channel('/words', STRING)
+    until(lambda: channel.connections)
+    os.kill(mortal.pid, signal.SIGSTOP)
+    other.stop()
+    os.kill(mortal.pid, signal.SIGCONT)
+    assert not channel.connections
+
+
 # -- peers that die
 
 
@@ -553,6 +578,30 @@ def test_killed_peer_is_found_again(master):
         with pytest.raises(pharos.PharosError):
             service.call(timeout=TIMEOUT)
     create(master, '/peer')  # it takes the name, so that nothing of the killed one stays
+
+
+def test_refused_connection_is_tried_again(node, peer):
+    handler = node._current_run.ros_handler
+    connect = handler._connect_topic
+    answers = [(0, 'not now', 0)]
+    handler._connect_topic = lambda *names: answers.pop() if answers else connect(*names)
+    box = Mailbox(node, '/words', STRING)
+    peer.run("out = rospy.Publisher('/words', message_class('std_msgs/String'), latch=True)")
+    peer.run("out.publish('x')")
+    assert box.next().data == 'x' and not answers
+
+
+def test_publisher_that_has_left_is_not_connected_again(node, monkeypatch, peer):
+    attempts, run = [], node._current_run
+    peer.run("out = rospy.Publisher('/words', message_class('std_msgs/String'), queue_size=1)")
+    channel = node.interested_in('/words', STRING)
+    until(lambda: channel.connections)
+    start = 'pharos.private_rospy.connections._start_connecting'
+    monkeypatch.setattr(start, lambda *arguments: attempts.append(arguments))
+    peer.run('out.unregister()')
+    until(lambda: run.retries)
+    until(lambda: not run.retries)
+    assert not attempts
 
 
 # -- clients that misbehave

@@ -513,6 +513,23 @@ def test_thread_of_a_thread_is_a_daemon_like_it(bench, daemon):
     assert bench.said() == ([] if daemon else ['worked'])
 
 
+def test_end_of_main_waits_for_threads_and_calls_atexit_in_reverse(bench):
+    text = '''
+        def work():
+            over.wait()
+            time.sleep(0.1)
+            say('thread')
+        over = threading.Event()
+        rospy.init_node('program')
+        threading.Thread(target=work).start()
+        for text in 'first', 'second': atexit.register(say, text)
+        say('main')
+        over.set()
+        '''
+    bench.load(text).wait(TIMEOUT)
+    assert bench.said() == ['main', 'thread', 'second', 'first']
+
+
 # -- asyncio
 
 
@@ -713,3 +730,29 @@ def test_reopened_output_is_written(bench):
         until(lambda: len(bench.said()) == 2)
         end(composed)
     assert 'one says ✓' in composed.output and 'two says ✓' in composed.output
+
+
+def test_script_that_ignores_the_stop_gets_systemexit(bench, capfd):
+    text = '''
+        over = threading.Event()
+        rospy.init_node('program')
+        say('ready')
+        try:
+            while True: over.wait(0.01)
+        except SystemExit:
+            say('SystemExit')
+        '''
+    script = bench.load(text)
+    until(bench.said)
+    script.stop_timeout = 0.1
+    script.stop()
+    assert f'left behind, since it did not end in time: {script.path}' in capfd.readouterr().err
+    until(lambda: bench.said() == ['ready', 'SystemExit'])
+
+
+def test_hooks_run_in_their_order(bench):
+    text = "for text in 'first', 'second': rospy.on_shutdown(lambda text=text: say(text))\n"
+    script = bench.load(f"{INIT}{text}say('ready')\nrospy.spin()")
+    until(bench.said)
+    script.stop()
+    assert bench.said() == ['ready', 'first', 'second']
