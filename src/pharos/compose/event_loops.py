@@ -15,14 +15,13 @@ _POLICY: Any = getattr(asyncio.events, f'{_PREFIX}BaseDefaultEventLoopPolicy')
 def _get_event_loop(policy, original=_POLICY.get_event_loop):
     """Return the event loop of this thread; make one in the main thread of a program.
 
-    asyncio makes one in the main thread of a process, up to Python 3.13.
+    asyncio makes one in the main thread of a process. (Python 3.14 makes none there.)
     """
     run = current.run
     if hasattr(run, 'event_loops') and threading.current_thread() is run.main:
         with contextlib.suppress(RuntimeError):
             return original(policy)
-        if not _PREFIX:
-            policy.set_event_loop(policy.new_event_loop())
+        policy.set_event_loop(policy.new_event_loop())
     return original(policy)
 
 
