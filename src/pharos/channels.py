@@ -314,7 +314,8 @@ class OutputChannel(Channel):
         :param timeout: seconds, None: without limit
         :returns: True if they are connected
         """
-        return wait(lambda: len(self.connections) >= count, timeout, self.node)
+        subject = f'{count} subscribers of {self.topic}'
+        return wait(lambda: len(self.connections) >= count, timeout, self.node, subject)
 
 
 # -- the class of a topic
