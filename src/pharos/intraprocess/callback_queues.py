@@ -239,8 +239,9 @@ class CallbackQueue:
         if self.closed or not self.jobs:
             return False
         if not self.thread:
-            # if no thread is left, the next message or the watcher tries again
-            self.order.start_thread(self._loop)
+            # if no thread is left, the next message or the watcher tries again. Set here, too: the thread
+            # may begin late, and a second one would be started
+            self.thread = self.order.start_thread(self._loop)
         elif self._wake_lock.locked():
             self.request_lock.acquire(False)
             self.wake()
