@@ -728,7 +728,8 @@ def test_start_and_stop_ask_few_questions(master, slow_master):
     assert len(slow_master.rounds) <= MAX_QUESTIONS, slow_master.rounds
 
 
-def test_slow_master_is_told_once(master, slow_master, capfd):
+def test_slow_master_is_told_once(master, slow_master, capfd, monkeypatch):
+    monkeypatch.setattr('pharos.transcript._shown_keys', set())  # of other tests
     slow_master.delays = iter([2, 2])
     create(master).stop()
     lines = ''.join(capfd.readouterr()).splitlines()
