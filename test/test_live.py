@@ -67,6 +67,8 @@ class Terminal:
         self._folder = tempfile.TemporaryDirectory()
         environ = {**os.environ, 'TERM': 'xterm', 'PROMPT_TOOLKIT_NO_CPR': '1'}
         environ.update(ROS_MASTER_URI=url, IPYTHONDIR=self._folder.name)
+        for name in 'COLUMNS', 'LINES':  # of pytest's own terminal: this one has a size
+            environ.pop(name, None)
         first, *more = [*DEFAULT_SIGNALS, *command]
         self._process = pexpect.spawn(
             first, more, env=environ, dimensions=size, encoding='utf-8', timeout=TIMEOUT
