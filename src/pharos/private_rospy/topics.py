@@ -342,8 +342,7 @@ class SubscriptionOverlay:
             self.give([self], message, connection, size)
             connection.latch = latch
 
-    @staticmethod
-    def give(subscriptions: Iterable, message: Any, connection: Any, size: int) -> None:
+    def give(self, subscriptions: Iterable, message: Any, connection: Any, size: int) -> None:
         """Give each inbox of some subscriptions a message of its own; shared ones get one and the same."""
         inboxes = []
         for each in subscriptions:
