@@ -12,7 +12,9 @@ import rosgraph
 import rosnode
 import rospkg
 
-# before pharos is imported: the tests have their own logs and addresses
+# before pharos is imported: the tests have their own logs and addresses, and Debian's own programs, as
+# in tools/workspace.sh: programs that begin with /usr/bin/env find another python3, which has no rospy
+os.environ['PATH'] = '/usr/sbin:/usr/bin:/sbin:/bin'
 os.environ['ROS_HOSTNAME'] = '127.0.0.1'
 os.environ['ROS_LOG_DIR'] = tempfile.mkdtemp(prefix='pharos-test-log-')
 atexit.register(shutil.rmtree, os.environ['ROS_LOG_DIR'], ignore_errors=True)
