@@ -10,7 +10,7 @@ import rospy
 from geometry_msgs.msg import Point32
 
 import pharos
-from helpers import COMPOSE, PYTHON, TIMEOUT, Program, create, free_port, registrations
+from helpers import COMPOSE, PYTHON, TIMEOUT, Gate, Program, create, free_port, registrations
 from pharos import BlockNode, Transcript
 from pharos.testing import Mailbox, until
 
@@ -248,6 +248,30 @@ def test_retry_waits_for_its_turn(node, other):
     leave.set()
     thread.join(TIMEOUT)
     assert order == ['bad', 'long', 'bad']
+
+
+def test_message_during_a_retry_comes(node, other):
+    gate, numbers = Gate(), []
+
+    def delegate(message, channel):
+        if message.data != 'bad':
+            numbers.append(message.data)
+        elif other.failures:
+            gate(message)
+        else:
+            raise RuntimeError
+
+    other.interested_in('/a', STRING, delegate)
+    node.send_to('/a', data='bad')
+    until(lambda: other.failures)
+    thread = threading.Thread(target=other.failures[0].retry, daemon=True)
+    thread.start()
+    assert gate.begun.wait(TIMEOUT)
+    node.send_to('/a', data='good')
+    assert not numbers
+    gate.open.set()
+    until(lambda: numbers == ['good'], TIMEOUT / 3)
+    thread.join(TIMEOUT)
 
 
 def test_debug_looks_at_raising_frame(master):

@@ -7,6 +7,7 @@ import socket
 import subprocess
 import threading
 
+import genpy
 import psutil
 import pytest
 import rosgraph
@@ -378,6 +379,41 @@ def test_proxy_calls_the_service_of_its_master(master):
         for each in list(other.own_nodes()):
             each.stop()
     assert answers == ['one', 'other']
+
+
+def test_service_here_that_exits_fails_its_call_alone(master, node):
+    """In rospy the thread of the service ends, and the caller goes on."""
+    node.ros.Service('/exit', std_srvs.srv.Empty, lambda request: exit('the motor is off'))
+    with pytest.raises(rospy.ServiceException, match='the motor is off'):
+        create(master, '/caller').ros.ServiceProxy('/exit', std_srvs.srv.Empty)()
+    node.serve('/set', SET, answer_set)
+    assert node.is_running and master.lookup_service('/set').call(data=True).success
+
+
+def test_proxy_of_another_type_fails_as_in_rospy(master, node):
+    node.ros.Service('/set', std_srvs.srv.SetBool, lambda request: (True, ''))
+    caller = create(master, '/caller')
+    with pytest.raises(rospy.ServiceException, match='md5sum'):
+        caller.ros.ServiceProxy('/set', std_srvs.srv.Trigger)()
+    with pytest.raises(genpy.SerializationError, match='data is not a bool'):
+        caller.ros.ServiceProxy('/set', std_srvs.srv.SetBool)('true')
+
+
+def test_sleep_after_a_call_here_is_the_callers(master, node):
+    """The stop of the caller's node ends its sleep as any other, and the soul goes on."""
+    texts, sleeps = [], threading.Event()
+    node.serve('/set', SET, answer_set)
+
+    def work(me):
+        me.ros.ServiceProxy('/set', std_srvs.srv.SetBool)(True)
+        sleeps.set()
+        me.ros.rostime.wallsleep(3600)
+        texts.append('woke')
+
+    node.fork(work)
+    assert sleeps.wait(TIMEOUT)
+    node.stop()
+    assert texts == ['woke']
 
 
 # -- waits and time limits

@@ -438,13 +438,32 @@ def test_stopped_reader_gets_newest(master, node, listener, topic):
         for each in stopped, listener:
             each.listen(topic)
         out = node.output_channel(topic, IMAGE, queue_size=1)
-        send_and_wait(out, topic, [bytes(LARGE)], stopped, listener)
+        images = send_and_wait(out, topic, [bytes(LARGE)], stopped, listener)
         stopped.pause()
-        send_and_wait(out, topic, [bytes(LARGE)] * 20, listener)
+        datas = [bytes([number]) * LARGE for number in range(1, 21)]
+        images += send_and_wait(out, topic, datas, listener)
         stopped.process.send_signal(signal.SIGCONT)
-        assert stopped.numbers(topic, 3) == [1, 2, 21]
+        notes = expected(images)
+        assert stopped.notes(topic, 3) == [notes[0], notes[1], notes[20]]
         assert stopped.channel(topic, 'dropped') == 18
-    assert listener.numbers(topic) == list(range(1, 22))
+        send_and_wait(out, topic, [b'last'], listener)
+        stopped.notes(topic, 4)
+        assert stopped.channel(topic, 'dropped') == 18
+    assert listener.numbers(topic) == list(range(1, 23))
+
+
+def test_large_message_behind_a_full_socket_comes(master, node, topic):
+    with Listener(master.url, 'stopped') as stopped:
+        stopped.listen(topic)
+        out = node.output_channel(topic, IMAGE)
+        send_and_wait(out, topic, [b'first'], stopped)
+        for small_count in range(1, 8):  # one of them fills the socket
+            stopped.pause()
+            for _ in range(small_count):
+                out.send(data=bytes(60_000))
+            out.send(data=bytes(LARGE))
+            stopped.process.send_signal(signal.SIGCONT)
+            assert stopped.notes(topic, out.sent)[-1][1] == LARGE
 
 
 def test_five_stopped_readers_hold_up_nobody(master, node, listener, topic):
