@@ -367,6 +367,13 @@ def test_service_here_shares_neither_request_nor_response(master, node):
     assert request.data and response == kept and response is not kept
 
 
+def test_proxy_calls_the_newest_node(master):
+    for text in 'old', 'new':
+        create(master, f'/{text}').serve('/set', SET, lambda request, text=text: (True, text))
+    proxy = create(master, '/caller').ros.ServiceProxy('/set', std_srvs.srv.SetBool)
+    assert proxy().message == 'new'
+
+
 def test_proxy_calls_the_service_of_its_master(master):
     answers = []
     with pharos.Master.embedded() as other:
