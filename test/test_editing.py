@@ -140,12 +140,41 @@ def test_own_class_is_edited(master, tmp_path, monkeypatch):
     assert wheels.reload().startswith('Wheels.speed takes') and wheels.speed() == 2
 
 
-def test_reload_gives_the_switch_interval_back(bench):
+@pytest.fixture
+def switch_interval():
+    """Threads take turns as often as they can."""
     before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    yield sys.getswitchinterval()
+    sys.setswitchinterval(before)
+
+
+def test_reload_gives_the_switch_interval_back(bench, switch_interval):
     script = bench.load(GAIN_PROGRAM.format(1, 1))
     bench.write(GAIN_PROGRAM.format(2, 1))
     assert 'GAIN takes effect' in script.reload()
-    assert sys.getswitchinterval() == before
+    assert sys.getswitchinterval() == switch_interval
+
+
+def test_decorator_of_an_edited_class_is_not_called_again(bench):
+    text = """
+classes = []
+def register(robot_class):
+    classes.append(robot_class)
+    return robot_class
+@register
+class Robot:
+    def speed(self): return {}
+rospy.init_node('program')
+while not rospy.is_shutdown():
+    say((Robot().speed(), len(classes)))
+    rospy.sleep(0.01)
+"""
+    script = bench.load(text.format(1))
+    bench.write(text.format(2))
+    script.reload()
+    until(lambda: bench.said()[-1:] not in ([], ['(1, 1)']))
+    assert bench.said()[-1] == '(2, 1)'
 
 
 def test_second_reload_changes_nothing(bench):

@@ -616,6 +616,9 @@ class Slow(Node):
     def answer(self, request):
         return True, 'slow'
 
+    def work(self):
+        self.said.append('slow soul')
+
 
 class Fast(Slow):
     def on_message(self, message, channel):
@@ -623,6 +626,9 @@ class Fast(Slow):
 
     def answer(self, request):
         return True, 'fast'
+
+    def work(self):
+        self.said.append('fast soul')
 
 
 def test_node_becomes_another_class(master, node):
@@ -633,12 +639,15 @@ def test_node_becomes_another_class(master, node):
     node.send_to('/a', data='1')
     until(lambda: other.said)
     uri = other.uri
+    other.soul = other.work
     other.become(Fast)
     node.send_to('/a', data='2')
     until(lambda: len(other.said) == 2)
     assert other.said == ['slow 1', 'fast 2']
     assert isinstance(other, Fast) and other.uri == uri and channel in other.channels
     assert master.lookup_service('/which').call().message == 'fast'
+    other.execute()
+    assert other.said[2:] == ['fast soul']
 
 
 @pytest.mark.parametrize('cls', [dict, 'Fast', None])

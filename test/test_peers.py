@@ -230,12 +230,15 @@ def test_message_of_a_shared_connection_is_its_nodes_own(peer, ears):
 
 def test_shared_channels_get_one_object(peer, ears):
     publish(peer, '/shared/object')
+    owns = hear(peer, ears[:1], '/shared/object')
     boxes = hear(peer, ears, '/shared/object', shared=True)
-    own = Mailbox(ears[0], '/shared/object', STRING)
+    owns += hear(peer, ears[2:], '/shared/object')
     peer.run("out.publish('x')")
     first, second, third = [box.next() for box in boxes]
     assert first is second is third
-    assert own.next() == first and own.all()[0] is not first
+    one, other = [box.next() for box in owns]
+    assert one == other == first
+    assert len({id(one), id(other), id(first)}) == 3
 
 
 def test_shared_connection_names_its_publisher(peer, ears):
@@ -300,6 +303,53 @@ def test_node_that_leaves_takes_no_message_from_others(master, peer, ears, end, 
     for channel in [boxes[2].channel, *[box.channel for box in lates]]:
         channel.close()
     until(lambda: not count(peer))
+
+
+FLOW = """
+def flow():
+    number = 0
+    while not is_over.is_set():
+        out.publish(str(number))
+        number += 1
+is_over = threading.Event()
+flowing = threading.Thread(target=flow)
+flowing.start()
+"""
+
+
+def test_nodes_come_and_go_while_messages_flow(master, peer, ears):
+    """Each hears the latched message, and then all others, one after another."""
+    publish(peer, '/shared/flow', latch=True)
+    peer.run('out.impl.queue_size = None')  # the publisher waits for the socket
+    hear(peer, ears[:1], '/shared/flow', queue_size=0)
+    peer.run(FLOW)
+    try:
+        for _ in range(10):
+            boxes = []
+            for ear in ears[1:]:
+                boxes.append(Mailbox())
+                ear.interested_in('/shared/flow', STRING, boxes[-1], queue_size=0)
+            for box, ear in zip(boxes, ears[1:]):
+                until(lambda box=box: len(box.all()) > 100)
+                ear.channels[0].close()
+                numbers = [int(message.data) for message in box.all()]
+                assert numbers == [*range(numbers[0], numbers[0] + len(numbers))]
+    finally:
+        peer.run('is_over.set(); flowing.join()')
+
+
+def test_each_publisher_has_a_shared_connection(master, peer, ears):
+    publish(peer, '/shared/two', 'of the first', latch=True)
+    with Peer(master.url, 'second') as second:
+        publish(second, '/shared/two', 'of the second', latch=True)
+        boxes = [Mailbox(ear, '/shared/two', STRING) for ear in ears]
+        for box in boxes:
+            texts = sorted(box.next().data for _ in range(2))
+            assert texts == ['of the first', 'of the second']
+        assert count(peer) == count(second) == 1
+        second.run("out.publish('end')")
+        for box in boxes:
+            assert len(texts_of(box, 'end')) == 3
 
 
 def lose_socket(camera):
