@@ -763,8 +763,9 @@ def test_listener_hears_one_subscriber_at_a_time(master, library):
         peer.run(f"ears = [{subscribe} for topic in ('/words0', '/words1', '/words2')]")
         until(lambda: len(slow.were_alone) == 3)
         peer.run('for ear in ears: ear.unregister()')
-        until(lambda: len(slow.were_alone) == 6)
-    assert slow.were_alone == [True] * 6
+        # rospy of Debian 11 connects once more if it unregisters before its handshake has ended
+        until(lambda: len(slow.were_alone) >= 6)
+    assert all(slow.were_alone)
 
 
 def test_closed_topic_is_forgotten(master, node, other):
