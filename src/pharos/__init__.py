@@ -36,7 +36,6 @@ from pharos.node import BlockNode, Node
 from pharos.parameter import Parameter
 from pharos.private_rospy.run import Lifecycle
 from pharos.private_rospy.plain import guide as _guide
-from pharos.service import Service
 from pharos.signals import live_nodes as _live_nodes
 from pharos.signals import spin
 from pharos.topic import Topic
@@ -48,6 +47,7 @@ if TYPE_CHECKING:
     from pharos.compose.script import ScriptNode
     from pharos.live.external_node import ExternalNode
     from pharos.live.graph import Graph
+    from pharos.live.service_client import Service
 
 __version__ = '0.3.0'
 __all__ = [
@@ -93,6 +93,7 @@ _EXTRA_MODULES = {
     'Graph': 'live.graph',
     'RosProcess': 'compose.child_process',
     'ScriptNode': 'compose.script',
+    'Service': 'live.service_client',
 }
 
 

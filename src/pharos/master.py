@@ -20,7 +20,6 @@ from pharos.names import check_node_class, full_name, node_name
 from pharos.node import Node
 from pharos.private_rospy.run import Settings
 from pharos.private_rospy.xmlrpc import CALLER_ID, UNREACHABLE, ServerProxy
-from pharos.service import Service
 from pharos.topic import Topic
 from pharos.transcript import show_once
 from pharos.waiting import wait_for
@@ -31,6 +30,7 @@ if TYPE_CHECKING:
     from pharos.compose.script import ScriptNode
     from pharos.live.external_node import ExternalNode
     from pharos.live.graph import Graph
+    from pharos.live.service_client import Service
 
 SLOW_ANSWER = 1.0  # seconds; the first that takes longer is told
 LIFE_LIMIT = 0.5  # seconds that a node has to show that the node lives
@@ -361,6 +361,8 @@ class Master:
         :param caller_id: the name of the calling node, which the provider gets
         :raises UnknownServiceError: if nobody offers the service
         """
+        from pharos.live.service_client import Service
+
         return Service(self, full_name(name), caller_id)
 
     def wait_for_service(

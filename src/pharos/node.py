@@ -31,11 +31,12 @@ from pharos.failures import Failures
 from pharos.names import legal_name, node_name
 from pharos.parameter import Parameter
 from pharos.private_rospy.run import Lifecycle, Run, Settings
-from pharos.service import OfferedService, Service
+from pharos.service import OfferedService
 from pharos.transcript import Transcript
 from pharos.waiting import current, wait, wait_for
 
 if TYPE_CHECKING:
+    from pharos.live.service_client import Service
     from pharos.master import Master
 
 

@@ -28,11 +28,11 @@ import numpy
 import rosbag
 from genpy import Time
 
-from pharos import service
 from pharos.compose import composition
 from pharos.errors import PharosError
 from pharos.intraprocess import callback_queues
 from pharos.intraprocess.links import runs
+from pharos.live import service_client
 from pharos.node import BlockNode
 from pharos.private_rospy import run, tcpros, xmlrpc
 from pharos.private_rospy.patches import patch
@@ -409,7 +409,7 @@ class Simulation:
             # senders' threads are real ones
             sending: {'let_others_run': _let_servers_run},
             tcpros: {'let_others_run': _let_servers_run},
-            service: {'ignores_timeout': True},
+            service_client: {'ignores_timeout': True},
             # all programs run here
             composition: {
                 'environment_of': lambda pairs: (),
