@@ -9,7 +9,6 @@ from __future__ import annotations
 import array
 import copy
 import functools
-import itertools
 import mmap
 import os
 import select
@@ -28,7 +27,7 @@ from pharos.private_rospy.tcpros import send_while_waiting, shutdown_socket
 from pharos.waiting import let_others_run
 
 MAX_PACKET = 1 << 16  # bytes of a message, or a part of one, that the socket takes itself
-MAX_FILES = 4  # of a publisher
+MAX_FILES = 4  # of a publisher; beyond that, the slowest readers lose messages
 MAX_EXCESS = 10  # a file so many times as large as its message is given back
 #: position of the file, or NO_FILE; slot of the field in it, or WHOLE; its bytes; dropped messages;
 #: the time of sending, as of time.monotonic(), which is the same for all processes of a host
@@ -43,7 +42,6 @@ class MemoryFile:
     def __init__(self, position, size):
         self.position = position
         self.capacity = size + size // 4  # messages grow
-        self.number = 0  # of the message
         self.senders = set()  # senders that announce it later, or have no receipt yet
         self.descriptor = os.memfd_create('pharos')
         try:
@@ -59,13 +57,12 @@ class MemoryFile:
 
 
 class MessageMemory:
-    """The files of a publisher, at most four."""
+    """The files of a publisher: four, or more while as many readers each read another one."""
 
     def __init__(self, run):
         self.run = run
         self.lock = threading.Lock()  # of the files, and of the queues of all senders
         self._files = []
-        self._numbers = itertools.count(1)
 
     def sort(self, connections):
         """Return the connections that share memory, and the others."""
@@ -116,7 +113,6 @@ class MessageMemory:
         if size > MAX_PACKET:
             file = self._free_file(size)
             file.map[:size] = value
-            file.number = next(self._numbers)
             entry = Entry(file, slot, size, rest, monotonic())
         else:
             entry = Entry(None, WHOLE, 0, value, monotonic())
@@ -124,9 +120,17 @@ class MessageMemory:
             sender.put(entry)
 
     def _free_file(self, size):
-        """Return a file that no reader needs, with room for so many bytes."""
-        if len(self._files) == MAX_FILES and all(file.senders for file in self._files):
-            self._drop_oldest()
+        """Return a file that no reader needs, with room for so many bytes.
+
+        If there is none, the slowest readers lose their oldest messages. A message that a reader may be
+        reading stays.
+        """
+        while len(self._files) >= MAX_FILES and all(file.senders for file in self._files):
+            senders = {sender for file in self._files for sender in file.senders}
+            slowest = max(senders, key=lambda sender: len(sender.messages))
+            if not slowest.messages:  # each file has a reader that is reading it
+                break
+            slowest.drop_beyond(len(slowest.messages) - 1)
         free_files = [file for file in self._files if not file.senders]
         for file in free_files:
             if size <= file.capacity <= MAX_EXCESS * size:
@@ -138,17 +142,6 @@ class MessageMemory:
         self._files[unfit_file.position] = MemoryFile(unfit_file.position, size)
         unfit_file.close()
         return self._files[unfit_file.position]
-
-    def _drop_oldest(self):
-        """Drop the oldest message that no reader may be reading; else give up its readers."""
-        files = sorted(self._files, key=lambda file: file.number)
-        queued_files = [
-            file for file in files if not any(sender.announced is file for sender in file.senders)
-        ]
-        oldest = (queued_files or files)[0]
-        for sender in list(oldest.senders):
-            sender.drop(oldest)
-        oldest.senders.clear()  # a signal may have ended an earlier drop
 
     def close(self):
         """Free the files."""
@@ -181,8 +174,8 @@ class MemoryTransport(LocalTransport):
 class MemorySender(MemoryTransport, BoundedQueue):
     """The publisher's end of a connection.
 
-    The lock of the MessageMemory guards the queue and the files. put(), drop(), take_receipts(),
-    _send_ready() and _break() need it held; is_busy, give_up() and close() take it.
+    The lock of the MessageMemory guards the queue and the files. put(), take_receipts(), _send_ready()
+    and _break() need it held; is_busy, give_up() and close() take it.
 
     :ivar dropped: the number of messages that were dropped since the last packet
     """
@@ -229,14 +222,6 @@ class MemorySender(MemoryTransport, BoundedQueue):
         if entry.file:
             entry.file.senders.discard(self)
         return True
-
-    def drop(self, file):
-        """Drop the message in a file. If the reader may be reading it, give up the reader."""
-        if self.announced is file:
-            self._break()
-        for entry in [each for each in self.messages if each.file is file]:
-            self.messages.remove(entry)
-            self.dropped += self.forget(entry)
 
     def give_up(self):
         """Have the reader connect anew."""
