@@ -739,7 +739,7 @@ def test_script_that_ignores_the_stop_gets_systemexit(bench, capfd):
         rospy.init_node('program')
         say('ready')
         try:
-            while True: pass
+            while True: sum(range(1000))
         except SystemExit:
             say('SystemExit')
         '''
