@@ -32,16 +32,17 @@ class RosProcess(subprocess.Popen):
     program.
 
     :param on_line: ``on_line(text)`` is called for each printed line, in another thread
+    :param environment: the environment variables, but for ROS_MASTER_URI and TERM; None: this process's
     :param options: of ``subprocess.Popen``; ``stdin=None``: the keyboard of this process
     """
 
-    def __init__(self, command, master_url, on_line=None, **options):
+    def __init__(self, command, master_url, on_line=None, environment=None, **options):
         self._lines = collections.deque(maxlen=MAX_LINES)
         self._on_line = on_line
         terminal, child_terminal = os.openpty()
         tty.setraw(child_terminal)
         self._terminal = open(terminal, errors='replace')
-        environ = {**os.environ, 'ROS_MASTER_URI': master_url, 'TERM': 'dumb'}
+        environ = {**(environment or os.environ), 'ROS_MASTER_URI': master_url, 'TERM': 'dumb'}
         try:
             super().__init__(  # type: ignore[call-overload]
                 command,

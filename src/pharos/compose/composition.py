@@ -79,8 +79,8 @@ class Composition:
         self._end_times: dict[ScriptNode, float] = {}  # as of time.monotonic()
         self._stopped_nodes: set[ScriptNode] = set()  # by control(); they do not respawn
         self._listener: socket.socket | None = None  # of control()
-        # variables that this process has for its nodes -> the values before, or None
-        self.former_environment: dict[str, str | None] = {}
+        self.environment = dict(os.environ)  # of the parts, and of this process after the end
+        self._own_variables: dict[str, str] = {}  # that this process has for its nodes
         self._watcher = threading.Thread(target=self._watch, name='composition', daemon=True)
         self._has_started = False  # True if one node was started
         self._has_failed = False  # True if a required node has ended, or a process by a signal
@@ -173,16 +173,15 @@ class Composition:
                 code = '' if is_alone else sets_environment(entry.path)
                 reason = code and f'a group of its own: {entry.name} has {code!r}'
             groups[reason, environment].append(entry)
-        # of two as large, this process gets the empty one
-        sizes = {
-            key: (len(nodes), not key[1])
-            for key, nodes in groups.items()
-            if not key[0] and not any(map(AT_START.match, dict(key[1])))
-        }
-        if sizes:
-            key = max(sizes, key=sizes.__getitem__)
+        own_keys = [
+            key for key in groups if not key[0] and not any(map(AT_START.match, dict(key[1])))
+        ]
+        if own_keys:
+            # of two as large, this process gets the empty one
+            key = max(own_keys, key=lambda key: (len(groups[key]), not key[1]))
             own_entries += groups.pop(key)
-            self._set_environment(dict(key[1]))
+            self._own_variables = dict(key[1])
+            os.environ.update(key[1])
         for (reason, environment), group_entries in groups.items():
             variables = ', '.join(map('='.join, environment)) or 'no variables'
             for entry in group_entries:
@@ -190,11 +189,6 @@ class Composition:
                 Transcript.show(f'{entry.name} runs in {why}')
             self._start_group(group_entries, environment)
         self.start_entries(own_entries)
-
-    def _set_environment(self, environment):
-        """Set variables of this process; stop() gives their former values back."""
-        self.former_environment = {name: os.environ.get(name) for name in environment}
-        os.environ.update(environment)
 
     def _start_group(self, entries, environment):
         own_path = dict(environment).get('PYTHONPATH', '')
@@ -407,12 +401,10 @@ class Composition:
             Transcript.show(f'the end waits for {names}; a further Ctrl-C ends all at once')
         for thread in late_threads:
             thread.join()
-        while self.former_environment:
-            name, value = self.former_environment.popitem()
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+        for name in self._own_variables:
+            os.environ.pop(name, None)
+            if name in self.environment:
+                os.environ[name] = self.environment[name]
 
     def __enter__(self) -> Composition:
         return self
@@ -441,17 +433,15 @@ class _Part:
 
     def start(self):
         """Start the process with the nodes in ``entries``."""
-        # without the variables that the nodes of this process have
-        former_variables = self._composition.former_environment.items()
-        changes = [f'{name}={value}' for name, value in former_variables if value is not None]
-        unset = [f'--unset={name}' for name, value in former_variables if value is None]
-        command = ['env', *unset, *changes, *self._command]
+        command = self._command
         if self._parcel_of:
             with tempfile.NamedTemporaryFile(delete=False) as file:  # the process deletes the file
                 pickle.dump(self._parcel_of(self.entries), file)
             # the process takes no SIGINT until it says so: an import may lose the signal
             command = ['env', '--block-signal=INT', *command, file.name, str(os.getpid())]
-        self.process = RosProcess(command, self._master.url, Transcript.show, stdin=None)
+        self.process = RosProcess(
+            command, self._master.url, Transcript.show, self._composition.environment, stdin=None
+        )
 
     @property
     def names(self):

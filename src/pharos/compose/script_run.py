@@ -62,7 +62,6 @@ class ScriptRun(Run):
     "The main thread" is the thread that runs the program. A stop sets the following attributes, in
     this order.
 
-    :ivar is_end_requested: True: the stop has begun
     :ivar pending_signal: a signal waits for the main thread; clear while the program's handlers run
     :ivar has_run_hooks: True: the hooks of rospy.on_shutdown() run, or have run
     :ivar stopping: ``is_shutdown()`` is True
@@ -73,8 +72,6 @@ class ScriptRun(Run):
     error = None  # raised by the program before it was a node
     exit_request = None  # the SystemExit that a handler or os._exit() raised
     is_registered = False  # True once rospy.init_node() has registered the node
-    is_starting = True  # False once start() has returned
-    is_end_requested = False
     has_run_hooks = False
     left_threads = ()  # of the program, which do not end at their next line
     main_has_ended = True  # there is no main thread yet; False from start() on
@@ -212,7 +209,6 @@ class ScriptRun(Run):
         self.main_has_ended = False
         self.main.start()
         wait(lambda: self.is_known or not self.main.is_alive(), node.init_timeout, node)
-        self.is_starting = False
         error, self.error = self.error, None
         if error:
             error_class = type(error) if isinstance(error, PharosError) else PharosError
@@ -293,7 +289,7 @@ class ScriptRun(Run):
                 self.node.exit_code = status
             self.main_has_ended = True
             signals.silenced_threads.discard(self.main.ident)  # another thread may get the number
-            if not self.is_end_requested:
+            if self.lifecycle not in (Lifecycle.STOPPING, Lifecycle.STOPPED):
                 self.request_stop()
 
     def _run_code(self, variables):
@@ -307,10 +303,9 @@ class ScriptRun(Run):
             self.modules.by_name['sys'].excepthook(type(error), error, error.__traceback__)
             if isinstance(error, KeyboardInterrupt):
                 return -signal.SIGINT
-            if self.is_starting and not self.is_known:
+            if not self.is_known:
                 self.error = error
-            else:
-                self.keep_failure(error, self.node.path)
+            self.keep_failure(error, self.node.path)
             return 1
 
     def _run_all(self, functions, position):
@@ -486,7 +481,6 @@ class ScriptRun(Run):
 
         :param timeout: seconds for the main thread, which then gets a SystemExit
         """
-        self.is_end_requested = True
         for child in self.children:
             interrupt(child)
         if not self.main_has_ended:

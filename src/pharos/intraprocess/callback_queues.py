@@ -306,7 +306,7 @@ def hand_over(callback_queues: list[CallbackQueue], last_wake: float, may_wait: 
     :param last_wake: the last time that the same publisher woke a thread, as of perf_counter()
     :param may_wait: True: wait until each thread runs, up to YIELD_LIMIT; after one that takes so long
         wait for no other
-    :returns: the time now if a thread was woken, else ``last_wake``
+    :returns: the time of the last wake of these, or ``last_wake`` if no thread was woken
     """
     global _no_yield_before
     now = perf_counter()
@@ -315,10 +315,10 @@ def hand_over(callback_queues: list[CallbackQueue], last_wake: float, may_wait: 
     for callback_queue in callback_queues:
         if not callback_queue.request_thread():
             continue
-        last_wake = now
         if waits:
             # _loop() frees the lock
             waits = callback_queue.request_lock.acquire(True, YIELD_LIMIT)
             if not waits:
                 _no_yield_before = now + YIELD_PAUSE
+        last_wake = perf_counter()  # after the wait: to wait is no rest of the publisher
     return last_wake
