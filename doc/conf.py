@@ -19,6 +19,7 @@ root_doc = 'doc/index'
 include_patterns = [
     '*.md',
     'CHANGELOG.rst',
+    'SECURITY.md',
     'doc/**.md',
     'benchmark/*.md',
     'examples/README.md',

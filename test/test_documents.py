@@ -90,6 +90,34 @@ def test_programs_of_pages_exist():
     assert named - there == set()
 
 
+# -- numbers of pages that are constants of the code
+
+UNITS = {'us': 1e-6, 'ms': 1e-3, 's': 1, 'KB': 1 << 10, 'MB': 1 << 20, 'GB': 1e9, '': 1}
+QUOTED = re.compile(
+    r'(\d[\d,.]*)(?: (us|ms|s|KB|MB|GB)\b)?[^()\d]{0,40}\(`?(?:\w+\.)?([a-zA-Z_]+)`?\)'
+)
+CONSTANT = re.compile(
+    r'^ *(?:#: )?([A-Za-z_]+)(?:: \w+)? = ([\d.e_<\- ]+?) *(?:#.*)?$', re.MULTILINE
+)
+
+
+def test_numbers_of_pages_are_those_of_the_code():
+    """A number with the name of a constant behind it, such as: 3 ms (`SLOW`)."""
+    values = {}
+    for path in (ROOT / 'src' / 'pharos').rglob('*.py'):
+        for name, value in CONSTANT.findall(path.read_text()):
+            values.setdefault(name, []).append(eval(value))
+    quoted = []
+    for page in [*PAGES, ROOT / 'SECURITY.md']:
+        for number, unit, name in QUOTED.findall(' '.join(prose(page).split())):
+            assert name in values or not name.isupper(), name
+            if name in values:
+                value = float(number.replace(',', '')) * UNITS[unit]
+                quoted.append(name)
+                assert value == pytest.approx(values[name][0]) or value in values[name], name
+    assert len(quoted) > 20, quoted
+
+
 # -- all pages but the tutorial: each block is a program, a test or a command
 
 ROBOT = """#!/usr/bin/python3

@@ -59,9 +59,20 @@ def test_versions_are_equal():
         'src/pharos/__init__.py': r"__version__ = '([\d.]+)'",
         'debian/changelog': r'pharos \(([\d.]+)-',
         'packaging/robostack/recipe.yaml': r'version: ([\d.]+)\n',
+        'CITATION.cff': r'\nversion: ([\d.]+)\n',
         'CHANGELOG.rst': r'\n([\d.]+) \(20',
     }
     versions = {
         re.search(pattern, (ROOT / name).read_text())[1] for name, pattern in places.items()
     }
     assert len(versions) == 1
+
+
+def test_read_the_docs_has_what_the_pages_need():
+    """tools/package may install nothing there."""
+    tool = (ROOT / 'tools' / 'package').read_text()
+    needed = re.search(r'doc\)\n\s+install_packages (.*?[^\\])\n', tool, re.S)[1]
+    config = (ROOT / '.readthedocs.yaml').read_text()
+    assert set(needed.replace('\\', '').split()) == set(
+        re.findall(r'\n    - ([\w-]+)(?=\n)', config)
+    )
