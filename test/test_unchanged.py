@@ -756,3 +756,56 @@ def test_hooks_run_in_their_order(bench):
     until(bench.said)
     script.stop()
     assert bench.said() == ['ready', 'first', 'second']
+
+
+# -- as rospy
+
+
+def test_frame_id_none_is_sent_as_in_rospy(master, bench):
+    text = '''
+        from sensor_msgs.msg import Imu
+        rospy.init_node('program')
+        imu = rospy.Publisher('/imu', Imu, queue_size=1)
+        message = Imu()
+        message.header.frame_id = None
+        imu.publish(message)
+        say(message.header.frame_id)
+        '''
+    assert bench.load(text).wait(TIMEOUT) == 0
+    assert bench.said() == ['0']
+
+
+def test_wrong_message_passes_while_nobody_hears_it(master, bench):
+    text = '''
+        from std_msgs.msg import Int32
+        rospy.init_node('program')
+        numbers = rospy.Publisher('/numbers', Int32, queue_size=1)
+        numbers.publish('seven')
+        say('passed')
+        while not numbers.get_num_connections(): time.sleep(0.01)
+        try: numbers.publish('seven')
+        except rospy.ROSSerializationException: say('refused')
+        '''
+    script = bench.load(text)
+    Mailbox(create(master, '/ear'), '/numbers', 'std_msgs/Int32')
+    assert script.wait(TIMEOUT) == 0
+    assert bench.said() == ['passed', 'refused']
+
+
+def test_relay_of_any_message_passes_headers(master, bench):
+    text = '''
+        import roslib.message
+        def relay(message):
+            if not outputs:
+                type_ = roslib.message.get_message_class(message._connection_header['type'])
+                outputs.append(rospy.Publisher('/out', type_, queue_size=10, latch=True))
+            outputs[0].publish(message)
+        outputs = []
+        rospy.init_node('program')
+        rospy.Subscriber('/in', rospy.AnyMsg, relay)
+        rospy.spin()
+        '''
+    bench.load(text)
+    node = create(master, '/mouth')
+    node.send_to('/in', typed_as='std_msgs/Header', frame_id='map')
+    assert Mailbox(node, '/out', 'std_msgs/Header').next().frame_id == 'map'
