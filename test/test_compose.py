@@ -581,8 +581,8 @@ def test_launch_file_names_groups(master, compose):
 
 def test_program_takes_groups(master, bench):
     with bench.program('robot', 'sensing.launch', '--group', 'sonar') as composed:
-        assert master.wait_for_node('/avoider', TIMEOUT).pid == composed.pid
-        sonar = master.wait_for_node('/sonar', TIMEOUT)
+        assert composed.node('/avoider').pid == composed.pid
+        sonar = composed.node('/sonar')
         assert sonar.pid != composed.pid
     assert not sonar.is_alive()
 
@@ -649,7 +649,7 @@ def test_end_waits_for_a_slow_program(master, bench, monkeypatch):
     monkeypatch.setattr('pharos.compose.composition.SLOW_END', 0.01)
     text = f"{INIT}rospy.on_shutdown(lambda: [time.sleep(0.5), say('stands')])\nsay('ready')\n"
     with master.compose(None, bench.launch_file(program=f'{text}rospy.spin()')):
-        until(bench.said)
+        bench.until(bench.said)
     assert bench.said() == ['ready', 'stands']
 
 
@@ -658,10 +658,11 @@ def test_end_waits_for_a_slow_program(master, bench, monkeypatch):
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_program_composes_until_signal(master, bench, number):
-    with bench.program('robot', 'mixed.launch', 'frame:=back') as composed:
+    command = ['rosrun', 'pharos', 'compose', 'robot', 'mixed.launch', 'frame:=back']
+    with Program(command, master.url) as composed:
         mailbox = Mailbox(create(master, '/ear'), '/relayed', 'sensor_msgs/Range')
         assert mailbox.next().header.frame_id == 'back'
-        assert master.wait_for_node('/sonar', TIMEOUT).pid == composed.pid
+        assert composed.node('/sonar').pid == composed.pid
         wait_for_gripper(master)
         composed.signal(number)
         composed.wait()
@@ -671,7 +672,7 @@ def test_program_composes_until_signal(master, bench, number):
 def test_program_takes_only_and_apart(master, bench):
     chosen = '--only', 'heartbeat', 'gripper', '--apart', 'gripper'
     with bench.program('robot', 'robot.launch', 'robot:=r2', *chosen) as composed:
-        assert master.wait_for_node('/r2/heartbeat', TIMEOUT).pid == composed.pid
+        assert composed.node('/r2/heartbeat').pid == composed.pid
         wait_for_gripper(master, '/r2/gripper')
         assert master.node('/r2/gripper').pid != composed.pid
         assert '/r2/mission' not in [each.name for each in master.nodes()]
@@ -698,7 +699,7 @@ def test_program_prefixes_what_scripts_print(master, bench):
 def test_program_runs_several_scripts(master, bench):
     with bench.program('--script', 'robot/gripper', 'robot/heartbeat') as composed:
         for name in '/gripper', '/heartbeat':
-            assert master.wait_for_node(name, TIMEOUT).pid == composed.pid
+            assert composed.node(name).pid == composed.pid
 
 
 @pytest.mark.parametrize(
@@ -745,8 +746,8 @@ def test_scripts_start_side_by_side_with_arguments(master, bench):
         "rospy.init_node('quick')\nsay(rospy.get_param('~rate'))\nrospy.spin()", 'quick'
     )
     with bench.program('--script', slow, quick, '_rate:=5', '__ns:=/left') as composed:
-        until(lambda: bench.said() == ['5'])
-        assert master.wait_for_node('/left/program', TIMEOUT)
+        bench.until(lambda: bench.said() == ['5'])
+        assert composed.node('/left/program')
         assert master.node('/left/quick').pid == composed.pid
 
 
@@ -791,7 +792,7 @@ def test_node_of_roslaunch_runs_scripts(bench):
     """The name and the log that roslaunch gives are those of compose, not of each program."""
     paths = f'{bench.folder}/talk {bench.folder}/hear'
     with as_node(bench, f'--script {paths}') as launched:
-        until(lambda: len(bench.said()) == 4 or launched.poll() is not None)
+        launched.until(lambda: len(bench.said()) == 4)
     assert sorted(bench.said()) == ['/rig/hear', '/rig/talk', '[]', '[]']
 
 
@@ -802,7 +803,7 @@ def test_remap_in_scope_of_a_node_is_taken(bench, args):
     bench.write(f'<launch>{xml}</launch>', 'programs.launch', '')
     remap = '<remap from="chatter" to="words"/>'
     with as_node(bench, args.format(bench.folder), remap) as launched:
-        until(lambda: len(bench.said()) == 4 or launched.poll() is not None)
+        launched.until(lambda: len(bench.said()) == 4)
     assert sorted(bench.said())[:2] == ['/rig/hear', '/rig/talk']
 
 
@@ -810,7 +811,7 @@ def test_respawn_waits_for_its_delay(bench):
     bench.write(INIT + 'say(time.time())\n')
     more = 'respawn="true" respawn_delay="0.5"'
     with bench.program(bench.launch_file(f'<node pkg="bench" type="program" name="p" {more}/>')):
-        until(lambda: len(bench.said()) >= 2)
+        bench.until(lambda: len(bench.said()) >= 2)
     first, second, *_ = map(float, bench.said())
     assert second - first >= 0.5
 
@@ -819,7 +820,7 @@ def test_node_with_a_folder_runs_there(bench):
     bench.write(INIT + 'say(os.getcwd())\nrospy.spin()\n')
     xml = '<node pkg="bench" type="program" name="program" cwd="node"/>'
     with bench.program(bench.launch_file(xml)):
-        until(bench.said)
+        bench.until(bench.said)
     assert bench.said() == [str(bench.folder)]
 
 
@@ -827,7 +828,7 @@ def test_program_with_a_window_runs_here_if_asked(bench):
     path = bench.launch_file(program=f'import tkinter\n{INIT}say(os.getpid())\nrospy.spin()\n')
     for options in [], ['--here', 'program']:
         with bench.program(path, *options) as composed:
-            until(lambda options=options: len(bench.said()) == 1 + len(options) // 2)
+            bench.until(lambda options=options: len(bench.said()) == 1 + len(options) // 2)
             is_here = bench.said()[-1] == str(composed.pid)
         assert is_here == bool(options)
 
@@ -835,7 +836,7 @@ def test_program_with_a_window_runs_here_if_asked(bench):
 def test_master_is_started_if_there_is_none(bench, monkeypatch):
     bench.master = pharos.Master(f'http://127.0.0.1:{free_port()}/')
     with bench.program(bench.launch_file(program=SPIN)) as composed:
-        until(lambda: bench.said() == ['ready'])
+        bench.until(lambda: bench.said() == ['ready'])
         assert bench.master.node('/program').pid == composed.pid
         assert 'no ROS master at' in composed.output
         end(composed)
@@ -871,11 +872,11 @@ def test_program_is_controlled_by_the_names_of_its_nodes(master, bench):
     )
     launch = bench.launch_file('<node pkg="bench" type="program" name="program"/>')
     with master.compose(None, launch) as composition:
-        until(lambda: bench.said() == ['ready'])
+        bench.until(lambda: bench.said() == ['ready'])
         assert control('stop', '/hand', master) == '/program'
         assert not composition.nodes[0].is_running
         assert control('start', '/arm', master) == '/program'
-        until(lambda: bench.said() == ['ready'] * 2)
+        bench.until(lambda: bench.said() == ['ready'] * 2)
 
 
 @pytest.mark.parametrize(
@@ -888,7 +889,7 @@ def test_program_is_controlled_by_the_names_of_its_nodes(master, bench):
 def test_restart_keeps_a_node_that_cannot_be_read(master, bench, name, text, said):
     bench.write('import rospy\n', 'helper.py', '')
     with master.compose(None, bench.launch_file(program='import helper\n' + SPIN)) as composition:
-        until(lambda: bench.said() == ['ready'])
+        bench.until(lambda: bench.said() == ['ready'])
         bench.write(text, name, '')
         with pytest.raises(pharos.PharosError, match=said):
             composition.control(composition.nodes[0], 'restart')
@@ -930,14 +931,14 @@ def test_failed_look_at_files_is_made_again(master, bench, monkeypatch, what):
     with master.compose(None, bench.launch_file(program=EDITED.format('first'))) as composition:
         thread = threading.Thread(target=reload_on_save, args=[composition])
         thread.start()
-        until(lambda: bench.said() == ['first'])
+        bench.until(lambda: bench.said() == ['first'])
         # nothing sees a save before the first look
-        until(lambda: bench.write(EDITED.format('second')) and len(bench.said()) > 1)
+        bench.until(lambda: bench.write(EDITED.format('second')) and len(bench.said()) > 1)
         may_fail.set()
         bench.write(EDITED.format('the third'))
         assert failed.wait(TIMEOUT)
         bench.write(EDITED.format('the fourth'))
-        until(lambda: bench.said()[-1] == 'the fourth')
+        bench.until(lambda: bench.said()[-1] == 'the fourth')
     thread.join(TIMEOUT)
 
 
@@ -974,7 +975,7 @@ def test_control_name_that_another_user_has_is_told(master, bench, transcript):
     with Program(command, master.url) as thief:
         thief.expect('taken')
         with master.compose(None, bench.launch_file(program=SPIN)):
-            until(bench.said)
+            bench.until(bench.said)
         thief.signal(signal.SIGKILL)
     (line,) = [line for line in transcript if 'control name' in line]
     assert 'user' in line

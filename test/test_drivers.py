@@ -13,7 +13,6 @@ import pharos
 from helpers import COMPOSE, DEFAULT_SIGNALS, INIT, SPIN, TIMEOUT
 from pharos.compose.composition import Composition
 from pharos.compose.script import ScriptNode
-from pharos.testing import until
 
 READERS = {
     'nobody': '',
@@ -63,13 +62,13 @@ def test_driver_respawns_and_opens_its_device_again(bench, port, reader, rest):
     bench.write(driver(port, reader, rest))
     launch = bench.launch_file('<node pkg="bench" type="program" name="program" respawn="true"/>')
     with bench.program(launch):
-        until(lambda: bench.said().count('opened') >= 3)
+        bench.until(lambda: bench.said().count('opened') >= 3)
 
 
 @pytest.mark.parametrize('reader', READERS)
 def test_stop_gives_the_device_back(bench, port, reader):
     script = bench.load(driver(port, reader))
-    until(lambda: bench.said() == ['begins', 'opened'])
+    bench.until(lambda: bench.said() == ['begins', 'opened'])
     script.stop()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind(('127.0.0.1', port))
@@ -91,7 +90,7 @@ def test_serial_driver_restarts_while_its_thread_reads(bench):
         '''
     script = bench.load(text)
     for count in 1, 2, 3:
-        until(lambda count=count: bench.said().count('opened') == count)
+        bench.until(lambda count=count: bench.said().count('opened') == count)
         script.restart()
     os.close(device)
     os.close(program_end)
@@ -128,7 +127,7 @@ def test_driver_of_pharos_respawns_and_opens_its_device_again(bench, port):
     bench.write(OWN_DRIVER.format(port=port))
     launch = bench.launch_file('<node pkg="bench" type="program" name="program" respawn="true"/>')
     with bench.program(launch):
-        until(lambda: bench.said().count('opened') >= 3)
+        bench.until(lambda: bench.said().count('opened') >= 3)
 
 
 # -- looks that fail, and lines that cannot be printed
@@ -164,7 +163,7 @@ def test_failed_look_ends_no_respawn(master, bench, monkeypatch, what):
         with monkeypatch.context() as moment:
             fail_each_second_time(moment, *LOOKS[what])
             count = len(bench.said())
-            until(lambda: len(bench.said()) > count + 3)
+            bench.until(lambda: len(bench.said()) > count + 3)
 
 
 def test_failed_look_costs_no_other_program(master, bench, monkeypatch):
@@ -179,7 +178,7 @@ def test_failed_look_costs_no_other_program(master, bench, monkeypatch):
 
     monkeypatch.setattr(Composition, '_look_at_ended', fail_for_first)
     with master.compose(None, bench.launch_file(xml)):
-        until(lambda: bench.said().count('/second') > 3)
+        bench.until(lambda: bench.said().count('/second') > 3)
 
 
 @pytest.mark.parametrize('output', ['reader gone', 'full disk'])
@@ -194,10 +193,10 @@ def test_respawn_goes_on_without_output(master, bench, output):
         )
     try:
         if composed.stdout:
-            until(bench.said)
+            bench.until(bench.said)
             composed.stdout.close()
         count = len(bench.said())
-        until(lambda: len(bench.said()) > count + 4)
+        bench.until(lambda: len(bench.said()) > count + 4)
         composed.send_signal(signal.SIGINT)
         assert composed.wait(TIMEOUT) == 0
     finally:

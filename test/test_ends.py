@@ -34,7 +34,7 @@ def test_child_is_interrupted_at_the_end(bench, rest):
         {rest}
         '''
     script = bench.load(text)
-    until(bench.said)
+    bench.until(bench.said)
     child = psutil.Process(int(bench.said()[0]))
     if 'spin' in rest:
         script.stop()
@@ -51,7 +51,7 @@ def test_forked_child_ends_nothing_of_its_parents(master, bench):
         rospy.spin()
         '''
     script = bench.load(text)
-    until(lambda: bench.said() == ['5'])
+    bench.until(lambda: bench.said() == ['5'])
     assert script.is_running and '/program' in [each.name for each in master.nodes()]
 
 
@@ -65,7 +65,7 @@ def test_system_default_of_sigint_ends_at_once(bench):
         while True: time.sleep(0.01)
         '''
     script = bench.load(text)
-    until(lambda: bench.said() == ['ready'])
+    bench.until(lambda: bench.said() == ['ready'])
     script.stop()
     assert bench.said() == ['ready']
 
@@ -76,7 +76,7 @@ def test_interrupt_while_roslaunch_starts_ends_its_nodes(master, bench):
     names = [f'node{number}' for number in range(6)]
     xml = ''.join(f'<node pkg="bench" type="program" name="{name}"/>' for name in names)
     with bench.program(bench.launch_file(xml), '--apart', *names) as composed:
-        until(lambda: 'process[node0' in composed.output)
+        composed.until(lambda: 'process[node0' in composed.output)
         begin = time.monotonic()
         end(composed)
         assert time.monotonic() - begin < 10
@@ -87,7 +87,7 @@ def assert_ends_within(bench, seconds, text):
     """In one of three runs, Ctrl-C ends the program so soon: the computer may be busy."""
     for run in range(1, 4):
         with bench.program('--script', bench.write(text)) as composed:
-            until(lambda run=run: bench.said().count('ready') == run)
+            bench.until(lambda run=run: bench.said().count('ready') == run)
             begin = time.monotonic()
             end(composed)
             duration = time.monotonic() - begin
@@ -131,7 +131,7 @@ def test_slow_end_is_told(bench):
     text = "rospy.init_node('program')\nrospy.on_shutdown(lambda: time.sleep(4))\n"
     text += "rospy.sleep(0.5)\n" + SPIN
     with bench.program('--script', bench.write(text)) as composed:
-        until(lambda: 'ready' in bench.said())
+        bench.until(lambda: 'ready' in bench.said())
         end(composed)
     assert 'the end waits for /program; a further Ctrl-C ends all at once' in composed.output
 
@@ -140,6 +140,6 @@ def test_slow_end_is_told(bench):
 def test_nodes_end_with_a_killed_composition(master, bench, option):
     path = bench.launch_file(program=INIT + "say('ready')\nrospy.spin()\n")
     with bench.program(path, option, 'program') as composed:
-        until(bench.said)
+        bench.until(bench.said)
         os.kill(composed.pid, signal.SIGKILL)
         until(lambda: not any(master.system_state()))

@@ -7,7 +7,6 @@ import pytest
 
 import pharos
 from helpers import INIT, SPIN, TIMEOUT
-from pharos.testing import until
 
 # -- variables
 
@@ -31,9 +30,9 @@ ENVIRONMENTS = {
 def test_environment_reaches_c_code_and_shells(master, bench, xml, first, reason):
     bench.write(first + SAYS_GPU)
     with bench.program(bench.launch_file(PROGRAM.format(xml), other=SPIN)) as composed:
-        until(lambda: {'shell 1', "C b'1'"} <= set(bench.said()))
-        assert master.wait_for_node('/program', TIMEOUT).pid != composed.pid
-        assert master.wait_for_node('/other', TIMEOUT).pid == composed.pid
+        bench.until(lambda: {'shell 1', "C b'1'"} <= set(bench.said()))
+        assert composed.node('/program').pid != composed.pid
+        assert composed.node('/other').pid == composed.pid
     assert f'/program runs in a group of its own: {reason}' in composed.output
 
 
@@ -47,7 +46,7 @@ rospy.spin()
 
 def where(bench, count):
     """Wait until so many nodes have said where they run; return {name: (PID, $GPU of a child)}."""
-    until(lambda: len([line for line in bench.said() if line]) >= count)
+    bench.until(lambda: len([line for line in bench.said() if line]) >= count)
     rows = [line.split(' ') for line in bench.said() if line]
     return {name: (int(pid), variable) for name, pid, variable in rows}
 
@@ -97,7 +96,7 @@ def test_composition_gives_the_environment_back(master, bench):
 def test_only_program_has_the_environment_of_the_process(master, bench):
     path = bench.write("os.environ['GPU'] = '1'\n" + SAYS_GPU)
     with bench.program('--script', path) as composed:
-        until(lambda: {'shell 1', "C b'1'"} <= set(bench.said()))
+        bench.until(lambda: {'shell 1', "C b'1'"} <= set(bench.said()))
         assert master.node('/program').pid == composed.pid
 
 
@@ -105,7 +104,7 @@ def test_only_program_comes_back_with_its_environment(bench):
     bench.write(INIT + "say(os.environ.get('PATH'))\n")
     xml = '<node pkg="bench" type="program" name="program" respawn="true"/>'
     with bench.program(bench.launch_file(xml)):
-        until(lambda: len(bench.said()) >= 2)
+        bench.until(lambda: len(bench.said()) >= 2)
     first, second, *_ = bench.said()
     assert first == second != 'None'
 

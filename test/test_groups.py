@@ -6,7 +6,7 @@ import sys
 import psutil
 import pytest
 
-from helpers import INIT, SPIN, TIMEOUT, end
+from helpers import INIT, SPIN, end
 from pharos.compose.sources import sets_environment, why_apart
 from pharos.testing import until
 
@@ -52,7 +52,7 @@ def test_node_apart_is_a_plain_process(master, bench, how):
     inside = '<param name="pharos_apart" value="true"/>' if how == 'parameter' else ''
     apart = ['--apart', 'program'] if how == 'option' else []
     with bench.program(bench.launch_file(APART.format(inside)), *apart) as composed:
-        until(bench.said)
+        bench.until(bench.said)
         parent, program = bench.said()[0].split()
         assert program == path
         assert 'roslaunch_parent.py' in ' '.join(psutil.Process(int(parent)).cmdline())
@@ -69,16 +69,16 @@ def test_nodes_of_a_killed_roslaunch_end_or_respawn(master, bench):
         for name, respawn in [('one', 'true'), ('two', 'false')]
     )
     with bench.program(bench.launch_file(xml), '--apart', 'one', 'two') as composed:
-        until(lambda: len(bench.said()) == 2)
+        bench.until(lambda: len(bench.said()) == 2)
         for name in 'one', 'two':
-            master.wait_for_node(f'/{name}', TIMEOUT)
+            composed.node(f'/{name}')
         two = master.node('/two')
         os.kill(psutil.Process(two.pid).ppid(), signal.SIGKILL)
-        until(lambda: len(bench.said()) == 3)
-        assert master.wait_for_node('/one', TIMEOUT).is_alive()
+        bench.until(lambda: len(bench.said()) == 3)
+        assert composed.node('/one').is_alive()
         until(lambda: '/two' not in [each.name for each in master.nodes()])
         assert end(composed) == 1
-    until(lambda: not any(psutil.pid_exists(int(pid)) for pid in bench.said()))
+    bench.until(lambda: not any(psutil.pid_exists(int(pid)) for pid in bench.said()))
 
 
 # -- crashes are told
@@ -107,13 +107,13 @@ def test_crash_of_a_group_is_told_and_its_node_respawns(master, bench, ending):
 
     with bench.program(bench.launch_file(xml)) as composed:
         for count in 1, 2:
-            until(lambda count=count: len(process_ids()) == count)
-            master.wait_for_node('/program', TIMEOUT)
+            bench.until(lambda count=count: len(process_ids()) == count)
+            composed.node('/program')
             if ending == 'SIGKILL':
                 os.kill(process_ids()[-1], signal.SIGKILL)
             else:
                 master.parameters['/crash'] = True
-            until(lambda count=count: len(process_ids()) == count + 1)
+            bench.until(lambda count=count: len(process_ids()) == count + 1)
             until(lambda: '/beside' not in [each.name for each in master.nodes()])
         assert end(composed) == 1
     assert f'/program: {ending} has ended their process' in composed.output
@@ -126,7 +126,7 @@ def test_crash_of_a_group_with_a_required_node_ends_all(master, bench):
     bench.write(CRASH)
     xml = f'<node pkg="bench" type="program" name="program" required="true">{GROUP}</node>'
     with bench.program(bench.launch_file(xml, other=SPIN)) as composed:
-        until(lambda: 'ready' in bench.said() and len(bench.said()) == 2)
+        bench.until(lambda: 'ready' in bench.said() and len(bench.said()) == 2)
         master.parameters['/crash'] = True
         assert composed.wait() == 1
     assert not any(master.system_state())
