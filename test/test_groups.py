@@ -88,9 +88,10 @@ CRASH = '''
 import ctypes
 rospy.init_node('program')
 say(os.getpid())
-while not rospy.get_param('/crash', False): time.sleep(0.01)
-rospy.delete_param('/crash')
-ctypes.string_at(0)
+while not rospy.is_shutdown() and not rospy.get_param('/crash', False): rospy.sleep(0.01)
+if not rospy.is_shutdown():
+    rospy.delete_param('/crash')
+    ctypes.string_at(0)
 '''
 GROUP = '<param name="pharos_group" value="g"/>'
 
