@@ -39,13 +39,29 @@ logging.getLogger('rosmaster').setLevel(logging.CRITICAL)
 collect_ignore = ['programs', 'robot']
 # rosmaster runs in this process: its threads end when the other side closes the connection
 SERVER_THREADS = 'process_request_thread', 'Dummy-'
+#: fixtures of a module that start several programs
+SLOW_FIXTURES = {'both', 'changed', 'drive', 'made', 'scene', 'session', 'tested'}
 
 
 def pytest_configure(config):
     """Have a test fail if a thread raises; the pytest of Debian 11 does not see that."""
+    config.addinivalue_line('markers', 'xdist_group(name): one process of pytest-xdist runs them')
     if hasattr(pytest, 'PytestUnhandledThreadExceptionWarning'):
         warning = 'error::pytest.PytestUnhandledThreadExceptionWarning'
         config.addinivalue_line('filterwarnings', warning)
+
+
+@pytest.hookimpl(tryfirst=True)  # before pytest-xdist looks for the groups
+def pytest_collection_modifyitems(items):
+    """Have one process of pytest-xdist run all tests of a fixture that takes seconds."""
+    for item in items:
+        for name in SLOW_FIXTURES.intersection(item.fixturenames):
+            item.add_marker(pytest.mark.xdist_group(name))
+
+
+def pytest_report_header():
+    """Say which seed chooses the packages of the walks."""
+    return f'PHAROS_SEED={helpers.SEED}: one installed package in five is walked through'
 
 
 @pytest.fixture(scope='session')

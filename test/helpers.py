@@ -1,5 +1,6 @@
 """Masters, nodes, peers and programs that the tests of several files need."""
 import contextlib
+import datetime
 import os
 import pathlib
 import pickle
@@ -23,7 +24,8 @@ PYTHON = '/usr/bin/python3'
 #: begins a command whose signals do what they do by default, also under nohup
 DEFAULT_SIGNALS = ['env', '--default-signal=INT,TERM,HUP']
 TIMEOUT = 30  # seconds; a test that passes never waits so long
-COMPOSE = ['rosrun', 'pharos', 'compose']
+#: without rosrun, which takes a while to find it
+COMPOSE = [PYTHON, str(ROOT / 'scripts' / 'compose')]
 #: begins each script of a Bench
 HEAD = '''#!/usr/bin/python3
 import asyncio, atexit, inspect, os, pharos, rospy, signal, sys, threading, time
@@ -35,6 +37,8 @@ def say(text):
 '''
 INIT = "rospy.init_node('program')\n"
 SPIN = INIT + "say('ready')\nrospy.spin()\n"
+#: chooses the packages of a walk over all of them: another fifth each day
+SEED = os.environ.get('PHAROS_SEED') or datetime.date.today().isoformat()
 threading.Thread.isAlive = threading.Thread.is_alive  # the rospy of Debian 11 calls it at its end
 _created = []
 
@@ -70,6 +74,11 @@ def free_port():
         port = random.randrange(20000, 32000)  # below those that the system hands out
         with contextlib.suppress(OSError), socket.create_server(('127.0.0.1', port)):
             return port
+
+
+def one_in_five(names):
+    """Return every fifth of the names, as the seed chooses them."""
+    return random.Random(SEED).sample(sorted(names), len(names) // 5 + 1)
 
 
 class MortalMaster:
@@ -244,6 +253,11 @@ class PharosPeer(Peer):
     library = 'pharos'
 
 
+def _node_or_none(url, name):
+    with contextlib.suppress(pharos.PharosError):
+        return Master(url).node(name)
+
+
 class Program:
     """A program in a child process, whose lines of output a test can wait for.
 
@@ -260,7 +274,7 @@ class Program:
             stderr=subprocess.STDOUT,
             text=True,
         )
-        self._lines = []
+        self._url, self._lines = url, []
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
         self.pid, self.poll = self._process.pid, self._process.poll
@@ -276,9 +290,35 @@ class Program:
 
     def expect(self, text):
         """Wait until it has written the text."""
-        until(lambda: text in self.output or self.poll() is not None, TIMEOUT, repr(text))
-        self._reader.join(TIMEOUT if self.poll() is not None else 0)
-        assert text in self.output, self.output
+        self.until(lambda: text in self.output, repr(text))
+
+    def until(self, predicate, what=''):
+        """Wait until a predicate is true; fail with its last lines, and as soon as it has ended."""
+        try:
+            until(lambda: predicate() or self.has_ended, TIMEOUT, what)
+        except TimeoutError as error:
+            pytest.fail(f'{error}; {self.last_lines}')
+        if self.has_ended:
+            self._reader.join(TIMEOUT)
+        value = predicate()
+        if not value:
+            code = self.poll()
+            pytest.fail(
+                f'{what or predicate}: it has ended, with exit code {code}; {self.last_lines}'
+            )
+        return value
+
+    def node(self, name):
+        """Wait for a node that it runs, and return the node."""
+        return self.until(lambda: _node_or_none(self._url, name), name)
+
+    @property
+    def has_ended(self):
+        return self.poll() is not None
+
+    @property
+    def last_lines(self):
+        return 'its last lines:\n' + ''.join(self._lines[-20:])
 
     def signal(self, number):
         """Send it a signal."""
@@ -334,6 +374,7 @@ class Bench:
 
     def __init__(self, folder, master):
         self.folder, self.master = folder, master
+        self._newest = None  # the Program or ScriptNode that was started last
         self.write('<package><name>bench</name></package>', 'package.xml', '')
 
     def write(self, text, name='program', head=HEAD):
@@ -346,12 +387,14 @@ class Bench:
 
     def load(self, text, *args, **options):
         """Load a script; the fixture of the master stops it."""
-        return self.master.load(self.write(text), None, *args, **options)
+        self._newest = self.master.load(self.write(text), None, *args, **options)
+        return self._newest
 
     @contextlib.contextmanager
     def program(self, *words):
-        """Run rosrun pharos compose; Ctrl-C ends it."""
+        """Run compose; Ctrl-C ends it."""
         with Program([*COMPOSE, *words], self.master.url) as running:
+            self._newest = running
             try:
                 yield running
             finally:
@@ -363,6 +406,16 @@ class Bench:
             self.write(text.replace("'program'", repr(name)), name)
             xml += f'<node pkg="bench" type="{name}" name="{name}"/>'
         return self.write(f'<launch>{xml}</launch>', 'a.launch', '')
+
+    def until(self, predicate):
+        """Wait until a predicate is true; fail as soon as the newest program or script has ended."""
+        if isinstance(self._newest, Program):
+            return self._newest.until(predicate)
+        script = self._newest
+        until(lambda: predicate() or script and not script.is_running)
+        value = predicate()
+        assert value, f'{script} has ended, with exit code {script.exit_code}: {self.said()}'
+        return value
 
     def said(self):
         """Return the lines that the scripts have said."""

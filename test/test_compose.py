@@ -3,8 +3,12 @@ import contextlib
 import importlib
 import inspect
 import os
+import shutil
 import signal
+import socket
+import subprocess
 import sys
+import threading
 import xmlrpc.client
 
 import genpy
@@ -12,8 +16,23 @@ import pytest
 import rospy
 
 import pharos
-from helpers import INIT, ROOT, SPIN, TIMEOUT, Peer, Program, create, end, free_port, registrations
+from helpers import (
+    COMPOSE,
+    INIT,
+    PYTHON,
+    ROOT,
+    SPIN,
+    TIMEOUT,
+    Peer,
+    Program,
+    create,
+    end,
+    free_port,
+    registrations,
+)
 from pharos import ExternalNode, Master, PharosError, ScriptNode, UnknownNodeError
+from pharos.compose.control import control, reload_on_save
+from pharos.live.editing import editable_modules
 from pharos.testing import Mailbox, until
 
 pytestmark = pytest.mark.usefixtures('bench')  # ROS finds the package robot
@@ -562,8 +581,8 @@ def test_launch_file_names_groups(master, compose):
 
 def test_program_takes_groups(master, bench):
     with bench.program('robot', 'sensing.launch', '--group', 'sonar') as composed:
-        assert master.wait_for_node('/avoider', TIMEOUT).pid == composed.pid
-        sonar = master.wait_for_node('/sonar', TIMEOUT)
+        assert composed.node('/avoider').pid == composed.pid
+        sonar = composed.node('/sonar')
         assert sonar.pid != composed.pid
     assert not sonar.is_alive()
 
@@ -630,7 +649,7 @@ def test_end_waits_for_a_slow_program(master, bench, monkeypatch):
     monkeypatch.setattr('pharos.compose.composition.SLOW_END', 0.01)
     text = f"{INIT}rospy.on_shutdown(lambda: [time.sleep(0.5), say('stands')])\nsay('ready')\n"
     with master.compose(None, bench.launch_file(program=f'{text}rospy.spin()')):
-        until(bench.said)
+        bench.until(bench.said)
     assert bench.said() == ['ready', 'stands']
 
 
@@ -639,10 +658,11 @@ def test_end_waits_for_a_slow_program(master, bench, monkeypatch):
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_program_composes_until_signal(master, bench, number):
-    with bench.program('robot', 'mixed.launch', 'frame:=back') as composed:
+    command = ['rosrun', 'pharos', 'compose', 'robot', 'mixed.launch', 'frame:=back']
+    with Program(command, master.url) as composed:
         mailbox = Mailbox(create(master, '/ear'), '/relayed', 'sensor_msgs/Range')
         assert mailbox.next().header.frame_id == 'back'
-        assert master.wait_for_node('/sonar', TIMEOUT).pid == composed.pid
+        assert composed.node('/sonar').pid == composed.pid
         wait_for_gripper(master)
         composed.signal(number)
         composed.wait()
@@ -652,7 +672,7 @@ def test_program_composes_until_signal(master, bench, number):
 def test_program_takes_only_and_apart(master, bench):
     chosen = '--only', 'heartbeat', 'gripper', '--apart', 'gripper'
     with bench.program('robot', 'robot.launch', 'robot:=r2', *chosen) as composed:
-        assert master.wait_for_node('/r2/heartbeat', TIMEOUT).pid == composed.pid
+        assert composed.node('/r2/heartbeat').pid == composed.pid
         wait_for_gripper(master, '/r2/gripper')
         assert master.node('/r2/gripper').pid != composed.pid
         assert '/r2/mission' not in [each.name for each in master.nodes()]
@@ -679,7 +699,7 @@ def test_program_prefixes_what_scripts_print(master, bench):
 def test_program_runs_several_scripts(master, bench):
     with bench.program('--script', 'robot/gripper', 'robot/heartbeat') as composed:
         for name in '/gripper', '/heartbeat':
-            assert master.wait_for_node(name, TIMEOUT).pid == composed.pid
+            assert composed.node(name).pid == composed.pid
 
 
 @pytest.mark.parametrize(
@@ -719,6 +739,30 @@ def test_stopped_node_does_not_respawn(master, compose):
     until(lambda: master.parameters['/ends/starts'] >= 3, TIMEOUT)  # it respawns again
 
 
+def test_scripts_start_side_by_side_with_arguments(master, bench):
+    waits = 'while not os.path.exists(SAID): time.sleep(0.01)\n'
+    slow = bench.write(f'{waits}{INIT}rospy.spin()', 'slow')
+    quick = bench.write(
+        "rospy.init_node('quick')\nsay(rospy.get_param('~rate'))\nrospy.spin()", 'quick'
+    )
+    with bench.program('--script', slow, quick, '_rate:=5', '__ns:=/left') as composed:
+        bench.until(lambda: bench.said() == ['5'])
+        assert composed.node('/left/program')
+        assert master.node('/left/quick').pid == composed.pid
+
+
+@pytest.mark.parametrize('text, status', [('sys.exit(3)', 3), ('1 / 0', 1), ('', 0)])
+def test_status_is_that_of_the_only_program(bench, text, status):
+    with bench.program(bench.write(INIT + text, 'program.py')) as composed:
+        assert composed.wait() == status
+
+
+def test_without_arguments_its_usage_is_shown(master):
+    with Program(COMPOSE, master.url) as composed:
+        assert composed.wait() == 2
+    assert 'usage: compose' in composed.output
+
+
 # -- compose as a node of roslaunch
 
 
@@ -748,7 +792,7 @@ def test_node_of_roslaunch_runs_scripts(bench):
     """The name and the log that roslaunch gives are those of compose, not of each program."""
     paths = f'{bench.folder}/talk {bench.folder}/hear'
     with as_node(bench, f'--script {paths}') as launched:
-        until(lambda: len(bench.said()) == 4 or launched.poll() is not None)
+        launched.until(lambda: len(bench.said()) == 4)
     assert sorted(bench.said()) == ['/rig/hear', '/rig/talk', '[]', '[]']
 
 
@@ -759,7 +803,7 @@ def test_remap_in_scope_of_a_node_is_taken(bench, args):
     bench.write(f'<launch>{xml}</launch>', 'programs.launch', '')
     remap = '<remap from="chatter" to="words"/>'
     with as_node(bench, args.format(bench.folder), remap) as launched:
-        until(lambda: len(bench.said()) == 4 or launched.poll() is not None)
+        launched.until(lambda: len(bench.said()) == 4)
     assert sorted(bench.said())[:2] == ['/rig/hear', '/rig/talk']
 
 
@@ -767,7 +811,7 @@ def test_respawn_waits_for_its_delay(bench):
     bench.write(INIT + 'say(time.time())\n')
     more = 'respawn="true" respawn_delay="0.5"'
     with bench.program(bench.launch_file(f'<node pkg="bench" type="program" name="p" {more}/>')):
-        until(lambda: len(bench.said()) >= 2)
+        bench.until(lambda: len(bench.said()) >= 2)
     first, second, *_ = map(float, bench.said())
     assert second - first >= 0.5
 
@@ -776,7 +820,7 @@ def test_node_with_a_folder_runs_there(bench):
     bench.write(INIT + 'say(os.getcwd())\nrospy.spin()\n')
     xml = '<node pkg="bench" type="program" name="program" cwd="node"/>'
     with bench.program(bench.launch_file(xml)):
-        until(bench.said)
+        bench.until(bench.said)
     assert bench.said() == [str(bench.folder)]
 
 
@@ -784,7 +828,7 @@ def test_program_with_a_window_runs_here_if_asked(bench):
     path = bench.launch_file(program=f'import tkinter\n{INIT}say(os.getpid())\nrospy.spin()\n')
     for options in [], ['--here', 'program']:
         with bench.program(path, *options) as composed:
-            until(lambda options=options: len(bench.said()) == 1 + len(options) // 2)
+            bench.until(lambda options=options: len(bench.said()) == 1 + len(options) // 2)
             is_here = bench.said()[-1] == str(composed.pid)
         assert is_here == bool(options)
 
@@ -792,8 +836,146 @@ def test_program_with_a_window_runs_here_if_asked(bench):
 def test_master_is_started_if_there_is_none(bench, monkeypatch):
     bench.master = pharos.Master(f'http://127.0.0.1:{free_port()}/')
     with bench.program(bench.launch_file(program=SPIN)) as composed:
-        until(lambda: bench.said() == ['ready'])
+        bench.until(lambda: bench.said() == ['ready'])
         assert bench.master.node('/program').pid == composed.pid
         assert 'no ROS master at' in composed.output
         end(composed)
     assert not bench.master.is_reachable()
+
+
+# -- control
+
+
+OTHER_USER = ['setpriv', '--reuid', '65534', '--clear-groups']
+needs_other_user = pytest.mark.skipif(
+    not shutil.which('setpriv') or subprocess.call([*OTHER_USER, 'true']) != 0,
+    reason='needs the right to be another user',
+)
+
+
+def test_silent_client_keeps_no_other_out(master, bench):
+    with master.compose(None, bench.launch_file(program=SPIN)) as composition:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as silent:
+            silent.connect(f'\0pharos-compose-{os.getpid()}')
+            control('restart', '/program', master)
+        assert composition.nodes[0].is_running
+
+
+def test_program_is_controlled_by_the_names_of_its_nodes(master, bench):
+    bench.write(
+        """
+        master = pharos.Master()
+        for name in 'arm', 'hand': master.create(pharos.BlockNode, name)
+        say('ready')
+        pharos.spin()
+        """
+    )
+    launch = bench.launch_file('<node pkg="bench" type="program" name="program"/>')
+    with master.compose(None, launch) as composition:
+        bench.until(lambda: bench.said() == ['ready'])
+        assert control('stop', '/hand', master) == '/program'
+        assert not composition.nodes[0].is_running
+        assert control('start', '/arm', master) == '/program'
+        bench.until(lambda: bench.said() == ['ready'] * 2)
+
+
+@pytest.mark.parametrize(
+    'name, text, said',
+    [
+        ('helper.py', 'import rospy\nx = = 1\n', r'helper\.py:2: '),
+        ('program', 'def', 'cannot be read as Python 3'),
+    ],
+)
+def test_restart_keeps_a_node_that_cannot_be_read(master, bench, name, text, said):
+    bench.write('import rospy\n', 'helper.py', '')
+    with master.compose(None, bench.launch_file(program='import helper\n' + SPIN)) as composition:
+        bench.until(lambda: bench.said() == ['ready'])
+        bench.write(text, name, '')
+        with pytest.raises(pharos.PharosError, match=said):
+            composition.control(composition.nodes[0], 'restart')
+        assert composition.nodes[0].is_running
+
+
+EDITED = '''
+def word(): return '{}'
+rospy.init_node('program')
+last = ''
+while not rospy.is_shutdown():
+    if word() != last:
+        last = word()
+        say(last)
+    time.sleep(0.01)
+'''
+
+
+@pytest.mark.parametrize('what', ['editable_modules', '_answer', 'Transcript'])
+def test_failed_look_at_files_is_made_again(master, bench, monkeypatch, what):
+    failed, may_fail = threading.Event(), threading.Event()
+
+    def failing_once(function):
+        def call(*args, **kwargs):
+            if may_fail.is_set() and not failed.is_set():
+                failed.set()
+                raise RuntimeError('this look fails')
+            return function(*args, **kwargs)
+
+        return call
+
+    module = 'pharos.compose.control'
+    if what == 'editable_modules':
+        monkeypatch.setattr(f'{module}.editable_modules', failing_once(editable_modules))
+    elif what == '_answer':
+        monkeypatch.setattr(f'{module}._answer', failing_once(pharos.compose.control._answer))
+    else:
+        monkeypatch.setattr(type(pharos.Transcript), 'show', failing_once(lambda *things: None))
+    with master.compose(None, bench.launch_file(program=EDITED.format('first'))) as composition:
+        thread = threading.Thread(target=reload_on_save, args=[composition])
+        thread.start()
+        bench.until(lambda: bench.said() == ['first'])
+        # nothing sees a save before the first look
+        bench.until(lambda: bench.write(EDITED.format('second')) and len(bench.said()) > 1)
+        may_fail.set()
+        bench.write(EDITED.format('the third'))
+        assert failed.wait(TIMEOUT)
+        bench.write(EDITED.format('the fourth'))
+        bench.until(lambda: bench.said()[-1] == 'the fourth')
+    thread.join(TIMEOUT)
+
+
+def test_failed_accept_ends_no_control(master, bench, monkeypatch):
+    accept, failed = socket.socket.accept, threading.Event()
+
+    def fail_once(sock):
+        if sock.family == socket.AF_UNIX and not failed.is_set():
+            failed.set()
+            raise ValueError('odd')
+        return accept(sock)
+
+    with master.compose(None, bench.launch_file(program=SPIN)):
+        monkeypatch.setattr(socket.socket, 'accept', fail_once)
+        control('restart', '/program', master)
+        assert failed.wait(TIMEOUT)
+        assert control('restart', '/program', master) == '/program'
+
+
+TAKES_NAME = '''
+import socket, sys, threading
+sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+sock.bind('\\0pharos-compose-' + sys.argv[1])
+sock.listen()
+print('taken', flush=True)
+threading.Event().wait()
+'''
+
+
+@needs_other_user
+def test_control_name_that_another_user_has_is_told(master, bench, transcript):
+    """The name has the number of this process: the nodes of the composition cannot be controlled."""
+    command = [*OTHER_USER, PYTHON, '-c', TAKES_NAME, str(os.getpid())]
+    with Program(command, master.url) as thief:
+        thief.expect('taken')
+        with master.compose(None, bench.launch_file(program=SPIN)):
+            bench.until(bench.said)
+        thief.signal(signal.SIGKILL)
+    (line,) = [line for line in transcript if 'control name' in line]
+    assert 'user' in line

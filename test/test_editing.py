@@ -173,7 +173,7 @@ while not rospy.is_shutdown():
     script = bench.load(text.format(1))
     bench.write(text.format(2))
     script.reload()
-    until(lambda: bench.said()[-1:] not in ([], ['(1, 1)']))
+    bench.until(lambda: bench.said()[-1:] not in ([], ['(1, 1)']))
     assert bench.said()[-1] == '(2, 1)'
 
 
@@ -186,10 +186,10 @@ def test_second_reload_changes_nothing(bench):
 
 def test_new_default_takes_effect(bench):
     script = bench.load(GAIN_PROGRAM.format(1, 1))
-    until(lambda: '1' in bench.said())
+    bench.until(lambda: '1' in bench.said())
     bench.write(GAIN_PROGRAM.format(1, 5))
     script.reload()
-    until(lambda: '5' in bench.said())
+    bench.until(lambda: '5' in bench.said())
 
 
 def test_members_of_an_enum_stay(bench):

@@ -53,6 +53,16 @@ def test_no_files_import_each_other():
     assert left == {}
 
 
+def test_table_of_contributing_has_all_files():
+    """It names each file of tests, and no file that is not there."""
+    text = (ROOT / 'CONTRIBUTING.md').read_text()
+    begin, end = text.index('| to change |'), text.index('## Layout')
+    names = set(re.findall(r'`([\w/]+\.py)`', text[begin:end]))
+    tests = {path.name for path in (ROOT / 'test').glob('test_*.py')}
+    assert {name for name in names if name.startswith('test_')} == tests
+    assert [name for name in names - tests if not (SOURCE / name).exists()] == []
+
+
 def test_versions_are_equal():
     places = {
         'package.xml': r'<version>([\d.]+)<',

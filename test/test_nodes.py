@@ -112,6 +112,14 @@ def test_name_of_peer_is_refused(master, peer):
     assert peer.value('rospy.is_shutdown()') is False
 
 
+def test_name_is_free_if_another_node_has_its_uri(master):
+    other = create(master, '/other')
+    master.call('registerPublisher', '/words', STRING, other.uri, caller_id='/talker')
+    assert master.call('lookupNode', '/talker') == other.uri
+    assert create(master, '/talker').is_running
+    assert other.is_running
+
+
 def test_first_node_takes_name_of_argv(master):
     argv = ['__name:=pilot', '__ns:=/robot', '/a:=/b']
     names = [create(master, name, argv=argv).name for name in ('one', 'two', 'three')]

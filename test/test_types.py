@@ -12,7 +12,7 @@ import pytest
 import std_msgs.msg
 import std_srvs.srv
 
-from helpers import create
+from helpers import create, one_in_five
 from pharos import (
     MessageTypeError,
     UnknownTypeError,
@@ -225,7 +225,7 @@ def assert_alike(made, cls):
 
 
 def test_defined_message_is_like_installed_one():
-    for name in packages_with('msg'):
+    for name in one_in_five(packages_with('msg')):
         for cls in installed(name):
             made = define_message(f'{cls._type}Again', cls._full_text)
             assert made._type == f'{cls._type}Again'
@@ -233,8 +233,8 @@ def test_defined_message_is_like_installed_one():
 
 
 def test_files_give_installed_md5sums(package, tmp_path):
-    """Each .msg and .srv file of the package, copied into one that has no generated code."""
-    for name in sorted({*packages_with('msg'), *packages_with('srv')}):
+    """Each .msg and .srv file of a package, copied into one that has no generated code."""
+    for name in one_in_five({*packages_with('msg'), *packages_with('srv')}):
         package(f'copied_{name}', 'README', '')
         for kind, find in ('msg', message_class), ('srv', service_class):
             if not (SHARE / name / kind).is_dir():

@@ -155,7 +155,7 @@ def test_hook_has_the_last_word(master, peer, bench, wait, hook, way):
             control('restart', '/program', master)
         else:
             master.parameters['/go'] = True
-        until(lambda: 'hook' in bench.said())
+        bench.until(lambda: 'hook' in bench.said())
         until(lambda: not peer.value('subscribers[0].get_num_connections()'))
     commands = [message.data for message in peer.heard('/cmd')]
     assert set(commands[commands.index(0.0) :]) == {0.0}
@@ -174,7 +174,7 @@ def test_handler_has_the_last_word(peer, bench):
 @pytest.mark.parametrize('name', STOPS)
 def test_stop_does_as_signal(bench, name):
     script = bench.load(text_of(name))
-    until(lambda: bench.said() == ['ready'])
+    bench.until(lambda: bench.said() == ['ready'])
     begin = time.monotonic()
     script.stop()
     assert (bench.said()[1:], script.exit_code) == STOPS[name]
@@ -219,10 +219,10 @@ def test_exit_ends_one_script(master, bench, monkeypatch, last):
 @pytest.mark.parametrize('name', SLOW)
 def test_quick_signals_are_one(master, bench, name):
     with Program([*SLOW[name], bench.write(text_of(name, 0.5, 0))], master.url) as running:
-        until(lambda: 'ready' in bench.said())
+        running.until(lambda: 'ready' in bench.said())
         begin = time.monotonic()
         running.signal(signal.SIGINT)
-        until(lambda: 'closing' in bench.said())
+        running.until(lambda: 'closing' in bench.said())
         if time.monotonic() - begin < 0.8:  # else this computer is too busy for two
             running.signal(signal.SIGINT)
         running.wait()
@@ -233,9 +233,9 @@ def test_quick_signals_are_one(master, bench, name):
 @pytest.mark.parametrize('name', SLOW)
 def test_late_signal_ends_at_once(mortal, bench, name):
     with Program([*SLOW[name], bench.write(text_of(name, 1.2, 60))], mortal.url) as running:
-        until(lambda: 'ready' in bench.said())
+        running.until(lambda: 'ready' in bench.said())
         running.signal(signal.SIGINT)
-        until(lambda: 'closed' in bench.said())
+        running.until(lambda: 'closed' in bench.said())
         assert end(running) in (-signal.SIGINT, 128 + signal.SIGINT)
 
 
@@ -379,7 +379,7 @@ def test_subscription_has_one_thread(bench, talk):
     )
     talk('/a')
     talk('/b')
-    until(lambda: bench.said() == ['1', '1'])
+    bench.until(lambda: bench.said() == ['1', '1'])
 
 
 def test_subscription_is_switched_on_again(bench, talk):
@@ -396,7 +396,7 @@ def test_subscription_is_switched_on_again(bench, talk):
         '''
     )
     talk('/a')
-    until(lambda: bench.said() == ['on'] * 50)
+    bench.until(lambda: bench.said() == ['on'] * 50)
 
 
 def test_blocking_delegate_holds_nobody_up(master):
@@ -422,7 +422,7 @@ def test_terminal_tells_of_each_node(bench):
     with bench.program(bench.launch_file(RESPAWNED, **TEXTS), '--screen') as composed:
         for text in SHOWN:
             composed.expect(text)
-        until(lambda: composed.output.count('ValueError: in vain') >= 2)
+        composed.until(lambda: composed.output.count('ValueError: in vain') >= 2)
         end(composed)
     vain = [line for line in composed.output.splitlines() if 'in vain' in line]
     assert all(line.startswith('[/ticks]') for line in vain), vain
@@ -433,7 +433,7 @@ def test_status_is_independent_of_order(bench, order):
     texts = {'good': SPIN, 'bad': 'import no_such_module'}
     with bench.program(bench.launch_file(**{name: texts[name] for name in order})) as composed:
         composed.expect('/bad is not started')
-        until(lambda: bench.said())
+        bench.until(lambda: bench.said())
         assert end(composed) == 0
 
 
@@ -450,7 +450,7 @@ def test_windows_need_own_process(bench, line, helper, why):
 def check_runs(master, bench, mailbox, names):
     """Yield each time that the program talker runs and its talker says its gain; all has ended at last."""
     for runs in 1, 2:
-        until(lambda: bench.said().count('ready') == runs)
+        bench.until(lambda: bench.said().count('ready') == runs)
         assert mailbox.next().data == '7'
         assert {each.name for each in master.nodes()} == {'/ear', *names}
         yield runs
@@ -559,7 +559,7 @@ FOREVER = "loop = asyncio.new_event_loop(); loop.call_soon(say, 'up'); loop.run_
 )
 def test_idle_loop_of_asyncio_is_interrupted(bench, run, said):
     with bench.program('--script', bench.write(ASYNC.format(run))) as composed:
-        until(bench.said)
+        bench.until(bench.said)
         end(composed)
     assert bench.said() == said
     assert 'the end waits' not in composed.output
@@ -641,7 +641,7 @@ rospy.spin()
 def test_default_timeout_is_the_programs_own(bench):
     """It holds for its sockets and for libraries that it uses, and for no other program."""
     with bench.program(bench.launch_file(timed=TIMED, beside=BESIDE)):
-        until(lambda: len(bench.said()) == 5)
+        bench.until(lambda: len(bench.said()) == 5)
     assert bench.said() == ['0.2', '0.2', 'nothing came', 'timed out', 'None']
 
 
@@ -660,7 +660,7 @@ if __name__ == '__main__':
 def test_pool_of_processes_computes(bench, function, values):
     """In this process, or in one of its own."""
     with bench.program(bench.launch_file(pool=POOL.format(function), beside=SPIN)):
-        until(lambda: len(bench.said()) == 3)
+        bench.until(lambda: len(bench.said()) == 3)
     assert sorted(bench.said()) == sorted(['ready', values, 'over'])
 
 
@@ -691,10 +691,10 @@ def test_handler_of_a_signal_is_called(master, bench, name, how):
     if how == 'launch file':
         words = [bench.launch_file(handler=text, program=SPIN)]
     with bench.program(*words) as composed:
-        until(lambda: {'ready', name} <= {*bench.said()} or composed.poll() is not None)
+        bench.until(lambda: {'ready', name} <= {*bench.said()})
         master.parameters['/go'] = True
-        until(lambda: 'lives' in bench.said() or composed.poll() is not None)
-        assert master.wait_for_node('/program', TIMEOUT).is_alive()
+        bench.until(lambda: 'lives' in bench.said())
+        assert composed.node('/program').is_alive()
         end(composed)
     assert sorted(bench.said()) == sorted(['ready', name, 'lives'])
 
@@ -709,7 +709,7 @@ def test_closed_output_silences_no_other(master, bench, line):
     beside = f"rospy.init_node('beside')\n{waits}{prints}say('printed')\nrospy.spin()"
     paths = bench.write(closes, 'closes'), bench.write(beside, 'beside')
     with bench.program('--script', *paths) as composed:
-        until(lambda: 'printed' in bench.said() or composed.poll() is not None)
+        bench.until(lambda: 'printed' in bench.said())
         end(composed)
     for text in 'still heard', 'still told', 'still logged':
         assert text in composed.output
@@ -727,7 +727,7 @@ def test_reopened_output_is_written(bench):
         '''
     paths = [bench.write(text.format(name), name) for name in ('one', 'two')]
     with bench.program('--script', *paths) as composed:
-        until(lambda: len(bench.said()) == 2)
+        bench.until(lambda: len(bench.said()) == 2)
         end(composed)
     assert 'one says ✓' in composed.output and 'two says ✓' in composed.output
 
@@ -757,3 +757,56 @@ def test_hooks_run_in_their_order(bench):
     until(bench.said)
     script.stop()
     assert bench.said() == ['ready', 'first', 'second']
+
+
+# -- as rospy
+
+
+def test_frame_id_none_is_sent_as_in_rospy(master, bench):
+    text = '''
+        from sensor_msgs.msg import Imu
+        rospy.init_node('program')
+        imu = rospy.Publisher('/imu', Imu, queue_size=1)
+        message = Imu()
+        message.header.frame_id = None
+        imu.publish(message)
+        say(message.header.frame_id)
+        '''
+    assert bench.load(text).wait(TIMEOUT) == 0
+    assert bench.said() == ['0']
+
+
+def test_wrong_message_passes_while_nobody_hears_it(master, bench):
+    text = '''
+        from std_msgs.msg import Int32
+        rospy.init_node('program')
+        numbers = rospy.Publisher('/numbers', Int32, queue_size=1)
+        numbers.publish('seven')
+        say('passed')
+        while not numbers.get_num_connections(): time.sleep(0.01)
+        try: numbers.publish('seven')
+        except rospy.ROSSerializationException: say('refused')
+        '''
+    script = bench.load(text)
+    Mailbox(create(master, '/ear'), '/numbers', 'std_msgs/Int32')
+    assert script.wait(TIMEOUT) == 0
+    assert bench.said() == ['passed', 'refused']
+
+
+def test_relay_of_any_message_passes_headers(master, bench):
+    text = '''
+        import roslib.message
+        def relay(message):
+            if not outputs:
+                type_ = roslib.message.get_message_class(message._connection_header['type'])
+                outputs.append(rospy.Publisher('/out', type_, queue_size=10, latch=True))
+            outputs[0].publish(message)
+        outputs = []
+        rospy.init_node('program')
+        rospy.Subscriber('/in', rospy.AnyMsg, relay)
+        rospy.spin()
+        '''
+    bench.load(text)
+    node = create(master, '/mouth')
+    node.send_to('/in', typed_as='std_msgs/Header', frame_id='map')
+    assert Mailbox(node, '/out', 'std_msgs/Header').next().frame_id == 'map'
