@@ -768,6 +768,27 @@ def test_listener_hears_one_subscriber_at_a_time(master, library):
     assert all(slow.were_alone)
 
 
+def test_failing_listener_is_a_failure_of_its_node(master, peer):
+    class Rude(rospy.SubscribeListener):
+        def peer_subscribe(self, *arguments):
+            raise ValueError('in vain')
+
+    node = create(master)
+    node.ros.Publisher('/words', String, queue_size=1, subscriber_listener=Rude())
+    peer.hear('/words', STRING)
+    until(lambda: [str(error) for error in node.errors] == ['in vain'])
+
+
+def test_publisher_of_rospy_counts_its_subscribers(master, peer):
+    """Programs compute while somebody hears it."""
+    out = create(master).ros.Publisher('/words', String, queue_size=1)
+    for _ in range(2):
+        peer.hear('/words', STRING)
+        until(lambda: out.get_num_connections() == 1)
+        peer.run('subscribers.pop().unregister()')
+        until(lambda: out.get_num_connections() == 0)
+
+
 def test_closed_topic_is_forgotten(master, node, other):
     """Else the node would connect anew to publishers of long ago."""
     node.output_channel('/words', STRING)

@@ -471,6 +471,7 @@ def test_lifecycle_is_told(master):
 @pytest.mark.parametrize('where', ['delegate', 'soul', 'service'])
 def test_node_stops_from_own_block(master, node, where):
     other = create(master, '/other')
+    other.stop_timeout = 2 * TIMEOUT  # it does not wait for the block that stops it
     if where == 'delegate':
         other.interested_in('/a', STRING, delegate=lambda message, channel: other.stop())
         node.send_to('/a', data='x')
@@ -656,6 +657,24 @@ def test_node_becomes_another_class(master, node):
     assert master.lookup_service('/which').call().message == 'fast'
     other.execute()
     assert other.said[2:] == ['fast soul']
+
+
+@pytest.mark.parametrize('again', [False, True], ids=['delegate', 'retry'])
+def test_delegate_changes_the_class_of_its_node(master, node, again):
+    """It need not wait for itself, also if the delegate runs again."""
+    other = create(master, '/other')
+
+    def delegate(message):
+        if again and not other.failures:
+            raise RuntimeError
+        other.become(Fast)
+
+    other.interested_in('/a', STRING, delegate)
+    node.send_to('/a', typed_as=STRING, data='x')
+    if again:
+        until(lambda: other.failures)
+        threading.Thread(target=other.failures[0].retry, daemon=True).start()
+    until(lambda: isinstance(other, Fast))
 
 
 @pytest.mark.parametrize('cls', [dict, 'Fast', None])
