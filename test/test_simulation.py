@@ -2,17 +2,19 @@
 import contextlib
 import os
 import queue
+import re
 import runpy
 import threading
 import time
 
 import genpy
+import pexpect
 import pytest
 import rosbag
 import sensor_msgs.msg
 import std_msgs.msg
 
-from helpers import COMPOSE, ROOT, TIMEOUT, Program
+from helpers import COMPOSE, INIT, ROOT, TIMEOUT, Program
 from pharos import BlockNode, PharosError, testing
 from pharos.simulation import Simulation
 from pharos.testing import Mailbox
@@ -160,6 +162,85 @@ def test_seeds_show_a_race(master):
     winners = [winner(seed) for seed in range(1, 6)]
     assert len(set(winners)) > 1
     assert [winner(seed) for seed in range(1, 6)] == winners
+
+
+# -- clocks, and other waits
+
+#: expressions -> how much more they are after 3 s
+CLOCKS = {
+    'datetime.datetime.now()': '0:00:03.0000..',
+    'datetime.datetime.utcnow()': '0:00:03.0000..',
+    'time.monotonic()': '3.0000.*',
+    'time.time_ns()': '30000.....',
+    'time.monotonic_ns()': '30000.....',
+    'time.perf_counter_ns()': '30000.....',
+}
+YEARS = "time.strftime('%Y'), time.localtime().tm_year, time.gmtime().tm_year, time.ctime()[-4:]"
+IS_REAL = 'isinstance(datetime.datetime.now(), datetime.datetime)'
+BUSY_WAIT = '''
+end = rospy.get_time() + 3
+while rospy.get_time() < end: pass
+say(rospy.get_time() - end)'''
+#: programs -> what they say
+PROGRAM_LINES = {
+    **{
+        f'start = {clock}; time.sleep(3); say({clock} - start)': line
+        for clock, line in CLOCKS.items()
+    },
+    f'say({YEARS})': '2001 2001 2001 2001',
+    'time.sleep(86400); say(datetime.date.today())': '2001-09-10',
+    f'say({IS_REAL}, issubclass(datetime.datetime, datetime.date))': 'True True',
+    'say(pickle.loads(pickle.dumps(datetime.datetime(2020, 1, 2))))': '2020-01-02 00:00:00',
+    'class Mine(datetime.datetime): pass\nsay(Mine is type(Mine.now()))': 'True',
+    BUSY_WAIT: '0.000.*|.*e-05',
+    BUSY_WAIT.replace('rospy.get_time', 'time.monotonic'): '0.000.*|.*e-05',
+    'try: os.fork()\nexcept Exception as error: say(error)': '.*use subprocess.*',
+}
+
+
+@pytest.mark.parametrize('program', PROGRAM_LINES)
+def test_program_runs_in_virtual_time(simulation, bench, program):
+    imports = "import datetime, pickle, select, socket, subprocess\nrospy.init_node('program')\n"
+    text = program.replace("say(", "SAY(")
+    with bench.load(f'{imports}SAY = lambda *words: say(" ".join(map(str, words)))\n{text}\n'):
+        simulation.run(100_000)
+    assert simulation.lost == []
+    (line,) = bench.said()
+    assert re.fullmatch(PROGRAM_LINES[program], line), line
+
+
+def test_thread_that_waits_by_looks_lets_others_run(simulation, create_node):
+    times = []
+
+    def look(me):
+        end = time.time() + 1
+        while time.time() < end:
+            pass
+
+    create_node(BlockNode, soul=look).fork()
+    create_node(
+        BlockNode, soul=lambda me: [times.append(time.time()) for _ in me.every(0.1)]
+    ).fork()
+    simulation.run(1.05)
+    assert len(times) == 11
+
+
+def test_prompt_of_a_debugger_stops_the_time(master, bench):
+    heard = "def hear(message):\n    if message.data == '5': breakpoint()\n    say(message.data)\n"
+    ear = bench.write(
+        f"{heard}{INIT}rospy.Subscriber('count', String, hear)\nrospy.spin()\n", 'ear'
+    )
+    count = "for n in range(40): pub.publish(str(n)); rospy.sleep(0.1)\n"
+    pub = "rospy.init_node('mouth')\npub = rospy.Publisher('count', String, queue_size=9)\n"
+    command = [*COMPOSE, '--for', '5', '--script', ear, bench.write(pub + count, 'mouth')]
+    session = pexpect.spawn(command[0], command[1:], encoding='utf-8', timeout=TIMEOUT)
+    session.expect_exact('(Pdb)')
+    with pytest.raises(pexpect.TIMEOUT):  # longer than a thread may wait for something else
+        session.expect_exact('lost', timeout=2)
+    session.sendline('c')
+    session.expect_exact('lost: []')
+    session.expect(pexpect.EOF)
+    assert bench.said() == [str(number) for number in range(40)]
 
 
 # -- in a test

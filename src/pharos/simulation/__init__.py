@@ -29,6 +29,14 @@ from pharos.simulation import stand_ins
 from pharos.simulation.stand_ins import PLAYER, local
 from pharos.waiting import wait
 
+#: nanoseconds that a look at a clock takes: programs divide by the time since their last look
+LOOK = 1000
+#: nanoseconds of looks after which a thread gives its turn back: it waits by looks
+LOOKS_LIMIT = 1_000_000
+LONGEST_LOOK = 64_000  # nanoseconds: the looks of a thread that waits by looks become longer
+#: modules with a wait that keeps the turn: the master may take long beside load, and its calls have a
+#: limit of their own; at the prompt of a debugger, all stands still
+KEEP_TURN = xmlrpc.__name__, 'bdb'
 LAST = math.inf  # the order of a wait that ends after all others that end at the same time
 
 
@@ -45,6 +53,7 @@ class Simulation:
     record: Any = None
     _looks = 0  # at the thread with the turn, since it got the turn
     _cpu_time = 0.0
+    _turn_begin = 0  # when the thread with the turn got it
 
     def __init__(self, master):
         self.master = master
@@ -142,6 +151,7 @@ class Simulation:
     def add_wait(self, thread, end, order=None, lock=None):
         """Have a thread wait, as :meth:`wait` says; if it has the turn, another thread gets it."""
         if order is None:
+            thread.look = LOOK
             order = next(self._orders)
             if self.seed_number:
                 end += self._random.randrange(10**6)  # up to 1 ms
@@ -171,7 +181,16 @@ class Simulation:
             self.nanoseconds = max(self.nanoseconds, end)
             self._holder = thread
             self._looks = 0
+            self._turn_begin = self.nanoseconds
             thread.turns.put(None)
+
+    def look(self):
+        """Have a look at a clock take some time."""
+        thread = local.thread
+        self.nanoseconds += thread.look
+        if self.nanoseconds > self._turn_begin + LOOKS_LIMIT:
+            thread.look = min(2 * thread.look, LONGEST_LOOK)
+            self.wait(self.nanoseconds, next(self._orders))
 
     def prepare(self, thread):
         """Give a thread its attributes: the turn comes by a queue."""
@@ -193,11 +212,7 @@ class Simulation:
                     self._give_turn()
 
     def _look(self):
-        """Take the turn from a thread that waits for something else, or computes without end.
-
-        A thread in a call of XML-RPC keeps the turn: the master may take long beside load, and the call
-        has a limit of its own.
-        """
+        """Take the turn from a thread that waits for something else, or computes without end."""
         cpu_time = time.process_time()
         is_idle = cpu_time < self._cpu_time + 0.01  # seconds of all threads since the last look
         self._cpu_time = cpu_time
@@ -209,7 +224,7 @@ class Simulation:
             if self._looks < limit or thread in (None, self._owner):
                 return
             frames = traceback.walk_stack(sys._current_frames()[thread.ident])
-            if any(frame.f_code.co_filename == xmlrpc.__file__ for frame, _ in frames):
+            if any(frame.f_globals.get('__name__') in KEEP_TURN for frame, _ in frames):
                 return
             self.lost.append(thread.name)
             self._give_turn()

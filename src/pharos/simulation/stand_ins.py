@@ -5,8 +5,10 @@ module; Python's events, conditions, semaphores and queues are made of locks.
 """
 from __future__ import annotations
 
+import datetime
 import functools
 import math
+import os
 import queue
 import sys
 import threading
@@ -22,12 +24,13 @@ from pharos.errors import PharosError
 from pharos.intraprocess import callback_queues
 from pharos.intraprocess.links import runs
 from pharos.private_rospy import run, tcpros
+from pharos.private_rospy.loader import Shim
 from pharos.private_rospy.patches import patch
 from pharos.shared_memory import sending
 
-#: clock -> nanoseconds that a look takes: programs divide by the time since their last look; our own
-#: waits for servers look at monotonic, more or less often
-READ_TIMES = {'time': 1000, 'perf_counter': 1000, 'monotonic': 0}
+CLOCKS = 'time', 'perf_counter', 'monotonic', 'time_ns', 'perf_counter_ns', 'monotonic_ns'
+#: looks of these modules at a clock take no time: they come more or less often, as they wait for servers
+FREE_LOOKS = 'logging', 'pharos.', 'threading', 'queue', 'subprocess', 'asyncio.'
 PLAYER = '/bag_player'  # the node that plays bags
 #: the functions of servers' threads are in these modules
 SERVERS = (
@@ -153,12 +156,90 @@ def read_all_parameters(changed_run, key, read_parameters=run.Run.read_parameter
         read_parameters(each, key)
 
 
+def _read_clock(clock, name):
+    """Return the time: virtual to threads that take part, that of a clock to others."""
+    if not takes_part():
+        return clock()
+    if not sys._getframe(1).f_globals.get('__name__', '').startswith(FREE_LOOKS):
+        _simulation.look()
+    return _simulation.nanoseconds if name.endswith('_ns') else _simulation.now
+
+
+def _now():
+    """Look at the clock for a program."""
+    if takes_part():
+        _simulation.look()
+    return time.time()
+
+
+def _split_time(function, seconds=None):
+    """Stand in for ``time.localtime`` and functions like that: without an argument, it is now."""
+    return function(_now() if seconds is None else seconds)
+
+
+def _format_time(text, moment=None, function=time.strftime):
+    """Stand in for ``time.strftime``."""
+    return function(text, moment or time.localtime())
+
+
+class _RealInstances(type):
+    """The class of stand-ins for classes: their instances are those of the real class."""
+
+    def _real(cls):
+        return cls.__base__ if cls.__module__ == __name__ else cls
+
+    def __instancecheck__(cls, instance):
+        return type.__instancecheck__(cls._real(), instance)
+
+    def __subclasscheck__(cls, subclass):
+        return type.__subclasscheck__(cls._real(), subclass)
+
+    def __call__(cls, *args, **kwargs):
+        return type.__call__(cls._real(), *args, **kwargs)
+
+
+class VirtualDatetime(datetime.datetime, metaclass=_RealInstances):
+    """Stand in for ``datetime.datetime``, which reads a clock in C."""
+
+    @classmethod
+    def now(cls, tz=None):
+        return cls.fromtimestamp(_now(), tz)
+
+    @classmethod
+    def utcnow(cls):
+        return cls.utcfromtimestamp(_now())
+
+
+class VirtualDate(datetime.date, metaclass=_RealInstances):
+    """Stand in for ``datetime.date``, which reads a clock in C."""
+
+    @classmethod
+    def today(cls):
+        return cls.fromtimestamp(_now())
+
+
+def substitutes(this_run, original=run.Run.substitutes):
+    """Stand in for ``Run.substitutes``: what programs import has the virtual time, too."""
+    module = Shim(datetime, datetime=VirtualDatetime, date=VirtualDate)
+    return {**original(this_run), 'datetime': module}
+
+
+def fork(original=os.fork):
+    """Stand in for ``os.fork``: the child would wait for a turn that never comes."""
+    if takes_part():
+        raise PharosError(
+            'os.fork() has no virtual time, nor has multiprocessing: use subprocess, or'
+            " multiprocessing.get_context('spawn')"
+        )
+    return original()
+
+
 @patch('rospy.rostime', 'get_rostime')
 def get_rostime(original, run):
     """rospy makes the time from a float, which is not exact. Virtual time has whole nanoseconds."""
     if not _simulation:
         return original()
-    time.time()  # this look at the clock takes some time
+    _now()  # a look takes some time
     return run.modules.by_name['rospy.rostime'].Time(0, _simulation.nanoseconds)
 
 
@@ -186,16 +267,6 @@ def sleep(seconds):
         _sleep(seconds)
 
 
-def _time(clock, read_time):
-    """Return the time in seconds: virtual to threads that take part, that of a clock to others."""
-    if not takes_part():
-        return clock()
-    # rospy logs how it connects to other processes, more or less each time
-    if sys._getframe(1).f_globals['__name__'] != 'logging':
-        _simulation.nanoseconds += read_time
-    return _simulation.now
-
-
 def _refuse_part(composition, entries, *rest):
     raise PharosError(
         f'{", ".join(entry.name for entry in entries)}: has a process of its own, which knows no virtual'
@@ -205,13 +276,15 @@ def _refuse_part(composition, entries, *rest):
 
 def changes():
     """Return what a simulation changes: modules and classes -> names -> stand-ins."""
-    clocks = {
-        name: functools.partial(_time, getattr(time, name), read_time)
-        for name, read_time in READ_TIMES.items()
+    clocks = {name: functools.partial(_read_clock, getattr(time, name), name) for name in CLOCKS}
+    splits = {
+        name: functools.partial(_split_time, getattr(time, name))
+        for name in ('localtime', 'gmtime', 'ctime')
     }
     monotonic = clocks['monotonic']
     return {
-        time: {**clocks, 'sleep': sleep},
+        time: {**clocks, **splits, 'strftime': _format_time, 'sleep': sleep},
+        os: {'fork': fork},
         threading: {
             'Lock': Lock,
             '_allocate_lock': Lock,
@@ -230,7 +303,7 @@ def changes():
             '_no_yield_before': 0.0,  # a virtual time is too late for the real clock
         },
         run: {'monotonic': monotonic},
-        run.Run: {'read_parameters': read_all_parameters},
+        run.Run: {'read_parameters': read_all_parameters, 'substitutes': substitutes},
         # senders' threads are real ones
         sending: {'let_others_run': _let_servers_run},
         tcpros: {'let_others_run': _let_servers_run},
