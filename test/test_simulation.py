@@ -209,6 +209,35 @@ def test_program_runs_in_virtual_time(simulation, bench, program):
     assert re.fullmatch(PROGRAM_LINES[program], line), line
 
 
+UNSEEDED = (
+    'uuid.uuid4()',
+    'os.urandom(8)',
+    'secrets.token_hex()',
+    'random.Random().random()',
+    '[random.seed(), random.random()]',
+    'numpy.random.default_rng().random()',
+    'numpy.random.RandomState().random()',
+    "{'front', 'left', 'right', 'back'}",
+)
+
+
+def test_random_numbers_are_by_seed(master, bench):
+    values = f"for value in {', '.join(UNSEEDED)}: say(value)\n"
+    text = f'import numpy, random, secrets, uuid\n{values}{INIT}'
+    command = [*COMPOSE, '--script', bench.write(text), '--for', '1', '--seed']
+
+    def run(seed):
+        with Program([*command, seed], master.url) as composed:
+            assert composed.wait() == 0, composed.output
+        lines = bench.said()
+        (bench.folder / 'said').unlink()
+        return lines
+
+    first = run('7')
+    assert len(first) == len(UNSEEDED) and run('7') == first
+    assert not any(map(str.__eq__, run('8')[:-1], first))
+
+
 def test_thread_that_waits_by_looks_lets_others_run(simulation, create_node):
     times = []
 

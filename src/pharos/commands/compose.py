@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import pathlib
 import sys
 import threading
 import time
@@ -89,6 +90,7 @@ def _run(stack, options, mappings):
     master = Master(share_connections=not options.own_connections)
     simulation = None
     if options.bag or options.seconds:
+        _fix_hashes(options.seed)
         # at a master of its own: a robot that runs at the usual one must not hear this
         master = stack.enter_context(Master.embedded())
         os.environ['ROS_MASTER_URI'] = master.url
@@ -111,6 +113,15 @@ def _run(stack, options, mappings):
         _simulate(simulation, options)
         composition.stopping.set()  # its wait() returns at once, with the status
     return composition.wait()
+
+
+def _fix_hashes(seed):
+    """Start this command anew, unless the order of its sets of texts is that of the seed."""
+    number = str(seed % 2**32)
+    if os.environ.get('PYTHONHASHSEED') != number:
+        os.environ['PYTHONHASHSEED'] = number
+        command = pathlib.Path('/proc/self/cmdline').read_bytes().split(b'\0')[:-1]
+        os.execv(sys.executable, command)
 
 
 def _begin_simulation(stack, master, options):

@@ -73,7 +73,7 @@ class Simulation:
         :param number: 0: each sleep ends when due; of those due at one time, the first to begin is first
         """
         self.seed_number = number
-        self._random = random.Random(number)
+        self.random = random.Random(number)
         random.seed(number)
         numpy.random.seed(number)
 
@@ -154,7 +154,7 @@ class Simulation:
             thread.look = LOOK
             order = next(self._orders)
             if self.seed_number:
-                end += self._random.randrange(10**6)  # up to 1 ms
+                end += self.random.randrange(10**6)  # up to 1 ms
         with self._lock:
             self._waits[thread] = end, order, lock
             if self._holder in (thread, None):

@@ -10,6 +10,7 @@ import functools
 import math
 import os
 import queue
+import random
 import sys
 import threading
 import time
@@ -224,6 +225,20 @@ def substitutes(this_run, original=run.Run.substitutes):
     return {**original(this_run), 'datetime': module}
 
 
+def urandom(size, original=os.urandom):
+    """Stand in for ``os.urandom``: random bytes by the seed of the simulation."""
+    if not takes_part():
+        return original(size)
+    return _simulation.random.getrandbits(8 * size).to_bytes(size, 'little')
+
+
+def seed(generator, number=None, version=2, original=random.Random.seed):
+    """Stand in for ``Random.seed``: without a number, the seed of the simulation gives one."""
+    if number is None and takes_part():
+        number = _simulation.random.random()
+    original(generator, number, version)
+
+
 def fork(original=os.fork):
     """Stand in for ``os.fork``: the child would wait for a turn that never comes."""
     if takes_part():
@@ -284,7 +299,9 @@ def changes():
     monotonic = clocks['monotonic']
     return {
         time: {**clocks, **splits, 'strftime': _format_time, 'sleep': sleep},
-        os: {'fork': fork},
+        os: {'fork': fork, 'urandom': urandom},
+        random: {'_urandom': urandom, 'seed': functools.partial(seed, random._inst)},  # type: ignore
+        random.Random: {'seed': seed},
         threading: {
             'Lock': Lock,
             '_allocate_lock': Lock,
