@@ -181,6 +181,26 @@ BUSY_WAIT = '''
 end = rospy.get_time() + 3
 while rospy.get_time() < end: pass
 say(rospy.get_time() - end)'''
+LATER = 'rospy.Timer(rospy.Duration(3), lambda event: wake(), oneshot=True)\nstart = time.time()\n'
+PIPE = "readable, writable = os.pipe()\nwake = lambda: os.write(writable, b'x')\n" + LATER
+POLL = PIPE + 'poll = select.poll(); poll.register(readable)\n'
+LOOP = (
+    """
+async def main():
+    global wake
+    woken = asyncio.Event()
+    wake = functools.partial(asyncio.get_running_loop().call_soon_threadsafe, woken.set)
+    await asyncio.wait([asyncio.ensure_future(task) for task in TASKS], return_when='FIRST_COMPLETED')
+wake = None
+"""
+    + LATER
+    + """
+asyncio.run(main())
+say(time.time() - start)
+"""
+)
+#: a time, in seconds since the start
+AT_1, AT_3 = '1.0000.*', '3.0000.*'
 #: programs -> what they say
 PROGRAM_LINES = {
     **{
@@ -194,13 +214,23 @@ PROGRAM_LINES = {
     'class Mine(datetime.datetime): pass\nsay(Mine is type(Mine.now()))': 'True',
     BUSY_WAIT: '0.000.*|.*e-05',
     BUSY_WAIT.replace('rospy.get_time', 'time.monotonic'): '0.000.*|.*e-05',
+    PIPE + 'select.select([readable], [], [], 5); say(time.time() - start)': AT_3,
+    PIPE + 'select.select([readable], [], [], 1); say(time.time() - start)': AT_1,
+    PIPE
+    + 'while not select.select([readable], [], [], 0)[0]: pass\nsay(time.time() - start)': '3.00.*',
+    POLL + 'poll.poll(5000); say(time.time() - start)': AT_3,
+    POLL + 'poll.poll(1000); say(time.time() - start)': AT_1,
+    LOOP.replace('TASKS', '[asyncio.sleep(1), woken.wait()]'): AT_1,
+    LOOP.replace('TASKS', '[woken.wait()]'): AT_3,
+    LOOP.replace('TASKS', '[asyncio.wait_for(woken.wait(), 1)]'): AT_1,
+    "child = subprocess.Popen(['sleep', '0.1'])\nsay(child.poll())": '0',
     'try: os.fork()\nexcept Exception as error: say(error)': '.*use subprocess.*',
 }
 
 
 @pytest.mark.parametrize('program', PROGRAM_LINES)
 def test_program_runs_in_virtual_time(simulation, bench, program):
-    imports = "import datetime, pickle, select, socket, subprocess\nrospy.init_node('program')\n"
+    imports = "import datetime, functools, pickle, select, socket, subprocess\nrospy.init_node('program')\n"
     text = program.replace("say(", "SAY(")
     with bench.load(f'{imports}SAY = lambda *words: say(" ".join(map(str, words)))\n{text}\n'):
         simulation.run(100_000)
@@ -415,6 +445,16 @@ def test_thread_that_waits_for_something_else_is_named(simulation, create_node):
     thread.join(TIMEOUT)
     os.close(readable)
     os.close(writable)
+
+
+def test_child_that_takes_long_is_named(simulation, bench):
+    simulation.allow_waits()
+    text = (
+        "import subprocess\nchild = subprocess.Popen(['sleep', '9'])\nchild.poll()\nchild.kill()\n"
+    )
+    with bench.load(INIT + text):
+        simulation.run(1)
+    assert "['sleep', '9']" in simulation.lost[0]
 
 
 def test_program_of_another_process_is_refused(simulation, bench):

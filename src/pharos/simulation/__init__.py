@@ -130,7 +130,7 @@ class Simulation:
 
     def time_after(self, seconds):
         """Return the time in so many seconds, in nanoseconds."""
-        return self.nanoseconds + round(seconds * 10**9)
+        return seconds if seconds == math.inf else self.nanoseconds + round(seconds * 10**9)
 
     def wait(self, end, order=None, lock=None):
         """Give the turn back, and wait until this thread gets the turn again.

@@ -11,6 +11,8 @@ import math
 import os
 import queue
 import random
+import select
+import selectors
 import sys
 import threading
 import time
@@ -32,6 +34,7 @@ from pharos.shared_memory import sending
 CLOCKS = 'time', 'perf_counter', 'monotonic', 'time_ns', 'perf_counter_ns', 'monotonic_ns'
 #: looks of these modules at a clock take no time: they come more or less often, as they wait for servers
 FREE_LOOKS = 'logging', 'pharos.', 'threading', 'queue', 'subprocess', 'asyncio.'
+CHILD_LIMIT = 1.5  # seconds that a child may compute while the time stands still
 PLAYER = '/bag_player'  # the node that plays bags
 #: the functions of servers' threads are in these modules
 SERVERS = (
@@ -45,6 +48,7 @@ SERVERS = (
 )
 
 _sleep = time.sleep
+_monotonic = time.monotonic
 _start = threading.Thread.start
 _join = threading.Thread.join
 _is_alive = threading.Thread.is_alive
@@ -239,6 +243,71 @@ def seed(generator, number=None, version=2, original=random.Random.seed):
     original(generator, number, version)
 
 
+class _Files:
+    """Files that a thread waits for, in the place of a Lock: locked until ``look()`` finds some ready."""
+
+    def __init__(self, look):
+        self.look = look
+
+    def locked(self):
+        try:
+            return not any(self.look())
+        except (OSError, ValueError):  # one is closed: the thread that waits gets the error
+            return False
+
+
+def wait_for_files(wait, timeout):
+    """Wait in virtual time, and return ``wait(0)``; other threads wait as usual: ``wait(timeout)``.
+
+    :param wait: waits for so many seconds, and returns lists that are not empty if files are ready
+    """
+    if not takes_part():
+        return wait(timeout)
+    files = _Files(functools.partial(wait, 0))
+    if timeout <= 0:
+        _simulation.look()
+    elif files.locked():
+        _simulation.wait(_simulation.time_after(timeout), lock=files)
+    return wait(0)
+
+
+def select_files(reads, writes, errors, timeout=None, original=select.select):
+    """Stand in for ``select.select``. Without a limit, it may wait for a child: that takes no time."""
+    wait = functools.partial(original, reads, writes, errors)
+    return wait() if timeout is None else wait_for_files(wait, timeout)
+
+
+def select_for_loop(selector, timeout=None, original=selectors.EpollSelector.select):
+    """Stand in for the ``select`` of the selectors of asyncio."""
+    if timeout is None and takes_part():
+        timeout = math.inf
+    return wait_for_files(functools.partial(original, selector), timeout)
+
+
+def make_poll(original=select.poll):
+    """Stand in for ``select.poll``."""
+    poll = original()
+
+    def wait(timeout=None):
+        if timeout is None or timeout < 0:
+            return poll.poll()
+        return wait_for_files(lambda seconds: poll.poll(seconds * 1000), timeout / 1000)
+
+    return Shim(poll, poll=wait)
+
+
+@patch('subprocess', 'Popen.poll')
+def poll_child(original, run, child):
+    """Python only looks. In virtual time, this lets the child end, for CHILD_LIMIT: that takes no time."""
+    end = _monotonic() + CHILD_LIMIT
+    while takes_part() and not hasattr(child, 'is_slow') and original(child) is None:
+        if _monotonic() > end:
+            child.is_slow = True
+            _simulation.lost.append(f'{local.thread.name} with its child {child.args}')
+        _let_servers_run()
+    return original(child)
+
+
 def fork(original=os.fork):
     """Stand in for ``os.fork``: the child would wait for a turn that never comes."""
     if takes_part():
@@ -300,6 +369,8 @@ def changes():
     return {
         time: {**clocks, **splits, 'strftime': _format_time, 'sleep': sleep},
         os: {'fork': fork, 'urandom': urandom},
+        select: {'select': select_files, 'poll': make_poll},
+        selectors.EpollSelector: {'select': select_for_loop},
         random: {'_urandom': urandom, 'seed': functools.partial(seed, random._inst)},  # type: ignore
         random.Random: {'seed': seed},
         threading: {
