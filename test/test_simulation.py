@@ -1,6 +1,7 @@
 """Virtual time: unmodified programs run as fast as they can, and say the same each time."""
 import contextlib
 import os
+import pathlib
 import queue
 import re
 import runpy
@@ -445,6 +446,53 @@ def test_thread_that_waits_for_something_else_is_named(simulation, create_node):
     thread.join(TIMEOUT)
     os.close(readable)
     os.close(writable)
+
+
+DEADLOCK = """
+def take(first, second):
+    with first:
+        time.sleep(0.1)
+        with second: pass  # this line
+locks = threading.RLock(), threading.Lock()
+for pair in locks, locks[::-1]:
+    threading.Thread(target=take, args=pair).start()
+"""
+SELF_LOCK = 'def take():\n    lock.acquire()\n    lock.acquire()  # this line\n'
+LEFT_LOCK = 'def take(): lock.acquire()\ntake()\ntime.sleep(0.1); lock.acquire()  # this line\n'
+LOCKS = {
+    DEADLOCK: 2,
+    SELF_LOCK + 'lock = threading.Lock(); threading.Thread(target=take).start()\n': 1,
+    'condition, event = threading.Condition(), threading.Event()\n'
+    'def wait():\n    with condition: condition.wait()\n'
+    'for block in wait, event.wait: threading.Thread(target=block).start()\n': 0,
+}
+
+
+@pytest.mark.parametrize('text', LOCKS)
+def test_deadlock_is_named(master, bench, text):
+    path = bench.write(INIT + text)
+    line = pathlib.Path(path).read_text().partition('# this line')[0].count('\n') + 1
+    with Program([*COMPOSE, '--for', '1', '--script', path], master.url) as composed:
+        assert composed.wait() == int(LOCKS[text] > 0)
+    assert composed.output.count(f'{path}:{line}') == LOCKS[text]
+    assert composed.output.count('for ever') == LOCKS[text]
+
+
+def test_deadlock_with_the_test_is_named(simulation, create_node):
+    """Nobody has a turn any more."""
+    locks = threading.Lock(), threading.Lock()
+
+    def take(me):
+        with locks[0]:
+            me.sleep(1)
+            locks[1].acquire()
+
+    create_node(BlockNode, soul=take).fork()
+    with locks[1]:
+        simulation.run(2)
+        with pytest.raises(PharosError, match='(?s)for ever.*test_simulation.*test_simulation'):
+            locks[0].acquire()
+    assert simulation.deadlocks() == []
 
 
 def test_child_that_takes_long_is_named(simulation, bench):

@@ -175,9 +175,12 @@ def simulation(master: Master) -> Iterator[Any]:
 
     with Simulation(master) as simulation:
         yield simulation
+        deadlocks = simulation.deadlocks()
     print(f'simulation: seed {simulation.seed_number}, {simulation.now:.9f} s')
     if simulation.lost and not simulation.allows_waits:
         pytest.fail(f'threads waited for something else: {simulation.lost}', False)
+    if deadlocks:
+        pytest.fail(f'threads wait for a lock for ever: {deadlocks}', False)
 
 
 @pytest.fixture(name='expect_failures')

@@ -109,10 +109,14 @@ def _run(stack, options, mappings):
         composition.launch(_read_launch_file(master.url, options, mappings))
     else:
         composition.run_scripts(options.script, mappings, options.here)
-    if simulation:
-        _simulate(simulation, options)
-        composition.stopping.set()  # its wait() returns at once, with the status
-    return composition.wait()
+    if not simulation:
+        return composition.wait()
+    _simulate(simulation, options)
+    deadlocks = simulation.deadlocks()
+    for text in deadlocks:
+        print(f'waits for a lock for ever: {text}')
+    composition.stopping.set()  # its wait() returns at once, with the status
+    return composition.wait() or int(bool(deadlocks))
 
 
 def _fix_hashes(seed):

@@ -126,6 +126,20 @@ class Simulation:
                 channels[key].send(message)
             self.run(0)
 
+    def deadlocks(self) -> list[str]:
+        """Return the threads that wait for a lock for ever: the name of each, its file and line."""
+        locks = {}
+        for thread, (end, _, lock) in list(self._waits.items()):
+            if end == math.inf and getattr(lock, 'holder', None) and _place_of(thread):
+                locks[thread] = lock
+        for _ in tuple(locks):  # in each round, those go whose lock may become free
+            locks = {
+                thread: lock
+                for thread, lock in locks.items()
+                if lock.holder in locks or lock.holder.has_ended
+            }
+        return [f'{thread.name} at {_place_of(thread)}' for thread in locks]
+
     # -- the turn
 
     def time_after(self, seconds):
@@ -221,6 +235,11 @@ class Simulation:
             thread = self._holder
             # three: beside load, a process may get no processor for the time of one look
             limit = 3 if is_idle else 120
+            deadlocks = self.deadlocks()
+            if not thread and deadlocks and self._looks >= limit:
+                self._holder = self._owner
+                del self._waits[self._owner]
+                raise PharosError(f'threads wait for a lock for ever: {deadlocks}')
             if self._looks < limit or thread in (None, self._owner):
                 return
             frames = traceback.walk_stack(sys._current_frames()[thread.ident])
@@ -244,3 +263,13 @@ class Simulation:
         self._stack.close()
         for thread in self._waits:
             thread.turns.put(None)
+
+
+def _place_of(thread):
+    """Return the file and line at which a thread waits for a lock; '' if it waits for an event or a queue."""
+    for frame, line in traceback.walk_stack(sys._current_frames()[thread.ident]):
+        module = frame.f_globals.get('__name__', '')
+        if module == 'threading' and frame.f_code.co_name == 'wait':
+            return ''
+        if not module.startswith(('threading', 'pharos.simulation')):
+            return '' if module.startswith('pharos.') else f'{frame.f_code.co_filename}:{line}'

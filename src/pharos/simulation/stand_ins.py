@@ -81,12 +81,15 @@ class Lock:
     If a server holds the lock, the thread keeps its turn: servers hold locks briefly. "Member" is short for
     a thread that takes part: only such a thread keeps a lock while it waits for the time. A release gives
     no turn away, unless a thread that takes no part releases while nobody has the turn.
+
+    :ivar holder: the member that has taken the lock, or None
     """
+
+    holder: Any = None
 
     def __init__(self):
         self._lock = allocate_lock()
         self.locked = self._lock.locked
-        self._is_held_by_member = False
 
     def acquire(self, blocking=True, timeout=-1):
         simulation = _simulation
@@ -94,7 +97,7 @@ class Lock:
         if simulation and timeout >= 0:
             end = simulation.time_after(timeout)
         while not self._lock.acquire(False):
-            if blocking and takes_part() and self._is_held_by_member:
+            if blocking and takes_part() and self.holder:
                 if simulation.nanoseconds >= end:
                     return False
                 simulation.wait(end, lock=self)
@@ -102,11 +105,11 @@ class Lock:
                 break
             else:
                 return False
-        self._is_held_by_member = takes_part()
+        self.holder = local.thread if takes_part() else None
         return True
 
     def release(self):
-        self._is_held_by_member = False
+        self.holder = None
         self._lock.release()
         if _simulation and not takes_part():
             _simulation.give_free_turn()
