@@ -15,7 +15,7 @@ import rosbag
 import sensor_msgs.msg
 import std_msgs.msg
 
-from helpers import COMPOSE, INIT, ROOT, TIMEOUT, Program
+from helpers import COMPOSE, INIT, PYTHON, ROOT, TIMEOUT, Program
 from pharos import BlockNode, PharosError, testing
 from pharos.simulation import Simulation
 from pharos.testing import Mailbox
@@ -125,19 +125,64 @@ def test_command_records_the_same_bytes_each_time(master, tmp_path):
     assert run('--for', '20') == run('--for', '20')
 
 
+def damage(path, new_path, start):
+    content = path.read_bytes()
+    new_path.write_bytes(content[:start] + bytes(600) + content[start + 600 :])
+
+
 @pytest.mark.parametrize(
-    'options', ['no.bag', 'a.text', 'a.bag --topics nix', 'a.bag --record a.bag']
+    'options, reason',
+    [
+        ('no.bag', 'No such file'),
+        ('a.text', 'cannot be played'),
+        ('gap.bag', 'a gap of 17361 days after 2.0 s'),
+        ('damaged.bag', 'is damaged after 15000'),
+        ('a.bag --topics nix', 'no messages'),
+        ('a.bag --record a.bag', 'record to another file'),
+    ],
 )
-def test_command_tells_of_a_bag_that_it_cannot_play(master, tmp_path, monkeypatch, options):
+def test_command_tells_of_a_bag_that_it_cannot_play(master, tmp_path, monkeypatch, options, reason):
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'a.text').write_text('no bag')
     write_bag(tmp_path / 'a.bag', 9)
+    write_bag(tmp_path / 'big.bag', 900)
+    damage(tmp_path / 'big.bag', tmp_path / 'damaged.bag', 90_000)
+    with rosbag.Bag('gap.bag', 'w') as bag:
+        for second in 2, 1500000000:
+            bag.write('/scan', sensor_msgs.msg.LaserScan(), genpy.Time(second))
     before = (tmp_path / 'a.bag').read_bytes()
     arguments = ['--bag', *options.split(), '--script', str(PROGRAMS / 'tracker')]
     with Program([*COMPOSE, *arguments], master.url) as composed:
         assert composed.wait() == 1
-    assert options.split()[0] in composed.output and 'Traceback' not in composed.output
+    assert reason in composed.output and 'Traceback' not in composed.output
+    assert options.split()[0] in composed.output
     assert (tmp_path / 'a.bag').read_bytes() == before
+
+
+def test_command_tells_of_a_full_disk(master, tmp_path):
+    record = str(tmp_path / 'out.bag')
+    arguments = ['--for', '9000', '--record', record, '--script', str(PROGRAMS / 'tracker')]
+    limit = ['prlimit', '--fsize=900000']
+    with Program([*limit, *COMPOSE, *arguments], master.url, ROS_HOME=str(tmp_path)) as composed:
+        assert composed.wait() == 1
+    assert f'compose: {record} cannot be written: [Errno 27]' in composed.output
+    assert 'has ended' not in composed.output and 'Traceback' not in composed.output
+
+
+def test_command_is_a_module_too_and_shows_its_progress(master):
+    """It records as many seconds as it shall."""
+    arguments = [
+        '-m',
+        'pharos.commands.compose',
+        '--for',
+        '3000',
+        '--script',
+        str(PROGRAMS / 'threads'),
+    ]
+    session = pexpect.spawn(PYTHON, arguments, encoding='utf-8', timeout=TIMEOUT)
+    session.expect('[0-9]+ s of ROS time\r')
+    session.expect_exact('600.0 s of ROS time took')
+    session.expect(pexpect.EOF)
 
 
 def test_seeds_show_a_race(master):

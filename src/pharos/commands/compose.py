@@ -13,8 +13,8 @@ from typing import Any
 import rospkg
 
 from pharos import Master
-from pharos.commands import argument_parser
-from pharos.compose.composition import Composition
+from pharos.commands import argument_parser, run_command
+from pharos.compose.composition import Composition, leave
 from pharos.compose.control import reload_on_save
 from pharos.compose.launch_file import LaunchFile
 
@@ -133,35 +133,55 @@ def _begin_simulation(stack, master, options):
 
     The time begins a second before the bag: the programs have started at its first message.
     """
-    import rosbag
+    from pharos.simulation import Simulation, open_bag
 
-    from pharos.simulation import Simulation
-
-    simulation = stack.enter_context(Simulation(master))
+    simulation = Simulation(master)
+    ended = threading.Event()
+    if sys.stderr.isatty():  # a thread from before takes no part
+        threading.Thread(target=_show_progress, args=[simulation, ended], daemon=True).start()
+    stack.enter_context(simulation)
+    stack.callback(ended.set)
     simulation.seed(options.seed)
     if options.bag:
-        try:
-            with rosbag.Bag(options.bag) as bag:
-                # at least 1 s: a ROS time of 0 is one that is not set
-                simulation.nanoseconds = round((max(2, bag.get_start_time()) - 1) * 10**9)
-        except (OSError, rosbag.ROSBagException) as error:
-            raise ValueError(f'{options.bag} cannot be played: {error}; see ls and rosbag info')
+        with open_bag(options.bag) as bag:
+            # at least 1 s: a ROS time of 0 is one that is not set
+            simulation.nanoseconds = round((max(2, bag.get_start_time()) - 1) * 10**9)
+    simulation.begin = simulation.now
     if options.record:
         if os.path.abspath(options.record) == options.bag:
             raise ValueError(f'{options.bag} is played: record to another file')
-        simulation.record = stack.enter_context(rosbag.Bag(options.record, 'w')).write
+        simulation.record = stack.enter_context(_recorder(options.record))
     return simulation
+
+
+def _show_progress(simulation, ended):
+    """Show the time on the terminal, in one line."""
+    while not ended.wait(1):
+        print(f'{simulation.now - simulation.begin:.0f} s of ROS time', end='\r', file=sys.stderr)
+
+
+@contextlib.contextmanager
+def _recorder(path):
+    """Yield the ``write`` of a new bag."""
+    import rosbag
+
+    try:
+        with rosbag.Bag(path, 'w') as bag:
+            yield bag.write
+    except OSError as error:
+        raise ValueError(f'{path} cannot be written: {error}') from error
 
 
 def _simulate(simulation, options):
     """Play the bag, or let the time go by; show how long the command has computed."""
-    start = simulation.now
     if options.bag:
         simulation.play(options.bag, options.topics)
     else:
-        simulation.run(options.seconds)
+        simulation.run(simulation.begin + options.seconds - simulation.now)
+    simulation.record = None
     print(
-        f'{simulation.now - start:.1f} s of ROS time took {time.process_time():.1f} s of CPU; lost: {simulation.lost}'
+        f'{simulation.now - simulation.begin:.1f} s of ROS time took {time.process_time():.1f} s of CPU;'
+        f' lost: {simulation.lost}'
     )
 
 
@@ -177,3 +197,7 @@ def _read_launch_file(url, options, mappings):
     os.makedirs(home, exist_ok=True)
     os.chdir(home)
     return launch_file
+
+
+if __name__ == '__main__':
+    sys.exit(leave(run_command('compose')))

@@ -37,6 +37,9 @@ LONGEST_LOOK = 64_000  # nanoseconds: the looks of a thread that waits by looks 
 #: modules with a wait that keeps the turn: the master may take long beside load, and its calls have a
 #: limit of their own; at the prompt of a debugger, all stands still
 KEEP_TURN = xmlrpc.__name__, 'bdb'
+MAX_GAP = (
+    86400  # seconds between two messages of a bag: in a longer one, nodes would compute for hours
+)
 LAST = math.inf  # the order of a wait that ends after all others that end at the same time
 
 
@@ -44,6 +47,7 @@ class Simulation:
     """Virtual time, in a ``with``, for this thread and for all nodes that the process starts there.
 
     :ivar nanoseconds: the ROS time
+    :ivar begin: the ROS time at the begin, in seconds
     :ivar lost: the names of threads that waited for something else than time and threads, or computed
         without end, and so lost the turn: what follows may come in another order another time
     :ivar record: None, or ``record(topic, message, time)``, called with what the nodes publish
@@ -53,11 +57,13 @@ class Simulation:
     record: Any = None
     _looks = 0  # at the thread with the turn, since it got the turn
     _cpu_time = 0.0
+    _error: Any = None  # of the record
     _turn_begin = 0  # when the thread with the turn got it
 
     def __init__(self, master):
         self.master = master
         self.nanoseconds = 1_000_000_000_000_000_000  # a time with as many digits as those of today
+        self.begin = self.now
         self.lost: list[str] = []
         self._owner: Any = threading.current_thread()
         self._holder: Any = self._owner  # the thread with the turn
@@ -104,9 +110,10 @@ class Simulation:
         The time jumps to one second before the begin of the bag. If that has passed, the bag is played
         from now on; the stamps in its messages stay.
 
-        :raises PharosError: if the bag has no message of one of these topics
+        :raises PharosError: if the bag has no message of one of these topics, is damaged, or has a gap of
+            more than a day
         """
-        with rosbag.Bag(bag) as file, self.master.create(BlockNode, PLAYER) as player:
+        with open_bag(bag) as file, self.master.create(BlockNode, PLAYER) as player:
             if not all(map(file.get_message_count, topics or [None])):  # type: ignore
                 raise PharosError(f'{bag} has no messages of one of {topics}: see rosbag info')
             player.connect_timeout = 0  # a wait for a socket would take another time in each run
@@ -114,9 +121,7 @@ class Simulation:
             delay = max(0, self.nanoseconds - start)
             self.nanoseconds = max(self.nanoseconds, start - 10**9)
             channels = {}
-            for topic, message, stamp, header in file.read_messages(
-                topics, return_connection_header=True
-            ):
+            for topic, message, stamp, header in _read(bag, file, topics):
                 self.wait(stamp.to_nsec() + delay, LAST)
                 key = topic, header.get('callerid')  # several nodes may latch a message each
                 if key not in channels:
@@ -158,9 +163,20 @@ class Simulation:
         period = 0.5 if thread is self._owner else None
         while True:
             try:
-                return thread.turns.get(timeout=period)
+                thread.turns.get(timeout=period)
+                break
             except Empty:
                 self._look()
+        if self._error and thread is self._owner:
+            raise self._error
+
+    def fail(self, error):
+        """End the run: have the wait of the owner raise an error, at once."""
+        self.record = None
+        self._error = error
+        with self._lock:
+            if self._owner in self._waits:
+                self._waits[self._owner] = self.nanoseconds, -1, None
 
     def add_wait(self, thread, end, order=None, lock=None):
         """Have a thread wait, as :meth:`wait` says; if it has the turn, another thread gets it."""
@@ -263,6 +279,33 @@ class Simulation:
         self._stack.close()
         for thread in self._waits:
             thread.turns.put(None)
+
+
+def open_bag(path):
+    """Open a bag to read it.
+
+    :raises PharosError: if the file is not there, or is not a bag
+    """
+    try:
+        return rosbag.Bag(path)
+    except (OSError, rosbag.ROSBagException) as error:
+        raise PharosError(f'{path} cannot be played: {error}; see ls and rosbag info') from error
+
+
+def _read(path, bag, topics):
+    """Yield the messages of a bag, as rosbag does."""
+    last = math.inf
+    try:
+        for item in bag.read_messages(topics, return_connection_header=True):
+            gap = item.timestamp.to_sec() - last
+            if gap > MAX_GAP:
+                raise PharosError(
+                    f'{path} has a gap of {gap / 86400:.0f} days after {last} s: cut it by rosbag filter'
+                )
+            last = item.timestamp.to_sec()
+            yield item
+    except (OSError, EOFError, ValueError, rosbag.ROSBagException) as error:
+        raise PharosError(f'{path} is damaged after {last} s: {error}; see rosbag check') from error
 
 
 def _place_of(thread):

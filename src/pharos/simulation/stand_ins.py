@@ -342,7 +342,10 @@ def publish(original, run, publisher, message, *options, **more):
     original(publisher, message, *options, **more)
     record = _simulation and _simulation.record
     if record and run.name != PLAYER and publisher.name != '/rosout':
-        record(publisher.name, message, Time(0, _simulation.nanoseconds))
+        try:
+            record(publisher.name, message, Time(0, _simulation.nanoseconds))
+        except OSError as error:  # the disk is full
+            _simulation.fail(error)
 
 
 def sleep(seconds):
