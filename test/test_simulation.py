@@ -5,6 +5,7 @@ import pathlib
 import queue
 import re
 import runpy
+import textwrap
 import threading
 import time
 
@@ -208,6 +209,83 @@ def test_seeds_show_a_race(master):
     winners = [winner(seed) for seed in range(1, 6)]
     assert len(set(winners)) > 1
     assert [winner(seed) for seed in range(1, 6)] == winners
+
+
+RACES = {
+    'a transform looked up too early': """
+        buffer = tf2_ros.Buffer(); listener = tf2_ros.TransformListener(buffer)
+        rospy.sleep(1)
+        if not buffer.can_transform('map', 'robot', rospy.Time(0)): say('a bug')
+        """,
+    'a number read and written across a sleep': """
+        def add(message):
+            global count
+            former = count
+            time.sleep(0.001)
+            count = former + 1
+            calls.append(1)
+            if len(calls) == 20 != count: say('a bug')
+        calls, count = [], 0
+        subscribers = [rospy.Subscriber(topic, String, add) for topic in ('a', 'b')]
+        """,
+    'a file read while another node writes it': """
+        rate = rospy.Rate(10)
+        while not rospy.is_shutdown():
+            if os.path.exists('FILE') and not open('FILE').read(): say('a bug')
+            rate.sleep()
+        """,
+    'the order of two publishers': """
+        last = 'b'
+        def hear(message):
+            global last
+            if last == message.data: say('a bug')
+            last = message.data
+        subscriber = rospy.Subscriber('word', String, hear)
+        """,
+}
+PARTNER = """
+import tf2_ros
+from geometry_msgs.msg import TransformStamped
+rospy.init_node('partner')
+a, b, word = [rospy.Publisher(topic, String, queue_size=9) for topic in ('a', 'b', 'word')]
+broadcaster = tf2_ros.TransformBroadcaster()
+rospy.sleep(1)
+rate = rospy.Rate(10)
+while not rospy.is_shutdown():
+    transform = TransformStamped(); transform.transform.rotation.w = 1
+    transform.header.frame_id = 'map'; transform.child_frame_id = 'robot'
+    transform.header.stamp = rospy.Time.now()
+    broadcaster.sendTransform(transform)
+    a.publish('a'); b.publish('b'); word.publish(rospy.get_name()[-1])
+    with open('FILE', 'w') as file: time.sleep(0.001); file.write('x')
+    rate.sleep()
+"""
+
+
+@pytest.mark.parametrize('race', RACES)
+def test_seeds_find_races_and_bring_them_back(master, bench, race):
+    imports = "import tf2_ros\nrospy.init_node('program')\n"
+    file = str(bench.folder / 'file')
+    program = bench.write(
+        imports + textwrap.dedent(RACES[race]).replace('FILE', file) + 'rospy.spin()\n'
+    )
+    partner = bench.write(PARTNER.replace('FILE', file), 'partner')
+    names = ['partner_b', 'partner_a'] if 'order' in race else ['partner_b']
+
+    def has_bug(seed):
+        with Simulation(master) as simulation:
+            simulation.seed(seed)
+            nodes = [master.load(partner, name=name) for name in names]
+            nodes.append(master.load(program))
+            simulation.run(4)
+            for node in nodes:
+                node.stop()
+        count = len(bench.said())
+        (bench.folder / 'said').unlink(missing_ok=True)
+        return count
+
+    seed = next(seed for seed in range(1, 20) if has_bug(seed))
+    assert has_bug(seed)
 
 
 # -- clocks, and other waits

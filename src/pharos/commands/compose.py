@@ -73,6 +73,12 @@ def _parse(arguments):
     parser.add_argument(
         '--seed', type=int, default=0, help='in virtual time: other delays, by chance'
     )
+    parser.add_argument(
+        '--jitter',
+        type=float,
+        default=0.03,
+        help='with a seed: seconds that a sleep is late at most',
+    )
     options = parser.parse_args(arguments)
     if options.file and options.file[0].endswith('.py'):
         options.script = options.file
@@ -141,7 +147,7 @@ def _begin_simulation(stack, master, options):
         threading.Thread(target=_show_progress, args=[simulation, ended], daemon=True).start()
     stack.enter_context(simulation)
     stack.callback(ended.set)
-    simulation.seed(options.seed)
+    simulation.seed(options.seed, options.jitter)
     if options.bag:
         with open_bag(options.bag) as bag:
             # at least 1 s: a ROS time of 0 is one that is not set

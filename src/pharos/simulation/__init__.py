@@ -40,6 +40,7 @@ KEEP_TURN = xmlrpc.__name__, 'bdb'
 MAX_GAP = (
     86400  # seconds between two messages of a bag: in a longer one, nodes would compute for hours
 )
+JITTER = 0.03  # seconds
 LAST = math.inf  # the order of a wait that ends after all others that end at the same time
 
 
@@ -73,12 +74,16 @@ class Simulation:
         self._stack = contextlib.ExitStack()
         self.seed(0)
 
-    def seed(self, number: int) -> None:
+    def seed(self, number: int, jitter: float = JITTER) -> None:
         """Have each sleep last a little longer, by chance, and programs get other random numbers.
 
+        Programs start up to a second later, too.
+
         :param number: 0: each sleep ends when due; of those due at one time, the first to begin is first
+        :param jitter: the longest delay of a sleep, in seconds; short ones are as probable as long ones
         """
         self.seed_number = number
+        self.jitter = jitter
         self.random = random.Random(number)
         random.seed(number)
         numpy.random.seed(number)
@@ -184,7 +189,7 @@ class Simulation:
             thread.look = LOOK
             order = next(self._orders)
             if self.seed_number:
-                end += self.random.randrange(10**6)  # up to 1 ms
+                end += round(10 ** self.random.uniform(3, 9 + math.log10(max(self.jitter, 1e-6))))
         with self._lock:
             self._waits[thread] = end, order, lock
             if self._holder in (thread, None):

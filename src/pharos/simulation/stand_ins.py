@@ -23,6 +23,7 @@ from genpy import Time
 
 from pharos import service
 from pharos.compose import composition
+from pharos.compose.script_run import ScriptRun
 from pharos.errors import PharosError
 from pharos.intraprocess import callback_queues
 from pharos.intraprocess.links import runs
@@ -34,6 +35,7 @@ from pharos.shared_memory import sending
 CLOCKS = 'time', 'perf_counter', 'monotonic', 'time_ns', 'perf_counter_ns', 'monotonic_ns'
 #: looks of these modules at a clock take no time: they come more or less often, as they wait for servers
 FREE_LOOKS = 'logging', 'pharos.', 'threading', 'queue', 'subprocess', 'asyncio.'
+START_LIMIT = 1.0  # seconds that a seed delays a program's start at most
 CHILD_LIMIT = 1.5  # seconds that a child may compute while the time stands still
 PLAYER = '/bag_player'  # the node that plays bags
 #: the functions of servers' threads are in these modules
@@ -311,6 +313,13 @@ def poll_child(original, run, child):
     return original(child)
 
 
+def init_node(this_run, *args, original=ScriptRun.init_node, **options):
+    """Stand in for ``ScriptRun.init_node``: with a seed, the program goes on later, as processes do."""
+    original(this_run, *args, **options)
+    if takes_part() and _simulation.seed_number:
+        time.sleep(_simulation.random.uniform(0, START_LIMIT))
+
+
 def fork(original=os.fork):
     """Stand in for ``os.fork``: the child would wait for a turn that never comes."""
     if takes_part():
@@ -407,5 +416,6 @@ def changes():
             'environment_of': lambda pairs: (),
             'sets_environment': lambda path: '',
         },
+        ScriptRun: {'init_node': init_node},
         composition.Composition: {'_start_part': _refuse_part},
     }
