@@ -426,6 +426,105 @@ def test_prompt_of_a_debugger_stops_the_time(master, bench):
     assert bench.said() == [str(number) for number in range(40)]
 
 
+# -- the prompt
+
+STEPS = {
+    'loop': 'while not rospy.is_shutdown():\n    count += 1; rospy.sleep(0.5)\n',
+    'callback': 'def hear(message): global count; count += 1; word = message.data\n'
+    "rospy.Subscriber('word', String, hear); rospy.spin()\n",
+    'timer': 'def tick(event): global count; count += 1\n'
+    'rospy.Timer(rospy.Duration(0.5), tick); rospy.spin()\n',
+    'thread': 'def work():\n    global count\n    while True: time.sleep(0.5); count += 1\n'
+    'threading.Thread(target=work, daemon=True).start(); rospy.spin()\n',
+    'service': 'from std_srvs.srv import Empty\ndef serve(request): global count; count += 1; return []\n'
+    "rospy.Service('ask', Empty, serve); rospy.spin()\n",
+    'client': "from std_srvs.srv import Empty\nask = rospy.ServiceProxy('ask', Empty)\n"
+    'while not rospy.is_shutdown(): rospy.sleep(0.5); ask()\n',
+    'mouth': """
+class Mouth:
+    def __init__(self):
+        self.spoken, self.is_tired = 0, False
+        self.publisher = rospy.Publisher('word', String, queue_size=1)
+    def say(self, event):
+        self.spoken += 1
+        self.is_tired = self.spoken == 30
+        self.publisher.publish(str(self.spoken))
+def main():
+    mouth = Mouth()
+    rospy.Timer(rospy.Duration(0.5), mouth.say)
+    rospy.spin()
+main()
+""",
+}
+PROMPT = r'(?:>>> |In \[\d+\]: |\(step\) )$'
+
+
+class Session:
+    """A session at the prompt of compose --at, as a person has it."""
+
+    def __init__(self, seconds, *arguments):
+        command = [*COMPOSE, '--at', seconds, *arguments]
+        environ = {**os.environ, 'IPY_TEST_SIMPLE_PROMPT': '1', 'TERM': 'dumb'}
+        self.process = pexpect.spawn(
+            command[0], command[1:], encoding='utf-8', timeout=TIMEOUT, env=environ, echo=False
+        )
+        self.process.expect(PROMPT)
+
+    def ask(self, text):
+        """Type a line, and return what is printed until the next prompt."""
+        self.process.sendline(text)
+        self.process.expect(PROMPT)
+        return self.process.before
+
+    def end(self):
+        self.process.sendcontrol('d')
+        self.process.expect(pexpect.EOF)
+        self.process.close()
+        return self.process.exitstatus
+
+
+@pytest.fixture
+def session(master, bench):
+    inits = {name: f"rospy.init_node('{name}')\ncount = 0\n" for name in STEPS}
+    scripts = [bench.write(inits[name] + text, name) for name, text in STEPS.items()]
+    session = Session('12.3', '--script', *scripts)
+    yield session
+    session.process.close(force=True)
+
+
+def test_prompt_goes_to_times_and_back(session):
+    look = "print(now, node('/loop').count, node('/mouth').spoken, node('/mouth').mouth.spoken)"
+    first = session.ask(look)
+    assert first.split() == ['12.3', '25', '24', '24']
+    assert "data: \"24\"" in session.ask("topic('/word')")
+    assert 'True' in session.ask("until(lambda: node('/mouth').is_tired)")
+    assert session.ask('print(now, node("/mouth").spoken)').split()[1] == '30'
+    assert 'has no nix' in session.ask("until(lambda: node('/mouth').nix)")
+    assert 'there is no node /nix' in session.ask("node('/nix')")
+    assert 'had no message' in session.ask("topic('/nix')")
+    session.ask('at(20)')
+    assert session.ask(look).split()[1] == '41'
+    session.ask('at(12.3)')
+    assert session.ask(look) == first
+    assert session.end() == 0
+
+
+def test_prompt_steps_in_a_node(session):
+    for name in ['loop', 'callback', 'timer', 'thread', 'service']:
+        before = session.ask(f"print(now, node('/{name}').count)").split()
+        assert f'/bench/{name}(' in session.ask(f"step('/{name}')")
+        session.ask('n')
+        assert re.match('[0-9]+', session.ask('p count'))
+        session.ask('c')
+        after = session.ask(f"print(now, node('/{name}').count)").split()
+        assert float(before[0]) < float(after[0]) < float(before[0]) + 1
+        assert int(after[1]) <= int(before[1]) + 2
+    assert session.ask("step('/loop')")
+    session.ask('q')
+    assert session.ask("at(12.3); print(1)")  # the node goes on
+    assert session.end() == 0
+
+
 # -- in a test
 
 
@@ -463,6 +562,28 @@ def test_robot_of_the_example_docks(simulation, create_node):
     create_node(example['World'])
     robot = create_node(example['Robot'])
     assert simulation.run_until(lambda: robot.docked, 3600)
+
+
+def test_time_goes_on_to_a_second_and_a_moment(simulation, create_node):
+    robot = create_node(Docker)
+    simulation.at(400)
+    assert simulation.seconds == pytest.approx(400, abs=1e-6)
+    assert simulation.run_to(lambda: robot.docked, ENDLESS)
+    assert simulation.seconds == pytest.approx(500, abs=0.02)
+    assert not simulation.run_to(lambda: False, 1)
+    create_node(BlockNode, soul=lambda me: [None for _ in me.every(0.1)]).fork()
+    with pytest.raises(ZeroDivisionError):
+        simulation.run_to(lambda: simulation.seconds > 510 and 1 / 0, ENDLESS)
+    with pytest.raises(ValueError, match='have passed'):
+        simulation.at(400)
+
+
+def test_failed_test_names_the_command(simulation, bench):
+    simulation.seed(7)
+    with simulation.master.compose('robot', 'robot.launch'):
+        simulation.at(3)
+        command = 'rosrun pharos compose --seed 7 --at 3.000 robot robot.launch'
+        assert simulation.command() == command
 
 
 def test_bag_is_played_to_a_node(simulation, create_node, tmp_path):

@@ -48,7 +48,7 @@ class Simulation:
     """Virtual time, in a ``with``, for this thread and for all nodes that the process starts there.
 
     :ivar nanoseconds: the ROS time
-    :ivar begin: the ROS time at the begin, in seconds
+    :ivar begin: the ROS time at the begin, in nanoseconds
     :ivar lost: the names of threads that waited for something else than time and threads, or computed
         without end, and so lost the turn: what follows may come in another order another time
     :ivar record: None, or ``record(topic, message, time)``, called with what the nodes publish
@@ -56,19 +56,23 @@ class Simulation:
 
     allows_waits = False
     record: Any = None
+    launch_file = bag = ''
     _looks = 0  # at the thread with the turn, since it got the turn
     _cpu_time = 0.0
+    on_turn: Any = None  # None, or called in each thread that gets the turn
+    _on_wait: Any = None  # None, or called in each thread that gives it back
     _error: Any = None  # of the record
     _turn_begin = 0  # when the thread with the turn got it
 
     def __init__(self, master):
         self.master = master
         self.nanoseconds = 1_000_000_000_000_000_000  # a time with as many digits as those of today
-        self.begin = self.now
+        self.begin = self.nanoseconds
         self.lost: list[str] = []
         self._owner: Any = threading.current_thread()
         self._holder: Any = self._owner  # the thread with the turn
         self._lock = allocate_lock()  # held while the turn changes
+        self.last_messages: dict[str, Any] = {}  # topic -> message
         self._waits: dict[Any, Any] = {}  # thread -> its wait: (end, order, Lock or None)
         self._orders = itertools.count()
         self._stack = contextlib.ExitStack()
@@ -101,6 +105,53 @@ class Simulation:
         """Let so many seconds of ROS time go by."""
         self.wait(self.time_after(seconds), LAST)
 
+    @property
+    def seconds(self) -> float:
+        """The time since the begin, in seconds."""
+        return (self.nanoseconds - self.begin) / 1e9
+
+    def command(self) -> str:
+        """Return the command that goes to this second of the launch file, '' without one."""
+        if not self.launch_file:
+            return ''
+        options = f'{self.bag}--seed {self.seed_number} --at {self.seconds:.3f}'
+        return f'rosrun pharos compose {options} {self.launch_file}'
+
+    def at(self, seconds: float) -> None:
+        """Go on to that time, in seconds since the begin.
+
+        :raises ValueError: if it has passed
+        """
+        if seconds < self.seconds:
+            raise ValueError(f'{seconds} s have passed: it is {self.seconds:.3f} s')
+        self.wait(self.begin + round(seconds * 10**9), LAST)
+
+    def run_to(self, predicate: Callable[[], Any], limit: float) -> bool:
+        """Let the time go on to the first moment at which ``predicate()`` is true.
+
+        :param predicate: called in all threads, whenever one gives its turn back
+        :param limit: seconds
+        :returns: False if it does not become true
+        """
+        results: list[Any] = [predicate()]
+
+        def look():
+            try:
+                results.append(predicate())
+            except Exception as error:
+                results.append(error)
+            if results[-1]:
+                self._on_wait = None
+                self.wake()
+
+        if not results[0]:
+            self._on_wait = look
+            self.run(limit)
+            self._on_wait = None
+        if isinstance(results[-1], Exception):
+            raise results[-1]
+        return bool(results[-1])
+
     def run_until(self, predicate: Callable[[], Any], limit: float) -> Any:
         """Let the time go on until ``predicate()`` is true, for ``limit`` seconds at most.
 
@@ -118,6 +169,7 @@ class Simulation:
         :raises PharosError: if the bag has no message of one of these topics, is damaged, or has a gap of
             more than a day
         """
+        self.bag = f'--bag {bag} '
         with open_bag(bag) as file, self.master.create(BlockNode, PLAYER) as player:
             if not all(map(file.get_message_count, topics or [None])):  # type: ignore
                 raise PharosError(f'{bag} has no messages of one of {topics}: see rosbag info')
@@ -163,6 +215,8 @@ class Simulation:
         :param lock: a Lock; the wait ends when the lock is free
         """
         thread = local.thread
+        if self._on_wait:
+            self._on_wait()
         self.add_wait(thread, end, order, lock)
         # seconds between two looks for a thread that keeps the turn; the owner alone looks
         period = 0.5 if thread is self._owner else None
@@ -174,11 +228,17 @@ class Simulation:
                 self._look()
         if self._error and thread is self._owner:
             raise self._error
+        if self.on_turn and thread is not self._owner:
+            self.on_turn()
 
     def fail(self, error):
         """End the run: have the wait of the owner raise an error, at once."""
         self.record = None
         self._error = error
+        self.wake()
+
+    def wake(self):
+        """End the wait of the owner now: it gets the next turn."""
         with self._lock:
             if self._owner in self._waits:
                 self._waits[self._owner] = self.nanoseconds, -1, None
@@ -238,8 +298,12 @@ class Simulation:
         local.thread = thread
         thread.turns.get()
         try:
+            if self.on_turn:
+                self.on_turn()
             block()
         finally:
+            if self._on_wait:
+                self._on_wait()
             thread.has_ended = True
             local.thread = None
             with self._lock:
@@ -271,17 +335,25 @@ class Simulation:
 
     # -- the change of this process
 
-    def __enter__(self):
+    def resume(self):
+        """Make this process one of virtual time."""
         for owner, values in stand_ins.changes().items():
             self._stack.enter_context(mock.patch.multiple(owner, **values))
+        stand_ins.set_current(self)
+
+    def pause(self):
+        """Give this process its own functions back, while all threads that take part stand still."""
+        stand_ins.set_current(None)
+        self._stack.close()
+
+    def __enter__(self):
         self.prepare(self._owner)
         local.thread = self._owner
-        stand_ins.set_current(self)
+        self.resume()
         return self
 
     def __exit__(self, *error):
-        stand_ins.set_current(None)
-        self._stack.close()
+        self.pause()
         for thread in self._waits:
             thread.turns.put(None)
 

@@ -26,6 +26,7 @@ from pharos.compose import composition
 from pharos.compose.script_run import ScriptRun
 from pharos.errors import PharosError
 from pharos.intraprocess import callback_queues
+from pharos.intraprocess.copier import copy_of
 from pharos.intraprocess.links import runs
 from pharos.private_rospy import run, tcpros
 from pharos.private_rospy.loader import Shim
@@ -320,6 +321,12 @@ def init_node(this_run, *args, original=ScriptRun.init_node, **options):
         time.sleep(_simulation.random.uniform(0, START_LIMIT))
 
 
+def compose(master, package, file, *options, original=composition.compose):
+    """Stand in for ``composition.compose``: a failed test names the launch file."""
+    _simulation.launch_file = f'{package or ""} {file}'
+    return original(master, package, file, *options)
+
+
 def fork(original=os.fork):
     """Stand in for ``os.fork``: the child would wait for a turn that never comes."""
     if takes_part():
@@ -349,6 +356,8 @@ def is_use_simtime(original, run):
 def publish(original, run, publisher, message, *options, **more):
     """rospy only sends. This also records what a node sends, if the simulation shall."""
     original(publisher, message, *options, **more)
+    if _simulation:
+        _simulation.last_messages[publisher.name] = copy_of(message)
     record = _simulation and _simulation.record
     if record and run.name != PLAYER and publisher.name != '/rosout':
         try:
@@ -413,6 +422,7 @@ def changes():
         service: {'ignores_timeout': True},
         # all programs run here
         composition: {
+            'compose': compose,
             'environment_of': lambda pairs: (),
             'sets_environment': lambda path: '',
         },
