@@ -176,7 +176,7 @@ def test_command_is_a_module_too_and_shows_its_progress(master):
         '-m',
         'pharos.commands.compose',
         '--for',
-        '3000',
+        '600',
         '--script',
         str(PROGRAMS / 'threads'),
     ]
