@@ -1,18 +1,22 @@
 """Virtual time: unmodified programs run as fast as they can, and say the same each time."""
 import contextlib
 import os
+import pathlib
 import queue
+import re
 import runpy
+import textwrap
 import threading
 import time
 
 import genpy
+import pexpect
 import pytest
 import rosbag
 import sensor_msgs.msg
 import std_msgs.msg
 
-from helpers import COMPOSE, ROOT, TIMEOUT, Program
+from helpers import COMPOSE, INIT, PYTHON, ROOT, TIMEOUT, Program
 from pharos import BlockNode, PharosError, testing
 from pharos.simulation import Simulation
 from pharos.testing import Mailbox
@@ -122,19 +126,64 @@ def test_command_records_the_same_bytes_each_time(master, tmp_path):
     assert run('--for', '20') == run('--for', '20')
 
 
+def damage(path, new_path, start):
+    content = path.read_bytes()
+    new_path.write_bytes(content[:start] + bytes(600) + content[start + 600 :])
+
+
 @pytest.mark.parametrize(
-    'options', ['no.bag', 'a.text', 'a.bag --topics nix', 'a.bag --record a.bag']
+    'options, reason',
+    [
+        ('no.bag', 'No such file'),
+        ('a.text', 'cannot be played'),
+        ('gap.bag', 'a gap of 17361 days after 2.0 s'),
+        ('damaged.bag', 'is damaged after 15000'),
+        ('a.bag --topics nix', 'no messages'),
+        ('a.bag --record a.bag', 'record to another file'),
+    ],
 )
-def test_command_tells_of_a_bag_that_it_cannot_play(master, tmp_path, monkeypatch, options):
+def test_command_tells_of_a_bag_that_it_cannot_play(master, tmp_path, monkeypatch, options, reason):
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'a.text').write_text('no bag')
     write_bag(tmp_path / 'a.bag', 9)
+    write_bag(tmp_path / 'big.bag', 900)
+    damage(tmp_path / 'big.bag', tmp_path / 'damaged.bag', 90_000)
+    with rosbag.Bag('gap.bag', 'w') as bag:
+        for second in 2, 1500000000:
+            bag.write('/scan', sensor_msgs.msg.LaserScan(), genpy.Time(second))
     before = (tmp_path / 'a.bag').read_bytes()
     arguments = ['--bag', *options.split(), '--script', str(PROGRAMS / 'tracker')]
     with Program([*COMPOSE, *arguments], master.url) as composed:
         assert composed.wait() == 1
-    assert options.split()[0] in composed.output and 'Traceback' not in composed.output
+    assert reason in composed.output and 'Traceback' not in composed.output
+    assert options.split()[0] in composed.output
     assert (tmp_path / 'a.bag').read_bytes() == before
+
+
+def test_command_tells_of_a_full_disk(master, tmp_path):
+    record = str(tmp_path / 'out.bag')
+    arguments = ['--for', '9000', '--record', record, '--script', str(PROGRAMS / 'tracker')]
+    limit = ['prlimit', '--fsize=900000']
+    with Program([*limit, *COMPOSE, *arguments], master.url, ROS_HOME=str(tmp_path)) as composed:
+        assert composed.wait() == 1
+    assert f'compose: {record} cannot be written: [Errno 27]' in composed.output
+    assert 'has ended' not in composed.output and 'Traceback' not in composed.output
+
+
+def test_command_is_a_module_too_and_shows_its_progress(master):
+    """It records as many seconds as it shall."""
+    arguments = [
+        '-m',
+        'pharos.commands.compose',
+        '--for',
+        '600',
+        '--script',
+        str(PROGRAMS / 'threads'),
+    ]
+    session = pexpect.spawn(PYTHON, arguments, encoding='utf-8', timeout=TIMEOUT)
+    session.expect('[0-9]+ s of ROS time\r')
+    session.expect_exact('600.0 s of ROS time took')
+    session.expect(pexpect.EOF)
 
 
 def test_seeds_show_a_race(master):
@@ -160,6 +209,320 @@ def test_seeds_show_a_race(master):
     winners = [winner(seed) for seed in range(1, 6)]
     assert len(set(winners)) > 1
     assert [winner(seed) for seed in range(1, 6)] == winners
+
+
+RACES = {
+    'a transform looked up too early': """
+        buffer = tf2_ros.Buffer(); listener = tf2_ros.TransformListener(buffer)
+        rospy.sleep(1)
+        if not buffer.can_transform('map', 'robot', rospy.Time(0)): say('a bug')
+        """,
+    'a number read and written across a sleep': """
+        def add(message):
+            global count
+            former = count
+            time.sleep(0.001)
+            count = former + 1
+            calls.append(1)
+            if len(calls) == 20 != count: say('a bug')
+        calls, count = [], 0
+        subscribers = [rospy.Subscriber(topic, String, add) for topic in ('a', 'b')]
+        """,
+    'a file read while another node writes it': """
+        rate = rospy.Rate(10)
+        while not rospy.is_shutdown():
+            if os.path.exists('FILE') and not open('FILE').read(): say('a bug')
+            rate.sleep()
+        """,
+    'the order of two publishers': """
+        last = 'b'
+        def hear(message):
+            global last
+            if last == message.data: say('a bug')
+            last = message.data
+        subscriber = rospy.Subscriber('word', String, hear)
+        """,
+}
+PARTNER = """
+import tf2_ros
+from geometry_msgs.msg import TransformStamped
+rospy.init_node('partner')
+a, b, word = [rospy.Publisher(topic, String, queue_size=9) for topic in ('a', 'b', 'word')]
+broadcaster = tf2_ros.TransformBroadcaster()
+rospy.sleep(1)
+rate = rospy.Rate(10)
+while not rospy.is_shutdown():
+    transform = TransformStamped(); transform.transform.rotation.w = 1
+    transform.header.frame_id = 'map'; transform.child_frame_id = 'robot'
+    transform.header.stamp = rospy.Time.now()
+    broadcaster.sendTransform(transform)
+    a.publish('a'); b.publish('b'); word.publish(rospy.get_name()[-1])
+    with open('FILE', 'w') as file: time.sleep(0.001); file.write('x')
+    rate.sleep()
+"""
+
+
+@pytest.mark.parametrize('race', RACES)
+def test_seeds_find_races_and_bring_them_back(master, bench, race):
+    imports = "import tf2_ros\nrospy.init_node('program')\n"
+    file = str(bench.folder / 'file')
+    program = bench.write(
+        imports + textwrap.dedent(RACES[race]).replace('FILE', file) + 'rospy.spin()\n'
+    )
+    partner = bench.write(PARTNER.replace('FILE', file), 'partner')
+    names = ['partner_b', 'partner_a'] if 'order' in race else ['partner_b']
+
+    def has_bug(seed):
+        with Simulation(master) as simulation:
+            simulation.seed(seed)
+            nodes = [master.load(partner, name=name) for name in names]
+            nodes.append(master.load(program))
+            simulation.run(4)
+            for node in nodes:
+                node.stop()
+        count = len(bench.said())
+        (bench.folder / 'said').unlink(missing_ok=True)
+        return count
+
+    seed = next(seed for seed in range(1, 20) if has_bug(seed))
+    assert has_bug(seed)
+
+
+# -- clocks, and other waits
+
+#: expressions -> how much more they are after 3 s
+CLOCKS = {
+    'datetime.datetime.now()': '0:00:03.0000..',
+    'datetime.datetime.utcnow()': '0:00:03.0000..',
+    'time.monotonic()': '3.0000.*',
+    'time.time_ns()': '30000.....',
+    'time.monotonic_ns()': '30000.....',
+    'time.perf_counter_ns()': '30000.....',
+}
+YEARS = "time.strftime('%Y'), time.localtime().tm_year, time.gmtime().tm_year, time.ctime()[-4:]"
+IS_REAL = 'isinstance(datetime.datetime.now(), datetime.datetime)'
+BUSY_WAIT = '''
+end = rospy.get_time() + 3
+while rospy.get_time() < end: pass
+say(rospy.get_time() - end)'''
+LATER = 'rospy.Timer(rospy.Duration(3), lambda event: wake(), oneshot=True)\nstart = time.time()\n'
+PIPE = "readable, writable = os.pipe()\nwake = lambda: os.write(writable, b'x')\n" + LATER
+POLL = PIPE + 'poll = select.poll(); poll.register(readable)\n'
+LOOP = (
+    """
+async def main():
+    global wake
+    woken = asyncio.Event()
+    wake = functools.partial(asyncio.get_running_loop().call_soon_threadsafe, woken.set)
+    await asyncio.wait([asyncio.ensure_future(task) for task in TASKS], return_when='FIRST_COMPLETED')
+wake = None
+"""
+    + LATER
+    + """
+asyncio.run(main())
+say(time.time() - start)
+"""
+)
+#: a time, in seconds since the start
+AT_1, AT_3 = '1.0000.*', '3.0000.*'
+#: programs -> what they say
+PROGRAM_LINES = {
+    **{
+        f'start = {clock}; time.sleep(3); say({clock} - start)': line
+        for clock, line in CLOCKS.items()
+    },
+    f'say({YEARS})': '2001 2001 2001 2001',
+    'time.sleep(86400); say(datetime.date.today())': '2001-09-10',
+    f'say({IS_REAL}, issubclass(datetime.datetime, datetime.date))': 'True True',
+    'say(pickle.loads(pickle.dumps(datetime.datetime(2020, 1, 2))))': '2020-01-02 00:00:00',
+    'class Mine(datetime.datetime): pass\nsay(Mine is type(Mine.now()))': 'True',
+    BUSY_WAIT: '0.000.*|.*e-05',
+    BUSY_WAIT.replace('rospy.get_time', 'time.monotonic'): '0.000.*|.*e-05',
+    PIPE + 'select.select([readable], [], [], 5); say(time.time() - start)': AT_3,
+    PIPE + 'select.select([readable], [], [], 1); say(time.time() - start)': AT_1,
+    PIPE
+    + 'while not select.select([readable], [], [], 0)[0]: pass\nsay(time.time() - start)': '3.00.*',
+    POLL + 'poll.poll(5000); say(time.time() - start)': AT_3,
+    POLL + 'poll.poll(1000); say(time.time() - start)': AT_1,
+    LOOP.replace('TASKS', '[asyncio.sleep(1), woken.wait()]'): AT_1,
+    LOOP.replace('TASKS', '[woken.wait()]'): AT_3,
+    LOOP.replace('TASKS', '[asyncio.wait_for(woken.wait(), 1)]'): AT_1,
+    "child = subprocess.Popen(['sleep', '0.1'])\nsay(child.poll())": '0',
+    'try: os.fork()\nexcept Exception as error: say(error)': '.*use subprocess.*',
+}
+
+
+@pytest.mark.parametrize('program', PROGRAM_LINES)
+def test_program_runs_in_virtual_time(simulation, bench, program):
+    imports = "import datetime, functools, pickle, select, socket, subprocess\nrospy.init_node('program')\n"
+    text = program.replace("say(", "SAY(")
+    with bench.load(f'{imports}SAY = lambda *words: say(" ".join(map(str, words)))\n{text}\n'):
+        simulation.run(100_000)
+    assert simulation.lost == []
+    (line,) = bench.said()
+    assert re.fullmatch(PROGRAM_LINES[program], line), line
+
+
+UNSEEDED = (
+    'uuid.uuid4()',
+    'os.urandom(8)',
+    'secrets.token_hex()',
+    'random.Random().random()',
+    '[random.seed(), random.random()]',
+    'numpy.random.default_rng().random()',
+    'numpy.random.RandomState().random()',
+    "{'front', 'left', 'right', 'back'}",
+)
+
+
+def test_random_numbers_are_by_seed(master, bench):
+    values = f"for value in {', '.join(UNSEEDED)}: say(value)\n"
+    text = f'import numpy, random, secrets, uuid\n{values}{INIT}'
+    command = [*COMPOSE, '--script', bench.write(text), '--for', '1', '--seed']
+
+    def run(seed):
+        with Program([*command, seed], master.url) as composed:
+            assert composed.wait() == 0, composed.output
+        lines = bench.said()
+        (bench.folder / 'said').unlink()
+        return lines
+
+    first = run('7')
+    assert len(first) == len(UNSEEDED) and run('7') == first
+    assert not any(map(str.__eq__, run('8')[:-1], first))
+
+
+def test_thread_that_waits_by_looks_lets_others_run(simulation, create_node):
+    times = []
+
+    def look(me):
+        end = time.time() + 1
+        while time.time() < end:
+            pass
+
+    create_node(BlockNode, soul=look).fork()
+    create_node(
+        BlockNode, soul=lambda me: [times.append(time.time()) for _ in me.every(0.1)]
+    ).fork()
+    simulation.run(1.05)
+    assert len(times) == 11
+
+
+def test_prompt_of_a_debugger_stops_the_time(master, bench):
+    heard = "def hear(message):\n    if message.data == '5': breakpoint()\n    say(message.data)\n"
+    ear = bench.write(
+        f"{heard}{INIT}rospy.Subscriber('count', String, hear)\nrospy.spin()\n", 'ear'
+    )
+    count = "for n in range(40): pub.publish(str(n)); rospy.sleep(0.1)\n"
+    pub = "rospy.init_node('mouth')\npub = rospy.Publisher('count', String, queue_size=9)\n"
+    command = [*COMPOSE, '--for', '5', '--script', ear, bench.write(pub + count, 'mouth')]
+    session = pexpect.spawn(command[0], command[1:], encoding='utf-8', timeout=TIMEOUT)
+    session.expect_exact('(Pdb)')
+    with pytest.raises(pexpect.TIMEOUT):  # longer than a thread may wait for something else
+        session.expect_exact('lost', timeout=2)
+    session.sendline('c')
+    session.expect_exact('lost: []')
+    session.expect(pexpect.EOF)
+    assert bench.said() == [str(number) for number in range(40)]
+
+
+# -- the prompt
+
+STEPS = {
+    'loop': 'while not rospy.is_shutdown():\n    count += 1; rospy.sleep(0.5)\n',
+    'callback': 'def hear(message): global count; count += 1; word = message.data\n'
+    "rospy.Subscriber('word', String, hear); rospy.spin()\n",
+    'timer': 'def tick(event): global count; count += 1\n'
+    'rospy.Timer(rospy.Duration(0.5), tick); rospy.spin()\n',
+    'thread': 'def work():\n    global count\n    while True: time.sleep(0.5); count += 1\n'
+    'threading.Thread(target=work, daemon=True).start(); rospy.spin()\n',
+    'service': 'from std_srvs.srv import Empty\ndef serve(request): global count; count += 1; return []\n'
+    "rospy.Service('ask', Empty, serve); rospy.spin()\n",
+    'client': "from std_srvs.srv import Empty\nask = rospy.ServiceProxy('ask', Empty)\n"
+    'while not rospy.is_shutdown(): rospy.sleep(0.5); ask()\n',
+    'mouth': """
+class Mouth:
+    def __init__(self):
+        self.spoken, self.is_tired = 0, False
+        self.publisher = rospy.Publisher('word', String, queue_size=1)
+    def say(self, event):
+        self.spoken += 1
+        self.is_tired = self.spoken == 30
+        self.publisher.publish(str(self.spoken))
+def main():
+    mouth = Mouth()
+    rospy.Timer(rospy.Duration(0.5), mouth.say)
+    rospy.spin()
+main()
+""",
+}
+PROMPT = r'(?:>>> |In \[\d+\]: |\(step\) )$'
+
+
+class Session:
+    """A session at the prompt of compose --at, as a person has it."""
+
+    def __init__(self, seconds, *arguments):
+        command = [*COMPOSE, '--at', seconds, *arguments]
+        environ = {**os.environ, 'IPY_TEST_SIMPLE_PROMPT': '1', 'TERM': 'dumb'}
+        self.process = pexpect.spawn(
+            command[0], command[1:], encoding='utf-8', timeout=TIMEOUT, env=environ, echo=False
+        )
+        self.process.expect(PROMPT)
+
+    def ask(self, text):
+        """Type a line, and return what is printed until the next prompt."""
+        self.process.sendline(text)
+        self.process.expect(PROMPT)
+        return self.process.before
+
+    def end(self):
+        self.process.sendcontrol('d')
+        self.process.expect(pexpect.EOF)
+        self.process.close()
+        return self.process.exitstatus
+
+
+@pytest.fixture
+def session(master, bench):
+    inits = {name: f"rospy.init_node('{name}')\ncount = 0\n" for name in STEPS}
+    scripts = [bench.write(inits[name] + text, name) for name, text in STEPS.items()]
+    session = Session('12.3', '--script', *scripts)
+    yield session
+    session.process.close(force=True)
+
+
+def test_prompt_goes_to_times_and_back(session):
+    look = "print(now, node('/loop').count, node('/mouth').spoken, node('/mouth').mouth.spoken)"
+    first = session.ask(look)
+    assert first.split() == ['12.3', '25', '24', '24']
+    assert "data: \"24\"" in session.ask("topic('/word')")
+    assert 'True' in session.ask("until(lambda: node('/mouth').is_tired)")
+    assert session.ask('print(now, node("/mouth").spoken)').split()[1] == '30'
+    assert 'has no nix' in session.ask("until(lambda: node('/mouth').nix)")
+    assert 'there is no node /nix' in session.ask("node('/nix')")
+    assert 'had no message' in session.ask("topic('/nix')")
+    session.ask('at(20)')
+    assert session.ask(look).split()[1] == '41'
+    session.ask('at(12.3)')
+    assert session.ask(look) == first
+    assert session.end() == 0
+
+
+def test_prompt_steps_in_a_node(session):
+    for name in ['loop', 'callback', 'timer', 'thread', 'service']:
+        before = session.ask(f"print(now, node('/{name}').count)").split()
+        assert f'/bench/{name}(' in session.ask(f"step('/{name}')")
+        session.ask('n')
+        assert re.match('[0-9]+', session.ask('p count'))
+        session.ask('c')
+        after = session.ask(f"print(now, node('/{name}').count)").split()
+        assert float(before[0]) < float(after[0]) < float(before[0]) + 1
+        assert int(after[1]) <= int(before[1]) + 2
+    assert session.ask("step('/loop')")
+    session.ask('q')
+    assert session.ask("at(12.3); print(1)")  # the node goes on
+    assert session.end() == 0
 
 
 # -- in a test
@@ -199,6 +562,28 @@ def test_robot_of_the_example_docks(simulation, create_node):
     create_node(example['World'])
     robot = create_node(example['Robot'])
     assert simulation.run_until(lambda: robot.docked, 3600)
+
+
+def test_time_goes_on_to_a_second_and_a_moment(simulation, create_node):
+    robot = create_node(Docker)
+    simulation.at(400)
+    assert simulation.seconds == pytest.approx(400, abs=1e-6)
+    assert simulation.run_to(lambda: robot.docked, ENDLESS)
+    assert simulation.seconds == pytest.approx(500, abs=0.02)
+    assert not simulation.run_to(lambda: False, 1)
+    create_node(BlockNode, soul=lambda me: [None for _ in me.every(0.1)]).fork()
+    with pytest.raises(ZeroDivisionError):
+        simulation.run_to(lambda: simulation.seconds > 510 and 1 / 0, ENDLESS)
+    with pytest.raises(ValueError, match='have passed'):
+        simulation.at(400)
+
+
+def test_failed_test_names_the_command(simulation, bench):
+    simulation.seed(7)
+    with simulation.master.compose('robot', 'robot.launch'):
+        simulation.at(3)
+        command = 'rosrun pharos compose --seed 7 --at 3.000 robot robot.launch'
+        assert simulation.command() == command
 
 
 def test_bag_is_played_to_a_node(simulation, create_node, tmp_path):
@@ -305,6 +690,63 @@ def test_thread_that_waits_for_something_else_is_named(simulation, create_node):
     thread.join(TIMEOUT)
     os.close(readable)
     os.close(writable)
+
+
+DEADLOCK = """
+def take(first, second):
+    with first:
+        time.sleep(0.1)
+        with second: pass  # this line
+locks = threading.RLock(), threading.Lock()
+for pair in locks, locks[::-1]:
+    threading.Thread(target=take, args=pair).start()
+"""
+SELF_LOCK = 'def take():\n    lock.acquire()\n    lock.acquire()  # this line\n'
+LEFT_LOCK = 'def take(): lock.acquire()\ntake()\ntime.sleep(0.1); lock.acquire()  # this line\n'
+LOCKS = {
+    DEADLOCK: 2,
+    SELF_LOCK + 'lock = threading.Lock(); threading.Thread(target=take).start()\n': 1,
+    'condition, event = threading.Condition(), threading.Event()\n'
+    'def wait():\n    with condition: condition.wait()\n'
+    'for block in wait, event.wait: threading.Thread(target=block).start()\n': 0,
+}
+
+
+@pytest.mark.parametrize('text', LOCKS)
+def test_deadlock_is_named(master, bench, text):
+    path = bench.write(INIT + text)
+    line = pathlib.Path(path).read_text().partition('# this line')[0].count('\n') + 1
+    with Program([*COMPOSE, '--for', '1', '--script', path], master.url) as composed:
+        assert composed.wait() == int(LOCKS[text] > 0)
+    assert composed.output.count(f'{path}:{line}') == LOCKS[text]
+    assert composed.output.count('for ever') == LOCKS[text]
+
+
+def test_deadlock_with_the_test_is_named(simulation, create_node):
+    """Nobody has a turn any more."""
+    locks = threading.Lock(), threading.Lock()
+
+    def take(me):
+        with locks[0]:
+            me.sleep(1)
+            locks[1].acquire()
+
+    create_node(BlockNode, soul=take).fork()
+    with locks[1]:
+        simulation.run(2)
+        with pytest.raises(PharosError, match='(?s)for ever.*test_simulation.*test_simulation'):
+            locks[0].acquire()
+    assert simulation.deadlocks() == []
+
+
+def test_child_that_takes_long_is_named(simulation, bench):
+    simulation.allow_waits()
+    text = (
+        "import subprocess\nchild = subprocess.Popen(['sleep', '9'])\nchild.poll()\nchild.kill()\n"
+    )
+    with bench.load(INIT + text):
+        simulation.run(1)
+    assert "['sleep', '9']" in simulation.lost[0]
 
 
 def test_program_of_another_process_is_refused(simulation, bench):

@@ -169,15 +169,21 @@ def simulation(master: Master) -> Iterator[Any]:
     """Virtual time for the nodes of the test: a :class:`pharos.simulation.Simulation`.
 
     The test fails if a thread waits for something else than time and threads, unless the
-    test says ``simulation.allow_waits()``. A failed test shows the seed and the time.
+    test says ``simulation.allow_waits()``. A failed test shows the seed, the time, and the command
+    that goes there, if the test has composed a launch file.
     """
     from pharos.simulation import Simulation
 
     with Simulation(master) as simulation:
         yield simulation
-    print(f'simulation: seed {simulation.seed_number}, {simulation.now:.9f} s')
+        deadlocks = simulation.deadlocks()
+    print(
+        f'simulation: seed {simulation.seed_number}, {simulation.now:.9f} s', simulation.command()
+    )
     if simulation.lost and not simulation.allows_waits:
         pytest.fail(f'threads waited for something else: {simulation.lost}', False)
+    if deadlocks:
+        pytest.fail(f'threads wait for a lock for ever: {deadlocks}', False)
 
 
 @pytest.fixture(name='expect_failures')

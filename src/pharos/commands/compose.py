@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import pathlib
 import sys
 import threading
 import time
@@ -11,12 +12,13 @@ from typing import Any
 
 import rospkg
 
-from pharos import Master
-from pharos.commands import argument_parser
-from pharos.compose.composition import Composition
+from pharos import Master, PharosError
+from pharos.commands import argument_parser, run_command
+from pharos.compose.composition import Composition, leave
 from pharos.compose.control import reload_on_save
 from pharos.compose.launch_file import LaunchFile
 
+FOLDER = os.getcwd()  # at the start; it changes to that of ROS
 #: options that take names -> help
 NAMES = {
     'script': 'programs to run',
@@ -41,6 +43,7 @@ def compose(arguments: list[str]) -> int:
       compose --script PKG/EXECUTABLE ... [_rate:=5 old:=new ...]    programs, as rosrun runs them
       compose talker.py ...                        the same, by paths
       compose --bag drive.bag --record out.bag PKG FILE.launch    in virtual time, as fast as it goes
+      compose --at 12.3 PKG FILE.launch            a prompt at this second, while the robot stands still
 
     Programs with windows, and those with a state that a process has but once, run as plain processes; a line
     says which and why. It ends when all nodes have ended, or by Ctrl-C.
@@ -68,9 +71,16 @@ def _parse(arguments):
         parser.add_argument(f'--{name}', action='store_true', help=text)
     parser.add_argument('--bag', type=os.path.abspath, help='virtual time: play this')  # type: ignore
     parser.add_argument('--for', type=float, dest='seconds', help='so long in virtual time, no bag')
+    parser.add_argument('--at', type=float, help='in virtual time: a prompt at this second')
     parser.add_argument('--record', help='in virtual time: write what nodes publish to this bag')
     parser.add_argument(
         '--seed', type=int, default=0, help='in virtual time: other delays, by chance'
+    )
+    parser.add_argument(
+        '--jitter',
+        type=float,
+        default=0.03,
+        help='with a seed: seconds that a sleep is late at most',
     )
     options = parser.parse_args(arguments)
     if options.file and options.file[0].endswith('.py'):
@@ -88,14 +98,15 @@ def _run(stack, options, mappings):
     """Run as the options say, and return the exit status; the stack ends all."""
     master = Master(share_connections=not options.own_connections)
     simulation = None
-    if options.bag or options.seconds:
+    if options.bag or options.seconds or options.at is not None:
+        _fix_hashes(options.seed)
         # at a master of its own: a robot that runs at the usual one must not hear this
         master = stack.enter_context(Master.embedded())
         os.environ['ROS_MASTER_URI'] = master.url
         # before the composition, whose locks are to be virtual, too
         simulation = _begin_simulation(stack, master, options)
     elif options.record or options.seed:
-        raise ValueError('--record and --seed go with --bag or --for')
+        raise ValueError('--record and --seed go with --bag, --for or --at')
     elif not master.is_reachable():
         port: Any = urllib.parse.urlsplit(master.url).port
         print(f'no ROS master at {master.url}: it is started here')
@@ -107,10 +118,32 @@ def _run(stack, options, mappings):
         composition.launch(_read_launch_file(master.url, options, mappings))
     else:
         composition.run_scripts(options.script, mappings, options.here)
-    if simulation:
+    if not simulation:
+        return composition.wait()
+    if options.at is None:
         _simulate(simulation, options)
-        composition.stopping.set()  # its wait() returns at once, with the status
-    return composition.wait()
+    else:
+        _open_prompt(simulation, options, stack.close)
+    deadlocks = simulation.deadlocks()
+    for text in deadlocks:
+        print(f'waits for a lock for ever: {text}')
+    composition.stopping.set()  # its wait() returns at once, with the status
+    return composition.wait() or int(bool(deadlocks))
+
+
+def _fix_hashes(seed):
+    """Start this command anew, unless the order of its sets of texts is that of the seed."""
+    number = str(seed % 2**32)
+    if os.environ.get('PYTHONHASHSEED') != number:
+        os.environ['PYTHONHASHSEED'] = number
+        _start_again()
+
+
+def _start_again(*options):
+    """Start this command anew, in this process, with options after those that it has."""
+    command = pathlib.Path('/proc/self/cmdline').read_bytes().split(b'\0')[:-1]
+    os.chdir(FOLDER)
+    os.execv(sys.executable, [*command, *options])
 
 
 def _begin_simulation(stack, master, options):
@@ -118,36 +151,76 @@ def _begin_simulation(stack, master, options):
 
     The time begins a second before the bag: the programs have started at its first message.
     """
-    import rosbag
+    from pharos.simulation import Simulation, open_bag
 
-    from pharos.simulation import Simulation
-
-    simulation = stack.enter_context(Simulation(master))
-    simulation.seed(options.seed)
+    simulation = Simulation(master)
+    ended = threading.Event()
+    if options.at is None and sys.stderr.isatty():  # a thread from before takes no part
+        threading.Thread(target=_show_progress, args=[simulation, ended], daemon=True).start()
+    stack.enter_context(simulation)
+    stack.callback(ended.set)
+    simulation.seed(options.seed, options.jitter)
     if options.bag:
-        try:
-            with rosbag.Bag(options.bag) as bag:
-                # at least 1 s: a ROS time of 0 is one that is not set
-                simulation.nanoseconds = round((max(2, bag.get_start_time()) - 1) * 10**9)
-        except (OSError, rosbag.ROSBagException) as error:
-            raise ValueError(f'{options.bag} cannot be played: {error}; see ls and rosbag info')
+        with open_bag(options.bag) as bag:
+            # at least 1 s: a ROS time of 0 is one that is not set
+            simulation.nanoseconds = round((max(2, bag.get_start_time()) - 1) * 10**9)
+    simulation.begin = simulation.nanoseconds
     if options.record:
         if os.path.abspath(options.record) == options.bag:
             raise ValueError(f'{options.bag} is played: record to another file')
-        simulation.record = stack.enter_context(rosbag.Bag(options.record, 'w')).write
+        simulation.record = stack.enter_context(_recorder(options.record))
     return simulation
+
+
+def _show_progress(simulation, ended):
+    """Show the time on the terminal, in one line."""
+    while not ended.wait(1):
+        print(f'{simulation.seconds:.0f} s of ROS time', end='\r', file=sys.stderr)
+
+
+@contextlib.contextmanager
+def _recorder(path):
+    """Yield the ``write`` of a new bag."""
+    import rosbag
+
+    try:
+        with rosbag.Bag(path, 'w') as bag:
+            yield bag.write
+    except OSError as error:
+        raise ValueError(f'{path} cannot be written: {error}') from error
 
 
 def _simulate(simulation, options):
     """Play the bag, or let the time go by; show how long the command has computed."""
-    start = simulation.now
     if options.bag:
         simulation.play(options.bag, options.topics)
     else:
-        simulation.run(options.seconds)
+        simulation.at(options.seconds)
+    simulation.record = None
     print(
-        f'{simulation.now - start:.1f} s of ROS time took {time.process_time():.1f} s of CPU; lost: {simulation.lost}'
+        f'{simulation.seconds:.1f} s of ROS time took {time.process_time():.1f} s of CPU;'
+        f' lost: {simulation.lost}'
     )
+
+
+def _open_prompt(simulation, options, close):
+    """Go to a time, and open a prompt."""
+    from pharos.simulation.time_travel import Prompt
+
+    def play():
+        try:
+            simulation.play(options.bag, options.topics)
+        except PharosError as error:
+            simulation.fail(error)
+
+    def go_back(seconds):
+        close()
+        _start_again('--at', str(seconds))
+
+    if options.bag:
+        threading.Thread(target=play, daemon=True).start()
+    simulation.at(options.at)
+    Prompt(simulation, go_back).interact()
 
 
 def _read_launch_file(url, options, mappings):
@@ -162,3 +235,7 @@ def _read_launch_file(url, options, mappings):
     os.makedirs(home, exist_ok=True)
     os.chdir(home)
     return launch_file
+
+
+if __name__ == '__main__':
+    sys.exit(leave(run_command('compose')))

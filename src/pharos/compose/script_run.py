@@ -53,7 +53,8 @@ def start_child(original, run, self, *args, env=None, **kwargs):
     """
     original(self, *args, env=run.environ if env is None else env, **kwargs)
     former_children = getattr(run, 'children', ())
-    run.children = [self, *(child for child in former_children if child.poll() is None)]
+    # not poll(), which waits in virtual time
+    run.children = [self, *(each for each in former_children if each._internal_poll() is None)]
 
 
 class ScriptRun(Run):

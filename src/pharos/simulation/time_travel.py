@@ -1,0 +1,194 @@
+"""The prompt of ``compose --at``: the whole robot stands still at one time, to look at and to debug."""
+from __future__ import annotations
+
+import code
+import gc
+import pdb
+import sys
+from typing import Any, Callable
+
+from pharos.errors import UnknownNodeError, UnknownTopicError
+from pharos.live.editing import editable_modules
+
+LIMIT = 600.0  # seconds of ROS time
+HELP = (
+    "It stands still. at(20), at(3) back, node('/x').name, topic('/t'), step('/x'),\n"
+    "until(lambda: node('/x').n > 3); now: the time. Ctrl-D ends all."
+)
+
+
+class Program:
+    """A node's program: its names as attributes, also those in running functions and in its objects.
+
+    :param node: the node
+    """
+
+    def __init__(self, node):
+        run = node._current_run
+        modules = [run.modules.by_name.get('__main__'), *editable_modules(node)]
+        self._scopes = [vars(module) for module in modules if module]
+        self._threads = list(run.threads)
+
+    def has(self, frame):
+        """True if a frame runs a function of the program, or of its package."""
+        return any(frame.f_globals is scope for scope in self._scopes)
+
+    def _values(self):
+        """Return names and values: objects of the program's classes, running functions, modules."""
+        values = {}
+        names = {scope['__name__'] for scope in self._scopes}
+        classes = set()
+        for scope in self._scopes:
+            for each in scope.values():
+                if isinstance(each, type) and each.__module__ in names:
+                    classes.add(each)
+        for each in gc.get_objects():
+            if type(each) in classes:
+                values.update(vars(each))
+        for thread in self._threads:
+            frame = sys._current_frames().get(thread.ident)
+            while frame:
+                if self.has(frame):
+                    values.update(frame.f_locals)
+                frame = frame.f_back
+        for scope in reversed(self._scopes):
+            values.update(scope)
+        return values
+
+    def __dir__(self):
+        return list(self._values())
+
+    def __getattr__(self, name):
+        values = self._values()
+        if name not in values:
+            raise AttributeError(f'the program has no {name}: dir() lists what it has')
+        return values[name]
+
+
+class Debugger(pdb.Pdb):
+    """The debugger of a step: ``c``, ``q`` and the return of the frame lead back to the prompt."""
+
+    def __init__(self, simulation):
+        super().__init__(nosigint=True)
+        self._simulation = simulation
+        self.prompt = '(step) '
+
+    def begin(self, frame):
+        """Debug a frame, and what it calls."""
+        self.reset()
+        self.botframe = frame
+        frame.f_trace = self.trace_dispatch
+        self.set_next(frame)
+        sys.settrace(self.trace_dispatch)
+
+    def user_return(self, frame, value):
+        super().user_return(frame, value)
+        if frame is self.botframe:
+            self.set_continue()
+
+    def set_continue(self):
+        super().set_continue()
+        self._simulation.wake()
+
+    set_quit = set_continue
+
+
+class Prompt:
+    """Goes to times of a simulation, and shows the nodes.
+
+    :param go_back: ``go_back(seconds)`` begins anew, and opens the prompt at that time
+    """
+
+    def __init__(self, simulation, go_back):
+        self._simulation = simulation
+        self._go_back = go_back
+        functions = self.at, self.node, self.topic, self.step, self.until
+        self._names: dict[str, Any] = {each.__name__: each for each in functions}
+
+    def interact(self) -> None:
+        """Open the prompt; return at its end."""
+        self._names['now'] = self._simulation.seconds
+        text = f'{self._simulation.seconds:.3f} s. {HELP}'
+        self._simulation.pause()
+        try:
+            import IPython
+        except ImportError:
+            import readline  # noqa: F401: input() has a history then
+
+            code.interact(text, local=self._names, exitmsg='')
+        else:
+            IPython.embed(banner1=text, user_ns=self._names, confirm_exit=False)
+        self._simulation.resume()
+
+    def _run(self, block, *args):
+        """Call a block while the robot may move."""
+        self._simulation.resume()
+        try:
+            return block(*args)
+        finally:
+            self._names['now'] = self._simulation.seconds
+            self._simulation.pause()
+
+    def at(self, seconds: float) -> None:
+        """Go to a time: on from here, or back, by a new process that does the same."""
+        is_back = seconds < self._simulation.seconds
+        self._run(self._go_back if is_back else self._simulation.at, seconds)
+
+    def node(self, name: str) -> Any:
+        """Return the program of a node, with its names as attributes; or the node, if made with pharos."""
+        node = self._find(name)
+        return Program(node) if hasattr(node._current_run, 'main') else node
+
+    def _find(self, name):
+        nodes = {node.name: node for node in self._simulation.master.own_nodes()}
+        if name not in nodes:
+            raise UnknownNodeError(f'there is no node {name} now: there are {", ".join(nodes)}')
+        return nodes[name]
+
+    def topic(self, name: str) -> Any:
+        """Return the last message of a topic."""
+        messages = self._simulation.last_messages
+        if name not in messages:
+            raise UnknownTopicError(f'{name} had no message; these had: {", ".join(messages)}')
+        return messages[name]
+
+    def until(self, predicate: Callable[[], Any], limit: float = LIMIT) -> bool:
+        """Go on to the first moment at which ``predicate()`` is true.
+
+        :param limit: seconds of ROS time
+        :returns: False if it does not become true
+        """
+        return self._run(self._simulation.run_to, predicate, limit)
+
+    def step(self, name: str, limit: float = LIMIT) -> None:
+        """Open the debugger at the next line that a node runs, while all others stand still.
+
+        :param limit: seconds of ROS time
+        """
+        program = Program(self._find(name))
+        simulation = self._simulation
+        debugger = Debugger(simulation)
+
+        def trace(frame, event, argument):
+            if simulation.on_turn is not look:  # the debugger has begun in another thread
+                sys.settrace(None)
+            elif program.has(frame):
+                simulation.on_turn = None
+                debugger.begin(frame)
+                if event == 'call':
+                    return debugger.trace_dispatch  # at the first line
+                return debugger.trace_dispatch(frame, event, argument)
+
+        def look() -> None:
+            sys.settrace(trace)
+            frame: Any = sys._getframe()
+            while frame:
+                if program.has(frame):
+                    frame.f_trace = trace
+                frame = frame.f_back
+
+        simulation.on_turn = look
+        self._run(simulation.run, limit)
+        if simulation.on_turn is not None:
+            simulation.on_turn = None
+            print(f'{name} has run no line of its program in {limit:g} s')
