@@ -109,7 +109,7 @@ class Channel(Endpoint):
     def connections(self) -> list[tuple[str, str]]:
         """The connected peers: ``(name of the node, 'INTRAPROCESS', 'SHARED_MEMORY' or 'TCPROS')``."""
         return [
-            (peer_of(connection), connection.transport_type)
+            (peer_of(connection), connection.transport_type)  # type: ignore[misc]
             for connection in connections_of(self.ros_object)
             if peer_of(connection)
         ]

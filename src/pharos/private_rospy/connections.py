@@ -189,7 +189,7 @@ def _watch(end):
         for run in list(runs.values()):
             for look in _LOOKS:
                 attempt(look, run)
-        run = None  # else a stopped run would live until the next look
+        run = None  # type: ignore[assignment] # else a stopped run would live until the next look
         if look_count % LOOKS_PER_MASTER == 0:
             _ask_masters()
 

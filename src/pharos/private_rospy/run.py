@@ -37,6 +37,7 @@ from pharos.waiting import current, let_others_run
 
 if TYPE_CHECKING:
     from pharos.master import Master
+    from pharos.node import Node
 
 STOP_LIMIT = 2.0  # seconds that a stop waits for threads of rospy
 CLOCK_LIMIT = 3.0  # seconds until a clock that stands still is told
@@ -90,7 +91,7 @@ class Run:
     lacks_memory = False  # True if the system had no memory or descriptor for a memory file
     lifecycle = Lifecycle.STARTING
 
-    def __init__(self, node: Any, settings: Settings) -> None:
+    def __init__(self, node: Node, settings: Settings) -> None:
         self.node = node
         self.settings = settings
         self.name = settings.name
@@ -132,8 +133,8 @@ class Run:
         self.ros = self.modules.load('rospy')
         self.core = self.ros.core
         registration = self.ros.impl.registration
-        self.topic_manager = registration.get_topic_manager()
-        self.service_manager = registration.get_service_manager()
+        self.topic_manager: Any = registration.get_topic_manager()
+        self.service_manager: Any = registration.get_service_manager()
 
     def substitutes(self) -> dict[str, Any]:
         """Return the stand-ins that the node's modules import for some modules of Python.
