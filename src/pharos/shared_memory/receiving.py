@@ -15,7 +15,6 @@ import select
 import socket
 import struct
 import threading
-from typing import Any
 
 from rosgraph.network import (
     ROSHandshakeException,
@@ -73,7 +72,7 @@ class SharedMemoryHandler(ProtocolHandler):
         return [[PROTOCOL, *host_and_user()]]
 
     @property
-    def _tcpros_handler(self) -> Any:
+    def _tcpros_handler(self):
         return self.run.ros_handler.protocol_handlers[-1]
 
     # -- publishers
@@ -224,7 +223,7 @@ class Reader:
 
     def _take_messages(self) -> list[tuple[float, MemoryReceiver, functools.partial]]:
         """Wait for messages, and return them as ``(time of sending, connection, deliver)``."""
-        messages = []
+        messages: list = []
         timeout = IDLE_PERIOD
         while len(messages) < MAX_MESSAGES:
             events = self._epoll.poll(timeout)
@@ -239,7 +238,7 @@ class Reader:
             timeout = 0
         return messages
 
-    def attempt(self, connection: MemoryReceiver, function) -> Any:
+    def attempt(self, connection: MemoryReceiver, function):
         """Call a function of a connection, and return the value; an error ends the connection."""
         try:
             return function()
@@ -260,7 +259,7 @@ class MemoryReceiver(MemoryTransport):
     latch = None
     header = None
 
-    def __init__(self, topic: str, uri: str, sock: socket.socket, subscription: Any) -> None:
+    def __init__(self, topic: str, uri: str, sock: socket.socket, subscription) -> None:
         super().__init__('i', topic, uri, sock)
         self._subscription = subscription
         self.descriptor = sock.fileno()
