@@ -7,7 +7,7 @@ from typing import Any, Callable
 Block = Callable[..., Any]
 
 
-def with_arguments(block, role, least, most):
+def with_arguments(block: Block | None, role: str, least: int, most: int) -> Any:
     """Return a block that takes ``most`` arguments, and passes on as many as the given one needs.
 
     Parameters keep their defaults: ``lambda message, side=side: ...`` gets the message alone.
@@ -42,7 +42,7 @@ def with_arguments(block, role, least, most):
     return lambda *values: block(*values[:count])
 
 
-def _count_needed(signature, least, most):
+def _count_needed(signature: inspect.Signature, least: int, most: int) -> int:
     """Return how many arguments to pass: ``most`` for ``*args``, else those without a default."""
     parameters = signature.parameters.values()
     if any(parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters):
@@ -65,7 +65,7 @@ class DelegateHolder:
     _delegate_block: Block | None = None  # the delegate, as a block that takes two arguments
 
     @property
-    def delegate(self):
+    def delegate(self) -> Block | None:
         """The block run for each message, as ``block(message, channel)`` or ``block(message)``.
 
         None: no block. A channel's delegate goes before its node's. A new delegate takes effect
@@ -81,7 +81,7 @@ class DelegateHolder:
         self._delegate = block
 
 
-def block_name(block):
+def block_name(block: Block | str) -> str:
     """Return the name of a block for logs and tables; a string is its own name."""
     if isinstance(block, str):
         return block

@@ -10,7 +10,7 @@ from rospy import ROSException
 from rospy.msg import args_kwds_to_message
 
 from pharos import definitions, messages
-from pharos.blocks import DelegateHolder
+from pharos.blocks import Block, DelegateHolder
 from pharos.errors import (
     MessageTypeError,
     NodeStoppedError,
@@ -19,12 +19,13 @@ from pharos.errors import (
 )
 from pharos.intraprocess.copier import SERIALIZE_ERRORS
 from pharos.intraprocess.inboxes import Inbox
-from pharos.intraprocess.links import peer_of
+from pharos.intraprocess.links import Connection, peer_of
 from pharos.private_rospy.topics import connections_of
 from pharos.waiting import wait
 
 if TYPE_CHECKING:
     from pharos.node import Node
+    from pharos.private_rospy.run import Run
 
 QUEUE_SIZE = 1000
 
@@ -45,17 +46,17 @@ class Endpoint:
     ros_object: Any = None  # rospy's Publisher, Subscriber or Service
 
     @property
-    def _run(self):
+    def _run(self) -> Run:
         return self.node._current_run
 
-    def _open(self):
+    def _open(self) -> bool | None:
         """Register with the master; return True if a delegate has closed the endpoint meanwhile.
 
         A question to the master comes first: if it does not answer, nothing is registered.
         """
         raise NotImplementedError
 
-    def open(self):
+    def open(self) -> None:
         """Register with the master, by _open() of the subclass.
 
         The constructor calls this, and each further start of the node.
@@ -77,7 +78,7 @@ class Endpoint:
             self.closed = True
             self._close()
 
-    def _close(self):
+    def _close(self) -> None:
         if self.ros_object:
             self.ros_object.unregister()
 
@@ -91,7 +92,7 @@ class Channel(Endpoint):
 
     queue_size: int | None
 
-    def _open_on(self, node, topic, message_class):
+    def _open_on(self, node: Node, topic: str, message_class: type[Message]) -> None:
         """Set the attributes, and open the channel.
 
         :raises ValueError: if the queue_size cannot be one
@@ -109,12 +110,12 @@ class Channel(Endpoint):
     def connections(self) -> list[tuple[str, str]]:
         """The connected peers: ``(name of the node, 'INTRAPROCESS', 'SHARED_MEMORY' or 'TCPROS')``."""
         return [
-            (peer_of(connection), connection.transport_type)
+            (peer_of(connection), connection.transport_type)  # type: ignore[misc]
             for connection in connections_of(self.ros_object)
             if peer_of(connection)
         ]
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         state = 'closed ' if self.closed else ''
         return f'<{state}{type(self).__name__} {self.topic} ({self.type}) of {self._run.name}>'
 
@@ -131,14 +132,24 @@ class InputChannel(DelegateHolder, Channel, Inbox):
 
     received = 0
 
-    def __init__(self, node, topic, message_class, delegate, queue_size, inline, shared, from_):
+    def __init__(
+        self,
+        node: Node,
+        topic: str,
+        message_class: type[Message],
+        delegate: Block | None,
+        queue_size: int | None,
+        inline: bool,
+        shared: bool,
+        from_: str | None,
+    ) -> None:
         Inbox.__init__(self, None, self._run_delegate, queue_size, inline, shared)
         self.queue_bytes = node.queue_bytes
         self.from_ = from_
         self.delegate = delegate
         self._open_on(node, topic, message_class)
 
-    def _open(self):
+    def _open(self) -> bool:
         self._run.master.call('getPid')
         self.messages.clear()  # the stop has dropped the jobs of these messages
         self.attach(self._run.callback_queue)
@@ -149,11 +160,11 @@ class InputChannel(DelegateHolder, Channel, Inbox):
             self._close()
         return self.closed
 
-    def __call__(self, message):
+    def __call__(self, message: Message) -> None:
         """Take a latched message of a connection that is older than the channel; rospy calls this."""
         self.receive(message)
 
-    def _run_delegate(self, message):
+    def _run_delegate(self, message: Message) -> None:
         try:
             if self.closed:
                 return
@@ -169,7 +180,7 @@ class InputChannel(DelegateHolder, Channel, Inbox):
             delegate = self.delegate or self.node.delegate
             self._run.report_failure(error, delegate, 'delegate', message, self, self._retry)
 
-    def _retry(self, message):
+    def _retry(self, message: Message) -> None:
         """Run the delegate on a message once more, while no other delegate of the node runs."""
         self.node._check_active()
         self.callback_queue.run_exclusively(lambda: self._run_delegate(message))
@@ -183,12 +194,19 @@ class OutputChannel(Channel):
 
     sent = 0
 
-    def __init__(self, node, topic, message_class, latch=False, queue_size=QUEUE_SIZE):
+    def __init__(
+        self,
+        node: Node,
+        topic: str,
+        message_class: type[Message],
+        latch: bool = False,
+        queue_size: int | None = QUEUE_SIZE,
+    ) -> None:
         self.latch = latch
         self.queue_size = queue_size
         self._open_on(node, topic, message_class)
 
-    def open(self):
+    def open(self) -> None:
         """Advertise, and wait for the subscribers that the master knows."""
         # asked before: later subscribers learn of this publisher from the master
         subscribers = set(self._run.master.system_state()[1].get(self.topic, []))
@@ -200,13 +218,13 @@ class OutputChannel(Channel):
             self._publisher.publish(self._publisher.thaw(latched), channel=self)
         self._wait_until_connected(subscribers)
 
-    def _open(self):
+    def _open(self) -> None:
         self.ros_object = self.node.ros.Publisher(
             self.topic, self.message_class, latch=self.latch, queue_size=self.queue_size
         )
         self._publisher = self.ros_object.impl
 
-    def _wait_until_connected(self, subscribers):
+    def _wait_until_connected(self, subscribers: set[str]) -> None:
         """Wait until these nodes are connected: rospy loses messages sent before (#176).
 
         Dead nodes, which refuse connections, are left out. A node that does not connect within the
@@ -214,7 +232,7 @@ class OutputChannel(Channel):
         """
         node = self.node
 
-        def connected():
+        def connected() -> set[str | None]:
             return {peer_of(connection) for connection in self._publisher.connections}
 
         may_live = self._run.master.may_live
@@ -229,7 +247,7 @@ class OutputChannel(Channel):
                 'warning',
             )
 
-    def publish(self, *values: Any, **fields) -> None:
+    def publish(self, *values: Any, **fields: Any) -> None:
         """Send a message, or one with these values of all its fields, or with these fields.
 
         Inline delegates of nodes of this process run before this returns, unless another thread runs a
@@ -248,7 +266,7 @@ class OutputChannel(Channel):
                 raise MessageTypeError(f'{self.topic} carries {self.type}: {error}') from error
         self._publish(message)
 
-    def _publish(self, message, connection=None):
+    def _publish(self, message: Message, connection: Connection | None = None) -> None:
         """Send a message, to all or to one connection."""
         if type(message) is not self.message_class:
             self._check_type(message)
@@ -263,14 +281,14 @@ class OutputChannel(Channel):
             raise messages.explain(message, error) from error
         self.sent += 1
 
-    def _check_type(self, message):
+    def _check_type(self, message: object) -> None:
         sent_class = type(message)
         # AnyMsg has the md5sum '*'
         if getattr(sent_class, '_md5sum', None) not in (self.message_class._md5sum, '*'):
             sent_type = getattr(sent_class, '_type', repr(message)[:80])
             raise MessageTypeError(f'{self.topic} carries {self.type}, not {sent_type}')
 
-    def send(self, block=None, *, to=None, **fields) -> Message:
+    def send(self, block: Any = None, *, to: Any = None, **fields: Any) -> Message:
         """Fill a new message, or take a ready one, and send the message.
 
         :param block: ``block(message)`` fills a new message; or a dict, or a ready message
@@ -286,7 +304,7 @@ class OutputChannel(Channel):
         self._publish(message, connection)
         return message
 
-    def _connection_to(self, node):
+    def _connection_to(self, node: Any) -> Connection:
         name = self.node._peer_name(node)
         for connection in connections_of(self.ros_object):
             if peer_of(connection) == name:
@@ -321,7 +339,7 @@ class OutputChannel(Channel):
 # -- the class of a topic
 
 
-def find_to_send(node, topic, typed_as):
+def find_to_send(node: Node, topic: str, typed_as: str | type | None) -> tuple[OutputChannel, bool]:
     """Return an OutputChannel of a node for a topic, and True if the channel is a new one."""
     message_class = class_of(node, topic, typed_as)
     for channel in node.channels:
@@ -330,7 +348,7 @@ def find_to_send(node, topic, typed_as):
     return OutputChannel(node, topic, message_class), True
 
 
-def class_of(node, topic, typed_as):
+def class_of(node: Node, topic: str, typed_as: str | type | None) -> type[Message]:
     """Return the message class of a topic for a node.
 
     :param typed_as: type name or message class; None: the type known to the node or the master
@@ -356,12 +374,12 @@ def class_of(node, topic, typed_as):
     return message_class
 
 
-def _ask_definition(node, topic, type_name):
+def _ask_definition(node: Node, topic: str, type_name: str) -> str | None:
     """Return the type's definition from the header of a publisher's connection, or None."""
     if not node._settings.master.topic(topic).publishers:
         return None
 
-    def definitions_of(subscriber):
+    def definitions_of(subscriber: Any) -> list[str]:
         headers = [connection.header or {} for connection in subscriber.impl.connections]
         return [
             header['message_definition'] for header in headers if header.get('type') == type_name
@@ -373,7 +391,9 @@ def _ask_definition(node, topic, type_name):
     return found[0] if found else None
 
 
-def wait_subscribed(node, predicate, timeout, topic, *arguments):
+def wait_subscribed(
+    node: Node, predicate: Block, timeout: float | None, topic: str, *arguments: Any
+) -> Any:
     """Return the first true ``predicate(subscriber)`` of a new rospy.Subscriber."""
     # a channel would not do: the delegate that calls this holds up the node's callback queue
     subscriber = node._current_run.ros.Subscriber(topic, *arguments)

@@ -39,7 +39,7 @@ class Failure:
         #: equal for failures of one kind, which share one entry
         self.place = block, type(error), traceback.extract_tb(self._frames, -1), channel
 
-    def drop_frames(self):
+    def drop_frames(self) -> None:
         """Drop the message and the frames, which may be large."""
         self.message = None
         self._retry = None
@@ -48,7 +48,7 @@ class Failure:
         self.error.__context__ = None
         self.error.__cause__ = None
 
-    def _check_kept(self, thing):
+    def _check_kept(self, thing: object) -> None:
         if thing is None:
             raise PharosError(
                 f'{self}: only the newest {MAX_WITH_FRAMES} of blocks can be run or shown'
@@ -76,7 +76,7 @@ class Failure:
         self._check_kept(self._frames)
         open_debugger(self._frames)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         times = f', {self.count} times' if self.count > 1 else ''
         error_type = type(self.error).__name__
         return f'<Failure of {block_name(self.block)}: {error_type}: {self.error}{times}>'
@@ -87,10 +87,10 @@ class Failures(list):
 
     total = 0  #: the number of all failures, also of those dropped since
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._lock = threading.RLock()
 
-    def keep(self, failure):
+    def keep(self, failure: Failure) -> None:
         """Add a failure; replace an older one of its kind, and add the counts."""
         with self._lock:
             self.total += 1

@@ -45,30 +45,30 @@ class Parameters(collections.abc.MutableMapping):
     Values are bools, ints, floats, strings, lists and dicts. All methods ask the master.
     """
 
-    def __init__(self, call):
+    def __init__(self, call: Block) -> None:
         self._call = call
 
-    def __getitem__(self, name):
+    def __getitem__(self, name: str) -> Any:
         value = self._call('getParam', full_name(name))
         if value is None:
             raise KeyError(name)
         return value
 
-    def __setitem__(self, name, value):
+    def __setitem__(self, name: str, value: Any) -> None:
         try:
             loads(dumps((value,)))
         except Exception as error:
             raise ValueError(f'{name} cannot be set to {value!r}: {error}') from None
         self._call('setParam', full_name(name), value)
 
-    def __delitem__(self, name):
+    def __delitem__(self, name: str) -> None:
         self[name]  # raises KeyError
         self._call('deleteParam', full_name(name))
 
-    def __iter__(self):
+    def __iter__(self) -> collections.abc.Iterator[str]:
         return iter(sorted(self._call('getParamNames')))
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self._call('getParamNames'))
 
 
@@ -92,16 +92,15 @@ class Master:
     """
 
     _environ = os.environ  # for ROS_NAMESPACE; a script's Master has its own
-    _first_nodes: Any = (
-        WeakValueDictionary()
-    )  # remappings -> the first node that was created with them
+    # remappings -> the first node that was created with them
+    _first_nodes: WeakValueDictionary[tuple, Node] = WeakValueDictionary()
 
     def __init__(
         self,
         url: str | None = None,
         shared_memory: bool | None = None,
         share_connections: bool = False,
-    ):
+    ) -> None:
         url = url or os.environ.get('ROS_MASTER_URI') or 'http://localhost:11311/'
         parts = _URL.fullmatch(str(url).lower())
         if not parts:
@@ -153,12 +152,12 @@ class Master:
     def __enter__(self) -> Master:
         return self
 
-    def __exit__(self, *error):
+    def __exit__(self, *error: object) -> None:
         self.stop()
 
     # -- questions
 
-    def call(self, method: str, *args, caller_id: str = CALLER_ID) -> Any:
+    def call(self, method: str, *args: Any, caller_id: str = CALLER_ID) -> Any:
         """Call a method of the master's API, and return its value; None if the master refuses.
 
         :param method: such as 'lookupNode'
@@ -231,7 +230,7 @@ class Master:
         soul: Block | None = None,
         delegate: Block | None = None,
         argv: Sequence[str] | None = None,
-        **kwargs,
+        **kwargs: Any,
     ) -> N:
         """Create a node, start and register the node, and return the node.
 
@@ -281,7 +280,7 @@ class Master:
             raise
         return node
 
-    def _remapped_name(self, node, name, mappings):
+    def _remapped_name(self, node: Node, name: str, mappings: tuple[str, ...]) -> str:
         """Return the full name of a new node; ``__name`` goes to one node of those remappings."""
         special_names = load_mappings(mappings)
         if '__name' in special_names:
@@ -316,7 +315,7 @@ class Master:
             node.uri  # raises if the master does not know the node
         return node
 
-    def _find_node(self, name):
+    def _find_node(self, name: str) -> Node | ExternalNode:
         nodes = [node for node in self.own_nodes() if node._settings.name == name]
         if not nodes:
             from pharos.live.external_node import ExternalNode
@@ -383,7 +382,7 @@ class Master:
         self,
         package: str,
         executable: str,
-        *args,
+        *args: Any,
     ) -> RosProcess:
         """Run a program of ROS as a process at this master, as rosrun does.
 
@@ -394,7 +393,7 @@ class Master:
 
         return run_program(self.url, package, executable, args)
 
-    def launch(self, package: str | None, file: str, **args) -> RosProcess:
+    def launch(self, package: str | None, file: str, **args: Any) -> RosProcess:
         """Run a launch file in a process of roslaunch, at this master.
 
         :param package: None: ``file`` is a path
@@ -409,7 +408,7 @@ class Master:
         self,
         package: str,
         executable: str | None = None,
-        *args,
+        *args: Any,
         name: str | None = None,
         namespace: str | None = None,
         remap: dict[str, str] | None = None,
@@ -444,7 +443,7 @@ class Master:
         here: Sequence[str] = (),
         groups: Sequence[Sequence[str]] = (),
         share_connections: bool = True,
-        **args,
+        **args: Any,
     ) -> Composition:
         """Run the Python nodes of a launch file in this process.
 
@@ -475,11 +474,11 @@ class Master:
 
         return graph_of(self, seconds)
 
-    def __eq__(self, other):
+    def __eq__(self, other: object) -> bool:
         return isinstance(other, Master) and self.url == other.url
 
-    def __hash__(self):
+    def __hash__(self) -> int:
         return hash(self.url)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f'<Master {self.url}>'

@@ -13,7 +13,7 @@ from pharos.intraprocess.copier import copy_of, nested_class
 _TYPE = re.compile(r'[A-Za-z][A-Za-z0-9_]{0,127}/[A-Za-z][A-Za-z0-9_]{0,127}')
 
 
-def generated_class(suffix, type_name):
+def generated_class(suffix: str, type_name: str | type):
     """Return the class of a type that an installed Python package has, or None."""
     if not (isinstance(type_name, str) and _TYPE.fullmatch(type_name)):
         raise UnknownTypeError(
@@ -26,13 +26,13 @@ def generated_class(suffix, type_name):
         return None
 
 
-def fields_text(cls):
+def fields_text(cls: type[Message]) -> str:
     """Return the fields of a message class as text."""
     fields = zip(cls.__slots__, cls._slot_types)
     return ', '.join(f'{name}: {type_}' for name, type_ in fields) or 'no fields'
 
 
-def build(cls, block, fields):
+def build(cls: type[Message], block: object, fields: dict) -> Message:
     """Return a message that is filled by a block and by keywords, or a ready message.
 
     Dicts fill nested messages, and a list of dicts fills an array of them. numpy arrays may stand
@@ -87,7 +87,7 @@ def response(cls, value):
     return checked_copy(message)
 
 
-def checked_copy(message):
+def checked_copy(message: Message) -> Message:
     """Return a copy of the message; raise MessageTypeError if it cannot be sent."""
     try:
         return copy_of(message)
@@ -95,7 +95,7 @@ def checked_copy(message):
         raise explain(message, error) from error
 
 
-def _fill(message, fields):
+def _fill(message: Message, fields: dict) -> Message:
     cls = type(message)
     types = dict(zip(cls.__slots__, cls._slot_types))
     for name, value in fields.items():
@@ -111,7 +111,7 @@ def _fill(message, fields):
     return message
 
 
-def explain(message, error):
+def explain(message: Message, error: Exception) -> MessageTypeError:
     """Return a MessageTypeError for an exception of serializing; it names the field."""
     try:
         for name, type_name in zip(message.__slots__, message._slot_types):
@@ -122,7 +122,7 @@ def explain(message, error):
     return MessageTypeError(f'{message._type} cannot be sent: {error}: {str(message)[:200]!r}')
 
 
-def _check_list(name, type_name, value):
+def _check_list(name: str, type_name: str, value) -> None:
     """Raise an exception if a list has the wrong length or a wrong item: genpy names neither."""
     base, is_array, length = parse_type(type_name)
     if not is_array or type(value) not in (list, tuple):

@@ -6,7 +6,7 @@ import rosgraph.names
 _NODE_NAME = re.compile(r'/?[A-Za-z]\w*(/[A-Za-z]\w*)*', re.ASCII)
 
 
-def legal_name(name):
+def legal_name(name: str) -> str:
     """Return the name; raise ValueError if it is not legal for a topic, service or parameter."""
     is_text = isinstance(name, str) and name.isascii() and name.strip('/~')
     if not (is_text and rosgraph.names.is_legal_name(name)):
@@ -16,19 +16,19 @@ def legal_name(name):
     return name
 
 
-def full_name(name):
+def full_name(name: str) -> str:
     """Return a legal name with a slash in front, and none at the end."""
     return rosgraph.names.make_global_ns(legal_name(name)).rstrip('/')
 
 
-def node_name(name):
+def node_name(name: str) -> str:
     """Return the name; raise ValueError if it is not legal for a node."""
     if isinstance(name, str) and _NODE_NAME.fullmatch(name):
         return name
     raise ValueError(f'{name!r} cannot be the name of a node: give one such as /robot1/driver')
 
 
-def check_node_class(node_class, base):
+def check_node_class(node_class: type, base: type) -> None:
     """Raise TypeError if a class does not derive from Node, the base, or hides names."""
     if not (isinstance(node_class, type) and issubclass(node_class, base)):
         raise TypeError(f'a node is made of a subclass of Node, not {node_class!r}')

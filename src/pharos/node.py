@@ -92,7 +92,7 @@ class Node(DelegateHolder):
     _is_start_held = False  # True while _start_held() runs
     _has_run_soul = False  # True once fork() or execute() was called
 
-    def __init__(self, *args, **kwargs):
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
         """Do nothing: :meth:`Master.create` has given the node its name and settings.
 
         :raises PharosError: if a program calls the class, or gives this method arguments
@@ -120,18 +120,19 @@ class Node(DelegateHolder):
 
             cls.stop = functools.update_wrapper(stop, own_stop)  # type: ignore[assignment]
 
-    def _configure(self, settings, soul, delegate):
+    def _configure(self, settings: Settings, soul: Block | None, delegate: Block | None) -> None:
         with_arguments(soul, 'soul', 0, 1)  # raises if the block is not a soul
         self._settings = settings
         self._life_lock = threading.RLock()  # held by a start, stop or restart
         self._send_lock = threading.Lock()  # held while send_to() opens a channel
-        self._send_channels = {}  # (topic, type) as given to send_to -> OutputChannel
+        # (topic, type) as given to send_to -> OutputChannel
+        self._send_channels: dict[tuple, OutputChannel] = {}
         # for users: their class may give these names another meaning, so this class reads _settings
         self.name = settings.name
         self.master = settings.master
         self.domain = settings.domain
         self.tcp_port, self.xmlrpc_port = settings.ports
-        self.uri = None
+        self.uri: str | None = None
         self.soul = soul
         self.delegate = delegate
 
@@ -171,11 +172,11 @@ class Node(DelegateHolder):
                 raise
 
     @property
-    def _has_own_start(self):
+    def _has_own_start(self) -> bool:
         """True if the node's class has a start(), which opens its endpoints and forks its souls."""
         return type(self).start is not Node.start
 
-    def _start_held(self):
+    def _start_held(self) -> None:
         """Start, and let delegates run when the start() of the node's class has returned.
 
         If a user calls start(), Node.start() itself lets delegates run.
@@ -206,7 +207,7 @@ class Node(DelegateHolder):
             if self.is_running:
                 self._stop_run()
 
-    def _stop_run(self):
+    def _stop_run(self) -> None:
         try:
             self._current_run.stop(self.stop_timeout)
         except (KeyboardInterrupt, SystemExit):
@@ -216,7 +217,7 @@ class Node(DelegateHolder):
             raise
         signals.started_nodes.remove(self)
 
-    def _stop_safely(self):
+    def _stop_safely(self) -> None:
         """Stop the node, even if the stop() of its class raises; for any number of threads."""
         with self._life_lock:
             try:
@@ -282,10 +283,10 @@ class Node(DelegateHolder):
     def __enter__(self):
         return self
 
-    def __exit__(self, *error):
+    def __exit__(self, *error: object) -> None:
         self.stop()
 
-    def _check_active(self):
+    def _check_active(self) -> None:
         """Raise NodeStoppedError if the node has not started, or has stopped."""
         if not (self._current_run and self._current_run.is_active):
             raise NodeStoppedError(
@@ -345,7 +346,7 @@ class Node(DelegateHolder):
 
         return describe(self._settings.master, self._settings.name, seconds)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f'<{type(self).__name__} {self._settings.name} {self.lifecycle.value}>'
 
     # -- souls
@@ -379,23 +380,23 @@ class Node(DelegateHolder):
         thread.start()
         return thread
 
-    def _check_soul(self, block):
+    def _check_soul(self, block: Block | None) -> Block:
         """Return the block; raise an error if the node is not active or the block is not a soul."""
         self._check_active()
         if with_arguments(block, 'soul', 0, 1) is None:
             raise PharosError(f'{self._settings.name} has no soul: give it one, node.soul = block')
         self._has_run_soul = True
-        return block
+        return block  # type: ignore[return-value]
 
-    def _run_soul(self, block, required=False):
+    def _run_soul(self, block: Block, required: bool = False) -> Any:
         run = self._current_run  # a restart makes another one
         former = current.node, current.run
         current.node = self
         current.run = run
         is_node_soul = block is self.soul
 
-        def retry(message):
-            self._run_soul(self.soul if is_node_soul else block)
+        def retry(message: None) -> None:
+            self._run_soul(self.soul if is_node_soul else block)  # type: ignore[arg-type]
 
         try:
             return with_arguments(block, 'soul', 0, 1)(self)
@@ -441,7 +442,7 @@ class Node(DelegateHolder):
         run = self._current_run
         rate = run.ros.Rate(1 / seconds, reset=True)
 
-        def turns():
+        def turns() -> Iterator[int]:
             turn = 0
             while not run.stopping.is_set():
                 yield turn
@@ -485,7 +486,7 @@ class Node(DelegateHolder):
         self._check_active()
         return self._current_run.ros.resolve_name(legal_name(name).replace('~/', '~'))
 
-    def _peer_name(self, peer):
+    def _peer_name(self, peer: Any) -> str:
         """Return the full name of a Node, an ExternalNode, or a node given by its name."""
         if isinstance(peer, Node):
             return peer._settings.name
@@ -500,7 +501,7 @@ class Node(DelegateHolder):
         queue_size: int = QUEUE_SIZE,
         inline: bool = False,
         shared: bool = False,
-        from_=None,
+        from_: Any = None,
     ) -> InputChannel:
         """Receive the messages of a topic from now on.
 
@@ -550,11 +551,11 @@ class Node(DelegateHolder):
     def send_to(
         self,
         topic: str,
-        block=None,
-        *values,
+        block: Any = None,
+        *values: Any,
         typed_as: str | type | None = None,
-        to=None,
-        **fields,
+        to: Any = None,
+        **fields: Any,
     ) -> Message:
         """Send a message to a topic, and return the message.
 
@@ -611,9 +612,9 @@ class Node(DelegateHolder):
         :raises NodeStoppedError: if the node stops meanwhile
         """
         topic = self._resolve(topic)
-        received = []
+        received: list[Message] = []
 
-        def find_wanted(subscriber):
+        def find_wanted(subscriber: Any) -> list[Message]:
             """Drop messages up to the first wanted one, and return the rest."""
             while received and where and not where(received[0]):
                 del received[0]
@@ -658,7 +659,7 @@ class Node(DelegateHolder):
         self._check_active()
         return wait_for(lambda: self.lookup_service(name), timeout, f'the service {name}', self)
 
-    def parameter(self, name: str, initialized=None) -> Parameter:
+    def parameter(self, name: str, initialized: Any = None) -> Parameter:
         """Return a parameter of the server, bound both ways; '~rate' is private to the node.
 
         :param name: each call with the same name returns the same object

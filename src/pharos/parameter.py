@@ -21,7 +21,8 @@ class Parameter(Endpoint):
         self.delegate = []
         self._value = initialized
         self._read_lock = threading.Lock()
-        self._changes = collections.deque()  # the values that the blocks have not got yet
+        # the values that the blocks have not got yet
+        self._changes: collections.deque = collections.deque()
         self._blocks_lock = threading.Lock()  # held by the thread that runs the blocks
         self.open()
         if self._value is None:
@@ -29,22 +30,22 @@ class Parameter(Endpoint):
             advice = '? '.join([*near_names, 'see rosparam list'])
             node.log(f'the server has no parameter {name}: {advice}', 'warning')
 
-    def restore(self):
+    def restore(self) -> None:
         """Set the node's value if the server has none."""
         if self._value is not None and self.name not in self._run.master.parameters:
             self._run.master.parameters[self.name] = self._value
 
-    def subscribe(self):
+    def subscribe(self) -> None:
         """Have the master report changes, and read the value."""
         run = self._run
         run.master.call('subscribeParam', run.uri, self.name, caller_id=run.name)
         self.read()
 
-    def _open(self):
+    def _open(self) -> None:
         self.restore()
         self.subscribe()
 
-    def _close(self):
+    def _close(self) -> None:
         """Have the master report no more changes."""
         run = self._run
         run.master.call('unsubscribeParam', run.uri, self.name, caller_id=run.name)
@@ -61,7 +62,7 @@ class Parameter(Endpoint):
         self.node._check_active()
         return deepcopy(self._value)
 
-    def set(self, value) -> None:
+    def set(self, value: object) -> None:
         """Set the value on the server, and run the node's blocks if the value is another one.
 
         If another thread runs the blocks already, that thread runs them on this value next.
@@ -74,7 +75,7 @@ class Parameter(Endpoint):
         self._run.master.parameters[self.name] = value
         self._run.read_parameters(self.name)
 
-    def read(self):
+    def read(self) -> None:
         """Read the value from the server, and run the blocks if the value is another one."""
         with self._read_lock:
             former = self._value
@@ -86,7 +87,7 @@ class Parameter(Endpoint):
             self._changes.append(value)
         self._run_blocks()
 
-    def _run_blocks(self):
+    def _run_blocks(self) -> None:
         """Run the blocks on all changes, one after another, unless another thread does so already.
 
         A block may set the parameter: then the blocks run on that value, too, after this one.
@@ -112,7 +113,7 @@ class Parameter(Endpoint):
         self.delegate = [*self.delegate, with_arguments(block, 'block of on_change', 1, 1)]
         return block
 
-    def _run_block(self, block, value):
+    def _run_block(self, block: Block, value: object) -> None:
         try:
             block(value)
         except BaseException as error:

@@ -3,7 +3,7 @@ import os
 import sys
 
 
-def _standard_modules():
+def _standard_modules() -> frozenset:
     """Return the names of the standard library's modules."""
     if sys.version_info >= (3, 10):
         return sys.stdlib_module_names

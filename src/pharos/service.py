@@ -24,14 +24,14 @@ class OfferedService(Endpoint):
         self.delegate = with_arguments(block, 'block of a service', 1, 1)
         self.open()
 
-    def _open(self):
+    def _open(self) -> None:
         self._run.master.call('getPid')
         try:
             self.ros_object = self.node.ros.Service(self.name, self.service_class, self._answer)
         except ServiceException as error:
             raise PharosError(f'{self._run.name} offers {self.name} already: {error}') from None
 
-    def _close(self):
+    def _close(self) -> None:
         self.ros_object.shutdown()
 
     def _answer(self, request):
@@ -44,6 +44,6 @@ class OfferedService(Endpoint):
             self._run.report_failure(error, self.delegate, role, request, retry=retry)
             raise ServiceException(f'{type(error).__name__}: {error}') from error
 
-    def _answer_again(self, request):
+    def _answer_again(self, request: object) -> None:
         with suppress(ServiceException):  # _answer() has reported it
             self._answer(request)

@@ -48,22 +48,24 @@ class QuietWait:
     RuntimeError for a signal that comes before its ``yield``.)
     """
 
-    def __enter__(self):
+    def __enter__(self) -> None:
         pass
 
-    def __exit__(self, error_class, error, trace):
+    def __exit__(
+        self, error_class: type | None, error: BaseException | None, trace: object
+    ) -> bool:
         if isinstance(error, (KeyboardInterrupt, SystemExit)):
             return is_ending()
         return isinstance(error, rospy.ROSInterruptException)
 
 
-def stop_all():
+def stop_all() -> None:
     """Stop every node of this process, side by side, also if the stop() of a class raises an exception."""
     for thread in _start_stops():
         thread.join()
 
 
-def _start_stops():
+def _start_stops() -> list[threading.Thread]:
     """Begin to stop every node of this process, each in a thread, and return the threads."""
     threads = []
     for node in own_nodes():
@@ -96,7 +98,7 @@ def spin() -> None:
         sys.exit(1)
 
 
-def handle_signals():
+def handle_signals() -> None:
     """Have SIGINT, SIGTERM and SIGHUP stop the nodes and end the program.
 
     Do nothing outside the main thread, and for a signal that the program handles. An interactive
@@ -114,12 +116,12 @@ def handle_signals():
             signal.signal(number, _handle_signal)
 
 
-def is_ending():
+def is_ending() -> bool:
     """True if a signal that ends the program has come."""
     return _signal_time is not None
 
 
-def may_be_signal():
+def may_be_signal() -> bool:
     """True if an exception of this thread may come from a signal."""
     if threading.current_thread() is not threading.main_thread():
         return False  # signals come in the main thread
@@ -128,7 +130,7 @@ def may_be_signal():
     return is_ending()  # ours raises, and sets this
 
 
-def _handle_signal(number, frame):
+def _handle_signal(number: int, frame: object) -> None:
     """Stop all nodes in another thread, and raise KeyboardInterrupt or SystemExit here.
 
     A second signal that comes more than SAME_SIGNAL later ends the process at once.
@@ -148,13 +150,13 @@ def _handle_signal(number, frame):
     raise SystemExit(128 + number)
 
 
-def _stop_at_exit():
+def _stop_at_exit() -> None:
     global _is_exiting
     _is_exiting = True
     stop_all()
 
 
-def _forget_nodes():
+def _forget_nodes() -> None:
     """Forget all nodes in a forked child: they run in the parent."""
     for node in own_nodes():
         node._current_run.mark_stopped()

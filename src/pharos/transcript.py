@@ -17,7 +17,7 @@ class _Transcript:
 
     receiver: Any = None  # ``receiver(line)`` takes the lines; None: standard output does
 
-    def show(self, *things) -> None:
+    def show(self, *things: object) -> None:
         """Show things in one line, on standard output or to the receiver."""
         line = ' '.join(map(str, things))
         if self.receiver:

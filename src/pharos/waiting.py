@@ -25,7 +25,7 @@ class _Current(threading.local):
 current = _Current()
 
 
-def let_others_run():
+def let_others_run() -> None:
     """Let other threads of this process run: one that computes keeps the interpreter for 5 ms."""
     time.sleep(1e-6)  # sleep(0) may end before another thread has woken
 

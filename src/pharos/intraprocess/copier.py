@@ -8,11 +8,14 @@ message of a class that genpy did not generate in the usual way.
 
 A frozen message is a tuple with the values of all fields, or the bytes of a serialized message.
 """
+from __future__ import annotations
+
 import functools
 import io
 import itertools
 import struct
 import sys
+from typing import Any, Callable
 
 import genpy
 from genmsg.msgs import parse_type
@@ -38,7 +41,7 @@ SERIALIZE_ERRORS = (
 )
 
 
-def serialize(message):
+def serialize(message: genpy.Message) -> bytes:
     """Return the bytes of a message on the wire, without their length."""
     buffer = io.BytesIO()
     message.serialize(buffer)
@@ -46,37 +49,39 @@ def serialize(message):
 
 
 @functools.lru_cache(None)
-def copier_for(cls):
+def copier_for(cls: type[genpy.Message]) -> tuple[Callable, Callable]:
     """Return two functions for a message class: ``freeze(message)`` and ``thaw(frozen)``.
 
     ``freeze`` raises the exceptions of ``serialize``.
     """
     try:
-        return _generate(cls)
+        return _generate(cls)  # type: ignore[arg-type]
     except Exception:  # serializing is slower, but right for every class
         return serialize, lambda frozen: cls().deserialize(frozen)
 
 
-def copy_of(message):
+def copy_of(message: genpy.Message) -> genpy.Message:
     """Return a copy of a message; raise the exceptions of ``serialize``."""
     freeze, thaw = copier_for(type(message))  # type: ignore[arg-type]
     return thaw(freeze(message))
 
 
 @functools.lru_cache(None)
-def thaw_function(sent_class, wanted_class):
+def thaw_function(
+    sent_class: type[genpy.Message], wanted_class: type[genpy.Message]
+) -> Callable[[Any], genpy.Message]:
     """Return the function that thaws a message of one class as one of another, such as AnyMsg."""
-    _, thaw = copier_for(sent_class)
+    _, thaw = copier_for(sent_class)  # type: ignore[arg-type]
     if sent_class is wanted_class:
         return thaw
 
-    def thaw_as_wanted(frozen):
+    def thaw_as_wanted(frozen: Any) -> genpy.Message:
         return wanted_class().deserialize(serialize(thaw(frozen)))
 
     return thaw_as_wanted
 
 
-def size_of(frozen):
+def size_of(frozen: Any) -> int:
     """Estimate the memory of a message, frozen or not, in bytes; sample 20 items of each list."""
     if isinstance(frozen, genpy.Message):
         frozen = [getattr(frozen, name) for name in frozen.__slots__]
@@ -90,7 +95,7 @@ def size_of(frozen):
 # -- functions that the generated ones call
 
 
-def _sequence(value):
+def _sequence(value: Any) -> tuple:
     if type(value) not in (list, tuple):
         if not getattr(value, 'ndim', 0):  # no array of numpy
             raise _UnusualError
@@ -98,14 +103,14 @@ def _sequence(value):
     return tuple(value)
 
 
-def _text(value):
+def _text(value: Any) -> str:
     if type(value) is not str:
         raise _UnusualError
     value.encode()
     return value
 
 
-def _octets(value):
+def _octets(value: Any) -> bytes:
     if getattr(value, 'dtype', None) == 'uint8':
         return value.tobytes()
     if type(value) is bytes:
@@ -113,14 +118,14 @@ def _octets(value):
     return bytes(_sequence(value))
 
 
-def _number_converter(code):
+def _number_converter(code: str) -> Callable[[Any], tuple]:
     """Return a function that passes a sequence of numbers through a code of struct."""
 
     @functools.lru_cache(128)
-    def struct_for(count):
+    def struct_for(count: int) -> struct.Struct:
         return struct.Struct(f'<{count}{code}')
 
-    def convert(value):
+    def convert(value: Any) -> tuple:
         numbers = _sequence(value)
         if code == 'd' and set(map(type, numbers)) == {float}:
             return numbers
@@ -133,7 +138,7 @@ def _number_converter(code):
 _bytes_of_booleans = _number_converter('B')
 
 
-def _booleans(value):
+def _booleans(value: Any) -> tuple[bool, ...]:
     return tuple([*map(bool, _bytes_of_booleans(value))])
 
 
@@ -168,8 +173,8 @@ class _Source:
     :ivar variables: the parts of a frozen message
     """
 
-    def __init__(self, cls, depth):
-        self.namespace = dict(_GLOBALS)
+    def __init__(self, cls: type[genpy.Message], depth: int) -> None:
+        self.namespace: dict[str, Any] = dict(_GLOBALS)
         self.freeze_lines = []
         self.thaw_lines = []
         self.variables = []
@@ -179,13 +184,13 @@ class _Source:
         if self._numbers:
             self._pack_numbers()
 
-    def name_for(self, thing):
+    def name_for(self, thing: Any) -> str:
         """Return a name for a thing in the generated code."""
         name = f'g{next(self._counter)}'
         self.namespace[name] = thing
         return name
 
-    def _pack_numbers(self):
+    def _pack_numbers(self) -> None:
         """Pass all single numbers through one pack and unpack, to make them those of the wire."""
         bases, fields, variables = zip(*self._numbers)
         sent_codes = ''.join(CODES[base] for base in bases)
@@ -194,7 +199,7 @@ class _Source:
         self.namespace['unpack'] = struct.Struct(f'<{received_codes}').unpack
         self.freeze_lines.append(f'{", ".join(variables)}, = unpack(pack({", ".join(fields)}))')
 
-    def _add_fields(self, cls, owner, depth):
+    def _add_fields(self, cls: type[genpy.Message], owner: str, depth: int) -> None:
         if cls in _TIMES.values():
             base = 'uint32' if cls is genpy.Time else 'int32'
             fields = [('secs', base), ('nsecs', base)]
@@ -205,7 +210,7 @@ class _Source:
         for name, type_name in fields:
             self._add_field(cls, f'{owner}.{name}', type_name, depth)
 
-    def _add_field(self, cls, field, type_name, depth):
+    def _add_field(self, cls: type[genpy.Message], field: str, type_name: str, depth: int) -> None:
         base, is_array, length = parse_type(type_name)
         variable = f'v{next(self._counter)}'
         is_nested = base not in CODES and base != 'string'
@@ -215,7 +220,7 @@ class _Source:
         self.variables.append(variable)
         new_value = variable
         if is_nested:
-            freeze, thaw = map(self.name_for, _generate(nested_class(base, cls), 1))
+            freeze, thaw = map(self.name_for, _generate(nested_class(base, cls), 1))  # type: ignore
             # not tuple(map(...)): gc.get_objects() of another thread makes Python raise a SystemError
             self.freeze_lines.append(f'{variable} = tuple([*map({freeze}, sequence({field}))])')
             new_value = f'list(map({thaw}, {variable}))'
@@ -231,7 +236,7 @@ class _Source:
             self.freeze_lines.append(f'if len({variable}) != {length}: raise Unusual')
         self.thaw_lines.append(f'{field} = {new_value}')
 
-    def _add_message(self, cls, field, variable, depth):
+    def _add_message(self, cls: type[genpy.Message], field: str, variable: str, depth: int) -> None:
         """Add the fields of a nested message."""
         self.freeze_lines.append(f'{variable} = {field}')
         self.thaw_lines.append(f'{variable} = {field} = new({self.name_for(cls)})')
@@ -240,7 +245,7 @@ class _Source:
             self.thaw_lines.append(f'{variable}.canon()')
 
 
-def nested_class(base, cls):
+def nested_class(base: str, cls: type[genpy.Message]) -> type[genpy.Message]:
     """Return the class of a nested field.
 
     :param base: the type's name, such as 'std_msgs/Header' or 'time'
@@ -255,7 +260,7 @@ def nested_class(base, cls):
 
 
 @functools.lru_cache(None)
-def _generate(cls, depth=0):
+def _generate(cls: type[genpy.Message], depth: int = 0) -> tuple[Callable, Callable]:
     """Return ``freeze`` and ``thaw`` for a class; depth 1 is an element of an array."""
     source = _Source(cls, depth)
     class_name = source.name_for(cls)

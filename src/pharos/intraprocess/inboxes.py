@@ -26,7 +26,7 @@ class BoundedQueue:
     queue_bytes = 64 << 20
     dropped = 0
 
-    def __init__(self, queue_size: int | None = None):
+    def __init__(self, queue_size: int | None = None) -> None:
         self.messages: collections.deque[Any] = collections.deque()
         self.queue_size = queue_size
 
@@ -82,7 +82,7 @@ class Inbox(BoundedQueue):
         self._next_number = callback_queue.order.numbers.__next__
         callback_queue.order.queues[callback_queue] = None
 
-    def put(self, item, size=0):
+    def put(self, item: tuple, size: int = 0) -> None:
         """Add a message; the caller then wakes or runs the callback queue.
 
         :param item: ``(value, thaw, header)``
@@ -100,14 +100,14 @@ class Inbox(BoundedQueue):
         if count >= self._capacity:  # drop last: a receiver must not find the queue empty
             self.drop_beyond(self._capacity)  # type: ignore[arg-type]
 
-    def forget(self, job):
+    def forget(self, job: tuple) -> bool:
         """Take a job away; return False if the thread has taken the job already."""
         with suppress(ValueError):
             self._jobs.remove(job)
             return True
         return False
 
-    def run_callback(self, job):
+    def run_callback(self, job: tuple) -> None:
         """Run the callback on the message of a job; who runs the callback queue calls this."""
         try:
             self.messages.remove(job)
@@ -119,7 +119,7 @@ class Inbox(BoundedQueue):
             value._connection_header = header
         self.callback(value)
 
-    def receive(self, message, size=0, connection=None):
+    def receive(self, message: Any, size: int = 0, connection: Any = None) -> None:
         """Take a message from a connection; the thread that reads the connection calls this.
 
         :param size: the bytes of the message; 0: unknown

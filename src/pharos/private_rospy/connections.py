@@ -181,7 +181,7 @@ def _start_connecting(run, topic, uri):
 # -- the watcher
 
 
-def _watch(end):
+def _watch(end: threading.Event) -> None:
     """Look after all runs until the last one ends; every two seconds, compare with the masters."""
     look_count = 0
     while not end.wait(WATCH_PERIOD):
@@ -189,7 +189,7 @@ def _watch(end):
         for run in list(runs.values()):
             for look in _LOOKS:
                 attempt(look, run)
-        run = None  # else a stopped run would live until the next look
+        run = None  # type: ignore[assignment] # else a stopped run would live until the next look
         if look_count % LOOKS_PER_MASTER == 0:
             _ask_masters()
 
@@ -239,7 +239,7 @@ _LOOKS = (
 )
 
 
-def _ask_masters():
+def _ask_masters() -> None:
     """Ask each master for its system state, and have the runs register again what is missing."""
     live_runs = [run for run in list(runs.values()) if not run.stopping.is_set()]
     for url in {run.master.url for run in live_runs}:

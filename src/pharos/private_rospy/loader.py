@@ -49,7 +49,7 @@ class Shim:
         return getattr(self._module, name)
 
 
-def private_path():
+def private_path() -> list:
     """Return a copy of sys.path; source folders that catkin has put in front go to the end.
 
     The ``__init__`` of a package in a devel space puts its source folder in front. A program that
@@ -87,7 +87,7 @@ def _code_of(loader, name, change_time):
     return loader.get_code(name)
 
 
-def _find(name, path):
+def _find(name: str, path: tuple) -> tuple:
     """Return the spec of a module, and its code; read the code again if the file has changed.
 
     :raises ModuleNotFoundError: if there is no such module on the path
@@ -101,17 +101,17 @@ def _find(name, path):
     return spec, _code_of(spec.loader, name, change_time)
 
 
-def _import_shared(name):
+def _import_shared(name: str) -> ModuleType:
     """Import a module that all nodes share: one at a time, or circular imports as scipy's fail."""
     module = sys.modules.get(name)
     spec = getattr(module, '__spec__', None)
     if spec and not getattr(spec, '_initializing', False):
-        return module
+        return module  # type: ignore[return-value]
     with process_lock:
         return importlib._bootstrap._gcd_import(name)  # type: ignore[attr-defined]
 
 
-def source_places(top_name):
+def source_places(top_name: str) -> tuple:
     """Return the file of a top-level module, and the folders of a package.
 
     :returns: ``(file, folders)``; ``(None, [])`` for a common module or one without source
@@ -129,7 +129,7 @@ def source_places(top_name):
 
 
 @lru_cache(None)
-def _imports_of(top_name):
+def _imports_of(top_name: str) -> set:
     """Return the top-level names that a package imports; an empty set for a large one or one in C.
 
     A package that contains the word rospy counts as one that imports rospy.
@@ -150,7 +150,7 @@ def _imports_of(top_name):
 
 
 @lru_cache(None)
-def _reaches_rospy(top_name):
+def _reaches_rospy(top_name: str) -> bool:
     """True if a package names rospy, imports rosgraph or pharos, or imports a package that does."""
     seen_names = set()
     new_names = {top_name}
@@ -165,7 +165,7 @@ def _reaches_rospy(top_name):
     return bool(new_names)  # else all are seen, and none is rospy
 
 
-def _is_generated(name):
+def _is_generated(name: str) -> bool:
     """True if a module has generated messages or services, which all nodes share."""
     top_name, *rest = name.split('.')
     return rest[:1] in (['msg'], ['srv']) and top_name not in ('rospy', 'rosgraph')
@@ -203,11 +203,11 @@ class PrivateModules:
         }
 
     @property
-    def path(self):
+    def path(self) -> list:
         """The folders to search: the current ``sys.path`` of the node."""
         return self.by_name['sys'].path
 
-    def _is_private(self, name):
+    def _is_private(self, name: str) -> bool:
         """True if each node has a copy of the module. The first rule that fits decides::
 
         generated messages and services             shared
@@ -229,7 +229,7 @@ class PrivateModules:
             return False
         return _reaches_rospy(top_name) or self._is_added(top_name)
 
-    def _is_added(self, top_name):
+    def _is_added(self, top_name: str) -> bool:
         """True if a module lies in a folder that the node searches and the process does not.
 
         A site-packages folder is added to the process's sys.path instead.
@@ -270,7 +270,7 @@ class PrivateModules:
                 setattr(self.by_name[parent], leaf, self.by_name[name])
             return self.by_name[name]
 
-    def _execute(self, name, path):
+    def _execute(self, name: str, path: tuple) -> None:
         spec, code = _find(name, path)
         module = module_from_spec(spec)
         self.by_name[name] = module
@@ -301,7 +301,7 @@ class PrivateModules:
             return self._with_private_modules(module)
         return module
 
-    def _with_private_modules(self, module):
+    def _with_private_modules(self, module: ModuleType) -> Shim:
         """Return a stand-in for ``import *``, with private modules among its names.
 
         Generated messages import sys: a star import would replace the program's stand-in for sys.

@@ -5,9 +5,12 @@ target. ``original`` is the former function, and ``run`` the Run that owns the p
 ``def f(original, run)``, ``@replace(module, target)`` puts the returned object in the target's
 place. Each docstring names first the behaviour of rospy, then that of the patch ("this").
 """
+from __future__ import annotations
+
 import socket
 import threading
 from contextlib import suppress
+from typing import TYPE_CHECKING, Any, Callable
 from urllib.parse import urlsplit
 
 import rospkg
@@ -19,10 +22,13 @@ from pharos.private_rospy.loader import Shim
 from pharos.private_rospy.services import answer, call_by_proxy
 from pharos.transcript import attempt
 
+if TYPE_CHECKING:
+    from pharos.private_rospy.run import Run
+
 MAX_REQUEST = 1 << 20  # bytes of a connection header
 POLL_INTERVAL = 60  # seconds between two looks for a stop; the stop itself wakes the server
 #: module -> [(target, function that makes the replacement)]
-TABLE = {}
+TABLE: dict[str, list[tuple[str, Callable]]] = {}
 
 
 #: the client that this thread answers: its address is ``(host, port)``; if it ends the node,
@@ -30,21 +36,21 @@ TABLE = {}
 _current_client = threading.local()
 
 
-def replace(module, target):
+def replace(module: str, target: str) -> Callable:
     """Return a decorator that enters a maker of replacements into the table."""
 
-    def add_to_table(make_replacement):
+    def add_to_table(make_replacement: Callable) -> Callable:
         TABLE.setdefault(module, []).append((target, make_replacement))
         return make_replacement
 
     return add_to_table
 
 
-def patch(module, target):
+def patch(module: str, target: str) -> Callable:
     """Return a decorator that enters a function into the table, to be called for the target."""
 
-    def add_to_table(function):
-        def make_replacement(original, run):
+    def add_to_table(function: Callable) -> Callable:
+        def make_replacement(original: Callable, run: Run) -> Callable:
             return lambda *args, **kwargs: function(original, run, *args, **kwargs)
 
         replace(module, target)(make_replacement)
@@ -53,7 +59,7 @@ def patch(module, target):
     return add_to_table
 
 
-def apply(module, run):
+def apply(module: Any, run: Run) -> None:
     """Patch a private module, right after its code has run.
 
     :raises AttributeError: if a target is missing: this is not the rospy that the table is for
@@ -64,7 +70,7 @@ def apply(module, run):
         setattr(owner, name, make_replacement(getattr(owner, name), run))
 
 
-def overlay(cls, methods, run):
+def overlay(cls: Any, methods: type, run: Run) -> type:
     """Set the methods of a plain class on a private class, and return the private class.
 
     ``rospy_NAME`` is the former method, or None. A subclass would recurse:
@@ -82,7 +88,9 @@ def overlay(cls, methods, run):
 
 
 @patch('rosgraph.network', 'read_ros_handshake_header')
-def read_handshake(original, run, sock, *buffer):
+def read_handshake(
+    original: Callable, run: Run, sock: socket.socket, *buffer: Any
+) -> dict[str, str]:
     """rospy waits for ever for a silent peer, and reads headers of 4 GiB. This has limits."""
     run.limit_silence(sock)
     head = sock.recv(4, socket.MSG_WAITALL)
@@ -97,13 +105,13 @@ def read_handshake(original, run, sock, *buffer):
 
 
 @patch('rospy.impl.tcpros_base', 'TCPROSServer._tcp_server_callback')
-def accept(original, run, self, sock, address):
+def accept(original: Callable, run: Run, self: Any, sock: socket.socket, address: Any) -> None:
     """rospy shakes hands in the thread that accepts: a silent client keeps out others.
 
     This starts a thread for each client.
     """
 
-    def shake_hands():
+    def shake_hands() -> None:
         tcpros.keep_alive(sock)
         original(self, sock, address)
 
@@ -113,13 +121,13 @@ def accept(original, run, self, sock, address):
 
 
 @patch('rospy.impl.tcpros_base', 'TCPServer.run')
-def accept_clients(original, run, self):
+def accept_clients(original: Callable, run: Run, self: Any) -> None:
     """rospy's server ends for ever if the system has no descriptor left. This tries again."""
     tcpros.accept_clients(self.server_sock, run.stopping, self.inbound_handler)
 
 
 @patch('rospy.impl.tcpros_base', 'TCPServer.shutdown')
-def shutdown_server(original, run, self):
+def shutdown_server(original: Callable, run: Run, self: Any) -> None:
     """rospy closes the socket, which does not wake accept(): the port stays taken.
 
     This wakes accept(), and closes the socket.
@@ -130,7 +138,7 @@ def shutdown_server(original, run, self):
 
 
 @patch('rospy.impl.tcpros_pubsub', '_configure_pub_socket')
-def no_delay(original, run, sock, is_tcp_nodelay):
+def no_delay(original: Callable, run: Run, sock: socket.socket, is_tcp_nodelay: bool) -> None:
     """rospy sends some messages 40 ms late, unless the subscriber asks for tcp_nodelay.
 
     This sets TCP_NODELAY for all subscribers.
@@ -139,13 +147,13 @@ def no_delay(original, run, sock, is_tcp_nodelay):
 
 
 @patch('rosgraph.xmlrpc', 'XmlRpcNode.start')
-def start_xmlrpc(original, run, self):
+def start_xmlrpc(original: Callable, run: Run, self: Any) -> None:
     """rospy binds the port in another thread, and prints an error. This binds here, and raises."""
     original.__globals__['print'] = lambda text: None
     self._run_init()
     server = self.server
 
-    def serve():
+    def serve() -> None:
         with server:  # closes the server's socket at the end
             while not self.is_shutdown:
                 attempt(server.serve_forever, POLL_INTERVAL)
@@ -155,7 +163,7 @@ def start_xmlrpc(original, run, self):
 
 
 @patch('rosgraph.xmlrpc', 'XmlRpcNode.shutdown')
-def shutdown_xmlrpc(original, run, self, reason):
+def shutdown_xmlrpc(original: Callable, run: Run, self: Any, reason: str) -> None:
     """rospy only closes the socket, and its thread spins (ros_comm #2238). This ends the thread."""
     self.is_shutdown = True
     if self.server:
@@ -165,13 +173,15 @@ def shutdown_xmlrpc(original, run, self, reason):
 
 
 @patch('rosgraph.xmlrpc', 'ThreadingXMLRPCServer.process_request')
-def process_request(original, run, self, request, address):
+def process_request(
+    original: Callable, run: Run, self: Any, request: socket.socket, address: Any
+) -> None:
     """rospy's threads and sockets wait for silent clients, even after a shutdown.
 
     The threads and sockets of this end with the run.
     """
 
-    def answer():
+    def answer() -> None:
         _current_client.address = address
         _current_client.must_stop = False
         self.process_request_thread(request, address)
@@ -185,7 +195,7 @@ def process_request(original, run, self, request, address):
 
 
 @patch('rosgraph.xmlrpc', 'SilenceableXMLRPCRequestHandler.do_POST')
-def wait_for_next(original, run, self):
+def wait_for_next(original: Callable, run: Run, self: Any) -> None:
     """rospy waits for ever for the next request. This has a limit.
 
     A call that ends the node is answered before: the stop closes the connection.
@@ -203,14 +213,14 @@ def wait_for_next(original, run, self):
 
 
 @replace('rospy.core', 'signal_shutdown')
-def signal_shutdown(original, run):
+def signal_shutdown(original: Callable, run: Run) -> Callable:
     """rospy ends itself alone. This stops the node."""
     run.rospy_signal_shutdown = original
     return run.signal_shutdown
 
 
 @patch('rospy.core', 'is_shutdown')
-def is_shutdown(original, run):
+def is_shutdown(original: Callable, run: Run) -> bool:
     """rospy is shut down only at the end of a stop, which waits for loops that ask this.
 
     This is True once the stop has begun.
@@ -222,14 +232,14 @@ def is_shutdown(original, run):
 
 
 @patch('rosgraph.roslogging', 'RosStreamHandler.emit')
-def print_line(original, run, self, record):
+def print_line(original: Callable, run: Run, self: Any, record: Any) -> None:
     """rospy raises an exception if the terminal has gone, or a disk is full. This prints nothing then."""
     with suppress(OSError, ValueError):
         original(self, record)
 
 
 @replace('rosgraph.roslogging', 'rospkg')
-def cached_packages(original, run):
+def cached_packages(original: Any, run: Run) -> Shim:
     """rosgraph searches all packages for the log's configuration, for each node.
 
     This searches once for all nodes.
@@ -238,7 +248,7 @@ def cached_packages(original, run):
 
 
 @patch('rospy.impl.masterslave', 'ROSHandler._ready')
-def ready(original, run, self, uri):
+def ready(original: Callable, run: Run, self: Any, uri: str) -> None:
     """rospy registers in another thread, which then looks for departed peers for ever.
 
     This registers in this thread, and the watcher of all runs looks.
@@ -249,7 +259,7 @@ def ready(original, run, self, uri):
 
 
 @patch('rospy.impl.registration', 'RegManager.run')
-def run_registration(original, run, self):
+def run_registration(original: Callable, run: Run, self: Any) -> None:
     """rospy connects to new publishers and looks for departed peers, in a thread for each node.
 
     This returns at once: publisher_update() connects, and the watcher of all runs looks.
@@ -257,13 +267,15 @@ def run_registration(original, run, self):
 
 
 @patch('rospy.impl.masterslave', 'ROSHandler._shutdown')
-def shut_down(original, run, self, reason=''):
+def shut_down(original: Callable, run: Run, self: Any, reason: str = '') -> None:
     """rospy closes all connections here. This leaves the closing to the run's stop."""
     self.done = True
 
 
 @patch('rospy.impl.masterslave', 'ROSHandler.shutdown')
-def shut_down_from_outside(original, run, self, caller_id, msg=''):
+def shut_down_from_outside(
+    original: Callable, run: Run, self: Any, caller_id: str, msg: str = ''
+) -> tuple[int, str, int]:
     """rospy obeys every caller, also a call for an earlier node at its URI (ros_comm #2241).
 
     This obeys callers on this host and on the master's, or all if allow_remote_shutdown is True.
@@ -288,19 +300,19 @@ def shut_down_from_outside(original, run, self, caller_id, msg=''):
 
 
 @replace('rospy.topics', '_PublisherImpl')
-def overlay_publisher(original, run):
+def overlay_publisher(original: Any, run: Run) -> type:
     """rospy serializes for all receivers. This freezes for links; see PublisherOverlay."""
     return overlay(original, topics.PublisherOverlay, run)
 
 
 @replace('rospy.topics', '_SubscriberImpl')
-def overlay_subscription(original, run):
+def overlay_subscription(original: Any, run: Run) -> type:
     """rospy runs callbacks in the threads that read. This has inboxes; see SubscriptionOverlay."""
     return overlay(original, topics.SubscriptionOverlay, run)
 
 
 @patch('rospy.topics', 'Subscriber.__init__')
-def subscribe(original, run, self, *args, **kwargs):
+def subscribe(original: Callable, run: Run, self: Any, *args: Any, **kwargs: Any) -> None:
     """rospy connects before the callback is there. This connects after, as add_callback() does."""
     original(self, *args, **kwargs)
     if self.callback is None:  # otherwise add_callback() has connected
@@ -308,13 +320,22 @@ def subscribe(original, run, self, *args, **kwargs):
 
 
 @patch('rospy.topics', 'QueuedConnection')
-def queue_connection(original, run, connection, queue_size):
+def queue_connection(original: Callable, run: Run, connection: Any, queue_size: int | None) -> Any:
     """rospy's queue is not bounded. A Sender's is; PublisherOverlay has put one there."""
     return connection
 
 
 @patch('rospy.impl.tcpros_pubsub', 'robust_connect_subscriber')
-def receive_and_retry(original, run, connection, address, port, uri, callback, topic):
+def receive_and_retry(
+    original: Callable,
+    run: Run,
+    connection: Any,
+    address: Any,
+    port: int,
+    uri: str,
+    callback: Any,
+    topic: str,
+) -> None:
     """rospy gives up silently, or tries ever more rarely. This logs, and tries each second.
 
     A publisher of another type is a failure of the node, and is not tried again.
@@ -324,7 +345,9 @@ def receive_and_retry(original, run, connection, address, port, uri, callback, t
 
 
 @patch('rospy.impl.registration', 'RegManager.reg_added')
-def register_once(original, run, self, name, data, registry):
+def register_once(
+    original: Callable, run: Run, self: Any, name: str, data: str, registry: str
+) -> None:
     """rospy tries for ever, and holds the lock of all topics. This tries once.
 
     The watcher registers later whatever the master lacks.
@@ -333,7 +356,7 @@ def register_once(original, run, self, name, data, registry):
 
 
 @patch('rospy.impl.registration', 'RegManager.publisher_update')
-def publisher_update(original, run, self, name, uris):
+def publisher_update(original: Callable, run: Run, self: Any, name: str, uris: list[str]) -> None:
     """rospy: ``for uri in uris: publisher_update(name, uris)``; a thread connects to each.
 
     This connects to all at the first call.
@@ -346,7 +369,7 @@ def publisher_update(original, run, self, name, uris):
 
 
 @patch('rospy.impl.masterslave', 'ROSHandler.publisherUpdate')
-def publishers_changed(original, run, self, *args):
+def publishers_changed(original: Callable, run: Run, self: Any, *args: Any) -> tuple[int, str, int]:
     """rospy ignores an update that the last publisher has left. This forgets the publishers.
 
     rospy then calls publisher_update() above, unless the list is empty.
@@ -358,7 +381,7 @@ def publishers_changed(original, run, self, *args):
 
 
 @patch('rospy.impl.registration', 'RegManager.cleanup')
-def cleanup(original, run, self, reason):
+def cleanup(original: Callable, run: Run, self: Any, reason: str) -> None:
     """rospy closes nothing if the master does not answer in time. This tells it, and closes all topics."""
     try:
         original(self, reason)
@@ -372,7 +395,7 @@ def cleanup(original, run, self, reason):
 
 
 @patch('actionlib.simple_action_client', 'SimpleActionClient.send_goal')
-def send_goal(original, run, self, *args, **kwargs):
+def send_goal(original: Callable, run: Run, self: Any, *args: Any, **kwargs: Any) -> None:
     """actionlib drops an answer that comes before send_goal() returns. Here the answer waits.
 
     No callback that waits for its turn begins meanwhile: the feedback stays before the result.
@@ -390,7 +413,7 @@ def send_goal(original, run, self, *args, **kwargs):
 
 
 @patch('rospy.impl.masterslave', 'ROSHandler.paramUpdate')
-def parameter_changed(original, run, self, *args):
+def parameter_changed(original: Callable, run: Run, self: Any, *args: Any) -> tuple[int, str, int]:
     """rospy updates its own cache alone. This updates the node's parameters, too."""
     if len(args) > 1:  # rospy refuses a call with too few arguments
         run.read_parameters(args[1])
@@ -399,14 +422,14 @@ def parameter_changed(original, run, self, *args):
 
 @patch('rospy.msproxy', 'MasterProxy.__setitem__')
 @patch('rospy.msproxy', 'MasterProxy.__delitem__')
-def set_parameter(original, run, self, key, *value):
+def set_parameter(original: Callable, run: Run, self: Any, key: str, *value: Any) -> None:
     """The master calls all other nodes at a change. This updates the node's own parameters, too."""
     original(self, key, *value)
     run.read_parameters(run.ros.resolve_name(key))
 
 
 @replace('rospy.impl.rosout', 'rospy')
-def rosout_without_master(original, run):
+def rosout_without_master(original: Any, run: Run) -> Shim:
     """rospy asks the master at each log line, which registers a stopping node anew.
 
     This returns the default, and asks nobody.
@@ -415,13 +438,13 @@ def rosout_without_master(original, run):
 
 
 @replace('rospy.service', 'ServiceException')
-def service_exception(original, run):
+def service_exception(original: Any, run: Run) -> type[Exception]:
     """rospy's ServiceException would be another class for each node. Here all nodes share one."""
     return rospy.ServiceException
 
 
 @patch('rospy.impl.tcpros_service', 'ServiceProxy.call')
-def call_service(original, run, self, *args, **kwargs):
+def call_service(original: Callable, run: Run, self: Any, *args: Any, **kwargs: Any) -> Any:
     """rospy asks the master and connects for each call. A service of this process answers here.
 
     The caller waits for the answer anyway: so its thread may run the service's handler.
@@ -434,7 +457,7 @@ def call_service(original, run, self, *args, **kwargs):
 
 
 @patch('rospy.impl.tcpros_service', 'ServiceImpl.handle')
-def handle_call(original, run, self, connection, header):
+def handle_call(original: Callable, run: Run, self: Any, connection: Any, header: dict) -> None:
     """rospy's thread ends with an exception if the client has gone. This closes the connection."""
     try:
         answer(run, original, self, connection, header)

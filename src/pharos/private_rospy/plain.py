@@ -22,10 +22,10 @@ def guide(rospy, nodes):
     """
     had_nodes = False
 
-    def watch(owner, attribute, name):
+    def watch(owner: object, attribute: str, name: str) -> None:
         original = getattr(owner, attribute)
 
-        def call(*args, **kwargs):
+        def call(*args: object, **kwargs: object) -> object:
             if rospy.core.is_initialized():
                 setattr(owner, attribute, original)  # or the log would name this file
             elif nodes():
@@ -49,7 +49,7 @@ def guide(rospy, nodes):
         watch(getattr(rospy, name), '__init__', name)
 
 
-def _advise(name):
+def _advise(name: str) -> None:
     """Say what to write instead of a call of rospy, once for each place of such a call."""
     caller = sys._getframe(2)
     module = caller.f_globals['__name__'].partition('.')[0]

@@ -37,6 +37,7 @@ from pharos.waiting import current, let_others_run
 
 if TYPE_CHECKING:
     from pharos.master import Master
+    from pharos.node import Node
 
 STOP_LIMIT = 2.0  # seconds that a stop waits for threads of rospy
 CLOCK_LIMIT = 3.0  # seconds until a clock that stands still is told
@@ -89,28 +90,34 @@ class Run:
     uri = ''  # of the XML-RPC server; '' until the server runs
     lacks_memory = False  # True if the system had no memory or descriptor for a memory file
     lifecycle = Lifecycle.STARTING
+    rospy_signal_shutdown: Callable
 
-    def __init__(self, node: Any, settings: Settings) -> None:
+    def __init__(self, node: Node, settings: Settings) -> None:
         self.node = node
         self.settings = settings
         self.name = settings.name
         self.master = settings.master
         self.failures = Failures()
         # thread that runs -> its block, None for the node's soul, and True if it is required
-        self.souls = {}
-        self.ended_souls = collections.deque(maxlen=10)  # names, the newest last
+        self.souls: dict[threading.Thread, tuple[Any, bool]] = {}
+        # names, the newest last
+        self.ended_souls: collections.deque[str] = collections.deque(maxlen=10)
         self.endpoints = []  # also those that the stop has closed, for the next start
         self.stopping = threading.Event()  # set when a stop begins: sleeps and waits end
         self.finished = threading.Event()  # set at the end of a stop: threads left behind end
-        self.threads = set()
+        self.threads: set[threading.Thread] = set()
         self.ended_cpu_seconds = 0.0  # of threads that have ended
-        self.troubles = set()  # texts for the log: a publisher must not log while it holds locks
-        self.sockets = WeakSet()
-        self.calls = WeakSet()  # sockets of calls of services
-        self.deadlines = {}  # socket of a silent client -> the time when it is closed
-        self.publisher_uris = {}  # topic -> URIs, the last list of the master
-        self.retries = {}  # (topic, URI) -> the time to connect again, and the last error
-        self.connecting = set()  # (topic, URI, id of the subscription) of attempts that go on
+        # texts for the log: a publisher must not log while it holds locks
+        self.troubles: set[str] = set()
+        self.sockets: WeakSet[socket.socket] = WeakSet()
+        self.calls: WeakSet[socket.socket] = WeakSet()  # sockets of calls of services
+        # socket of a silent client -> the time when it is closed
+        self.deadlines: dict[socket.socket, float] = {}
+        self.publisher_uris: dict[str, list[str]] = {}  # topic -> URIs, the last list of the master
+        # (topic, URI) -> the time to connect again, and the last error
+        self.retries: dict[tuple[str, str], tuple[float, str]] = {}
+        # (topic, URI, id of the subscription) of attempts that go on
+        self.connecting: set[tuple[str, str, int]] = set()
         self.callback_order = CallbackOrder(self.start_thread)
         # the pause ends when the node's start() has returned
         self.callback_queue = CallbackQueue(self.callback_order, HOLD_LIMIT)
@@ -129,11 +136,11 @@ class Run:
         remember_text(sys.modules.get(type(node).__module__))
         patch = functools.partial(patches.apply, run=self)
         self.modules = PrivateModules(self.substitutes(), patch)
-        self.ros = self.modules.load('rospy')
+        self.ros: Any = self.modules.load('rospy')
         self.core = self.ros.core
         registration = self.ros.impl.registration
-        self.topic_manager = registration.get_topic_manager()
-        self.service_manager = registration.get_service_manager()
+        self.topic_manager: Any = registration.get_topic_manager()
+        self.service_manager: Any = registration.get_service_manager()
 
     def substitutes(self) -> dict[str, Any]:
         """Return the stand-ins that the node's modules import for some modules of Python.
@@ -311,7 +318,7 @@ class Run:
 
     # -- start
 
-    def start(self, **options) -> None:
+    def start(self, **options: Any) -> None:
         """Bind the ports, start the servers, and set the address and ports of the node.
 
         :param options: further options of ``rospy.init_node``
@@ -401,7 +408,7 @@ class Run:
         deadline = monotonic() + timeout
         for publisher in list(self.topic_manager.pubs.values()):
             publisher.flush(deadline)
-        self.rospy_signal_shutdown('stop')  # type: ignore[attr-defined]
+        self.rospy_signal_shutdown('stop')
 
     def _begin_stop(self) -> None:
         """End sleeps, waits and service calls of the node."""
@@ -428,7 +435,7 @@ class Run:
         has_ended = self.callback_queue.close(timeout)
         if not has_ended:
             left_behind.append('a delegate')
-            self.threads.discard(self.callback_queue.thread)
+            self.threads.discard(self.callback_queue.thread)  # type: ignore[arg-type]
         if left_behind:
             self.ros.logwarn(
                 f'left behind, since they did not end in time: {", ".join(left_behind)}'

@@ -25,13 +25,13 @@ _CREDENTIALS = struct.Struct('3i')  # numbers of the process, the user, and the 
 _LENGTH = struct.Struct('<I')
 
 
-def shutdown_socket(sock):
+def shutdown_socket(sock: socket.socket) -> None:
     """Shut a socket down, which wakes a thread that reads from the socket; close() wakes none."""
     with contextlib.suppress(OSError):
         sock.shutdown(socket.SHUT_RDWR)
 
 
-def keep_alive(sock):
+def keep_alive(sock: socket.socket) -> None:
     """Have a connection break within 30 s if the other host has silently gone."""
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 10)
@@ -39,7 +39,7 @@ def keep_alive(sock):
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 4)
 
 
-def check_user(sock):
+def check_user(sock: socket.socket) -> None:
     """Raise PermissionError if the process at the other end of a local socket has another user."""
     credentials = sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
     _, user, _ = _CREDENTIALS.unpack(credentials)
@@ -47,7 +47,7 @@ def check_user(sock):
         raise PermissionError(f'a process of user {user}')
 
 
-def accept_clients(listener, stopping, take):
+def accept_clients(listener: socket.socket, stopping: threading.Event, take) -> None:
     """Accept clients, and call ``take(sock, address)`` for each; tell errors, and try again.
 
     :param stopping: an Event that ends this; who sets it wakes accept() by shutdown_socket()
@@ -142,7 +142,7 @@ class MessageParts(list):
 
     write = list.append  # genpy's serialize() calls this
 
-    def with_length(self):
+    def with_length(self) -> tuple:
         """Return a list of parts with the length of the message in front, and the bytes of all."""
         size = sum(map(len, self))
         parts = []
@@ -157,7 +157,7 @@ class MessageParts(list):
         return parts, size + _LENGTH.size
 
 
-def send_while_waiting(sock, send):
+def send_while_waiting(sock: socket.socket, send) -> None:
     """Call ``send()`` until it returns None; before each further call, wait for the event that it returns."""
     poller = select.poll()
     event = send()
@@ -194,11 +194,11 @@ class Sender(BoundedQueue):
         return getattr(self._connection, name)
 
     @property
-    def is_busy(self):
+    def is_busy(self) -> bool:
         """True while something waits for the socket."""
         return bool(self.messages or self._unsent_parts())
 
-    def write_data(self, parts, size):
+    def write_data(self, parts: list, size: int) -> None:
         """Send a message, or queue the rest if the socket is full.
 
         :param parts: the bytes of the message, with their length in front
@@ -209,7 +209,7 @@ class Sender(BoundedQueue):
         if self._has_thread:
             let_others_run()
 
-    def _write(self, parts, size):
+    def _write(self, parts: list, size: int) -> None:
         self.queue_size = self._publication.queue_size
         if self.queue_size is None:
             self._unsent = self._unsent_parts() + parts, []
@@ -225,7 +225,7 @@ class Sender(BoundedQueue):
         if self.is_busy and not self._has_thread:
             self._has_thread = self._publication.run.start_thread(self._send_queue) is not None
 
-    def _send_ready(self):
+    def _send_ready(self) -> None:
         """Send what the socket takes."""
         # IndexError: the handler of a signal has published meanwhile, and so sent all
         with contextlib.suppress(BlockingIOError, IndexError):
@@ -234,7 +234,7 @@ class Sender(BoundedQueue):
                     self._unsent = self.messages.popleft(), []
                 self._send(socket.MSG_DONTWAIT)
 
-    def _unsent_parts(self):
+    def _unsent_parts(self) -> list:
         """Return the parts that the socket has not taken yet."""
         parts, counts = self._unsent
         parts = [*parts]
@@ -245,7 +245,7 @@ class Sender(BoundedQueue):
             parts[0] = memoryview(parts[0])[sent_bytes:]
         return parts
 
-    def _send(self, flags=0):
+    def _send(self, flags: int = 0) -> None:
         """Have the socket take bytes, and keep their number.
 
         The handler of a signal may raise an exception between any two lines of Python: the next
@@ -258,7 +258,7 @@ class Sender(BoundedQueue):
         self._connection.stat_bytes += counts[-1]
         self._connection.stat_num_msg += not self._unsent_parts()
 
-    def _send_queue(self):
+    def _send_queue(self) -> None:
         try:
             send_while_waiting(self._connection.socket, self._send_rest)
         except CLOSED:
@@ -271,6 +271,6 @@ class Sender(BoundedQueue):
             self._has_thread = self.is_busy
             return select.POLLOUT if self._has_thread else None
 
-    def close(self):
+    def close(self) -> None:
         """Close the connection, which ends the thread."""
         self._connection.close()

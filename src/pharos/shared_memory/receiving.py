@@ -3,6 +3,8 @@
 rospy asks each protocol of a node for its offer, and a publisher takes the first offer that it
 supports. roscpp and nodes of rospy alone do not know this protocol, and take TCPROS.
 """
+from __future__ import annotations
+
 import array
 import contextlib
 import functools
@@ -50,7 +52,7 @@ _DESCRIPTOR_SIZE = array.array('i').itemsize
 
 
 @functools.lru_cache(None)
-def host_and_user():
+def host_and_user() -> list[str | int]:
     """Return values that are equal for processes that may share memory."""
     with open('/proc/sys/kernel/random/boot_id') as file:
         return [file.read().strip(), os.getuid()]
@@ -59,14 +61,14 @@ def host_and_user():
 class SharedMemoryHandler(ProtocolHandler):
     """The protocol of a node. The first reader that asks makes its socket."""
 
-    def __init__(self, run):
+    def __init__(self, run) -> None:
         self.run = run
-        self._listener = None
+        self._listener: socket.socket | None = None
 
-    def supports(self, protocol):
+    def supports(self, protocol: str) -> bool:
         return protocol == PROTOCOL
 
-    def get_supported(self):
+    def get_supported(self) -> list[list]:
         return [[PROTOCOL, *host_and_user()]]
 
     @property
@@ -75,7 +77,7 @@ class SharedMemoryHandler(ProtocolHandler):
 
     # -- publishers
 
-    def init_publisher(self, topic, protocol):
+    def init_publisher(self, topic: str, protocol: list) -> tuple[int, str, list]:
         """Answer with the name of the socket.
 
         Readers of another host or user get TCPROS, and so do all if the node lacks memory.
@@ -94,12 +96,12 @@ class SharedMemoryHandler(ProtocolHandler):
                 self._listener = listener
         return 1, '', [PROTOCOL, self._listener.getsockname()[1:].decode()]
 
-    def _accept(self, sock, address):
+    def _accept(self, sock: socket.socket, address: object) -> None:
         self.run.sockets.add(sock)
         if not self.run.start_thread(functools.partial(self._add_reader, sock)):
             sock.close()
 
-    def _add_reader(self, sock):
+    def _add_reader(self, sock: socket.socket) -> None:
         """Shake hands, and add a connection to the publisher."""
         try:
             sock.settimeout(self.run.node.client_timeout)
@@ -129,7 +131,7 @@ class SharedMemoryHandler(ProtocolHandler):
 
     # -- subscriptions
 
-    def create_transport(self, topic, uri, answer):
+    def create_transport(self, topic: str, uri: str, answer: list) -> tuple[int, str, int]:
         """Connect to a publisher, or by TCPROS if its socket cannot be reached or the class is no plain one."""
         subscription = self.run.topic_manager.subs.get(topic)
         sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -152,7 +154,7 @@ class SharedMemoryHandler(ProtocolHandler):
             return 0, 'no thread is left', 0
         return 1, '', 0
 
-    def _connect_by_tcpros(self, topic, uri):
+    def _connect_by_tcpros(self, topic: str, uri: str) -> tuple[int, str, int]:
         offer = self._tcpros_handler.get_supported()
         try:
             code, text, answer = ServerProxy(uri).requestTopic(  # type: ignore[misc]
@@ -161,7 +163,7 @@ class SharedMemoryHandler(ProtocolHandler):
         except UNREACHABLE as error:
             return 0, str(error), 0
         if code != 1:
-            return code, text, 0
+            return code, text, 0  # type: ignore[return-value]
         return self._tcpros_handler.create_transport(topic, uri, answer)
 
 
@@ -173,12 +175,13 @@ class Reader:
     for a receipt. The thread waits for no callback.
     """
 
-    def __init__(self):
-        self._connections = {}  # descriptor -> MemoryReceiver
-        self._thread = None
-        self._last_copy = None, b''  # the key of a message, and its bytes
+    def __init__(self) -> None:
+        self._connections: dict[int, MemoryReceiver] = {}  # by their descriptor
+        self._thread: threading.Thread | None = None
+        # the key of a message, and its bytes
+        self._last_copy: tuple[tuple | None, bytes] = None, b''
 
-    def add(self, connection):
+    def add(self, connection: MemoryReceiver) -> None:
         """Read a connection from now on."""
         with _lock:
             self._connections[connection.descriptor] = connection
@@ -193,20 +196,20 @@ class Reader:
             if connection.done:
                 self.remove(connection)
 
-    def remove(self, connection):
+    def remove(self, connection: MemoryReceiver) -> None:
         """Read a connection no more."""
         if self._connections.get(connection.descriptor) is connection:
             del self._connections[connection.descriptor]
             with contextlib.suppress(OSError, ValueError):
                 self._epoll.unregister(connection.descriptor)
 
-    def copy_once(self, key, memory):
+    def copy_once(self, key: tuple, memory: memoryview) -> bytes:
         """Return the bytes of a message in memory; one copy is for all nodes of this process."""
         if key != self._last_copy[0]:
             self._last_copy = key, bytes(memory)
         return self._last_copy[1]
 
-    def _read_all(self):
+    def _read_all(self) -> None:
         while True:
             messages = attempt(self._take_messages) or []
             for _, connection, deliver in sorted(messages, key=operator.itemgetter(0)):
@@ -218,9 +221,9 @@ class Reader:
                     self._thread = None
                     return
 
-    def _take_messages(self):
+    def _take_messages(self) -> list[tuple[float, MemoryReceiver, functools.partial]]:
         """Wait for messages, and return them as ``(time of sending, connection, deliver)``."""
-        messages = []
+        messages: list = []
         timeout = IDLE_PERIOD
         while len(messages) < MAX_MESSAGES:
             events = self._epoll.poll(timeout)
@@ -235,7 +238,7 @@ class Reader:
             timeout = 0
         return messages
 
-    def attempt(self, connection, function):
+    def attempt(self, connection: MemoryReceiver, function):
         """Call a function of a connection, and return the value; an error ends the connection."""
         try:
             return function()
@@ -256,18 +259,18 @@ class MemoryReceiver(MemoryTransport):
     latch = None
     header = None
 
-    def __init__(self, topic, uri, sock, subscription):
+    def __init__(self, topic: str, uri: str, sock: socket.socket, subscription) -> None:
         super().__init__('i', topic, uri, sock)
         self._subscription = subscription
         self.descriptor = sock.fileno()
-        self._maps = {}  # position -> map of a file
+        self._maps: dict[int, mmap.mmap] = {}  # by the position of the file
 
-    def connect(self):
+    def connect(self) -> None:
         """Shake hands, and have the reader receive the messages."""
         self._shake_hands(self._subscription.data_class, self._subscription.run)
         _reader.add(self)
 
-    def read(self):
+    def read(self) -> tuple[float, MemoryReceiver, functools.partial]:
         """Return the next message as ``(time of sending, connection, deliver)``.
 
         :raises EOFError: at the end of the connection
@@ -296,7 +299,7 @@ class MemoryReceiver(MemoryTransport):
             self._socket.send(RECEIPT)  # fails if the publisher has given this reader up
         return send_time, self, functools.partial(self._deliver, data, slot, value, dropped)
 
-    def _deliver(self, data, slot, value, dropped):
+    def _deliver(self, data: bytes, slot: int, value: bytes, dropped: int) -> None:
         message = self._subscription.data_class()
         if slot == WHOLE:
             message.deserialize(data or value)
@@ -307,20 +310,20 @@ class MemoryReceiver(MemoryTransport):
             inbox.dropped += dropped
         self._subscription.deliver(message, self, len(data) + len(value))
 
-    def pause(self):
+    def pause(self) -> None:
         """Read no more until resume(): messages wait in the socket, and in the publisher."""
         _reader.remove(self)
 
-    def resume(self):
+    def resume(self) -> None:
         """Read again."""
         if not self.done:
             _reader.add(self)
 
-    def end(self, error):
+    def end(self, error: Exception) -> None:
         """Close the connection, and connect again, unless the subscription is closed."""
         end_connection(self._subscription, self, self.endpoint_id, str(error))
 
-    def _shake_hands(self, message_class, run):
+    def _shake_hands(self, message_class: type, run) -> None:
         """Exchange the headers of TCPROS.
 
         :raises ROSHandshakeException: if the publisher refuses
@@ -337,7 +340,7 @@ class MemoryReceiver(MemoryTransport):
         self.callerid_pub = header['callerid']
         self.is_latched = header.get('latching') == '1'
 
-    def close(self):
+    def close(self) -> None:
         if not self.done:
             super().close()
             _reader.remove(self)

@@ -39,10 +39,12 @@ WHOLE = 255
 class MemoryFile:
     """A file in memory for one message; the kernel frees it with the last process that has it."""
 
-    def __init__(self, position, size):
+    def __init__(self, position: int, size: int) -> None:
         self.position = position
         self.capacity = size + size // 4  # messages grow
-        self.senders = set()  # senders that announce it later, or have no receipt yet
+        self.senders: set[
+            MemorySender
+        ] = set()  # senders that announce it later, or have no receipt yet
         self.descriptor = os.memfd_create('pharos')
         try:
             os.ftruncate(self.descriptor, self.capacity)
@@ -51,7 +53,7 @@ class MemoryFile:
             os.close(self.descriptor)
             raise
 
-    def close(self):
+    def close(self) -> None:
         self.map.close()
         os.close(self.descriptor)
 
@@ -59,17 +61,17 @@ class MemoryFile:
 class MessageMemory:
     """The files of a publisher: four, or more while as many readers each read another one."""
 
-    def __init__(self, run):
+    def __init__(self, run) -> None:
         self.run = run
         self.lock = threading.Lock()  # of the files, and of the queues of all senders
-        self._files = []
+        self._files: list[MemoryFile] = []
 
-    def sort(self, connections):
+    def sort(self, connections: list) -> tuple[list[MemorySender], list]:
         """Return the connections that share memory, and the others."""
         senders = [each for each in connections if isinstance(each, MemorySender)]
         return senders, [each for each in connections if each not in senders]
 
-    def split(self, message):
+    def split(self, message: genpy.Message) -> tuple[int, bytes | memoryview, bytes]:
         """Return the slot of a large field and its bytes, or WHOLE and the message, and the rest."""
         for slot in _byte_fields(type(message)):  # type: ignore[arg-type]
             name = message.__slots__[slot]
@@ -82,7 +84,9 @@ class MessageMemory:
                     return slot, value, rest
         return WHOLE, serialize(message), b''
 
-    def write(self, parts, senders):
+    def write(
+        self, parts: tuple[int, bytes | memoryview, bytes], senders: list[MemorySender]
+    ) -> None:
         """Send a message by the connections that share memory.
 
         If that fails half way, the connections close, and the readers connect anew. If no memory
@@ -105,7 +109,9 @@ class MessageMemory:
         if any(sender.is_sending for sender in senders):
             let_others_run()
 
-    def _put(self, parts, senders):
+    def _put(
+        self, parts: tuple[int, bytes | memoryview, bytes], senders: list[MemorySender]
+    ) -> None:
         slot, value, rest = parts
         size = len(value)
         for sender in senders:
@@ -119,7 +125,7 @@ class MessageMemory:
         for sender in senders:
             sender.put(entry)
 
-    def _free_file(self, size):
+    def _free_file(self, size: int) -> MemoryFile:
         """Return a file that no reader needs, with room for so many bytes.
 
         If there is none, the slowest readers lose their oldest messages. A message that a reader may be
@@ -143,7 +149,7 @@ class MessageMemory:
         unfit_file.close()
         return self._files[unfit_file.position]
 
-    def close(self):
+    def close(self) -> None:
         """Free the files."""
         with self.lock:
             for file in self._files:
@@ -166,7 +172,7 @@ class MemoryTransport(LocalTransport):
 
     transport_type = 'SHARED_MEMORY'
 
-    def __init__(self, direction, topic, endpoint_id, sock):
+    def __init__(self, direction: str, topic: str, endpoint_id: str, sock: socket.socket) -> None:
         super().__init__(direction, topic, endpoint_id)
         self._socket = sock
 
@@ -182,29 +188,29 @@ class MemorySender(MemoryTransport, BoundedQueue):
 
     is_sending = False  # True while a thread sends the queue
     is_broken = False
-    announced = None  # the file that the reader has no receipt for yet
+    announced: MemoryFile | None = None  # the file that the reader has no receipt for yet
 
-    def __init__(self, publisher, reader_name, sock):
+    def __init__(self, publisher, reader_name: str, sock: socket.socket) -> None:
         MemoryTransport.__init__(self, 'o', publisher.resolved_name, reader_name, sock)
         BoundedQueue.__init__(self)  # its messages are Entries
         self._publisher = publisher
         self._memory = publisher.memory
         self.queue_bytes = self._memory.run.node.queue_bytes
-        self._known_files = {}  # position -> the file that the reader has mapped
+        self._known_files: dict[int, MemoryFile | None] = {}  # that the reader has, by position
 
-    def fileno(self):
+    def fileno(self) -> int:
         """Let rospy find readers that have left; a reader has none, since it reads to the end."""
         return self._socket.fileno()
 
     @property
-    def is_busy(self):
+    def is_busy(self) -> bool:
         """True until the reader has read all: if its receipt finds the socket closed, it drops a message."""
         with self._memory.lock:
             if self.announced:
                 self.take_receipts()
             return bool(self.messages or self.announced)
 
-    def put(self, entry):
+    def put(self, entry: Entry) -> None:
         """Add a message to the queue, and send all that the socket takes; never waits."""
         if self.done or self.is_broken:
             return
@@ -217,18 +223,18 @@ class MemorySender(MemoryTransport, BoundedQueue):
         if self.messages and not self.is_sending:
             self.is_sending = self._memory.run.start_thread(self._send_queue) is not None
 
-    def forget(self, entry):
+    def forget(self, entry: Entry) -> bool:
         """Free the file of a dropped message."""
         if entry.file:
             entry.file.senders.discard(self)
         return True
 
-    def give_up(self):
+    def give_up(self) -> None:
         """Have the reader connect anew."""
         with self._memory.lock:
             self._break()
 
-    def _break(self):
+    def _break(self) -> None:
         """Have the reader find its socket closed: its receipt fails, and it drops the message."""
         self.is_broken = True
         shutdown_socket(self._socket)
@@ -237,7 +243,7 @@ class MemorySender(MemoryTransport, BoundedQueue):
             self.announced = None
         self.drop_beyond(0)
 
-    def _send_ready(self):
+    def _send_ready(self) -> None:
         """Send the messages that the socket takes, one in a file at a time."""
         while self.messages:
             entry = self.messages[0]
@@ -256,7 +262,7 @@ class MemorySender(MemoryTransport, BoundedQueue):
             self.stat_num_msg += 1
             self.stat_bytes += entry.size + len(entry.data)
 
-    def _send(self, entry):
+    def _send(self, entry: Entry) -> None:
         file = entry.file
         position = file.position if file else NO_FILE
         head = PACKET.pack(position, entry.slot, entry.size, self.dropped, entry.time)
@@ -267,7 +273,7 @@ class MemorySender(MemoryTransport, BoundedQueue):
         self._socket.sendmsg([head, entry.data], rights, socket.MSG_DONTWAIT)
         self._known_files[position] = file
 
-    def take_receipts(self):
+    def take_receipts(self) -> None:
         """Free the file that the reader has read."""
         try:
             receipt = self._socket.recv(1, socket.MSG_DONTWAIT)
@@ -281,11 +287,11 @@ class MemorySender(MemoryTransport, BoundedQueue):
             self.announced.senders.discard(self)
             self.announced = None
 
-    def _send_queue(self):
+    def _send_queue(self) -> None:
         send_while_waiting(self._socket, self._send_rest)
         self.close_if_broken()
 
-    def _send_rest(self):
+    def _send_rest(self) -> int | None:
         """Send what the socket takes; return the event to wait for, None if that is all."""
         with self._memory.lock:
             self.take_receipts()
@@ -296,11 +302,11 @@ class MemorySender(MemoryTransport, BoundedQueue):
             waits_for_receipt = self.messages[0].file and self.announced
             return select.POLLIN if waits_for_receipt else select.POLLOUT
 
-    def close_if_broken(self):
+    def close_if_broken(self) -> None:
         if self.is_broken:
             self.close()
 
-    def close(self):
+    def close(self) -> None:
         if not self.done:
             super().close()
             with self._memory.lock:
@@ -308,20 +314,20 @@ class MemorySender(MemoryTransport, BoundedQueue):
                 self._socket.close()
 
 
-def is_plain(message_class):
+def is_plain(message_class: type[genpy.Message]) -> bool:
     """True for classes as genpy makes them: not AnyMsg, and not a class of numpy_msg."""
     return message_class.__bases__ == (genpy.Message,) and message_class._md5sum != '*'
 
 
 @functools.lru_cache(None)
-def _byte_fields(message_class):
+def _byte_fields(message_class: type[genpy.Message]) -> list[int]:
     """Return the slots of the fields that may lie in a file by themselves."""
     if not is_plain(message_class):
         return []
     return [slot for slot, name in enumerate(message_class._slot_types) if name == 'uint8[]']
 
 
-def _view(value):
+def _view(value) -> bytes | memoryview:
     """Return the bytes of a field without copying them, b'' if that cannot be."""
     if isinstance(value, bytes):
         return value
