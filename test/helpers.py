@@ -71,7 +71,8 @@ class InProcessMaster:
 def free_port():
     """Return a port that no server of another test gets, and that can so be taken again."""
     while True:
-        port = random.randrange(20000, 32000)  # below those that the system hands out
+        # below those that the system hands out; a simulation gives `random` the same seed in two processes
+        port = random.SystemRandom().randrange(20000, 32000)
         with contextlib.suppress(OSError), socket.create_server(('127.0.0.1', port)):
             return port
 
