@@ -19,6 +19,7 @@ import std_msgs.msg
 from helpers import COMPOSE, INIT, PYTHON, ROOT, TIMEOUT, Program
 from pharos import BlockNode, PharosError, testing
 from pharos.simulation import Simulation
+from pharos.simulation.comparing import differences
 from pharos.testing import Mailbox
 
 PROGRAMS = ROOT / 'test' / 'programs' / 'virtual'
@@ -752,3 +753,118 @@ def test_child_that_takes_long_is_named(simulation, bench):
 def test_program_of_another_process_is_refused(simulation, bench):
     with pytest.raises(PharosError, match='/rover/avoider: has a process of its own'):
         simulation.master.compose('robot', 'robot.launch', apart=['avoider'])
+
+
+# -- two recordings
+
+DRIVER = '''#!/usr/bin/python3
+import rospy
+from geometry_msgs.msg import Twist
+rospy.init_node('driver')
+commands = rospy.Publisher('/cmd_vel', Twist, queue_size=10)
+rate, speed = rospy.Rate(10), 0.0
+while not rospy.is_shutdown():
+    speed += rospy.get_param('~gain', 0.5) * (1 - speed)
+    message = Twist()
+    message.linear.x = speed
+    commands.publish(message)
+    rate.sleep()
+'''
+
+
+def bag_of(path, *rows):
+    """Write messages (topic, message, seconds) to a bag, and return its path."""
+    with rosbag.Bag(str(path), 'w') as bag:
+        for topic, message, seconds in rows:
+            bag.write(topic, message, genpy.Time.from_sec(seconds))
+    return str(path)
+
+
+def numbers(*values, topic='/n', begin=10.0):
+    return [
+        (topic, std_msgs.msg.Float64(value), begin + number / 2)
+        for number, value in enumerate(values)
+    ]
+
+
+NAN = float('nan')
+GOOD = numbers(1.0, 2.0, NAN)
+FIELDS = sensor_msgs.msg.Imu(orientation_covariance=[0.0] * 9)
+OTHER_FIELDS = sensor_msgs.msg.Imu(orientation_covariance=[0.0] * 5 + [0.1] + [0.0] * 3)
+
+
+@pytest.mark.parametrize(
+    'expected, actual, lines',
+    [
+        (GOOD, GOOD, []),
+        (GOOD, numbers(1.0, 2.0001, NAN), ['0.500 s /n #1 data: 2.0 -> 2.0001']),
+        (GOOD, numbers(1.0, 2.0), ['1.000 s /n #2 is missing, with all after it']),
+        (numbers(1.0, 2.0), GOOD, ['1.000 s /n #2 is additional']),
+        (GOOD, numbers(1.0, 2.0, NAN, begin=10.01), ['0.000 s /n #0 came 0.010000 s later']),
+        (
+            GOOD,
+            numbers(1.0, 2.0, NAN, topic='/m'),
+            ['0.000 s /m #0 is additional', '0.000 s /n #0 is missing, with all after it'],
+        ),
+        (
+            [('/i', FIELDS, 10.0), *numbers(1.0, begin=9.5)],
+            [('/i', OTHER_FIELDS, 10.0), *numbers(1.5, begin=9.5)],
+            [
+                '-0.500 s /n #0 data: 1.0 -> 1.5',
+                '0.000 s /i #0 orientation_covariance[5]: 0.0 -> 0.1',
+            ],
+        ),
+        (
+            GOOD[:1],
+            [('/n', std_msgs.msg.String('1'), 10.0)],
+            ['0.000 s /n #0 type: std_msgs/Float64 -> std_msgs/String'],
+        ),
+    ],
+)
+def test_recordings_differ_by_the_first_field(tmp_path, expected, actual, lines):
+    paths = bag_of(tmp_path / 'good.bag', *expected), bag_of(tmp_path / 'new.bag', *actual)
+    assert differences(*paths, 10.0) == lines
+
+
+def test_tolerance_lets_numbers_differ(tmp_path):
+    old = bag_of(tmp_path / 'good.bag', *GOOD)
+    new = bag_of(tmp_path / 'new.bag', *numbers(1.0, 2.0001, NAN))
+    assert differences(old, new, 10.0, 1e-3) == []
+    assert differences(old, new, 10.0, 1e-5) != []
+
+
+def test_command_compares_with_a_recording(master, tmp_path):
+    driver = tmp_path / 'driver'
+    driver.write_text(DRIVER)
+
+    def run(*arguments):
+        command = [*COMPOSE, '--for', '5', *arguments, '--script', str(driver)]
+        with Program(command, master.url, ROS_HOME=str(tmp_path)) as composed:
+            return composed.wait(), composed.output
+
+    good = str(tmp_path / 'good.bag')
+    status, output = run('--expect', good)
+    assert status == 1 and f'there is no {good}: make it by --record {good}' in output
+    assert run('--record', good)[0] == 0
+    status, output = run('--expect', good)
+    assert status == 0 and 'all messages are the same' in output
+    driver.write_text(DRIVER.replace('0.5', '0.50005'))
+    status, output = run('--expect', good)
+    assert status == 1
+    assert re.search(r'^0\.\d{3} s /cmd_vel #0 linear\.x: 0\.5 -> 0\.50005$', output, re.M)
+    assert run('--expect', good, '--tolerance', '1e-3')[0] == 0
+
+
+def test_simulation_expects_a_recording(simulation, create_node, tmp_path):
+    bag, mouth = str(tmp_path / 'good.bag'), create_node(BlockNode, 'mouth')
+
+    def say(text):
+        simulation.nanoseconds = simulation.begin
+        with simulation.expect(bag):
+            mouth.send_to('/words', typed_as=STRING, data=text)
+
+    with pytest.raises(AssertionError, match='it is recorded now'):
+        say('hello')
+    say('hello')
+    with pytest.raises(AssertionError, match=r's /words #0 data: hello -> hallo'):
+        say('hallo')

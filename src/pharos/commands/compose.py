@@ -5,6 +5,7 @@ import contextlib
 import os
 import pathlib
 import sys
+import tempfile
 import threading
 import time
 import urllib.parse
@@ -72,7 +73,19 @@ def _parse(arguments):
     parser.add_argument('--bag', type=os.path.abspath, help='virtual time: play this')  # type: ignore
     parser.add_argument('--for', type=float, dest='seconds', help='so long in virtual time, no bag')
     parser.add_argument('--at', type=float, help='in virtual time: a prompt at this second')
-    parser.add_argument('--record', help='in virtual time: write what nodes publish to this bag')
+    parser.add_argument(
+        '--record',
+        type=os.path.abspath,  # type: ignore[arg-type]
+        help='in virtual time: write what nodes publish to this bag',
+    )
+    parser.add_argument(
+        '--expect',
+        type=os.path.abspath,  # type: ignore[arg-type]
+        help='in virtual time: show what differs from this recording',
+    )
+    parser.add_argument(
+        '--tolerance', type=float, default=0.0, help='with --expect: numbers may differ by so much'
+    )
     parser.add_argument(
         '--seed', type=int, default=0, help='in virtual time: other delays, by chance'
     )
@@ -105,8 +118,8 @@ def _run(stack, options, mappings):
         os.environ['ROS_MASTER_URI'] = master.url
         # before the composition, whose locks are to be virtual, too
         simulation = _begin_simulation(stack, master, options)
-    elif options.record or options.seed:
-        raise ValueError('--record and --seed go with --bag, --for or --at')
+    elif options.record or options.expect or options.seed:
+        raise ValueError('--record, --expect and --seed go with --bag, --for or --at')
     elif not master.is_reachable():
         port: Any = urllib.parse.urlsplit(master.url).port
         print(f'no ROS master at {master.url}: it is started here')
@@ -128,7 +141,21 @@ def _run(stack, options, mappings):
     for text in deadlocks:
         print(f'waits for a lock for ever: {text}')
     composition.stopping.set()  # its wait() returns at once, with the status
-    return composition.wait() or int(bool(deadlocks))
+    status = composition.wait() or int(bool(deadlocks))
+    if options.expect and _show_differences(simulation, options):
+        return 1
+    return status
+
+
+def _show_differences(simulation, options):
+    """Show what the run has published otherwise than a recording; return True if there is something."""
+    from pharos.simulation.comparing import differences
+
+    simulation.close_record()
+    begin = simulation.begin / 1e9
+    lines = differences(options.expect, options.record, begin, options.tolerance)
+    print('\n'.join(lines) or f'as {options.expect}: all messages are the same')
+    return bool(lines)
 
 
 def _fix_hashes(seed):
@@ -165,10 +192,19 @@ def _begin_simulation(stack, master, options):
             # at least 1 s: a ROS time of 0 is one that is not set
             simulation.nanoseconds = round((max(2, bag.get_start_time()) - 1) * 10**9)
     simulation.begin = simulation.nanoseconds
+    if options.expect:
+        if not os.path.isfile(options.expect):
+            raise ValueError(f'there is no {options.expect}: make it by --record {options.expect}')
+        if not options.record:
+            folder = stack.enter_context(tempfile.TemporaryDirectory())
+            options.record = f'{folder}/actual.bag'
     if options.record:
-        if os.path.abspath(options.record) == options.bag:
-            raise ValueError(f'{options.bag} is played: record to another file')
-        simulation.record = stack.enter_context(_recorder(options.record))
+        if options.record in (options.bag, options.expect):
+            raise ValueError(f'{options.record} is read: record to another file')
+        record = contextlib.ExitStack()
+        stack.callback(record.close)
+        simulation.record = record.enter_context(_recorder(options.record))
+        simulation.close_record = record.close
     return simulation
 
 

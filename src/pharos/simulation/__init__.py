@@ -9,14 +9,16 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
+import os
 import random
 import sys
+import tempfile
 import threading
 import time
 import traceback
 from _queue import Empty, SimpleQueue  # in C: real ones, also in a simulation
 from _thread import allocate_lock
-from typing import Any, Callable
+from typing import Any, Callable, Iterator
 from unittest import mock
 
 import numpy
@@ -56,6 +58,7 @@ class Simulation:
 
     allows_waits = False
     record: Any = None
+    close_record: Any = None  # ends the file of the record
     launch_file = bag = ''
     _looks = 0  # at the thread with the turn, since it got the turn
     _cpu_time = 0.0
@@ -100,6 +103,28 @@ class Simulation:
     def allow_waits(self) -> None:
         """Let threads wait for something else than time and threads."""
         self.allows_waits = True
+
+    @contextlib.contextmanager
+    def expect(self, bag: str, tolerance: float = 0.0) -> Iterator[None]:
+        """Compare what the nodes publish in this ``with`` with a recording; make one if there is none.
+
+        :param tolerance: numbers may differ by so much
+        :raises AssertionError: with the first difference of each topic; or that the recording is new
+        """
+        from pharos.simulation.comparing import differences
+
+        is_new = not os.path.exists(bag)
+        with tempfile.TemporaryDirectory() as folder:
+            actual = bag if is_new else f'{folder}/actual.bag'
+            with rosbag.Bag(actual, 'w') as file:
+                self.record = file.write
+                yield
+                self.record = None
+            lines = differences(bag, actual, self.begin / 1e9, tolerance)
+        if is_new:
+            lines = [f'{bag} was not there: it is recorded now']
+        if lines:
+            raise AssertionError('\n'.join(lines))
 
     def run(self, seconds: float) -> None:
         """Let so many seconds of ROS time go by."""
