@@ -151,7 +151,6 @@ def _show_differences(simulation, options):
     """Show what the run has published otherwise than a recording; return True if there is something."""
     from pharos.simulation.comparing import differences
 
-    simulation.close_record()
     begin = simulation.begin / 1e9
     lines = differences(options.expect, options.record, begin, options.tolerance)
     print('\n'.join(lines) or f'as {options.expect}: all messages are the same')
@@ -201,10 +200,8 @@ def _begin_simulation(stack, master, options):
     if options.record:
         if options.record in (options.bag, options.expect):
             raise ValueError(f'{options.record} is read: record to another file')
-        record = contextlib.ExitStack()
-        stack.callback(record.close)
-        simulation.record = record.enter_context(_recorder(options.record))
-        simulation.close_record = record.close
+        simulation.record_to(options.record)
+        stack.callback(simulation.close_record)
     return simulation
 
 
@@ -214,25 +211,13 @@ def _show_progress(simulation, ended):
         print(f'{simulation.seconds:.0f} s of ROS time', end='\r', file=sys.stderr)
 
 
-@contextlib.contextmanager
-def _recorder(path):
-    """Yield the ``write`` of a new bag."""
-    import rosbag
-
-    try:
-        with rosbag.Bag(path, 'w') as bag:
-            yield bag.write
-    except OSError as error:
-        raise ValueError(f'{path} cannot be written: {error}') from error
-
-
 def _simulate(simulation, options):
     """Play the bag, or let the time go by; show how long the command has computed."""
     if options.bag:
         simulation.play(options.bag, options.topics)
     else:
         simulation.at(options.seconds)
-    simulation.record = None
+    simulation.close_record()
     print(
         f'{simulation.seconds:.1f} s of ROS time took {time.process_time():.1f} s of CPU;'
         f' lost: {simulation.lost}'

@@ -23,6 +23,7 @@ from unittest import mock
 
 import numpy
 import rosbag
+from genpy import Time
 
 from pharos.errors import PharosError
 from pharos.node import BlockNode
@@ -53,12 +54,11 @@ class Simulation:
     :ivar begin: the ROS time at the begin, in nanoseconds
     :ivar lost: the names of threads that waited for something else than time and threads, or computed
         without end, and so lost the turn: what follows may come in another order another time
-    :ivar record: None, or ``record(topic, message, time)``, called with what the nodes publish
+    :ivar record: None, or the bag that gets what the nodes publish
     """
 
     allows_waits = False
     record: Any = None
-    close_record: Any = None  # ends the file of the record
     launch_file = bag = ''
     _looks = 0  # at the thread with the turn, since it got the turn
     _cpu_time = 0.0
@@ -116,15 +116,43 @@ class Simulation:
         is_new = not os.path.exists(bag)
         with tempfile.TemporaryDirectory() as folder:
             actual = bag if is_new else f'{folder}/actual.bag'
-            with rosbag.Bag(actual, 'w') as file:
-                self.record = file.write
+            self.record_to(actual)
+            try:
                 yield
-                self.record = None
+            finally:
+                self.close_record()
             lines = differences(bag, actual, self.begin / 1e9, tolerance)
         if is_new:
             lines = [f'{bag} was not there: it is recorded now']
         if lines:
             raise AssertionError('\n'.join(lines))
+
+    def record_to(self, path: str) -> None:
+        """Write what the nodes publish to a new bag, until :meth:`close_record`.
+
+        :raises PharosError: if the file cannot be made
+        """
+        with _named(path):
+            self.record = rosbag.Bag(path, 'w')
+
+    def close_record(self) -> None:
+        """End the bag of :meth:`record_to`.
+
+        :raises PharosError: if the file cannot be written
+        """
+        bag, self.record = self.record, None
+        if bag:
+            with _named(bag.filename):
+                bag.close()
+
+    def record_message(self, topic, message):
+        """Write a message to the bag, if there is one; end the run if that cannot be written."""
+        if self.record:
+            try:
+                with _named(self.record.filename):
+                    self.record.write(topic, message, Time(0, self.nanoseconds))
+            except PharosError as error:
+                self.fail(error)
 
     def run(self, seconds: float) -> None:
         """Let so many seconds of ROS time go by."""
@@ -258,7 +286,7 @@ class Simulation:
 
     def fail(self, error):
         """End the run: have the wait of the owner raise an error, at once."""
-        self.record = None
+        self.record = None  # not closed: rosbag of Debian 11 would write to a full disk for ever
         self._error = error
         self.wake()
 
@@ -381,6 +409,15 @@ class Simulation:
         self.pause()
         for thread in self._waits:
             thread.turns.put(None)
+
+
+@contextlib.contextmanager
+def _named(path):
+    """Name the file in an error of the system."""
+    try:
+        yield
+    except OSError as error:  # such as a full disk
+        raise PharosError(f'{path} cannot be written: {error}') from error
 
 
 def open_bag(path):

@@ -19,7 +19,6 @@ import time
 from _thread import allocate_lock
 from typing import Any
 
-from genpy import Time
 
 from pharos.compose import composition
 from pharos.compose.script_run import ScriptRun
@@ -358,12 +357,8 @@ def publish(original, run, publisher, message, *options, **more):
     original(publisher, message, *options, **more)
     if _simulation:
         _simulation.last_messages[publisher.name] = copy_of(message)
-    record = _simulation and _simulation.record
-    if record and run.name != PLAYER and publisher.name != '/rosout':
-        try:
-            record(publisher.name, message, Time(0, _simulation.nanoseconds))
-        except OSError as error:  # the disk is full
-            _simulation.fail(error)
+        if run.name != PLAYER and publisher.name != '/rosout':
+            _simulation.record_message(publisher.name, message)
 
 
 def sleep(seconds):
