@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from helpers import INIT, SPIN, create
-from pharos import PharosError
+from pharos import Lifecycle, PharosError
 from pharos.testing import Mailbox, until
 
 INT = 'std_msgs/Int32'
@@ -123,11 +123,85 @@ def test_invalid_edit_changes_nothing(bench, program, ask, new):
     assert ask() == 1001
 
 
+KINDS = """
+import dataclasses, enum
+from helper import FACTOR
+K = 1
+class S(enum.Enum): A = 1
+@dataclasses.dataclass
+class D: x: int = 1
+class Base: pass
+class C(Base):
+    k = K
+    def f(self): return 1
+def count():
+    while True: yield 1
+def main():
+    rospy.init_node('program')
+    say('ready')
+    while not rospy.is_shutdown(): rospy.sleep(0.01)
+counter = count()
+main()
+"""
+STAYS = 'what was made of it stays as it was'
+AT_NEXT_CALL = 'takes effect at its next call; what runs of it, or was made by it, stays as it was'
+SAID = {
+    'value and its user': ('K = 1', 'K = 2', ['K takes effect; ' + STAYS]),
+    'member of an Enum': ('A = 1', 'A = 1; B = 2', ['S.B takes effect at a restart']),
+    'field': ('int = 1', 'int = 2', ['D.x takes effect at a restart']),
+    'base class': ('C(Base)', 'C', ['its decorators and base classes takes effect at a restart']),
+    'method that has gone': ('    def f(self): return 1', '', ['f has gone; it stays in force']),
+    'class statement': ('    k = K', '    k = K\n    print()', [': takes effect at a restart']),
+    'generator': ('yield 1', 'yield 2', ['count ' + AT_NEXT_CALL]),
+    'loop that runs': ('(0.01)', '(0.02)', ['main ' + AT_NEXT_CALL]),
+    'exit': ('K = 1', 'import helper, leave', None),
+    'empty file': (KINDS, '', ['K has gone; it stays in force', 'C has gone', 'main has gone']),
+}
+
+
+@pytest.mark.parametrize('old, new, lines', SAID.values(), ids=SAID)
+def test_answer_says_what_is_so(bench, old, new, lines):
+    bench.write('FACTOR = 1', 'helper.py', '')
+    bench.write('raise SystemExit', 'leave.py', '')
+    script = bench.load(KINDS)
+    until(bench.said)
+    bench.write(KINDS.replace(old, new))
+    if lines is None:
+        with pytest.raises(PharosError, match='SystemExit; nothing has changed'):
+            script.reload()
+    else:
+        answer = script.reload()
+        assert all(line in answer for line in lines), answer
+        assert script.reload() == 'nothing has changed'
+    bench.write(KINDS)
+    script.reload()
+    assert script.lifecycle is Lifecycle.RUNNING
+
+
+def test_names_that_were_imported_follow(bench):
+    """If they are still the values of the other module."""
+    bench.write('FACTOR = 1.5\nOTHER = 2.5', 'helper.py', '')
+    text = '''
+from helper import FACTOR, OTHER
+OTHER = 7
+rospy.init_node('program')
+while not rospy.is_shutdown():
+    say((FACTOR, OTHER))
+    rospy.sleep(0.01)
+'''
+    script = bench.load(text)
+    until(lambda: '(1.5, 7)' in bench.said())
+    bench.write('FACTOR = 3.5\nOTHER = 4.5', 'helper.py', '')
+    answer = script.reload()
+    assert '__main__.FACTOR takes effect' in answer and '__main__.OTHER' not in answer
+    until(lambda: bench.said()[-1] == '(3.5, 7)')
+
+
 def test_what_takes_effect_later_is_named(bench, program):
     os.remove(bench.write('', 'helper.py', ''))
     bench.write(PROGRAM.replace('sleep(0.01)', 'sleep(0.02)').replace('\nmain()', '\nmain(), 1'))
     answer = program.reload()
-    assert 'main takes effect, functions at their next call' in answer
+    assert 'main takes effect at its next call; what runs of it' in answer
     assert re.search(r'program:\d+: takes effect at a restart', answer)
 
 

@@ -7,7 +7,7 @@ import os
 import pathlib
 import sys
 import traceback
-from types import MethodType
+from types import CodeType, MethodType
 
 from pharos.errors import PharosError
 from pharos.names import check_node_class
@@ -15,7 +15,12 @@ from pharos.names import check_node_class
 CHANGE_LIMIT = 0.05  # seconds: for so long at most, a change keeps all other threads from running
 NO_CHANGE = 'nothing has changed'
 TAKES_EFFECT = 'takes effect, functions at their next call'
+VALUE_TAKES_EFFECT = 'takes effect; what was made of it stays as it was'
 AT_RESTART = 'takes effect at a restart'
+AT_NEXT_CALL = 'takes effect at its next call; what runs of it, or was made by it, stays as it was'
+#: the flags of functions with calls that may be under way on no stack
+GENERATORS = inspect.CO_GENERATOR | inspect.CO_COROUTINE | inspect.CO_ASYNC_GENERATOR
+NAMED = ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef
 
 
 def become(node, node_class, base):
@@ -56,14 +61,19 @@ def editable_modules(node):
 def reload(node):
     """Do the work of :meth:`Node.reload`."""
     notes = []
-    edits = [(module, *_read(module, notes)) for module in editable_modules(node)]
+    undo = []  # arguments of setattr()
+    trees = [(module, _parse(module.__file__)) for module in editable_modules(node)]
+    stacks = map(traceback.walk_stack, sys._current_frames().values())
+    running = {'__init__', *(frame.f_code.co_name for stack in stacks for frame, _ in stack)}
     interval = sys.getswitchinterval()
     sys.setswitchinterval(CHANGE_LIMIT)  # no thread shall see a half of the change
     try:
-        for module, text, changes in edits:
-            module.__text__ = text
-            for owner, name, *rest in changes:
-                notes.append(f'{owner.__name__}.{name} {_change(owner, name, *rest)}')
+        edits = [(module, tree, _read(module, tree, notes, undo)) for module, tree in trees]
+        for module, tree, changes in edits:
+            module.__text__ = tree
+            for line, owner, name, *rest in changes:
+                effect = _change(running, owner, name, *rest)
+                notes.append(f'{owner.__name__}.{name} {effect} (line {line})')
     finally:
         sys.setswitchinterval(interval)
     for failure in node._current_run.failures:
@@ -72,73 +82,169 @@ def reload(node):
     return '\n'.join(notes) or NO_CHANGE
 
 
-def _read(module, notes):
-    """Run the definitions in a module's file that are new; add to the notes the lines of other statements.
+def _parse(file):
+    """Return the statements of a file, as ast.parse() does.
 
-    Names that the module has keep their values. It gets those that it lacks, since other definitions
-    may use them; they stay if a later one raises an exception.
+    :raises PharosError: if the text is not valid
+    """
+    try:
+        return ast.parse(pathlib.Path(file).read_bytes(), file)
+    except (SyntaxError, ValueError) as error:
+        raise _failure(file, getattr(error, 'lineno', 1), error) from error
 
-    :returns: the text of the file, and the changes: arguments of _change()
-    :raises PharosError: if the text is not valid, or a definition raises an exception
+
+def _failure(file, line, error):
+    text = ''.join(traceback.format_exception_only(type(error), error)).strip()
+    return PharosError(f'{file}:{line}: {text}; {NO_CHANGE}')
+
+
+def _read(module, tree, notes, undo):
+    """Run the definitions of a module that are new; add to the notes the lines of other statements.
+
+    The module gets new values at once, and the names that it lacks, since other definitions may use
+    them. If a later one raises an exception, the former values come back.
+
+    :param tree: the statements of the module's file; gets those that have gone, and stay in force
+    :param undo: gets the former values, as arguments of setattr()
+    :returns: the changes: a line, and arguments of _change()
+    :raises PharosError: if a definition raises an exception
     """
     file = module.__file__
     changes, line = [], 1
-
-    def code_of(item):
-        return compile(ast.Module([item], []), file, 'exec', 0, True)
-
+    former_tree = ast.parse(module.__text__)
+    classes = {item.name: item for item in former_tree.body if isinstance(item, ast.ClassDef)}
     try:
-        text = pathlib.Path(file).read_bytes()
-        former_items = ast.parse(module.__text__).body
-        bodies = {item.name: item.body for item in former_items if isinstance(item, ast.ClassDef)}
-        for item in _new_items(former_items, ast.parse(text, file).body):
+        for item in _new_items(former_tree, tree):
             line = item.lineno
-            former_body = bodies.get(getattr(item, 'name', ''))  # of a class that is there
-            new_body = former_body and _new_items(former_body, item.body)
-            if new_body == [] or not _is_definition(item):
+            if not _is_definition(item):
                 notes.append(f'{file}:{line}: {AT_RESTART}')
                 continue
-            owner, found = module, {}
-            if new_body:
+            former_class = isinstance(item, ast.ClassDef) and classes.get(item.name)
+            decorators = getattr(item, 'decorator_list', [])
+            if former_class:
+                if _header(item) != _header(former_class):
+                    notes.append(
+                        f'{file}:{line}: with its decorators and base classes {AT_RESTART}'
+                    )
                 item.decorator_list = []
-            exec(code_of(item), vars(module), found)
-            for name, new in found.items():
-                vars(module).setdefault(name, new)
-            if new_body:
+            owner, found = module, _run(item, module)
+            lines = dict.fromkeys(found, line)
+            if former_class:
                 # the whole body has run, since its statements need each other; the new ones take effect
-                owner = vars(module)[item.name]
-                item.body = new_body
-                names = code_of(item).co_consts[0].co_names
-                found = {
-                    name: new
-                    for name, new in vars(found[item.name]).items()
-                    if name in names and (callable(new) or not name.startswith('__'))
-                }
-            changes += [(owner, *each, hasattr(item, 'names')) for each in found.items()]
-    except Exception as error:
-        error_text = ''.join(traceback.format_exception_only(type(error), error)).strip()
-        raise PharosError(
-            f'{file}:{getattr(error, "lineno", line)}: {error_text}; {NO_CHANGE}'
-        ) from error
-    return text, changes
+                item.decorator_list = decorators
+                owner, found = vars(module)[item.name], dict(vars(found[item.name]))
+                new_items = _new_items(former_class, item)
+                lines = {name: each.lineno for each in new_items for name in _names(each)}
+                others = [each.lineno for each in new_items if not _names(each)]
+                notes += [f'{file}:{number}: {AT_RESTART}' for number in others]
+                notes += _keep(former_class, item, file)
+            for name in [name for name in lines if name in found]:
+                if found[name] is not vars(owner).get(name):
+                    _set_value(owner, name, found[name], undo)
+                    changes.append((lines[name], owner, name, found[name], hasattr(item, 'names')))
+        changes += _copies(module, tree, undo)
+    except (Exception, SystemExit) as error:  # an imported program may end itself
+        for former in reversed(undo):
+            setattr(*former)
+        raise _failure(file, line, error) from error
+    notes += _keep(former_tree, tree, file)
+    return changes
 
 
-def _new_items(former_items, items):
-    """Return the statements that the former ones lack."""
-    former_dumps = [*map(ast.dump, former_items)]
-    return [item for item in items if ast.dump(item) not in former_dumps]
+def _run(item, module):
+    """Run a statement in a module, and return the names that it defines, with their values."""
+    found = {}
+    code = compile(ast.Module([item], []), module.__file__, 'exec', 0, True)
+    exec(code, vars(module), found)
+    found.pop('__annotations__', None)
+    return found
+
+
+def _set_value(owner, name, new, undo):
+    """Give a module or class a new value, or a name that it lacks; functions change later."""
+    former = vars(owner).get(name)
+    if _is_field(owner, name):
+        return
+    if name not in vars(owner):
+        setattr(owner, name, new)
+    elif not (callable(former) or callable(new)):
+        undo.append((owner, name, former))
+        setattr(owner, name, new)
+
+
+def _copies(module, tree, undo):
+    """Give a module the new values that it has imported by name, and return these changes."""
+    former_values = [former for _, _, former in undo]
+    changes = []
+    if former_values:
+        for item in [item for item in tree.body if isinstance(item, ast.ImportFrom)]:
+            for name, new in _run(item, module).items():
+                former = vars(module).get(name)
+                if new is not former and any(former is each for each in former_values):
+                    _set_value(module, name, new, undo)
+                    changes.append((item.lineno, module, name, new, True))
+    return changes
+
+
+def _new_items(former_tree, tree):
+    """Return the statements that are new, and those that are now the last to define their name."""
+    known = [*map(ast.dump, former_tree.body)]
+    former_texts = {name: ast.dump(item) for item in former_tree.body for name in _names(item)}
+    last_items = {name: item for item in tree.body for name in _names(item)}
+    return [
+        item
+        for item in tree.body
+        if ast.dump(item) not in known
+        or any(
+            last_items[name] is item and former_texts[name] != ast.dump(item)
+            for name in _names(item)
+        )
+    ]
+
+
+def _keep(former_tree, tree, file):
+    """Add the definitions to a tree that are in force, though they have gone; return new lines on them."""
+    names = {name for item in tree.body for name in _names(item)}
+    gone = [item for item in former_tree.body if _names(item) and names.isdisjoint(_names(item))]
+    tree.body += gone
+    new_names = [name for item in gone for name in _names(item) if not hasattr(item, 'has_gone')]
+    for item in gone:
+        item.has_gone = True
+    return [f'{file}: {name} has gone; it stays in force until a restart' for name in new_names]
+
+
+def _names(item):
+    """Return the names that a definition gives values; none of another statement."""
+    if isinstance(item, (ast.Import, ast.ImportFrom)):
+        return [alias.asname or alias.name for alias in item.names]
+    targets = getattr(item, 'targets', [getattr(item, 'target', None)])
+    names = [target.id for target in targets if isinstance(target, ast.Name)]
+    return names or ([item.name] if isinstance(item, NAMED) else [])
+
+
+def _header(item):
+    """Return the decorators and base classes of a class, and its other arguments."""
+    return [*map(ast.dump, [*item.decorator_list, *item.bases, *item.keywords])]
 
 
 def _is_definition(item):
     """True for functions, classes, imports, and a name with a value that calls nothing."""
-    if not isinstance(item, ast.Assign):
-        return isinstance(item, (ast.FunctionDef, ast.ClassDef, ast.Import, ast.ImportFrom))
-    return isinstance(item.targets[0], ast.Name) and 'Call(' not in ast.dump(item)
+    if not isinstance(item, (ast.Assign, ast.AnnAssign)):
+        return isinstance(item, (*NAMED, ast.Import, ast.ImportFrom))
+    return bool(_names(item)) and 'Call(' not in ast.dump(item)
 
 
-def _change(owner, name, new, is_import):
+def _is_field(owner, name):
+    """True for what a class has been made of: members of an Enum or a dataclass, and slots."""
+    is_enum = type(owner).__module__ == 'enum'
+    return is_enum or name in ('__slots__', *getattr(owner, '__dataclass_fields__', ()))
+
+
+def _change(running, owner, name, new, is_import):
     """Change a name of a module or class, functions in place; return what to say of that."""
     former = vars(owner).get(name)
+    if new is former and not callable(new):
+        return VALUE_TAKES_EFFECT
     if not (is_import or new is former):
         # the functions inside of decorators, staticmethods and classmethods
         function, new_function = (
@@ -153,11 +259,16 @@ def _change(owner, name, new, is_import):
         ):
             for part in '__code__', '__defaults__', '__kwdefaults__':
                 setattr(function, part, getattr(new_function, part))
+            if hasattr(former, 'cache_clear'):
+                former.cache_clear()
+            # functions inside of it, and calls that are under way: of generators, too
+            is_maker = any(isinstance(each, CodeType) for each in code.co_consts)
+            if is_maker or name in running or code.co_flags & GENERATORS:
+                return AT_NEXT_CALL
             return TAKES_EFFECT
         # super() needs the class
         is_bound = new_code and (code or '__class__' in new_code.co_freevars)
-        # members of an Enum would not equal the former ones
-        if is_bound or isinstance(former, type) or type(owner).__module__ == 'enum':
+        if is_bound or isinstance(former, type) or _is_field(owner, name):
             return AT_RESTART
     setattr(owner, name, new)
     return TAKES_EFFECT
