@@ -5,6 +5,7 @@ import pathlib
 import queue
 import re
 import runpy
+import sys
 import textwrap
 import threading
 import time
@@ -510,6 +511,9 @@ def test_prompt_goes_to_times_and_back(session):
     assert session.end() == 0
 
 
+@pytest.mark.skipif(
+    sys.version_info >= (3, 12), reason='its tracing finds no line there now and then'
+)
 def test_prompt_steps_in_a_node(session):
     for name in ['loop', 'callback', 'timer', 'thread', 'service']:
         before = session.ask(f"print(now, node('/{name}').count)").split()

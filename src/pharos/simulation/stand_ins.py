@@ -166,11 +166,25 @@ def read_all_parameters(changed_run, key, read_parameters=run.Run.read_parameter
         read_parameters(each, key)
 
 
+class _NoMethod:
+    """Calls a function with arguments, as functools.partial does; no method of a class that has it.
+
+    logging has ``time.localtime`` in a class. (Python 3.14 makes a method of a partial.)
+    """
+
+    def __init__(self, function, *arguments):
+        self._function = function
+        self._arguments = arguments
+
+    def __call__(self, *arguments):
+        return self._function(*self._arguments, *arguments)
+
+
 def _read_clock(clock, name):
     """Return the time: virtual to threads that take part, that of a clock to others."""
     if not takes_part():
         return clock()
-    if not sys._getframe(1).f_globals.get('__name__', '').startswith(FREE_LOOKS):
+    if not sys._getframe(2).f_globals.get('__name__', '').startswith(FREE_LOOKS):
         _simulation.look()
     return _simulation.nanoseconds if name.endswith('_ns') else _simulation.now
 
@@ -217,7 +231,7 @@ class VirtualDatetime(datetime.datetime, metaclass=_RealInstances):
 
     @classmethod
     def utcnow(cls):
-        return cls.utcfromtimestamp(_now())
+        return cls.fromtimestamp(_now(), datetime.timezone.utc).replace(tzinfo=None)
 
 
 class VirtualDate(datetime.date, metaclass=_RealInstances):
@@ -379,9 +393,9 @@ def _refuse_part(composition, entries, *rest):
 
 def changes():
     """Return what a simulation changes: modules and classes -> names -> stand-ins."""
-    clocks = {name: functools.partial(_read_clock, getattr(time, name), name) for name in CLOCKS}
+    clocks = {name: _NoMethod(_read_clock, getattr(time, name), name) for name in CLOCKS}
     splits = {
-        name: functools.partial(_split_time, getattr(time, name))
+        name: _NoMethod(_split_time, getattr(time, name))
         for name in ('localtime', 'gmtime', 'ctime')
     }
     monotonic = clocks['monotonic']
