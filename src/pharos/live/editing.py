@@ -111,7 +111,9 @@ def _read(module, tree, notes, undo):
     """
     file = module.__file__
     changes, line = [], 1
-    former_tree = ast.parse(module.__text__)
+    former_tree = module.__text__  # of the first reload: the bytes that remember_text() has kept
+    if isinstance(former_tree, bytes):
+        former_tree = ast.parse(former_tree)
     classes = {item.name: item for item in former_tree.body if isinstance(item, ast.ClassDef)}
     try:
         for item in _new_items(former_tree, tree):
