@@ -149,12 +149,18 @@ def _run(stack, options, mappings):
 
 def _show_differences(simulation, options):
     """Show what the run has published otherwise than a recording; return True if there is something."""
+    from pharos.simulation import open_bag
     from pharos.simulation.comparing import differences
 
     begin = simulation.begin / 1e9
     lines = differences(options.expect, options.record, begin, options.tolerance)
-    print('\n'.join(lines) or f'as {options.expect}: all messages are the same')
-    return bool(lines)
+    if lines:
+        print('\n'.join(lines))
+        return True
+    with open_bag(options.expect) as bag:
+        topics = bag.get_type_and_topic_info()[1]
+        print(f'as {options.expect}: {bag.get_message_count()} messages of {len(topics)} topics')
+    return False
 
 
 def _fix_hashes(seed):
