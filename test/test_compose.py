@@ -921,9 +921,15 @@ def test_failed_look_at_files_is_made_again(master, bench, monkeypatch, what):
 
         return call
 
+    def look(node):
+        looks.append(node)
+        return editable_modules(node)
+
     module = 'pharos.compose.control'
+    looks = []
+    monkeypatch.setattr(f'{module}.editable_modules', look)
     if what == 'editable_modules':
-        monkeypatch.setattr(f'{module}.editable_modules', failing_once(editable_modules))
+        monkeypatch.setattr(f'{module}.editable_modules', failing_once(look))
     elif what == '_answer':
         monkeypatch.setattr(f'{module}._answer', failing_once(pharos.compose.control._answer))
     else:
@@ -932,8 +938,9 @@ def test_failed_look_at_files_is_made_again(master, bench, monkeypatch, what):
         thread = threading.Thread(target=reload_on_save, args=[composition])
         thread.start()
         bench.until(lambda: bench.said() == ['first'])
-        # nothing sees a save before the first look
-        bench.until(lambda: bench.write(EDITED.format('second')) and len(bench.said()) > 1)
+        bench.until(lambda: len(looks) > 1)  # nothing sees a save before the end of the first
+        bench.write(EDITED.format('second'))
+        bench.until(lambda: len(bench.said()) > 1)
         may_fail.set()
         bench.write(EDITED.format('the third'))
         assert failed.wait(TIMEOUT)

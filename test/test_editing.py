@@ -178,6 +178,18 @@ def test_answer_says_what_is_so(bench, old, new, lines):
     assert script.lifecycle is Lifecycle.RUNNING
 
 
+def test_what_has_gone_is_told_after_an_error_elsewhere(bench):
+    bench.write('FACTOR = 1', 'helper.py', '')
+    script = bench.load(KINDS)
+    until(bench.said)
+    bench.write(KINDS.replace('class Base: pass', 'class Base: pass\nclass Bad(int, int): pass'))
+    bench.write('', 'helper.py', '')
+    with pytest.raises(PharosError, match='nothing has changed'):
+        script.reload()
+    bench.write(KINDS)
+    assert 'helper.py: FACTOR has gone; it stays in force' in script.reload()
+
+
 def test_names_that_were_imported_follow(bench):
     """If they are still the values of the other module."""
     bench.write('FACTOR = 1.5\nOTHER = 2.5', 'helper.py', '')

@@ -104,6 +104,8 @@ def _parse(arguments):
         parser.error('give a launch file, or programs')
     if options.script and (options.file or names_nodes) or len(options.file) > 2:
         parser.error('give one launch file, by package and name or by its path, first; or --script')
+    if options.expect and options.at is not None:
+        parser.error('--expect compares a whole run: give --for or --bag, and leave out --at')
     return options
 
 

@@ -405,6 +405,7 @@ class Composition:
             os.environ.pop(name, None)
             if name in self.environment:
                 os.environ[name] = self.environment[name]
+        self._own_variables = {}  # a second stop() does nothing
 
     def __enter__(self) -> Composition:
         return self

@@ -72,19 +72,21 @@ def _answer(composition, action, name):
 
 def reload_on_save(composition):
     """Reload the nodes of this process whose files are saved, until the composition stops."""
-    save_times = {}  # node -> the times of its files
+    saves = {}  # node -> times and sizes of its files: of the last reload, and of the last look
     while not composition.stopping.wait(SAVE_PERIOD):
         for node in composition.nodes:
             if node.is_running:
-                attempt(_reload_if_saved, composition, node, save_times)
+                attempt(_reload_if_saved, composition, node, saves)
 
 
-def _reload_if_saved(composition, node, save_times):
+def _reload_if_saved(composition, node, saves):
     with contextlib.suppress(FileNotFoundError):  # an editor is about to replace a file
-        times = [os.path.getmtime(each.__file__) for each in editable_modules(node)]
-        if save_times.setdefault(node, times) != times:
-            save_times[node] = times
-            composition.stopping.wait(SAVE_PERIOD)  # the editor may still write
+        files = [os.stat(module.__file__) for module in editable_modules(node)]
+        save = [(file.st_mtime, file.st_size) for file in files]
+        reloaded, last = saves.setdefault(node, (save, save))
+        saves[node] = reloaded, save
+        if reloaded != save == last:  # else the editor may still write
+            saves[node] = save, save
             answer = _answer(composition, 'reload', node.name)
             # nothing: as when the program has imported one more module
             if answer != f'{DONE}{NO_CHANGE}':

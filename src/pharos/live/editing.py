@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import ast
+import copy
 import inspect
 import os
 import pathlib
@@ -208,10 +209,10 @@ def _keep(former_tree, tree, file):
     """Add the definitions to a tree that are in force, though they have gone; return new lines on them."""
     names = {name for item in tree.body for name in _names(item)}
     gone = [item for item in former_tree.body if _names(item) and names.isdisjoint(_names(item))]
-    tree.body += gone
     new_names = [name for item in gone for name in _names(item) if not hasattr(item, 'has_gone')]
-    for item in gone:
-        item.has_gone = True
+    for item in map(copy.copy, gone):  # the former tree stays, if the edit of another module fails
+        item.has_gone = True  # type: ignore[attr-defined]
+        tree.body.append(item)
     return [f'{file}: {name} has gone; it stays in force until a restart' for name in new_names]
 
 

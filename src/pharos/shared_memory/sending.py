@@ -42,9 +42,8 @@ class MemoryFile:
     def __init__(self, position: int, size: int) -> None:
         self.position = position
         self.capacity = size + size // 4  # messages grow
-        self.senders: set[
-            MemorySender
-        ] = set()  # senders that announce it later, or have no receipt yet
+        # those that announce it later, or have no receipt yet
+        self.senders: set[MemorySender] = set()
         self.descriptor = os.memfd_create('pharos')
         try:
             os.ftruncate(self.descriptor, self.capacity)

@@ -40,9 +40,8 @@ LONGEST_LOOK = 64_000  # nanoseconds: the looks of a thread that waits by looks 
 #: modules with a wait that keeps the turn: the master may take long beside load, and its calls have a
 #: limit of their own; at the prompt of a debugger, all stands still
 KEEP_TURN = xmlrpc.__name__, 'bdb'
-MAX_GAP = (
-    86400  # seconds between two messages of a bag: in a longer one, nodes would compute for hours
-)
+#: seconds between two messages of a bag: in a longer one, nodes would compute for hours
+MAX_GAP = 86400
 JITTER = 0.03  # seconds
 LAST = math.inf  # the order of a wait that ends after all others that end at the same time
 
@@ -180,7 +179,7 @@ class Simulation:
         self.wait(self.begin + round(seconds * 10**9), LAST)
 
     def run_to(self, predicate: Callable[[], Any], limit: float) -> bool:
-        """Let the time go on to the first moment at which ``predicate()`` is true.
+        """Let the time go on to the first moment at which ``predicate()`` is true, for the prompt.
 
         :param predicate: called in all threads, whenever one gives its turn back
         :param limit: seconds
@@ -341,8 +340,12 @@ class Simulation:
             self.wait(self.nanoseconds, next(self._orders))
 
     def prepare(self, thread):
-        """Give a thread its attributes: the turn comes by a queue."""
+        """Give a thread its attributes: the turn comes by a queue.
+
+        ``look`` is the number of nanoseconds that its next look at a clock takes.
+        """
         thread.simulation = self
+        thread.look = LOOK
         thread.has_ended = False
         thread.turns = SimpleQueue()
 
@@ -453,5 +456,8 @@ def _place_of(thread):
         module = frame.f_globals.get('__name__', '')
         if module == 'threading' and frame.f_code.co_name == 'wait':
             return ''
-        if not module.startswith(('threading', 'pharos.simulation')):
-            return '' if module.startswith('pharos.') else f'{frame.f_code.co_filename}:{line}'
+        if module.startswith('pharos.') and not module.startswith('pharos.simulation'):
+            return ''
+        if not module.startswith(('threading', 'pharos.')):
+            return f'{frame.f_code.co_filename}:{line}'
+    return ''

@@ -7,7 +7,7 @@ import pdb
 import sys
 from typing import Any, Callable
 
-from pharos.errors import UnknownNodeError, UnknownTopicError
+from pharos.errors import PharosError, UnknownNodeError, UnknownTopicError
 from pharos.live.editing import editable_modules
 
 LIMIT = 600.0  # seconds of ROS time
@@ -164,7 +164,12 @@ class Prompt:
         """Open the debugger at the next line that a node runs, while all others stand still.
 
         :param limit: seconds of ROS time
+        :raises PharosError: with Python 3.14, whose debugger loses the next line
         """
+        if sys.version_info >= (3, 14):
+            raise PharosError(
+                'step() needs an older Python than 3.14: write breakpoint() at the line'
+            )
         program = Program(self._find(name))
         simulation = self._simulation
         debugger = Debugger(simulation)
