@@ -7,7 +7,7 @@ import psutil
 import pytest
 
 from helpers import INIT, SPIN, end
-from pharos.compose.sources import sets_environment, why_apart
+from pharos.compose.sources import needs_group, why_apart
 from pharos.testing import until
 
 
@@ -37,9 +37,10 @@ def test_program_may_need_an_environment(tmp_path):
     sets = "os.environ['GPU'] = '1'|os.environ.setdefault('OMP_NUM_THREADS', '1')|env = os.environ"
     sets += "|os.environ.update(TZ='UTC')|os.putenv('TZ', 'UTC')|os.environ[name] = value"
     sets += "|os.environ.pop('TZ')|del os.environ['TZ']"
-    check(tmp_path, sets_environment, sets, 'env')
+    check(tmp_path, needs_group, sets, 'env')
+    check(tmp_path, needs_group, 'np.set_printoptions(precision=3)', 'set_printoptions(')
     reads = "os.environ['ROS_NAMESPACE'] = ''|os.environ['TZ'] == 'UTC'|print(os.environ['TZ'])"
-    check(tmp_path, sets_environment, f'{reads}|subprocess.run(command, env=os.environ)', '')
+    check(tmp_path, needs_group, f'{reads}|subprocess.run(command, env=os.environ)', '')
 
 
 APART = '<node pkg="bench" type="program" name="program">{}</node>'
@@ -78,7 +79,7 @@ def test_nodes_of_a_killed_roslaunch_end_or_respawn(master, bench):
         assert composed.node('/one').is_alive()
         until(lambda: '/two' not in [each.name for each in master.nodes()])
         assert end(composed) == 1
-    bench.until(lambda: not any(psutil.pid_exists(int(pid)) for pid in bench.said()))
+    until(lambda: not any(psutil.pid_exists(int(pid)) for pid in bench.said()))
 
 
 # -- crashes are told

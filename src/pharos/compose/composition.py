@@ -28,7 +28,7 @@ from pharos.compose.script import ScriptNode, name_of_file, wait_for_end
 from pharos.compose.sources import (
     environment_of,
     needs_process,
-    sets_environment,
+    needs_group,
     source_of,
     why_not_this_python,
 )
@@ -170,7 +170,7 @@ class Composition:
             environment = ()
             if not reason:
                 environment = environment_of(entry.roslaunch_node.env_args)
-                code = '' if is_alone else sets_environment(entry.path)
+                code = '' if is_alone else needs_group(entry.path)
                 reason = code and f'a group of its own: {entry.name} has {code!r}'
             groups[reason, environment].append(entry)
         own_keys = [

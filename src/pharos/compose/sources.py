@@ -26,11 +26,11 @@ _NEEDS_PROCESS = re.compile(
     r'|\bweb\.run_app\(|\buvicorn\.run\(',
     re.MULTILINE,
 )
-#: code that sets environment variables other than ROS's
-_SETS_ENVIRONMENT = re.compile(
+#: code that sets environment variables other than ROS's, or has numpy print otherwise
+_NEEDS_GROUP = re.compile(
     r'\benviron\[\s*(?![\'"]ROS)[^]\n]*\]\s*=(?!=)|\bdel\s+os\.environ\b|\benviron\s*\|='
     r'|\benviron\.(?:update\(|(?:setdefault|pop)\(\s*(?![\'"]ROS))|\bos\.putenv\('
-    r'|^[ \t]*\w+[ \t]*=[ \t]*os\.environ[ \t]*$',
+    r'|^[ \t]*\w+[ \t]*=[ \t]*os\.environ[ \t]*$|\bset_printoptions\(',
     re.MULTILINE,
 )
 _IMPORT = re.compile(
@@ -100,12 +100,13 @@ def environment_of(pairs):
     return tuple(sorted((name, value) for name, value in pairs if not name.startswith('ROS')))
 
 
-def sets_environment(path):
-    """Return the code of a Python program that sets environment variables, or ''.
+def needs_group(path):
+    """Return the code of a Python program that sets environment variables or print options, or ''.
 
-    In a process with other programs, code in C and shared modules do not see its variables.
+    In a process with other programs, code in C and shared modules do not see its variables, and all
+    have its print options of numpy.
     """
-    return _search(path, _SETS_ENVIRONMENT)
+    return _search(path, _NEEDS_GROUP)
 
 
 def forget_files():

@@ -433,7 +433,7 @@ def changes():
         composition: {
             'compose': compose,
             'environment_of': lambda pairs: (),
-            'sets_environment': lambda path: '',
+            'needs_group': lambda path: '',
         },
         ScriptRun: {'init_node': init_node},
         composition.Composition: {'_start_part': _refuse_part},
