@@ -53,6 +53,16 @@ def test_no_files_import_each_other():
     assert left == {}
 
 
+def test_clock_is_read_as_an_attribute_unless_it_is_to_be_real():
+    """A simulation replaces the functions of the modules time and threading."""
+    by_name = re.compile(r'^ *from (?:time|threading|_thread) import (.*)', re.M)
+    for path in FILES.values():
+        for names in by_name.findall(path.read_text()):
+            if re.search(r'monotonic|perf_counter|sleep|[Ll]ock|Event|Condition', names):
+                is_simulation = path.parent.name == 'simulation'
+                assert is_simulation or names.endswith('# by name: real, also in a simulation')
+
+
 def test_table_of_contributing_has_all_files():
     """It names each file of tests, and no file that is not there."""
     text = (ROOT / 'CONTRIBUTING.md').read_text()

@@ -6,7 +6,7 @@ import contextlib
 import inspect
 import os
 import re
-from time import monotonic
+from time import monotonic  # by name: real, also in a simulation
 from typing import TYPE_CHECKING, Any, Sequence, TypeVar
 from weakref import WeakValueDictionary
 from xmlrpc.client import dumps, loads

@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 import time
-from time import monotonic  # by name: signals come in real time, also in a simulation
+from time import monotonic  # by name: real, also in a simulation
 
 import rospy
 

@@ -3,6 +3,7 @@ import contextlib
 import math
 import threading
 import time
+from time import sleep  # by name: real, also in a simulation
 from typing import Any
 
 from pharos.errors import PharosError
@@ -28,6 +29,11 @@ current = _Current()
 def let_others_run() -> None:
     """Let other threads of this process run: one that computes keeps the interpreter for 5 ms."""
     time.sleep(1e-6)  # sleep(0) may end before another thread has woken
+
+
+def let_senders_run() -> None:
+    """Let the threads of senders run, which have no virtual time."""
+    sleep(1e-6)
 
 
 def wait(predicate, timeout=None, node=None, subject=''):

@@ -12,8 +12,8 @@ import collections
 import contextlib
 import itertools
 import threading
-from _thread import allocate_lock, get_ident
-from time import perf_counter
+import time
+from threading import get_ident
 from typing import Any, Callable
 
 BURST = 100e-6  # seconds; a publisher that woke a thread less than this ago does not wait for one
@@ -49,7 +49,7 @@ class CallbackOrder:
         """True if no callback on a message before this number delays the queue's next one."""
         if self.is_paused:
             return False
-        now = perf_counter()
+        now = time.perf_counter()
         for queue in list(self.queues):
             if queue is not callback_queue and queue.delays(number, now):
                 return False
@@ -73,10 +73,10 @@ class CallbackQueue:
         queue that is made meanwhile prolongs the pause to the end of its own: a constructor may
         subscribe to several topics before it has set all that its callbacks use
     :ivar jobs: the messages of all inboxes, as Inbox says
-    :ivar pause_end: the time when the first pause ends, as of perf_counter(); 0 after the pause
+    :ivar pause_end: the time when the first pause ends, as of time.perf_counter(); 0 after the pause
     :ivar running_thread: the identifier of the thread that runs callbacks, or None
     :ivar thread: the thread of the queue, from the first message on; None if the thread has ended
-    :ivar begin_time: the time when the callback that runs began, as of perf_counter(), or None
+    :ivar begin_time: the time when the callback that runs began, as of time.perf_counter(), or None
     :ivar waits_for_turn: True while the next callback waits for those of other queues
     """
 
@@ -92,7 +92,7 @@ class CallbackQueue:
         self.order = order
         self.jobs = collections.deque()
         self._maker = get_ident()  # the thread that has made the queue
-        now = perf_counter()
+        now = time.perf_counter()
         self.pause_end = now + first_pause if first_pause else 0.0
         for queue in list(order.queues):
             if now < queue.pause_end < self.pause_end:
@@ -101,14 +101,14 @@ class CallbackQueue:
         # a signal may raise between any two lines of a publisher, and the next message gives them again.
         # Locked: the thread may sleep. Unlocked: it has to look for jobs before it sleeps, and that
         # look locks it. Only the thread takes it, in its rest, its first pause and its wait for a turn.
-        self._wake_lock = allocate_lock()
+        self._wake_lock = threading.Lock()
         self._wake_lock.acquire()
         # Locked: a publisher has woken the thread, which has not begun to look. The thread unlocks it:
         # so a publisher waits for the thread by taking it.
-        self.request_lock = allocate_lock()
+        self.request_lock = threading.Lock()
         # These two guard, as locks do.
-        self._loop_lock = allocate_lock()  # held by the thread: there is but one
-        self._running_lock = allocate_lock()  # held by the thread that runs callbacks
+        self._loop_lock = threading.Lock()  # held by the thread: there is but one
+        self._running_lock = threading.Lock()  # held by the thread that runs callbacks
 
     def release(self) -> None:
         """End the first pause; any thread may do so."""
@@ -146,10 +146,10 @@ class CallbackQueue:
 
     def _wait_for_turn(self) -> None:
         """Wait until callbacks on earlier messages have ended, or have run for SLOW."""
-        deadline = perf_counter() + TURN_LIMIT
+        deadline = time.perf_counter() + TURN_LIMIT
         self.waits_for_turn = True
         while not self.order.has_turn(self, self.next_number()) and not self.closed:
-            if perf_counter() > deadline:
+            if time.perf_counter() > deadline:
                 break
             self._wake_lock.acquire(True, TURN_PERIOD)
         self.waits_for_turn = False
@@ -185,7 +185,7 @@ class CallbackQueue:
             job = self.jobs.popleft()
         except IndexError:  # a publisher has dropped the last one
             return
-        self.begin_time = perf_counter()
+        self.begin_time = time.perf_counter()
         job[1].run_callback(job)
         self.begin_time = None
 
@@ -194,14 +194,14 @@ class CallbackQueue:
         if waits_for_turn:
             self._wait_for_turn()
         self._current_number = self.next_number()
-        begin_time = self.begin_time = perf_counter()
+        begin_time = self.begin_time = time.perf_counter()
         if self._was_slow:  # the next callbacks need not wait for this one
             self.order.pass_turn()
         try:
             if not self.closed:  # else a stop has begun
                 self._run_next()
         finally:
-            self._was_slow = perf_counter() - begin_time > SLOW
+            self._was_slow = time.perf_counter() - begin_time > SLOW
             self.begin_time = None
             self.order.pass_turn()
 
@@ -256,7 +256,7 @@ class CallbackQueue:
     def _wait_for_first_run(self) -> None:
         """Wait until the first pause is over; release() and stop() wake this."""
         while self.pause_end and not self.closed:
-            pause = self.pause_end - perf_counter()
+            pause = self.pause_end - time.perf_counter()
             if pause > 0:
                 self._wake_lock.acquire(True, pause)
             else:
@@ -303,13 +303,13 @@ class CallbackQueue:
 def hand_over(callback_queues: list[CallbackQueue], last_wake: float, may_wait: bool) -> float:
     """Wake the threads of some callback queues; a publisher calls this.
 
-    :param last_wake: the last time that the same publisher woke a thread, as of perf_counter()
+    :param last_wake: the last time that the same publisher woke a thread, as of time.perf_counter()
     :param may_wait: True: wait until each thread runs, up to YIELD_LIMIT; after one that takes so long
         wait for no other
     :returns: the time of the last wake of these, or ``last_wake`` if no thread was woken
     """
     global _no_yield_before
-    now = perf_counter()
+    now = time.perf_counter()
     # a busy publisher keeps the interpreter for 5 ms, unless it waits for the thread to run
     waits = may_wait and now - last_wake > BURST and now > _no_yield_before
     for callback_queue in callback_queues:
@@ -320,5 +320,5 @@ def hand_over(callback_queues: list[CallbackQueue], last_wake: float, may_wait: 
             waits = callback_queue.request_lock.acquire(True, YIELD_LIMIT)
             if not waits:
                 _no_yield_before = now + YIELD_PAUSE
-        last_wake = perf_counter()  # after the wait: to wait is no rest of the publisher
+        last_wake = time.perf_counter()  # after the wait: to wait is no rest of the publisher
     return last_wake

@@ -6,7 +6,7 @@ import functools
 import socket
 import threading
 from contextlib import suppress
-from time import monotonic
+from time import monotonic  # by name: real, also in a simulation
 
 from pharos.errors import MasterUnreachableError, NodeNameInUseError
 from pharos.intraprocess.links import link_topic, runs, runs_lock

@@ -14,7 +14,6 @@ import threading
 import time
 import xmlrpc.client
 from contextlib import suppress
-from time import monotonic
 from typing import TYPE_CHECKING, Any, Callable, Iterable, Sequence
 from urllib.parse import urlsplit
 from weakref import WeakSet
@@ -122,7 +121,7 @@ class Run:
         # the pause ends when the node's start() has returned
         self.callback_queue = CallbackQueue(self.callback_order, HOLD_LIMIT)
         namespace, _, self.base_name = self.name.rpartition('/')
-        self.clock_deadline = monotonic() + CLOCK_LIMIT  # when a clock that stands is told
+        self.clock_deadline = time.monotonic() + CLOCK_LIMIT  # when a clock that stands is told
         self.environ = {
             'ROSCONSOLE_FORMAT': '[${severity}] [${time}]: ${node}: ${message}',
             **os.environ,
@@ -383,7 +382,7 @@ class Run:
         The end of a handshake takes the client out of ``deadlines``. A call of XML-RPC, with its answer,
         has that time as a whole.
         """
-        self.deadlines[sock] = monotonic() + self.node.client_timeout
+        self.deadlines[sock] = time.monotonic() + self.node.client_timeout
 
     # -- stop
 
@@ -405,7 +404,7 @@ class Run:
         """
         self._begin_stop()  # the end of a script calls close_rospy() before stop()
         connections.leave(self)
-        deadline = monotonic() + timeout
+        deadline = time.monotonic() + timeout
         for publisher in list(self.topic_manager.pubs.values()):
             publisher.flush(deadline)
         self.rospy_signal_shutdown('stop')
@@ -443,9 +442,11 @@ class Run:
         self.close_rospy(timeout)
         for sock in list(self.sockets):
             shutdown_socket(sock)  # wakes the threads that read; close() would not
-        deadline = monotonic() + STOP_LIMIT
+        deadline = time.monotonic() + STOP_LIMIT
         # souls have had their time; a thread that ends may have started another one
-        while join(set(self.threads) - set(self.souls), JOIN_PERIOD) and monotonic() < deadline:
+        while (
+            join(set(self.threads) - set(self.souls), JOIN_PERIOD) and time.monotonic() < deadline
+        ):
             pass
         self.finished.set()
         logging = self.modules.load('logging')
@@ -461,12 +462,12 @@ def join(threads: Iterable[threading.Thread], timeout: float) -> list[threading.
 
     :param timeout: seconds for all of them together
     """
-    deadline = monotonic() + timeout
+    deadline = time.monotonic() + timeout
     others = [
         thread
         for thread in threads
         if thread.is_alive() and thread is not threading.current_thread()
     ]
     for thread in others:
-        thread.join(max(0.0, deadline - monotonic()))
+        thread.join(max(0.0, deadline - time.monotonic()))
     return [thread for thread in others if thread.is_alive()]

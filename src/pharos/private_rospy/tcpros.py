@@ -10,7 +10,7 @@ from pharos.intraprocess.inboxes import BoundedQueue
 from pharos.private_rospy import sharing
 from pharos.private_rospy.connections import connect_later
 from pharos.transcript import tell_once
-from pharos.waiting import let_others_run
+from pharos.waiting import let_senders_run
 
 MAX_MESSAGE = 1_000_000_000  # bytes, as in roscpp
 MAX_DIRECT = 2 << 20  # bytes; the write of a larger message would hold up the publisher
@@ -207,7 +207,7 @@ class Sender(BoundedQueue):
         with self._lock:
             self._write(parts, size)
         if self._has_thread:
-            let_others_run()
+            let_senders_run()
 
     def _write(self, parts: list, size: int) -> None:
         self.queue_size = self._publication.queue_size

@@ -15,7 +15,7 @@ import select
 import socket
 import struct
 import threading
-from time import monotonic
+from time import monotonic  # by name: real, also in a simulation
 from typing import NamedTuple
 
 import genpy
@@ -24,7 +24,7 @@ from pharos.intraprocess.copier import serialize
 from pharos.intraprocess.inboxes import BoundedQueue
 from pharos.intraprocess.links import LocalTransport
 from pharos.private_rospy.tcpros import send_while_waiting, shutdown_socket
-from pharos.waiting import let_others_run
+from pharos.waiting import let_senders_run
 
 MAX_PACKET = 1 << 16  # bytes of a message, or a part of one, that the socket takes itself
 MAX_FILES = 4  # of a publisher; beyond that, the slowest readers lose messages
@@ -106,7 +106,7 @@ class MessageMemory:
                     sender.give_up()
                 sender.close_if_broken()
         if any(sender.is_sending for sender in senders):
-            let_others_run()
+            let_senders_run()
 
     def _put(
         self, parts: tuple[int, bytes | memoryview, bytes], senders: list[MemorySender]

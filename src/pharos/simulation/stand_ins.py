@@ -27,10 +27,10 @@ from pharos.intraprocess import callback_queues
 from pharos.intraprocess.copier import copy_of
 from pharos.intraprocess.links import runs
 from pharos.live import service_client
-from pharos.private_rospy import run, tcpros
+from pharos.private_rospy import run
 from pharos.private_rospy.loader import Shim
 from pharos.private_rospy.patches import patch
-from pharos.shared_memory import sending
+from pharos.waiting import let_senders_run
 
 CLOCKS = 'time', 'perf_counter', 'monotonic', 'time_ns', 'perf_counter_ns', 'monotonic_ns'
 #: looks of these modules at a clock take no time: they come more or less often, as they wait for servers
@@ -54,7 +54,6 @@ _monotonic = time.monotonic
 _start = threading.Thread.start
 _join = threading.Thread.join
 _is_alive = threading.Thread.is_alive
-_let_servers_run = functools.partial(_sleep, 1e-6)
 _simulation: Any = None  # the Simulation that goes on, or None
 
 
@@ -323,7 +322,7 @@ def poll_child(original, run, child):
         if _monotonic() > end:
             child.is_slow = True
             _simulation.lost.append(f'{local.thread.name} with its child {child.args}')
-        _let_servers_run()
+        let_senders_run()
     return original(child)
 
 
@@ -418,16 +417,8 @@ def changes():
             'is_alive': is_alive,
         },
         queue: {'SimpleQueue': queue._PySimpleQueue, 'time': monotonic},  # type: ignore
-        callback_queues: {
-            'allocate_lock': Lock,
-            'perf_counter': monotonic,
-            '_no_yield_before': 0.0,  # a virtual time is too late for the real clock
-        },
-        run: {'monotonic': monotonic},
+        callback_queues: {'_no_yield_before': 0.0},  # a virtual time is too late for the real clock
         run.Run: {'read_parameters': read_all_parameters, 'substitutes': substitutes},
-        # senders' threads are real ones
-        sending: {'let_others_run': _let_servers_run},
-        tcpros: {'let_others_run': _let_servers_run},
         service_client: {'ignores_timeout': True},
         # all programs run here
         composition: {
