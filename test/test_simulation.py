@@ -17,7 +17,7 @@ import rosbag
 import sensor_msgs.msg
 import std_msgs.msg
 
-from helpers import COMPOSE, INIT, PYTHON, ROOT, TIMEOUT, Program
+from helpers import COMPOSE, INIT, PYTHON, ROOT, SPIN, TIMEOUT, Program
 from pharos import BlockNode, PharosError, testing
 from pharos.simulation import Simulation
 from pharos.simulation.comparing import differences
@@ -307,6 +307,10 @@ BUSY_WAIT = '''
 end = rospy.get_time() + 3
 while rospy.get_time() < end: pass
 say(rospy.get_time() - end)'''
+BUSY_LOOP = '''
+while not rospy.is_shutdown():
+    if woken.is_set(): break
+say(time.time() - start)'''
 LATER = 'rospy.Timer(rospy.Duration(3), lambda event: wake(), oneshot=True)\nstart = time.time()\n'
 PIPE = "readable, writable = os.pipe()\nwake = lambda: os.write(writable, b'x')\n" + LATER
 POLL = PIPE + 'poll = select.poll(); poll.register(readable)\n'
@@ -340,6 +344,10 @@ PROGRAM_LINES = {
     'class Mine(datetime.datetime): pass\nsay(Mine is type(Mine.now()))': 'True',
     BUSY_WAIT: '0.000.*|.*e-05',
     BUSY_WAIT.replace('rospy.get_time', 'time.monotonic'): '0.000.*|.*e-05',
+    # as loops that wait for a transform
+    LATER.replace('wake()', 'woken.set()').join(
+        ['woken = threading.Event()\n', BUSY_LOOP]
+    ): '3.00.*',
     PIPE + 'select.select([readable], [], [], 5); say(time.time() - start)': AT_3,
     PIPE + 'select.select([readable], [], [], 1); say(time.time() - start)': AT_1,
     PIPE
@@ -508,6 +516,16 @@ def test_prompt_goes_to_times_and_back(session):
     assert session.ask(look).split()[1] == '41'
     session.ask('at(12.3)')
     assert session.ask(look) == first
+    assert session.end() == 0
+
+
+def test_prompt_goes_back_in_the_first_environment(master, bench):
+    """A single program has the process's variables, and ROS adds its namespace to names."""
+    bench.write(SPIN)
+    xml = '<group ns="foo"><node pkg="bench" type="program" name="program"/></group>'
+    session = Session('3', bench.launch_file(xml))
+    session.ask('at(1)')
+    assert 'Program' in session.ask("node('/foo/program')")
     assert session.end() == 0
 
 

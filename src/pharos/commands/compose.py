@@ -19,7 +19,9 @@ from pharos.compose.composition import Composition, leave
 from pharos.compose.control import reload_on_save
 from pharos.compose.launch_file import LaunchFile
 
-FOLDER = os.getcwd()  # at the start; it changes to that of ROS
+# of the start: both change to what the robot needs
+FOLDER = os.getcwd()
+ENVIRONMENT = dict(os.environ)
 #: options that take names -> help
 NAMES = {
     'script': 'programs to run',
@@ -168,8 +170,8 @@ def _show_differences(simulation, options):
 def _fix_hashes(seed):
     """Start this command anew, unless the order of its sets of texts is that of the seed."""
     number = str(seed % 2**32)
-    if os.environ.get('PYTHONHASHSEED') != number:
-        os.environ['PYTHONHASHSEED'] = number
+    if ENVIRONMENT.get('PYTHONHASHSEED') != number:
+        ENVIRONMENT['PYTHONHASHSEED'] = number
         _start_again()
 
 
@@ -177,7 +179,7 @@ def _start_again(*options):
     """Start this command anew, in this process, with options after those that it has."""
     command = pathlib.Path('/proc/self/cmdline').read_bytes().split(b'\0')[:-1]
     os.chdir(FOLDER)
-    os.execv(sys.executable, [*command, *options])
+    os.execve(sys.executable, [*command, *options], ENVIRONMENT)
 
 
 def _begin_simulation(stack, master, options):
@@ -214,9 +216,13 @@ def _begin_simulation(stack, master, options):
 
 
 def _show_progress(simulation, ended):
-    """Show the time on the terminal, in one line."""
+    """Show the time on the terminal, in one line, unless it stands still at a breakpoint()."""
+    shown = ''
     while not ended.wait(1):
-        print(f'{simulation.seconds:.0f} s of ROS time', end='\r', file=sys.stderr)
+        text = f'{simulation.seconds:.0f} s of ROS time'
+        if text != shown:
+            print(text, end='\r', file=sys.stderr)
+        shown = text
 
 
 def _simulate(simulation, options):

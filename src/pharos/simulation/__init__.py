@@ -36,6 +36,7 @@ from pharos.waiting import wait
 LOOK = 1000
 #: nanoseconds of looks after which a thread gives its turn back: it waits by looks
 LOOKS_LIMIT = 1_000_000
+FREE_ASKS = 10  # in a turn: a loop that asks for the end and sleeps keeps its rate
 LONGEST_LOOK = 64_000  # nanoseconds: the looks of a thread that waits by looks become longer
 #: modules with a wait that keeps the turn: the master may take long beside load, and its calls have a
 #: limit of their own; at the prompt of a debugger, all stands still
@@ -60,6 +61,7 @@ class Simulation:
     record: Any = None
     launch_file = bag = ''
     _looks = 0  # at the thread with the turn, since it got the turn
+    _asks = 0  # by that thread, whether it shall end
     _cpu_time = 0.0
     on_turn: Any = None  # None, or called in each thread that gets the turn
     _on_wait: Any = None  # None, or called in each thread that gives it back
@@ -327,7 +329,7 @@ class Simulation:
             del self._waits[thread]
             self.nanoseconds = max(self.nanoseconds, end)
             self._holder = thread
-            self._looks = 0
+            self._looks = self._asks = 0
             self._turn_begin = self.nanoseconds
             thread.turns.put(None)
 
@@ -338,6 +340,12 @@ class Simulation:
         if self.nanoseconds > self._turn_begin + LOOKS_LIMIT:
             thread.look = min(2 * thread.look, LONGEST_LOOK)
             self.wait(self.nanoseconds, next(self._orders))
+
+    def ask(self):
+        """Have a question for the end take some time, unless it is one of the first of a turn."""
+        self._asks += 1
+        if self._asks > FREE_ASKS:
+            self.look()
 
     def prepare(self, thread):
         """Give a thread its attributes: the turn comes by a queue.
