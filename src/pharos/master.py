@@ -114,7 +114,7 @@ class Master:
         self.shared_memory = shared_memory and hasattr(os, 'memfd_create')
         self.share_connections = share_connections
         self.parameters = Parameters(self.call)
-        self._process = None
+        self._process: Any = None
         signals.handle_signals()
 
     # -- an embedded master

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 import tty
+from typing import Any
 
 import psutil
 import roslib.packages
@@ -36,8 +37,15 @@ class RosProcess(subprocess.Popen):
     :param options: of ``subprocess.Popen``; ``stdin=None``: the keyboard of this process
     """
 
-    def __init__(self, command, master_url, on_line=None, environment=None, **options):
-        self._lines = collections.deque(maxlen=MAX_LINES)
+    def __init__(
+        self,
+        command: list[str],
+        master_url: str,
+        on_line: Any = None,
+        environment: dict[str, str] | None = None,
+        **options: Any,
+    ) -> None:
+        self._lines: collections.deque[str] = collections.deque(maxlen=MAX_LINES)
         self._on_line = on_line
         terminal, child_terminal = os.openpty()
         tty.setraw(child_terminal)
@@ -58,7 +66,7 @@ class RosProcess(subprocess.Popen):
         self._reader.start()
         atexit.register(self.terminate)
 
-    def _read(self):
+    def _read(self) -> None:
         with contextlib.suppress(OSError), self._terminal:
             for line in self._terminal:  # until the program has closed it
                 text = _TERMINAL_CODES.sub('', line.rstrip('\n'))
@@ -112,11 +120,11 @@ class RosProcess(subprocess.Popen):
                 process.kill()
         return self.wait()
 
-    def __exit__(self, *error):
+    def __exit__(self, *error: object) -> None:
         self.terminate()
 
 
-def start_master(port):
+def start_master(port: int) -> tuple[str, subprocess.Popen[str]]:
     """Start the master of :meth:`Master.embedded`, and return its URL and its subprocess.Popen."""
     environ = dict(os.environ)
     environ['PYTHONPATH'] = os.pathsep.join(folder for folder in sys.path if folder)
@@ -140,34 +148,34 @@ def start_master(port):
     return url, process
 
 
-def run_program(url, package, executable, args):
+def run_program(url: str, package: str, executable: str, args: tuple) -> RosProcess:
     """Do the work of :meth:`Master.run`."""
     path = find_program(package, executable)
     return RosProcess([path, *map(str, args)], url)
 
 
-def run_launch_file(url, package, file, args):
+def run_launch_file(url: str, package: str | None, file: str, args: dict) -> RosProcess:
     """Do the work of :meth:`Master.launch`."""
     path = find_launch_file(package, file)
     arguments = [f'{name}:={value}' for name, value in args.items()]
     return RosProcess(['roslaunch', '--skip-log-check', path, *arguments], url)
 
 
-def descendants_of(process):
+def descendants_of(process: subprocess.Popen) -> list[psutil.Process]:
     """Return the children of a subprocess.Popen, and their children, as psutil's processes."""
     if process.poll() is not None:
         return []
     return psutil.Process(process.pid).children(recursive=True)
 
 
-def interrupt(process):
+def interrupt(process: subprocess.Popen) -> None:
     """Send SIGINT to a subprocess.Popen and its descendants, as Ctrl-C in a terminal does."""
     for each in [process, *descendants_of(process)]:
         with contextlib.suppress(psutil.Error):
             each.send_signal(signal.SIGINT)
 
 
-def find_program(package, executable):
+def find_program(package: str, executable: str) -> str:
     """Return the path of a program, found as rosrun does.
 
     :raises UnknownNodeError: if the package has no such program
@@ -188,7 +196,7 @@ def find_program(package, executable):
     return paths[0]
 
 
-def find_launch_file(package, file):
+def find_launch_file(package: str | None, file: str) -> str:
     """Return the path of a launch file, found as roslaunch does.
 
     :param package: None: ``file`` is a path
@@ -205,6 +213,6 @@ def find_launch_file(package, file):
         raise UnknownNodeError(f'there is no launch file {file!r}: {error}') from None
 
 
-def no_package(name):
+def no_package(name: str) -> UnknownNodeError:
     """Return the error of an unknown package."""
     return UnknownNodeError(f'no package {name!r}: is the workspace sourced?')

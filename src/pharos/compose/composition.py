@@ -13,6 +13,7 @@ import sys
 import tempfile
 import threading
 import time
+from typing import TYPE_CHECKING, Any, Iterator
 
 import rosgraph
 import roslaunch.core
@@ -39,6 +40,9 @@ from pharos.private_rospy.tcpros import shutdown_socket
 from pharos.transcript import Transcript, attempt
 from pharos.waiting import wait
 
+if TYPE_CHECKING:
+    from pharos.master import Master
+
 #: seconds until the next node starts side by side with one that has not registered yet
 HEAD_START = 0.1
 SLOW_END = 2.0  # seconds; the Transcript names what takes longer to end
@@ -51,7 +55,7 @@ POLL_PERIOD = 0.02  # seconds between two looks at the nodes that have ended
 SWITCH_INTERVAL = 0.3e-3
 
 
-def compose(master, *options):
+def compose(master: Master, *options: Any) -> Composition:
     """Do the work of :meth:`Master.compose`; the options are those of LaunchFile."""
     launch_file = LaunchFile(master.url, *options)
     composition = Composition(master)
@@ -69,7 +73,7 @@ class Composition:
     :ivar stopping: an Event, set when the end has begun
     """
 
-    def __init__(self, master, owns_process=False):
+    def __init__(self, master: Master, owns_process: bool = False) -> None:
         self.master = master
         self.owns_process = owns_process
         self.nodes: list[ScriptNode] = []
@@ -88,7 +92,7 @@ class Composition:
             faulthandler.enable(all_threads=False)  # a crash in C says where in Python it was
             sys.setswitchinterval(SWITCH_INTERVAL)
 
-    def launch(self, launch_file):
+    def launch(self, launch_file: LaunchFile) -> None:
         """Set the parameters of a launch file, and start its nodes.
 
         The Transcript shows why a node does not start, or runs in another process.
@@ -115,7 +119,9 @@ class Composition:
             entries.append(entry._replace(args=[*entry.args, f'__log:={log}.log'], log=log))
         self._start_groups(entries)
 
-    def run_scripts(self, programs, arguments, programs_here):
+    def run_scripts(
+        self, programs: list[str], arguments: list[str], programs_here: list[str]
+    ) -> None:
         """Run programs without a launch file; the Transcript shows why a program does not start.
 
         :param programs: texts: PACKAGE/EXECUTABLE, or a path
@@ -123,13 +129,13 @@ class Composition:
         :param programs_here: those of them that run in this process even if they show windows
         """
         Transcript.show(f'ROS master {self.master.url}, logs in {rospkg.get_log_dir()}')
-        entries = []
+        entries: list[Entry] = []
         for text in programs:
             with self._show_failure(text):
                 entries += self._script_entries(text, arguments, text in programs_here)
         self._start_groups(entries)
 
-    def _script_entries(self, text, arguments, is_here):
+    def _script_entries(self, text: str, arguments: list[str], is_here: bool) -> list[Entry]:
         """Return a list with the entry of a program; start a plain process if it needs one."""
         path = text
         if not os.path.isfile(text):
@@ -153,7 +159,7 @@ class Composition:
             return []
         return [entry]
 
-    def _start_groups(self, entries):
+    def _start_groups(self, entries: list[Entry]) -> None:
         """Start the groups, then the nodes of this process.
 
         Nodes with one environment share a process: code in C and shared modules see its variables. This
@@ -167,7 +173,7 @@ class Composition:
                 own_entries.append(entry)
                 continue
             reason = entry.group
-            environment = ()
+            environment: tuple = ()
             if not reason:
                 environment = environment_of(entry.roslaunch_node.env_args)
                 code = '' if is_alone else needs_group(entry.path)
@@ -190,7 +196,7 @@ class Composition:
             self._start_group(group_entries, environment)
         self.start_entries(own_entries)
 
-    def _start_group(self, entries, environment):
+    def _start_group(self, entries: list[Entry], environment: tuple) -> None:
         own_path = dict(environment).get('PYTHONPATH', '')
         folders = [own_path, *sys.path]
         command = [
@@ -205,7 +211,7 @@ class Composition:
         ]
         self._start_part(entries, command, list)
 
-    def start_entries(self, entries):
+    def start_entries(self, entries: list[Entry]) -> None:
         """Start nodes in this process, side by side, in the order of the launch file."""
         for entry in entries:
             with self._show_failure(entry.name):
@@ -214,7 +220,7 @@ class Composition:
         self._watcher.start()
         wait(lambda: all(map(_has_begun, self.nodes)), INIT_LIMIT)
 
-    def _start_part(self, *arguments):
+    def _start_part(self, *arguments: Any) -> _Part:
         part = _Part(self, *arguments)
         part.start()
         self._has_started = True
@@ -222,14 +228,14 @@ class Composition:
         return part
 
     @contextlib.contextmanager
-    def _show_failure(self, name):
+    def _show_failure(self, name: str) -> Iterator[None]:
         """Show a PharosError of a start in the Transcript, and go on: the other programs start."""
         try:
             yield
         except PharosError as error:
             Transcript.show(f'{name} is not started: {error}')
 
-    def _start(self, entry, owns_process):
+    def _start(self, entry: Entry, owns_process: bool) -> None:
         """Start a program as a node of this process.
 
         :raises PharosError: if the program failed before ``init_node``
@@ -263,13 +269,13 @@ class Composition:
                 return False
         return all(part.is_over for part in self._parts)
 
-    def _watch(self):
+    def _watch(self) -> None:
         """Show ends, start again nodes that respawn, and end all if a required node has ended."""
         while not (attempt(lambda: self.is_over) or self.stopping.wait(POLL_PERIOD)):
             attempt(self._look)
         attempt(self._look)
 
-    def _look(self):
+    def _look(self) -> None:
         for node in self.nodes:
             if self.stopping.is_set():
                 return
@@ -279,7 +285,7 @@ class Composition:
             if not self.stopping.is_set():
                 attempt(self._look_at_part, part)
 
-    def _look_at_part(self, part):
+    def _look_at_part(self, part: _Part) -> None:
         """Tell of a process that a signal has ended, and start again its nodes that respawn.
 
         roslaunch and groups end with a required node.
@@ -300,7 +306,7 @@ class Composition:
         else:
             part.is_over = True
 
-    def _respawn_part(self, part):
+    def _respawn_part(self, part: _Part) -> None:
         self.stopping.wait(max(float(each.roslaunch_node.respawn_delay) for each in part.entries))
         if not self.stopping.is_set():
             Transcript.show(f'{part.names}: back in a new process')
@@ -308,7 +314,7 @@ class Composition:
             if self.stopping.is_set():  # stop() may have looked before the start
                 part.process.terminate(TERMINATE_LIMIT)
 
-    def _look_at_ended(self, node):
+    def _look_at_ended(self, node: ScriptNode) -> None:
         name = node._settings.name
         now = time.monotonic()
         if node not in self._end_times:
@@ -321,7 +327,7 @@ class Composition:
             if now - self._end_times[node] >= float(roslaunch_node.respawn_delay):
                 self._respawn(node, name)
 
-    def _respawn(self, node, name):
+    def _respawn(self, node: ScriptNode, name: str) -> None:
         with self._show_failure(name):
             Transcript.show(f'{name} comes back')
             del self._end_times[node]
@@ -329,7 +335,7 @@ class Composition:
         if self.stopping.is_set():  # stop() may have looked before the start
             node._stop_safely()
 
-    def control(self, node, action):
+    def control(self, node: ScriptNode, action: str) -> str:
         """Restart, stop or start a node, or reload its program; a required one may stop, too.
 
         :returns: the node's name, or the answer of the reload
@@ -350,7 +356,7 @@ class Composition:
             self._stopped_nodes.discard(node)
         return node._settings.name
 
-    def _end(self, name):
+    def _end(self, name: str) -> None:
         if not self.stopping.is_set():
             Transcript.show(f'{name}, which is required, has ended: all others end')
             self._has_failed = True
@@ -410,7 +416,7 @@ class Composition:
     def __enter__(self) -> Composition:
         return self
 
-    def __exit__(self, *error):
+    def __exit__(self, *error: object) -> None:
         self.stop()
 
 
@@ -424,7 +430,13 @@ class _Part:
     :ivar is_over: True if the process has ended, that was told, and no node respawns
     """
 
-    def __init__(self, composition, entries, command, parcel_of=None):
+    def __init__(
+        self,
+        composition: Composition,
+        entries: list[Entry],
+        command: list[str],
+        parcel_of: Any = None,
+    ) -> None:
         self.entries = entries
         self._composition = composition
         self._master = composition.master
@@ -432,7 +444,7 @@ class _Part:
         self._parcel_of = parcel_of
         self.is_over = False
 
-    def start(self):
+    def start(self) -> None:
         """Start the process with the nodes in ``entries``."""
         command = self._command
         if self._parcel_of:
@@ -445,11 +457,11 @@ class _Part:
         )
 
     @property
-    def names(self):
+    def names(self) -> str:
         """The names of the nodes, as text."""
         return ', '.join(entry.name for entry in self.entries)
 
-    def forget_nodes(self):
+    def forget_nodes(self) -> None:
         """Unregister the nodes after a crash of the process; keep the entries that respawn.
 
         The nodes of roslaunch go on without it: end them.
@@ -463,7 +475,7 @@ class _Part:
         self.entries = [entry for entry in self.entries if entry.roslaunch_node.respawn]
 
 
-def leave(status):
+def leave(status: int) -> int:
     """Return an exit status; end this process at once if a thread goes on that is not a daemon.
 
     Such a thread of a library, as of socketserver, would go on for ever.
@@ -474,6 +486,6 @@ def leave(status):
     return status
 
 
-def _has_begun(node):
+def _has_begun(node: ScriptNode) -> bool:
     """True if a program has registered its node, or has ended."""
     return not node.is_running or node._current_run.is_known

@@ -10,7 +10,7 @@ import os
 import re
 import socket
 import threading
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pharos.errors import PharosError, UnknownNodeError
 from pharos.live.editing import NO_CHANGE, editable_modules
@@ -18,6 +18,7 @@ from pharos.private_rospy.tcpros import accept_clients, check_user
 from pharos.transcript import Transcript, attempt
 
 if TYPE_CHECKING:
+    from pharos.compose.composition import Composition
     from pharos.master import Master
 
 ANSWER_LIMIT = 60.0  # seconds
@@ -27,7 +28,7 @@ _PREFIX = 'pharos-compose-'
 DONE = 'done: '
 
 
-def listen(composition):
+def listen(composition: Composition) -> socket.socket:
     """Obey other processes, in a thread, until the composition has stopped."""
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
@@ -42,15 +43,15 @@ def listen(composition):
     return listener
 
 
-def _serve(listener, composition):
-    def obey(client, address):
+def _serve(listener: socket.socket, composition: Composition) -> None:
+    def obey(client: socket.socket, address: object) -> None:
         threading.Thread(target=_obey, args=[client, composition], daemon=True).start()
 
     with listener:
         accept_clients(listener, composition.stopping, obey)
 
 
-def _obey(client, composition):
+def _obey(client: socket.socket, composition: Composition) -> None:
     client.settimeout(ANSWER_LIMIT)
     with client, contextlib.suppress(OSError, ValueError):  # it has gone, or sends nonsense
         check_user(client)
@@ -59,7 +60,7 @@ def _obey(client, composition):
             client.send(_answer(composition, action, name).encode())
 
 
-def _answer(composition, action, name):
+def _answer(composition: Composition, action: str, name: str) -> str:
     """Do what a client wants, and return the text for it; '' if the node is not of this composition."""
     for node in composition.nodes:
         if name in (node._settings.name, *node.created_names):
@@ -70,7 +71,7 @@ def _answer(composition, action, name):
     return ''
 
 
-def reload_on_save(composition):
+def reload_on_save(composition: Composition) -> None:
     """Reload the nodes of this process whose files are saved, until the composition stops."""
     saves = {}  # node -> times and sizes of its files: of the last reload, and of the last look
     while not composition.stopping.wait(SAVE_PERIOD):
@@ -79,7 +80,7 @@ def reload_on_save(composition):
                 attempt(_reload_if_saved, composition, node, saves)
 
 
-def _reload_if_saved(composition, node, saves):
+def _reload_if_saved(composition: Composition, node: Any, saves: dict) -> None:
     with contextlib.suppress(FileNotFoundError):  # an editor is about to replace a file
         files = [os.stat(module.__file__) for module in editable_modules(node)]
         save = [(file.st_mtime, file.st_size) for file in files]

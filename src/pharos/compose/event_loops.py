@@ -12,7 +12,7 @@ _PREFIX = '_' if sys.version_info >= (3, 14) else ''
 _POLICY: Any = getattr(asyncio.events, f'{_PREFIX}BaseDefaultEventLoopPolicy')
 
 
-def _get_event_loop(policy, original=_POLICY.get_event_loop):
+def _get_event_loop(policy: Any, original: Any = _POLICY.get_event_loop) -> Any:
     """Return the event loop of this thread; make one in the main thread of a program.
 
     asyncio makes one in the main thread of a process. (Python 3.14 makes none there.)
@@ -25,7 +25,7 @@ def _get_event_loop(policy, original=_POLICY.get_event_loop):
     return original(policy)
 
 
-def _new_event_loop(policy, original=_POLICY.new_event_loop):
+def _new_event_loop(policy: Any, original: Any = _POLICY.new_event_loop) -> Any:
     """Return a new event loop; the end of the program that has made the loop closes it."""
     loop = original(policy)
     if hasattr(current.run, 'event_loops'):

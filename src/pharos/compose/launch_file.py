@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import os
-from typing import Any, NamedTuple
+from typing import Any, Collection, NamedTuple
 
 import rosgraph.names
 import rospkg
@@ -70,17 +70,17 @@ class LaunchFile:
 
     def __init__(
         self,
-        url,
-        package,
-        file,
-        args,
-        only=(),
-        apart=(),
-        here=(),
-        groups=(),
-        screen=False,
-        is_node=False,
-    ):
+        url: str,
+        package: str | None,
+        file: str,
+        args: dict[str, Any],
+        only: Collection[str] = (),
+        apart: Collection[str] = (),
+        here: Collection[str] = (),
+        groups: Collection[Collection[str]] = (),
+        screen: bool = False,
+        is_node: bool = False,
+    ) -> None:
         forget_files()
         self.path = find_launch_file(package, file)
         self._read(args, is_node)
@@ -103,7 +103,7 @@ class LaunchFile:
                 group = self._group_of(name, short_names[name], groups)
                 self._sort(name, node, is_apart, is_here, group)
 
-    def _read(self, args, is_node):
+    def _read(self, args: dict[str, Any], is_node: bool) -> None:
         loader = roslaunch.xmlloader.XmlLoader()
         arguments = [f'{name}:={value}' for name, value in args.items()]
         try:
@@ -120,13 +120,15 @@ class LaunchFile:
         else:
             self._check(args, known_args, 'arg')
 
-    def _check(self, names, known_names, role):
+    def _check(self, names: Collection[str], known_names: Collection[str], role: str) -> None:
         for name in names:
             if name not in known_names:
                 known_text = ', '.join(sorted(known_names)) or 'none'
                 raise UnknownNodeError(f'{self.path} has no {role} {name!r}; it has {known_text}')
 
-    def _group_of(self, name, short_names, groups):
+    def _group_of(
+        self, name: str, short_names: set[str], groups: Collection[Collection[str]]
+    ) -> str:
         """Return the name of the group of a node; '' if there is none."""
         for number, group in enumerate(groups, 1):
             if not short_names.isdisjoint(group):
@@ -134,14 +136,14 @@ class LaunchFile:
         group_name = self._private_parameter(name, GROUP_PARAMETER)
         return group_name and f'the group {group_name}' or ''
 
-    def _private_parameter(self, name, parameter_name):
+    def _private_parameter(self, name: str, parameter_name: str) -> Any:
         parameter = self.config.params.get(f'{name}/{parameter_name}')
         return parameter and parameter.value
 
-    def _sort(self, name, node, is_apart, is_here, group):
+    def _sort(self, name: str, node: Any, is_apart: bool, is_here: bool, group: str) -> None:
         """Put a node into the entries, or among those apart."""
         if is_apart or self._private_parameter(name, APART_PARAMETER):
-            reason = 'as --apart or pharos_apart says'
+            reason: Any = 'as --apart or pharos_apart says'
         else:
             reason = self._why_apart(node)
         try:
@@ -161,7 +163,7 @@ class LaunchFile:
             return
         self.entries.append(Entry(name, source_of(command[0]), command[1:], node, group, is_here))
 
-    def _why_apart(self, node):
+    def _why_apart(self, node: Any) -> str:
         """Return why the launch file wants a process for a node, as text; else ''."""
         if node.launch_prefix:
             return 'it has a launch-prefix'
@@ -171,7 +173,7 @@ class LaunchFile:
             return f'it belongs to the machine {node.machine.name}'
         return ''
 
-    def set_parameters(self, run_id):
+    def set_parameters(self, run_id: str) -> None:
         """Run the commands of rosparam, and clear and set the parameters, as roslaunch does.
 
         :param run_id: the /run_id of the master
@@ -186,7 +188,7 @@ class LaunchFile:
         except roslaunch.core.RLException as error:
             raise PharosError(f'{self.path}: {error}') from error
 
-    def config_of(self, entries):
+    def config_of(self, entries: list[Entry]) -> Any:
         """Return a configuration with nothing but some nodes, for a process of roslaunch."""
         config = roslaunch.config.ROSLaunchConfig()
         config.master = self.config.master

@@ -9,18 +9,19 @@ import signal
 import sys
 import threading
 import time
+from typing import Any
 
 
 PARENT_PERIOD = 1.0  # seconds between two looks at the parent
 
 
-def receive(path, parent):
+def receive(path: str, parent: int) -> Any:
     """Return the object that the parent has pickled in a file, and delete the file.
 
     From now on, SIGINT and the end of the parent end this process, as Ctrl-C does.
     """
 
-    def watch():
+    def watch() -> None:
         while os.getppid() == parent:
             time.sleep(PARENT_PERIOD)
         os.kill(os.getpid(), signal.SIGINT)
@@ -33,7 +34,7 @@ def receive(path, parent):
     return parcel
 
 
-def main(path, parent):
+def main(path: str, parent: int) -> int:
     """Run the nodes, and return the exit status.
 
     :param path: the file with the pickled configuration

@@ -40,10 +40,13 @@ class ScriptNode(Node):
     owns_process = False  # True: the process's environment is the program's
     output_file = ''  # what the program prints goes there; '': to the terminal
     _run_class = ScriptRun
+    _current_run: ScriptRun
     roslaunch_node: Any = None  # roslaunch's Node, if the program comes from a launch file
     _has_own_start = True  # the program itself opens its endpoints at each start
 
-    def __init__(self, path: str, args: list[str], params: dict | None = None, env: Any = ()):
+    def __init__(
+        self, path: str, args: list[str], params: dict | None = None, env: Any = ()
+    ) -> None:
         self.path = path
         self.args = args
         self.params = params or {}
@@ -51,7 +54,7 @@ class ScriptNode(Node):
         self.created_names = set()  # of nodes that the program has created with pharos
         self._settings.remappings = args
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f'<{type(self).__name__} {self._settings.name} {self.lifecycle.value} {self.path}>'
 
     def wait(self, timeout: float | None = None) -> int | None:
@@ -64,7 +67,7 @@ class ScriptNode(Node):
         return self.exit_code
 
 
-def wait_for_end(predicate, timeout, name):
+def wait_for_end(predicate: Any, timeout: float | None, name: str) -> None:
     """Wait until ``predicate()`` is true, or Ctrl-C.
 
     :param name: the name of the thing that must end, for the error
@@ -76,7 +79,17 @@ def wait_for_end(predicate, timeout, name):
             raise TimeoutError(f'{name} has not ended within {timeout:g} s: stop() it')
 
 
-def load(master, package, executable, args, name, namespace, remap, params, here):
+def load(
+    master: Any,
+    package: str,
+    executable: str | None,
+    args: tuple,
+    name: str | None,
+    namespace: str | None,
+    remap: dict[str, str],
+    params: dict[str, Any] | None,
+    here: bool,
+) -> ScriptNode:
     """Do the work of :meth:`Master.load`."""
     path = os.path.abspath(package) if executable is None else find_program(package, executable)
     if not os.path.isfile(path):
@@ -100,6 +113,6 @@ def load(master, package, executable, args, name, namespace, remap, params, here
     return master.create(ScriptNode, node_name, path=source_of(path), args=arguments, params=params)
 
 
-def name_of_file(path):
+def name_of_file(path: str) -> str:
     """Return the name of a program's node until the program calls ``rospy.init_node``."""
     return re.sub(r'\W|^(?=[^A-Za-z])', 'x', pathlib.Path(path).stem)

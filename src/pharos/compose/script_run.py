@@ -2,6 +2,8 @@
 
 These are signals, atexit, sys.argv, the output, the environment, and the main thread.
 """
+from __future__ import annotations
+
 import collections
 import contextlib
 import ctypes
@@ -16,13 +18,14 @@ import time
 import traceback
 import types
 from threading import ExceptHookArgs
+from typing import Any
 from weakref import WeakSet, WeakValueDictionary
 
 from rosgraph import get_master_uri
 from rosgraph.names import anonymous_name, get_ros_namespace, load_mappings, ns_join
 
 from pharos import signals
-from pharos.blocks import block_name
+from pharos.blocks import Block, block_name
 import pharos.compose.event_loops  # noqa: F401: it changes asyncio
 from pharos.compose.child_process import interrupt
 from pharos.compose.sources import compile_program
@@ -46,7 +49,9 @@ _HIDDEN = '<frozen importlib', loader.__file__, private_classes.__file__, __file
 
 
 @patch('subprocess', 'Popen.__init__')
-def start_child(original, run, self, *args, env=None, **kwargs):
+def start_child(
+    original: Block, run: Any, self: Any, *args: Any, env: Any = None, **kwargs: Any
+) -> None:
     """Python gives a child the environment of this process. This passes on the program's.
 
     The end of the program interrupts the child, as roslaunch and a terminal do.
@@ -70,14 +75,15 @@ class ScriptRun(Run):
     :ivar finished: threads left behind end
     """
 
-    error = None  # raised by the program before it was a node
-    exit_request = None  # the SystemExit that a handler or os._exit() raised
+    error: BaseException | None = None  # raised by the program before it was a node
+    exit_request: SystemExit | None = None  # the SystemExit that a handler or os._exit() raised
     is_registered = False  # True once rospy.init_node() has registered the node
     has_run_hooks = False
-    left_threads = ()  # of the program, which do not end at their next line
+    # of the program, which do not end at their next line
+    left_threads: tuple[()] | list[threading.Thread] = ()
     main_has_ended = True  # there is no main thread yet; False from start() on
 
-    def __init__(self, node, settings):
+    def __init__(self, node: Any, settings: Any) -> None:
         self.process_id = os.getpid()  # os.fork() makes another one
         self.children = []  # processes, as subprocess.Popen
         self.exit_functions = []  # of atexit
@@ -101,7 +107,7 @@ class ScriptRun(Run):
         self.modules.builtins.update(print=self.print, exit=sys.exit, quit=sys.exit)
         self.ros.init_node = self.init_node
 
-    def substitutes(self):
+    def substitutes(self) -> dict[str, Any]:
         """Return the stand-ins that the program imports for some modules of Python."""
         # without ${node}: NamedLines puts the node's name in front
         self.environ['ROSCONSOLE_FORMAT'] = os.environ.get(
@@ -116,13 +122,13 @@ class ScriptRun(Run):
         class Thread(self.Thread):
             """A thread of the program. The program's end waits for the thread if not a daemon."""
 
-            def __init__(self, *args, **kwargs):
+            def __init__(self, *args: Any, **kwargs: Any) -> None:
                 super().__init__(*args, **kwargs)
                 # all threads of a run are daemons, and would pass that on; these would not be in a process
                 if threading.current_thread() in (run.main, *run.threads_to_join):
                     self.daemon = bool(kwargs.get('daemon'))
 
-            def start(self):
+            def start(self) -> None:
                 if not self.daemon:
                     run.threads_to_join.add(self)
                 super().start()
@@ -152,49 +158,51 @@ class ScriptRun(Run):
         stand_ins['sys'].excepthook = self.print_error
         return stand_ins
 
-    def _kill(self, process_id, number):
+    def _kill(self, process_id: int, number: int) -> None:
         """Stand in for ``os.kill``: a signal to its own process stops the program alone."""
         if process_id == os.getpid() and number in (signal.SIGINT, signal.SIGTERM):
             self.request_stop()
         else:
             os.kill(process_id, number)
 
-    def _register_at_exit(self, function, *args, **kwargs):
+    def _register_at_exit(self, function: Block, *args: Any, **kwargs: Any) -> Block:
         self.exit_functions.append(functools.partial(function, *args, **kwargs))
         return function
 
-    def _tell_left_threads(self):
+    def _tell_left_threads(self) -> None:
         left_threads = join({*self.threads, *self.left_threads}, BLOCK_LIMIT)
         if left_threads:
             names = ', '.join(thread.name for thread in left_threads)
             Transcript.show(f'{self.name} leaves threads that block, with what they use: {names}')
 
-    def _handler_of(self, number):
+    def _handler_of(self, number: int) -> Any:
         default = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
         return self.handlers.get(number, default)
 
-    def _set_handler(self, number, handler):
+    def _set_handler(self, number: int, handler: Any) -> Any:
         former_handler = self._handler_of(number)
         self.handlers[number] = handler
         return former_handler
 
-    def print(self, *values, file=None, **options):
+    def print(self, *values: object, file: Any = None, **options: Any) -> None:
         """Stand in for ``print``: write to the program's own sys.stdout, not to the process's."""
         print(*values, file=file or self.modules.by_name['sys'].stdout, **options)
 
-    def print_error(self, error_class, error, trace, title=''):
+    def print_error(
+        self, error_class: Any, error: BaseException, trace: Any, title: str = ''
+    ) -> None:
         """Stand in for ``sys.excepthook``: print a traceback, without the frames of pharos."""
         summary = traceback.TracebackException(error_class, error, trace)
         summary.stack[:] = [each for each in summary.stack if not each.filename.startswith(_HIDDEN)]
         self.stderr.write(title + ''.join(summary.format()))
 
-    def _print_thread_error(self, args):
+    def _print_thread_error(self, args: Any) -> None:
         """Stand in for ``threading.excepthook``."""
-        self.print_error(*args[:3], f'Exception in thread {args.thread.name}:\n')
+        self.print_error(*args[:3], f'Exception in thread {args.thread.name}:\n')  # type: ignore
 
     # -- start
 
-    def start(self):
+    def start(self) -> None:  # type: ignore[override]
         """Start the program, and wait until its node is registered.
 
         Return at the end of the program, too, and after the node's ``init_timeout``. The program
@@ -216,13 +224,20 @@ class ScriptRun(Run):
             raise error_class(f'{node.path} ended before it was a node: {error!r}') from error
 
     @property
-    def is_known(self):
+    def is_known(self) -> bool:
         """True if the program has a node of its own, or has created one with pharos."""
         return self.is_registered or bool(self.created_nodes)
 
     def init_node(
-        self, name, argv=None, anonymous=False, log_level=None, *, disable_signals=False, **options
-    ):
+        self,
+        name: str,
+        argv: Any = None,
+        anonymous: bool = False,
+        log_level: int | None = None,
+        *,
+        disable_signals: bool = False,
+        **options: Any,
+    ) -> None:
         """Stand in for ``rospy.init_node``: give the node its name, and register the node.
 
         A second call does nothing.
@@ -250,7 +265,7 @@ class ScriptRun(Run):
 
     # -- the program
 
-    def run_thread(self, thread, target):
+    def run_thread(self, thread: threading.Thread, target: Block) -> None:
         """Run the target of a thread; show and keep its exception."""
         try:
             super().run_thread(thread, target)
@@ -263,7 +278,7 @@ class ScriptRun(Run):
         finally:
             self.threads_to_join.discard(thread)
 
-    def run_main(self):
+    def run_main(self) -> None:
         """Run the program to its end, with its threads and exit functions; stop the node."""
         current.node = self.node
         current.run = self
@@ -293,7 +308,7 @@ class ScriptRun(Run):
             if self.lifecycle not in (Lifecycle.STOPPING, Lifecycle.STOPPED):
                 self.request_stop()
 
-    def _run_code(self, variables):
+    def _run_code(self, variables: dict[str, Any]) -> Any:
         """Run the program's code, and return its exit status."""
         try:
             exec(self.code, variables)
@@ -309,7 +324,7 @@ class ScriptRun(Run):
             self.keep_failure(error, self.node.path)
             return 1
 
-    def _run_all(self, functions, position):
+    def _run_all(self, functions: list[Block], position: int) -> None:
         """Run functions of the program; each leaves the list before.
 
         :param position: 0: the first one comes first; -1: the last one
@@ -323,7 +338,7 @@ class ScriptRun(Run):
                     self.print_error(type(error), error, error.__traceback__)
                     self.keep_failure(error, block_name(getattr(function, 'func', function)))
 
-    def exit_now(self, status):
+    def exit_now(self, status: int) -> None:
         """Stand in for ``os._exit``: end the program, not the process, without hooks."""
         if os.getpid() != self.process_id:
             os._exit(status)  # a child by os.fork()
@@ -338,14 +353,14 @@ class ScriptRun(Run):
         self.request_stop()
         raise self.exit_request
 
-    def _join_threads(self):
+    def _join_threads(self) -> None:
         """Wait for the threads that are not daemons; a signal ends the wait, as in Python."""
         with contextlib.suppress(KeyboardInterrupt, SystemExit):
             while self.threads_to_join and not self.finished.is_set():
                 self.handle_signal()
                 join(list(self.threads_to_join), JOIN_PERIOD)
 
-    def _status_of(self, exit_request):
+    def _status_of(self, exit_request: SystemExit) -> Any:
         """Return the exit status of a SystemExit; print its text if it has one."""
         if isinstance(exit_request.code, str):
             self.stderr.write(f'{exit_request.code}\n')
@@ -354,7 +369,7 @@ class ScriptRun(Run):
 
     # -- signals
 
-    def sleep(self, seconds):
+    def sleep(self, seconds: float) -> None:
         """Stand in for ``time.sleep``: a signal ends a sleep of the main thread.
 
         A stop ends sleeps of other threads. Once ``stopping`` is set, the main thread sleeps as
@@ -373,7 +388,7 @@ class ScriptRun(Run):
             self.pending_signal.wait(seconds)
             self.handle_signal()
 
-    def checkpoint(self):
+    def checkpoint(self) -> None:
         """Have the main thread wait while another thread handles a signal, for STOP_LIMIT at most.
 
         The caller of is_shutdown() may hold a lock that a hook takes, as smach does.
@@ -382,7 +397,7 @@ class ScriptRun(Run):
             if self.handler_lock.acquire(timeout=STOP_LIMIT):
                 self.handler_lock.release()
 
-    def handle_signal(self):
+    def handle_signal(self) -> None:
         """Call the program's handlers for a stop, once; they may raise an exception.
 
         Wait while another thread does so.
@@ -400,7 +415,7 @@ class ScriptRun(Run):
                 elif handler is signal.SIG_DFL:  # the system ends a process at once
                     self.exit_now(-number)
 
-    def _signal_numbers(self):
+    def _signal_numbers(self) -> list[int]:
         """Return [SIGINT], and SIGTERM if the program has a handler of its own for that alone."""
         defaults = signal.default_int_handler, self.core._ros_signal
         handler = self._handler_of(signal.SIGTERM)
@@ -409,7 +424,7 @@ class ScriptRun(Run):
             return [signal.SIGINT, signal.SIGTERM]
         return [signal.SIGINT]
 
-    def handle_signal_for_main(self):
+    def handle_signal_for_main(self) -> None:
         """Handle the signal in this thread: the main thread is blocked or computes.
 
         What the main thread publishes meanwhile is dropped: a process would stand still. An exception
@@ -426,7 +441,7 @@ class ScriptRun(Run):
         finally:
             signals.silenced_threads.discard(self.main.ident)
 
-    def raise_in_main(self, error):
+    def raise_in_main(self, error: BaseException) -> None:
         """Raise an exception of this class in the main thread, at its next line of Python."""
         if isinstance(error, SystemExit):
             self.exit_request = error
@@ -439,7 +454,7 @@ class ScriptRun(Run):
 
     # -- stop
 
-    def check_readable(self):
+    def check_readable(self) -> None:
         """Compile the program, and its modules that lie outside of the system's folders.
 
         :raises PharosError: if one cannot be read as Python 3
@@ -448,7 +463,7 @@ class ScriptRun(Run):
         for module in editable_modules(self.node):
             compile_program(module.__file__)
 
-    def signal_shutdown(self, reason):
+    def signal_shutdown(self, reason: str) -> None:
         """Stand in for ``rospy.signal_shutdown``: run the program's hooks, and close rospy.
 
         A second call does nothing.
@@ -459,12 +474,12 @@ class ScriptRun(Run):
         self._run_all(self.core._client_shutdown_hooks, 0)
         self.close_rospy(STOP_LIMIT)
 
-    def stop_created_nodes(self):
+    def stop_created_nodes(self) -> None:
         """Stop the nodes that the program has created with pharos."""
         for node in self.created_nodes[:]:
             node._stop_safely()
 
-    def spin(self):
+    def spin(self) -> None:
         """Stand in for ``pharos.spin``: wait until the nodes of the program have stopped."""
         with contextlib.suppress(KeyboardInterrupt):
             while any(node in signals.own_nodes() for node in self.created_nodes):
@@ -477,7 +492,7 @@ class ScriptRun(Run):
         if lost_names:
             sys.exit(1)
 
-    def end_program(self, timeout):
+    def end_program(self, timeout: float) -> None:
         """End the program as Ctrl-C does: handlers and hooks, main thread, then created nodes.
 
         :param timeout: seconds for the main thread, which then gets a SystemExit
@@ -511,7 +526,7 @@ class ScriptRun(Run):
             raise_in(thread, SystemExit)  # at its next line
             end_reads(thread)  # after that: a thread that has woken would read again
 
-    def stop(self, timeout):
+    def stop(self, timeout: float) -> None:
         """Stop the node, and drop what the program has opened, as the end of a process does.
 
         These are ports, files, locks. The Transcript names threads that keep some.
@@ -532,7 +547,7 @@ class ScriptRun(Run):
             gc.collect()
 
 
-def end_reads(thread):
+def end_reads(thread: threading.Thread) -> None:
     """End the wait of a thread that reads a socket, or a port of pyserial, without a limit."""
     frame = sys._current_frames().get(thread.ident)
     while frame:
@@ -546,7 +561,7 @@ def end_reads(thread):
         frame = frame.f_back
 
 
-def raise_in(thread, error_class):
+def raise_in(thread: threading.Thread, error_class: type[BaseException]) -> None:
     """Raise an exception of a class in a thread, at its next line of Python."""
     if sys.version_info[:2] == (3, 11) and sys.gettrace():
         return  # traced threads would stand still until the thread has come to that line
@@ -563,26 +578,26 @@ class NamedLines:
 
     closed = False
 
-    def __init__(self, stream, run):
+    def __init__(self, stream: Any, run: ScriptRun) -> None:
         self._stream = stream
         self._run = run
         self._partial_line = ''  # the text after the last line end, not written yet
 
-    def __getattr__(self, name):
+    def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
-    def close(self):
+    def close(self) -> None:
         """Take no more text."""
         self.flush()
         self.closed = True
 
-    def detach(self):
+    def detach(self) -> Any:
         """Return a stream of bytes, which a program may wrap anew, and close."""
         return os.fdopen(os.dup(self._stream.fileno()), 'wb')
 
     buffer = property(detach)
 
-    def write(self, text):
+    def write(self, text: str) -> int:
         """Write the complete lines, keep the rest, and return the number of characters."""
         if self.closed:
             raise ValueError('I/O operation on closed file.')
@@ -590,13 +605,13 @@ class NamedLines:
         self._write(lines)
         return len(text)
 
-    def flush(self):
+    def flush(self) -> None:
         """Write the rest of the text as a line."""
         if self._partial_line:
             self._write([self._partial_line])
             self._partial_line = ''
 
-    def _write(self, lines):
+    def _write(self, lines: list[str]) -> None:
         text = ''.join(f'[{self._run.name}] {line}\n' for line in lines)
         # the reader of a pipe may have gone: the program must go on, and stop its motors
         with contextlib.suppress(OSError, ValueError):
@@ -610,7 +625,7 @@ class _Pharos(Shim):
     They get the name and remappings of its entry in the launch file. Its Transcript prints lines.
     """
 
-    def __init__(self, run):
+    def __init__(self, run: ScriptRun) -> None:
         facade = sys.modules['pharos']  # it lies above, and is loaded already
 
         class EntryMaster(facade.Master):
@@ -621,26 +636,26 @@ class _Pharos(Shim):
 
             def __init__(
                 self,
-                url=None,
-                shared_memory=run.master.shared_memory,
-                share_connections=run.master.share_connections,
-            ):
+                url: str | None = None,
+                shared_memory: bool | None = run.master.shared_memory,
+                share_connections: bool = run.master.share_connections,
+            ) -> None:
                 super().__init__(url or run.master.url, shared_memory, share_connections)
 
-            def _remapped_name(self, node, name, mappings):
+            def _remapped_name(self, node: Any, name: str, mappings: tuple[str, ...]) -> str:
                 full_name = super()._remapped_name(node, name, mappings)
                 for parameter_name, value in run.node.params.items():
                     self.parameters[f'{full_name}/{parameter_name}'] = value
                 return full_name
 
-            def _live_nodes(self):
+            def _live_nodes(self) -> list:
                 return [
                     node
                     for node in signals.live_nodes()
                     if type(node._settings.master) is type(self)
                 ]
 
-            def create(self, *args, **kwargs):
+            def create(self, *args: Any, **kwargs: Any) -> Any:
                 if not run.created_nodes:
                     guide(run.ros, self._live_nodes)
                 node = super().create(*args, **kwargs)

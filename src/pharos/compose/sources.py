@@ -1,10 +1,13 @@
 """Read the sources of programs, to find out which ones need a process of their own."""
+from __future__ import annotations
+
 import ast
 import os
 import pathlib
 import re
 import sys
 from functools import lru_cache
+from typing import Any
 
 from pharos.errors import PharosError
 from pharos.private_rospy.loader import SYSTEM_FOLDERS, source_places
@@ -39,7 +42,7 @@ _IMPORT = re.compile(
 )
 
 
-def source_of(path):
+def source_of(path: str) -> str:
     """Return the file with the source of a program.
 
     :param path: the program, or the wrapper that catkin's devel space has for a program
@@ -49,7 +52,7 @@ def source_of(path):
     return str(ast.literal_eval(wrapper[1])) if wrapper else path
 
 
-def compile_program(path):
+def compile_program(path: str) -> Any:
     """Return the compiled code of a program.
 
     :raises PharosError: if the file cannot be read as Python 3
@@ -62,7 +65,7 @@ def compile_program(path):
         raise PharosError(f'{path}:{line}: cannot be read as Python 3: {error}') from error
 
 
-def why_apart(path, may_show_windows=False):
+def why_apart(path: str, may_show_windows: bool = False) -> str:
     """Return why a program of a launch file needs a plain process, as text; else ''.
 
     :param path: the program, whose first line must name Python 3
@@ -71,7 +74,7 @@ def why_apart(path, may_show_windows=False):
     return why_not_this_python(path) or ('' if may_show_windows else needs_process(path))
 
 
-def why_not_this_python(path, needs_first_line=True):
+def why_not_this_python(path: str, needs_first_line: bool = True) -> str:
     """Return why this Python cannot run a program, by its first line, as text; else ''.
 
     :param needs_first_line: False: a program without a first line for the system is one of Python
@@ -89,18 +92,18 @@ def why_not_this_python(path, needs_first_line=True):
     return ''
 
 
-def needs_process(path):
+def needs_process(path: str) -> str:
     """Return why a Python program needs a plain process, as text; else ''."""
     match = _search(path, _NEEDS_PROCESS)
     return match and f'it has {match!r}, which needs one; --here overrides this'
 
 
-def environment_of(pairs):
+def environment_of(pairs: list[tuple[str, str]]) -> tuple[tuple[str, str], ...]:
     """Return the environment variables that a launch file sets for a node, sorted, without ROS's."""
     return tuple(sorted((name, value) for name, value in pairs if not name.startswith('ROS')))
 
 
-def needs_group(path):
+def needs_group(path: str) -> str:
     """Return the code of a Python program that sets environment variables or print options, or ''.
 
     In a process with other programs, code in C and shared modules do not see its variables, and all
@@ -109,12 +112,12 @@ def needs_group(path):
     return _search(path, _NEEDS_GROUP)
 
 
-def forget_files():
+def forget_files() -> None:
     """Look for the files of modules anew: a user may have moved some."""
     _user_file.cache_clear()
 
 
-def _search(path, pattern):
+def _search(path: str, pattern: re.Pattern[str]) -> str:
     """Return the first text of a program that a pattern matches, or ''.
 
     This also reads the program's modules that lie beside the program or in its own package; not those
@@ -132,19 +135,19 @@ def _search(path, pattern):
             imported_file = _user_file(name, file.parent, tuple(sys.path))
             is_own = imported_file and str(imported_file.resolve()).startswith(own_folder)
             if is_own and imported_file not in files:
-                files.append(imported_file)
+                files.append(imported_file)  # type: ignore[arg-type]
     return ''
 
 
 @lru_cache(None)
-def _read(file, change_time, pattern):
+def _read(file: pathlib.Path, change_time: int, pattern: re.Pattern[str]) -> tuple[str, set[str]]:
     """Return the first text of a file that a pattern matches, or '', and the names that it imports."""
     text = re.sub('#.*', '', file.read_text(errors='replace'))
     match = pattern.search(text)
     return match[0].strip() if match else '', set(_imported_names(text))
 
 
-def _imported_names(text):
+def _imported_names(text: str) -> Any:
     """Yield the names that could be modules in the imports of a text."""
     for package, names, modules in _IMPORT.findall(text):
         yield package
@@ -154,7 +157,9 @@ def _imported_names(text):
 
 
 @lru_cache(None)
-def _user_file(module, folder, search_path):
+def _user_file(
+    module: str, folder: pathlib.Path, search_path: tuple[str, ...]
+) -> pathlib.Path | None:
     """Return the file of a module in a folder, or in a package outside of the system's, or None."""
     top_name, *rest = module.lstrip('.').split('.')  # a relative one is sought in the folder, too
     if not top_name:
