@@ -2,6 +2,7 @@
 import concurrent.futures
 import os
 import signal
+import sys
 import threading
 import time
 
@@ -282,6 +283,16 @@ def test_queue_is_bounded_by_bytes(node, other):
     kept = [len(data) for data in take(gate, 5)]
     assert kept == [0, *range(MEGABYTE - 994, MEGABYTE - 990)]
     assert channel.dropped == 6
+
+
+def test_heard_message_is_not_kept(node, other):
+    heard = threading.Event()
+    other.interested_in('/large', BYTES, lambda message: heard.set())
+    data = bytes(MEGABYTE)
+    references = sys.getrefcount(data)
+    node.send_to('/large', data=data)
+    assert heard.wait(TIMEOUT)
+    until(lambda: sys.getrefcount(data) == references)
 
 
 def test_messages_of_publisher_keep_order(master, other, peer, pool):
