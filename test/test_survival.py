@@ -433,6 +433,14 @@ def test_link_to_rospy_survives_the_master(mortal):
         assert [message.data for message in heard.all()] == ['before', 'meanwhile', 'after']
 
 
+def test_nodes_of_a_process_connect_without_the_master(mortal):
+    heard = Mailbox(create(mortal.master, '/ear'), '/plain', STRING)
+    node = create(mortal.master)
+    mortal.end()
+    node.ros.Publisher('/plain', std_msgs.msg.String, queue_size=5).publish('hello')
+    assert heard.next().data == 'hello'
+
+
 def test_plain_rospy_is_registered_later(mortal):
     master = Master(mortal.url)
     node, heard = create(master), Mailbox()
@@ -678,12 +686,14 @@ def test_slow_client_is_closed(master, which, beginning):
     assert_served(host)
 
 
-def test_lying_publisher_is_tried_again(master):
+def test_lying_publisher_is_tried_again(master, node):
+    log = LogOf(master, node)
     with FakeNode(master, '/huge').publish_here() as publisher:
-        heard = Mailbox(create(master), '/huge', STRING)
+        heard = Mailbox(node, '/huge', STRING)
         with publisher.accept() as connection:
             connection.sendall(FOUR_GIB)
             assert is_closed(connection)
+            assert '/huge: no connection to' in log.warnings('4294967295 bytes')[0]
         with publisher.accept() as connection:
             connection.sendall(string_message('small'))
             assert heard.next().data == 'small'
