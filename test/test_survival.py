@@ -441,6 +441,15 @@ def test_nodes_of_a_process_connect_without_the_master(mortal):
     assert heard.next().data == 'hello'
 
 
+def test_forgotten_subscriber_hears_new_publishers(master, node, peer):
+    """A new master may know the publisher first."""
+    heard = Mailbox(node, '/words', STRING)
+    rosgraph.Master('/node', master.url).unregisterSubscriber('/words', node.uri)
+    peer.run("out = rospy.Publisher('/words', message_class('std_msgs/String'), latch=True)")
+    peer.run("out.publish('hello')")
+    assert heard.next().data == 'hello'
+
+
 def test_plain_rospy_is_registered_later(mortal):
     master = Master(mortal.url)
     node, heard = create(master), Mailbox()
