@@ -7,6 +7,7 @@ In the tutorial, ``python`` and ``debugger`` are typed into a session, which ``c
 import contextlib
 import re
 import signal
+import subprocess
 from typing import NamedTuple
 from urllib.parse import unquote
 
@@ -20,7 +21,8 @@ from pharos.testing import until
 README, TUTORIAL = ROOT / 'README.md', ROOT / 'doc' / 'tutorial.md'
 PAGES = [README, *sorted((ROOT / 'doc').glob('*.md')), *sorted(ROOT.glob('examples/*.md'))]
 ROBOT_NODES = 'camera', 'detector', 'planner'
-EXAMPLES = sorted((ROOT / 'examples').glob('*.py'))
+PROPERTY = ROOT / 'examples' / 'test_lift.py'
+EXAMPLES = sorted({*(ROOT / 'examples').glob('*.py')} - {PROPERTY})
 SHOW_FAILURES = ['supervisor.py']
 FENCE = re.compile(r'^```(\w*)\n(.*?)^```$', re.DOTALL | re.MULTILINE)
 INDENTED = re.compile(r'^(?: {4}[^\n]*\n)+', re.MULTILINE)
@@ -283,3 +285,17 @@ def test_example_starts_and_ends(example, master):
     # the log has the node's name before each line of a block's failure
     failures = re.findall(r'^(?:/\S+: )?Traceback', output, re.MULTILINE)
     assert not failures or example.name in SHOW_FAILURES, output
+
+
+@pytest.mark.parametrize(
+    'sleep, result',
+    [('self.sleep(0.5)', r"script=\[\('/go', 0\), \('/stop', 0\)\]"), ('pass', '1 passed')],
+    ids=['as it is', 'mended'],
+)
+def test_example_shrinks_what_breaks_a_property(tmp_path, sleep, result):
+    """The lift without its sleep has no mistake."""
+    path = tmp_path / PROPERTY.name
+    path.write_text(PROPERTY.read_text().replace('self.sleep(0.5)', sleep))
+    command = [PYTHON, '-m', 'pytest', '-p', 'pharos.testing', path]
+    run = subprocess.run(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    assert re.search(result, run.stdout), run.stdout
