@@ -6,13 +6,17 @@ In the tutorial, ``python`` and ``debugger`` are typed into a session, which ``c
 """
 import contextlib
 import re
+import shutil
 import signal
 import subprocess
 from typing import NamedTuple
 from urllib.parse import unquote
 
+import genpy
 import pexpect
 import pytest
+import rosbag
+import std_msgs.msg
 
 import helpers
 from helpers import DEFAULT_SIGNALS, PYTHON, ROOT, TIMEOUT
@@ -189,6 +193,49 @@ def test_page_does_what_it_says(page, master, folder):
         expected = pattern_of(after.text) if after and after.kind == 'text' else '.'
         for command in commands_of(block, folder) if block.kind in ('python', 'console') else ():
             run(command, master, expected)
+
+
+# -- the commit that has changed a robot
+
+ECHO = """#!/usr/bin/python3
+import rospy
+from std_msgs.msg import Float64
+rospy.init_node('camera')
+out = rospy.Publisher('out', Float64, queue_size=10)
+rospy.Subscriber('in', Float64, lambda message: out.publish(message.data * 2))
+rospy.spin()
+"""
+
+
+@pytest.mark.skipif(not shutil.which('git'), reason='there is no git')
+def test_recipe_finds_the_commit(folder):
+    """The third of six commits does not start, and the fifth changes what the robot does."""
+    robot = folder / 'my_robot'
+    (robot / 'robot.launch').write_text(
+        '<launch><node name="camera" pkg="my_robot" type="camera" /></launch>'
+    )
+    with rosbag.Bag(str(robot / 'drive.bag'), 'w') as bag:
+        bag.write('/in', std_msgs.msg.Float64(1.5), genpy.Time(100))
+    page = ROOT / 'doc' / 'time.md'
+    (recipe,) = (block.text for block in blocks(page) if block.text.startswith('git checkout'))
+    (check,) = (block.text for block in blocks(page) if block.text.startswith('#!/bin/sh'))
+    (robot / 'check.sh').write_text(check)
+    (robot / 'check.sh').chmod(0o755)
+    commit = 'git -c user.name=me -c user.email=me@localhost commit -qam'
+    lines = ['git init -qb main', 'git add camera package.xml robot.launch']
+    for number in range(7):
+        text = ECHO.replace('* 2', '* 4') if number >= 5 else ECHO
+        if number == 3:
+            text = text.replace('out = ', 'out == ')
+        (folder / f'camera{number}').write_text(f'{text}# {number}\n')
+        lines.append(f'cp ../camera{number} camera && {commit} number{number}')
+    lines.insert(3, 'git tag v1.0')
+    recipe = re.sub('bisect run .*', 'bisect run ./check.sh', recipe)
+    process = subprocess.run(
+        ['bash', '-c', '\n'.join([*lines, recipe])], cwd=robot, stdout=subprocess.PIPE, text=True
+    )
+    assert '/out #0 data: 3.0 -> 6.0' in process.stdout  # at main
+    assert re.search(r'is the first bad commit(\n.*)*number5', process.stdout), process.stdout
 
 
 # -- the tutorial: a session that is typed
