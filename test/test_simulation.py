@@ -832,6 +832,16 @@ OTHER_FIELDS = sensor_msgs.msg.Imu(orientation_covariance=[0.0] * 5 + [0.1] + [0
         (GOOD, numbers(1.0, 2.0001, NAN), ['0.500 s /n #1 data: 2.0 -> 2.0001']),
         (GOOD, numbers(1.0, 2.0), ['1.000 s /n #2 is missing, with all after it']),
         (numbers(1.0, 2.0), GOOD, ['1.000 s /n #2 is additional']),
+        (
+            numbers(*range(9)),
+            numbers(*range(9))[:3] + numbers(*range(9))[4:],
+            ['1.500 s /n #3 is missing'],
+        ),
+        (
+            numbers(*range(9))[:3] + numbers(*range(9))[4:],
+            numbers(*range(9)),
+            ['2.000 s /n #3 is additional'],
+        ),
         (GOOD, numbers(1.0, 2.0, NAN, begin=10.01), ['0.000 s /n #0 came 0.010000 s later']),
         (
             GOOD,
@@ -863,6 +873,22 @@ def test_tolerance_lets_numbers_differ(tmp_path):
     new = bag_of(tmp_path / 'new.bag', *numbers(1.0, 2.0001, NAN))
     assert differences(old, new, 10.0, 1e-3) == []
     assert differences(old, new, 10.0, 1e-5) != []
+
+
+def test_tolerance_lets_times_differ(tmp_path):
+    clock = std_msgs.msg.Time
+    old = bag_of(tmp_path / 'a.bag', ('/t', clock(genpy.Time(5)), 10.0))
+    new = bag_of(tmp_path / 'b.bag', ('/t', clock(genpy.Time(5, 10**7)), 10.01))
+    assert differences(old, new, 10.0, 0.02) == []
+    assert differences(old, new, 10.0, 0.005) == ['0.000 s /t #0 data: 5000000000 -> 5010000000']
+
+
+def test_difference_is_told_in_one_line(tmp_path):
+    path = std_msgs.msg.MultiArrayLayout
+    old = bag_of(tmp_path / 'a.bag', ('/p', path(dim=[]), 10.0))
+    new = bag_of(tmp_path / 'b.bag', ('/p', path(dim=[std_msgs.msg.MultiArrayDimension()]), 10.0))
+    (line,) = differences(old, new, 10.0)
+    assert line.startswith("0.000 s /p #0 dim: [] -> [label: '' size: 0"), line
 
 
 def test_command_compares_with_a_recording(master, tmp_path):

@@ -86,7 +86,10 @@ def _parse(arguments):
         help='in virtual time: show what differs from this recording',
     )
     parser.add_argument(
-        '--tolerance', type=float, default=0.0, help='with --expect: numbers may differ by so much'
+        '--tolerance',
+        type=float,
+        default=0.0,
+        help='with --expect: numbers and times may differ so',
     )
     parser.add_argument(
         '--seed', type=int, default=0, help='in virtual time: other delays, by chance'

@@ -85,7 +85,7 @@ class Simulation:
     def seed(self, number: int, jitter: float = JITTER) -> None:
         """Have each sleep last a little longer, by chance, and programs get other random numbers.
 
-        Programs start up to a second later, too.
+        Programs start later, too, by up to 30 times the longest delay of a sleep.
 
         :param number: 0: each sleep ends when due; of those due at one time, the first to begin is first
         :param jitter: the longest delay of a sleep, in seconds; short ones are as probable as long ones
@@ -109,7 +109,7 @@ class Simulation:
     def expect(self, bag: str, tolerance: float = 0.0) -> Iterator[None]:
         """Compare what the nodes publish in this ``with`` with a recording; make one if there is none.
 
-        :param tolerance: numbers may differ by so much
+        :param tolerance: numbers may differ by so much, and times by so many seconds
         :raises AssertionError: with the first difference of each topic; or that the recording is new
         """
         from pharos.simulation.comparing import differences

@@ -16,7 +16,7 @@ def differences(expected: str, actual: str, begin: float, tolerance: float = 0.0
 
     :param expected: the path of the bag that was recorded before
     :param begin: the ROS time at which the run began, in seconds
-    :param tolerance: numbers may differ by so much
+    :param tolerance: numbers may differ by so much, and times by so many seconds
     """
     found = []
     with rosbag.Bag(expected) as old_bag, rosbag.Bag(actual) as new_bag:
@@ -40,10 +40,16 @@ def _compare_topic(old_bag, new_bag, topic, tolerance) -> Iterator[tuple[int, An
             return
         text = _difference(old.message, new.message, tolerance, '')
         delay = (new.timestamp - old.timestamp).to_sec()
+        if abs(delay) > tolerance:
+            # virtual times are exact: this one is not late if it comes when the next one should
+            if next(bags[0], old).timestamp == new.timestamp:
+                text = 'is missing'
+            elif next(bags[1], new).timestamp == old.timestamp:
+                text = 'is additional'
+            elif not text:
+                text = f'came {abs(delay):.6f} s {"later" if delay > 0 else "earlier"}'
         if text:
             yield number, old.timestamp, text
-        elif delay:
-            yield number, old.timestamp, f'came {abs(delay):.6f} s {"later" if delay > 0 else "earlier"}'
 
 
 def _difference(old, new, tolerance, path) -> str:
@@ -53,7 +59,7 @@ def _difference(old, new, tolerance, path) -> str:
     """
     if isinstance(old, genpy.Message) and old._type != new._type:
         return f'{path or "type"}: {old._type} -> {new._type}'
-    if isinstance(old, (genpy.Message, genpy.TVal)):
+    if isinstance(old, genpy.Message):
         parts = [
             (f'{path}.{name}', getattr(old, name), getattr(new, name)) for name in old.__slots__
         ]
@@ -62,7 +68,7 @@ def _difference(old, new, tolerance, path) -> str:
     else:
         if _is_same(old, new, tolerance):
             return ''
-        return f'{path[1:]}: {str(old)[:MAX_VALUE]} -> {str(new)[:MAX_VALUE]}'
+        return f'{path[1:]}: {_text(old)} -> {_text(new)}'
     for part_path, old_part, new_part in parts:
         text = _difference(old_part, new_part, tolerance, part_path)
         if text:
@@ -70,7 +76,14 @@ def _difference(old, new, tolerance, path) -> str:
     return ''
 
 
+def _text(value) -> str:
+    """Return a value as text of one line."""
+    return ' '.join(str(value).split())[:MAX_VALUE]
+
+
 def _is_same(old, new, tolerance) -> bool:
+    if isinstance(old, genpy.TVal):
+        return abs((old - new).to_sec()) <= tolerance
     if isinstance(old, float):
         is_near = abs(old - new) <= tolerance
         return old == new or is_near or math.isnan(old) and math.isnan(new)

@@ -35,7 +35,7 @@ from pharos.waiting import let_senders_run
 CLOCKS = 'time', 'perf_counter', 'monotonic', 'time_ns', 'perf_counter_ns', 'monotonic_ns'
 #: looks of these modules at a clock take no time: they come more or less often, as they wait for servers
 FREE_LOOKS = 'logging', 'pharos.', 'threading', 'queue', 'subprocess', 'asyncio.'
-START_LIMIT = 1.0  # seconds that a seed delays a program's start at most
+START_DELAY = 30  # times the jitter: so much does a seed delay a program's start at most
 CHILD_LIMIT = 1.5  # seconds that a child may compute while the time stands still
 PLAYER = '/bag_player'  # the node that plays bags
 #: the functions of servers' threads are in these modules
@@ -330,7 +330,7 @@ def init_node(this_run, *args, original=ScriptRun.init_node, **options):
     """Stand in for ``ScriptRun.init_node``: with a seed, the program goes on later, as processes do."""
     original(this_run, *args, **options)
     if takes_part() and _simulation.seed_number:
-        time.sleep(_simulation.random.uniform(0, START_LIMIT))
+        time.sleep(_simulation.random.uniform(0, START_DELAY * _simulation.jitter))
 
 
 def compose(master, package, file, *options, original=composition.compose):
