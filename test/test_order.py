@@ -379,6 +379,10 @@ def test_closed_subscription_delays_no_callback(master, monkeypatch):
     assert box.next(TIMEOUT / 3).data == 7
 
 
+def waits_for_turn(queue):
+    return queue.running_thread and queue.begin_time is None
+
+
 def test_callback_waits_for_one_on_an_earlier_message(master, node, monkeypatch):
     for limit in 'SLOW', 'TURN_LIMIT':  # both are too short for a test
         monkeypatch.setattr(f'pharos.intraprocess.callback_queues.{limit}', TIMEOUT)
@@ -391,7 +395,7 @@ def test_callback_waits_for_one_on_an_earlier_message(master, node, monkeypatch)
         node.ros.Subscriber(topic, std_msgs.msg.String, callback)
         mouth.send_to(topic, typed_as=STRING, data='x')
     queues = node._current_run.callback_order.queues
-    until(lambda: order or gate.heard and any(queue.waits_for_turn for queue in list(queues)))
+    until(lambda: order or gate.heard and any(map(waits_for_turn, list(queues))))
     gate.open.set()
     until(lambda: len(order) == 2)
     assert order == ['first', 'second']

@@ -14,7 +14,7 @@ class Failure:
     """An exception that a block raised at one place: one of :attr:`Node.failures`.
 
     :ivar error: the newest exception
-    :ivar block: the block that raised the exception
+    :ivar block: the block that raised the exception; or a text: a topic, a program or its thread
     :ivar message: the message, request or value that the block was run on; None for a soul, and for
         all but the newest 5 failures
     :ivar channel: the channel of the message, or None

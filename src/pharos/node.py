@@ -127,7 +127,7 @@ class Node(DelegateHolder):
         self._send_lock = threading.Lock()  # held while send_to() opens a channel
         # (topic, type) as given to send_to -> OutputChannel
         self._send_channels: dict[tuple, OutputChannel] = {}
-        # for users: their class may give these names another meaning, so this class reads _settings
+        # for users: their class may give these names another meaning, so _settings has what holds
         self.name = settings.name
         self.master = settings.master
         self.domain = settings.domain
@@ -365,7 +365,7 @@ class Node(DelegateHolder):
 
         The report (listing 3.8): ``[node execute] fork``. :meth:`stop` ends the soul at its next
         :meth:`sleep` or turn of :meth:`every`. An exception of the soul goes to :attr:`failures`,
-        but for a rospy.ROSException after a stop has begun.
+        but for SystemExit, and a rospy.ROSException after a stop has begun.
 
         :param name: the thread's name; default: the block's
         :param required: True: when the soul ends, the node stops, and ``spin()`` ends the program
@@ -636,10 +636,10 @@ class Node(DelegateHolder):
     def serve(self, name: str, typed_as: str | type, block: Block) -> OfferedService:
         """Offer a service, and return an object with ``close()``.
 
-        ``block(request)`` runs in a thread of the caller's connection, or in the caller's thread if
-        that is one of this process. Several calls may run at once. The block returns a response, a
-        dict, tuple or list of its fields, or its only field; None for an empty response. If the
-        block raises an exception, the caller gets an error, and :attr:`failures` an entry.
+        ``block(request)`` runs in a thread of the caller's connection; or in the caller's thread, if
+        that is one of this process, and the call has no ``timeout``. Several calls may run at once. The
+        block returns a response, a dict, tuple or list of its fields, or its only field; None for an
+        empty response. If the block raises an exception, the caller gets an error, and :attr:`failures` an entry.
 
         :raises PharosError: if the node offers the service already
         :raises UnknownTypeError: if the type is not known

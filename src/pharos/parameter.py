@@ -104,8 +104,8 @@ class Parameter(Endpoint):
     def on_change(self, block: Block) -> Block:
         """Have ``block(value)`` run when the value changes, also by other nodes; return the block.
 
-        The block runs in the thread that sets or reads the value, not in that of the node's
-        delegates. The blocks get the values in their order, and run one at a time. An exception of
+        The block runs in the thread that sets or reads the value: that of a delegate, if it does so. The
+        blocks get the values in their order, and run one at a time. An exception of
         the block goes to :attr:`Node.failures`. What changed while the node was stopped is not told.
 
         :raises TypeError: if the block does not take one argument

@@ -135,8 +135,8 @@ def expect_failures() -> None:
 def create_node(master: Master) -> Iterator[Callable[..., Any]]:
     """Create and start nodes by ``create_node(node_class, name=None, **kwargs)``.
 
-    The end of the test stops them. If a block of theirs fails, the test fails, unless the test calls
-    :func:`expect_failures`.
+    The end of the test stops them. If a block of theirs fails, after the last start of the node, the test
+    fails, unless it calls :func:`expect_failures`.
     """
     nodes: list[Node] = []
 

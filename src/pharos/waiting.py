@@ -72,8 +72,8 @@ def wait_for(find, timeout, subject, node=None):
     :raises PharosError: the error of ``find()`` after that time, or after the stop of the node
     """
 
-    def attempt():
+    def find_or_none():
         with contextlib.suppress(PharosError):
             return find()
 
-    return wait(attempt, timeout, node, subject) or find()  # the last attempt raises the error
+    return wait(find_or_none, timeout, node, subject) or find()  # the last look raises the error

@@ -79,7 +79,7 @@ class ScriptRun(Run):
     exit_request: SystemExit | None = None  # the SystemExit that a handler or os._exit() raised
     is_registered = False  # True once rospy.init_node() has registered the node
     has_run_hooks = False
-    # of the program, which do not end at their next line
+    # of the program, which may not end at their next line, where a SystemExit waits for them
     left_threads: tuple[()] | list[threading.Thread] = ()
     main_has_ended = True  # there is no main thread yet; False from start() on
 

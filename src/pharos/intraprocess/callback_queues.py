@@ -2,9 +2,9 @@
 
 A callback queue has one thread. A node has one queue for its delegates, and one for each subscription
 of plain rospy. The thread begins a callback when those on earlier messages of the node have ended, or
-have run for SLOW; :meth:`CallbackQueue.delays` and TURN_LIMIT have more. Two other threads run
-callbacks: a publisher runs the queue of an inline channel, and a thread that reads a TCPROS connection
-of one node runs those of plain rospy without a queue_size.
+have run for SLOW; :meth:`CallbackQueue.delays` and TURN_LIMIT have more. Three other threads run
+callbacks: a publisher runs the queue of an inline channel, a thread that reads a TCPROS connection
+of one node runs those of plain rospy without a queue_size, and Failure.retry() runs one in its caller's.
 """
 from __future__ import annotations
 
@@ -22,8 +22,6 @@ YIELD_PAUSE = 0.02  # seconds without such a wait after one that reached its lim
 SLOW = 3e-3  # seconds; the callbacks on later messages do not wait longer for one that runs
 TURN_PERIOD = 1e-3  # seconds between two looks whether it is a queue's turn
 TURN_LIMIT = 0.05  # seconds that a callback waits at most, also for those that have not begun
-
-_no_yield_before = 0.0
 
 
 class CallbackOrder:
@@ -57,7 +55,11 @@ class CallbackOrder:
 
     def pass_turn(self) -> None:
         """Wake the thread that waits for its turn with the lowest number."""
-        waiting_queues = [queue for queue in list(self.queues) if queue.waits_for_turn]
+        waiting_queues = [
+            queue
+            for queue in list(self.queues)
+            if queue.running_thread and queue.begin_time is None
+        ]
         if waiting_queues:
             min(waiting_queues, key=CallbackQueue.next_number).wake()
 
@@ -73,17 +75,15 @@ class CallbackQueue:
         queue that is made meanwhile prolongs the pause to the end of its own: a constructor may
         subscribe to several topics before it has set all that its callbacks use
     :ivar jobs: the messages of all inboxes, as Inbox says
-    :ivar pause_end: the time when the first pause ends, as of time.perf_counter(); 0 after the pause
+    :ivar pause_end: the time when the first pause ends, as of perf_counter(); 0 after the pause
     :ivar running_thread: the identifier of the thread that runs callbacks, or None
     :ivar thread: the thread of the queue, from the first message on; None if the thread has ended
-    :ivar begin_time: the time when the callback that runs began, as of time.perf_counter(), or None
-    :ivar waits_for_turn: True while the next callback waits for those of other queues
+    :ivar begin_time: the time when the callback that runs began, as of perf_counter(), or None
     """
 
     closed = False
     running_thread = None
     begin_time = None
-    waits_for_turn = False
     _was_slow = False  # True if the last callback took longer than SLOW
     _current_number = 0.0  # of the message whose callback runs
     thread = None
@@ -100,11 +100,12 @@ class CallbackQueue:
         # The next two locks guard nothing. They are signals, which any thread may give: the handler of
         # a signal may raise between any two lines of a publisher, and the next message gives them again.
         # Locked: the thread may sleep. Unlocked: it has to look for jobs before it sleeps, and that
-        # look locks it. Only the thread takes it, in its rest, its first pause and its wait for a turn.
+        # look locks it. Who runs the queue takes it: in the thread's rest, in the first pause, and in a wait
+        # for the turn.
         self._wake_lock = threading.Lock()
         self._wake_lock.acquire()
-        # Locked: a publisher has woken the thread, which has not begun to look. The thread unlocks it:
-        # so a publisher waits for the thread by taking it.
+        # Locked: a publisher has woken the thread, which has not begun to look, or has waited for that.
+        # The thread unlocks it before it looks: so a publisher waits for the thread by taking it.
         self.request_lock = threading.Lock()
         # These two guard, as locks do.
         self._loop_lock = threading.Lock()  # held by the thread: there is but one
@@ -147,19 +148,17 @@ class CallbackQueue:
     def _wait_for_turn(self) -> None:
         """Wait until callbacks on earlier messages have ended, or have run for SLOW."""
         deadline = time.perf_counter() + TURN_LIMIT
-        self.waits_for_turn = True
         while not self.order.has_turn(self, self.next_number()) and not self.closed:
             if time.perf_counter() > deadline:
                 break
             self._wake_lock.acquire(True, TURN_PERIOD)
-        self.waits_for_turn = False
 
     # -- running
 
-    def run_jobs(self, waits_for_turn: bool = True) -> None:
+    def run_jobs(self, in_turn: bool = True) -> None:
         """Run all jobs in this thread, unless another thread does so already.
 
-        :param waits_for_turn: False: begin at once, whatever other queues of the node do
+        :param in_turn: False: begin at once, whatever other queues of the node do
         """
         jobs = self.jobs
         order = self.order
@@ -173,7 +172,7 @@ class CallbackQueue:
                 try:
                     while jobs and not self.closed:
                         if len(order.queues) > 1:
-                            self._run_in_order(waits_for_turn)
+                            self._run_in_order(in_turn)
                         else:
                             self._run_next()
                 finally:
@@ -189,9 +188,9 @@ class CallbackQueue:
         job[1].run_callback(job)
         self.begin_time = None
 
-    def _run_in_order(self, waits_for_turn: bool) -> None:
+    def _run_in_order(self, in_turn: bool) -> None:
         """Run the next job in the queue's turn, and say so to the other queues of the node."""
-        if waits_for_turn:
+        if in_turn:
             self._wait_for_turn()
         self._current_number = self.next_number()
         begin_time = self.begin_time = time.perf_counter()
@@ -285,7 +284,7 @@ class CallbackQueue:
         self.wake()
 
     def close(self, timeout: float) -> bool:
-        """Begin no more callbacks, drop all jobs, and wait for the callback that runs.
+        """Begin no more callbacks, and wait for the callback that runs; drop all jobs if it has ended.
 
         :param timeout: seconds
         :returns: True if that callback has ended, or runs in this thread
@@ -303,22 +302,22 @@ class CallbackQueue:
 def hand_over(callback_queues: list[CallbackQueue], last_wake: float, may_wait: bool) -> float:
     """Wake the threads of some callback queues; a publisher calls this.
 
-    :param last_wake: the last time that the same publisher woke a thread, as of time.perf_counter()
+    :param last_wake: what the last call for the same publisher has returned
     :param may_wait: True: wait until each thread runs, up to YIELD_LIMIT; after one that takes so long
         wait for no other
-    :returns: the time of the last wake of these, or ``last_wake`` if no thread was woken
+    :returns: the time of the last wake, as of perf_counter(), or of one that took so long, plus
+        YIELD_PAUSE: the publisher waits for no thread before
     """
-    global _no_yield_before
     now = time.perf_counter()
     # a busy publisher keeps the interpreter for 5 ms, unless it waits for the thread to run
-    waits = may_wait and now - last_wake > BURST and now > _no_yield_before
+    waits = may_wait and now - last_wake > BURST
     for callback_queue in callback_queues:
         if not callback_queue.request_thread():
             continue
-        if waits:
-            # _loop() frees the lock
-            waits = callback_queue.request_lock.acquire(True, YIELD_LIMIT)
-            if not waits:
-                _no_yield_before = now + YIELD_PAUSE
-        last_wake = time.perf_counter()  # after the wait: to wait is no rest of the publisher
+        # _loop() frees the lock
+        if waits and not callback_queue.request_lock.acquire(True, YIELD_LIMIT):
+            waits = False
+            last_wake = now + YIELD_PAUSE
+        # after the wait: to wait is no rest of the publisher
+        last_wake = max(last_wake, time.perf_counter())
     return last_wake

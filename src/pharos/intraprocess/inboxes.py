@@ -57,7 +57,7 @@ class Inbox(BoundedQueue):
     message waits as the job ``(number, inbox, (value, thaw, header))``. The value is a frozen
     message. If ``thaw`` is None, the value is the message itself, which came from a socket or is
     shared. Several publishers may be here at once: who takes a job out of the callback queue's
-    ``jobs`` runs it or drops it.
+    ``jobs`` runs it or drops it. A run takes it from ``jobs`` first, a drop from ``messages``.
 
     :param callback_queue: the CallbackQueue that runs the callback
     :param callback: called as ``callback(message)``; raises only what a signal raises
@@ -120,7 +120,7 @@ class Inbox(BoundedQueue):
         self.callback(value)
 
     def receive(self, message: Any, size: int = 0, connection: Any = None) -> None:
-        """Take a message from a connection; the thread that reads the connection calls this.
+        """Take a message, as the thread that reads a connection does.
 
         :param size: the bytes of the message; 0: unknown
         """

@@ -38,7 +38,7 @@ class Connection(Protocol):
     transport_type: str
     #: True once the connection is closed
     done: bool
-    #: the number of messages that went through
+    #: the number of messages that went through; a link has that of its publisher, since its topic opened
     stat_num_msg: int
     #: the number of bytes that went through; a link leaves it at 0
     stat_bytes: int

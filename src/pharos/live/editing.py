@@ -220,9 +220,10 @@ def _names(item):
     """Return the names that a definition gives values; none of another statement."""
     if isinstance(item, (ast.Import, ast.ImportFrom)):
         return [alias.asname or alias.name for alias in item.names]
-    targets = getattr(item, 'targets', [getattr(item, 'target', None)])
-    names = [target.id for target in targets if isinstance(target, ast.Name)]
-    return names or ([item.name] if isinstance(item, NAMED) else [])
+    if isinstance(item, (ast.Assign, ast.AnnAssign)):
+        targets = item.targets if isinstance(item, ast.Assign) else [item.target]
+        return [target.id for target in targets if isinstance(target, ast.Name)]
+    return [item.name] if isinstance(item, NAMED) else []
 
 
 def _header(item):

@@ -54,7 +54,7 @@ class Snapshot:
     time: float  # seconds, as of time.time()
     nodes: dict[str, NodeReport]
     topic_types: dict[str, str]  # '*' for a topic that has only subscribers, of any type
-    links: dict[Link, int]  # link -> messages since it began
+    links: dict[Link, int]  # link -> messages; of a link, those of its publisher
 
     def rates_since(self, start: Snapshot) -> dict[Link, float]:
         """Return the messages in one second of the links that both snapshots have."""

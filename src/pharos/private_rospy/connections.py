@@ -48,8 +48,11 @@ def leave(run):
             _watch_end.set()  # type: ignore[union-attr]
 
 
-def check_name_free(run):
-    """Raise NodeNameInUseError if a node of this name answers within NAME_LIMIT, or is of this process."""
+def take_name(run):
+    """Take the name of a run.
+
+    :raises NodeNameInUseError: if a node of this name answers within NAME_LIMIT, or is of this process
+    """
     with runs_lock:
         namesake = _names.setdefault((run.master.url, run.name), run)
     if namesake is not run:
@@ -115,10 +118,10 @@ def _connect(run, topic, uri):
     subscription = run.topic_manager.subs.get(topic)
     if run.stopping.is_set() or not subscription or subscription.has_connection(uri):
         return
-    attempt = topic, uri, id(subscription)
-    if attempt in run.connecting:
+    key = topic, uri, id(subscription)  # a closed one may still connect
+    if key in run.connecting:
         return
-    run.connecting.add(attempt)
+    run.connecting.add(key)
     try:
         publisher_run = runs.get(uri)
         share = share_of(subscription, uri)
@@ -133,7 +136,7 @@ def _connect(run, topic, uri):
     except Exception as error:  # told by the watcher, which tries again
         connect_later(run, topic, uri, repr(error))
     finally:
-        run.connecting.discard(attempt)
+        run.connecting.discard(key)
 
 
 def _negotiate(run, topic, uri, subscription):
@@ -207,9 +210,8 @@ def _start_threads(run):
 
 
 def _check_clock(run):
-    """Tell once that a clock stands still."""
+    """Tell that a clock stands still; the log has equal texts once a minute."""
     if monotonic() > run.clock_deadline:
-        run.clock_deadline += 1e9
         rostime = run.ros.rostime
         if not (rostime.is_wallclock() or rostime.get_time()):
             run.troubles.add('time stands still: /use_sim_time is set, and no /clock comes')

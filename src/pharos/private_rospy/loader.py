@@ -2,8 +2,8 @@
 
 Private modules have ``__builtins__`` of their own. The ``__import__`` in there finds rospy, rosgraph
 and libraries written on rospy among the private modules of the run, and all other modules as usual.
-``sys.modules`` has no private module. :mod:`.inspecting` has inspect find them, in the whole process,
-and live/private_classes.py dataclasses and importlib.
+``sys.modules`` has no private module, but while a ``@dataclass`` is made. :mod:`.inspecting` has inspect
+find them, in the whole process, and live/private_classes.py dataclasses and importlib.
 """
 import builtins
 import importlib

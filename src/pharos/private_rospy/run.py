@@ -323,7 +323,7 @@ class Run:
         :param options: further options of ``rospy.init_node``
         :raises MasterUnreachableError, NodeNameInUseError, PortInUseError: stop() then cleans up
         """
-        connections.check_name_free(self)
+        connections.take_name(self)
         tcpros_base = self.ros.impl.tcpros_base
         tcp_port, xmlrpc_port = self.settings.ports
         try:
@@ -434,6 +434,7 @@ class Run:
         has_ended = self.callback_queue.close(timeout)
         if not has_ended:
             left_behind.append('a delegate')
+            # it has had its time: the join below waits for it no more
             self.threads.discard(self.callback_queue.thread)  # type: ignore[arg-type]
         if left_behind:
             self.ros.logwarn(

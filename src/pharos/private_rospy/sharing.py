@@ -25,7 +25,7 @@ class Share:
 
     :ivar connection: the newest one, or None
     :ivar lock: held while a subscription connects, joins or leaves, and while a message is delivered:
-        one that joins gets the latched message once, before the next one. No callback runs meanwhile
+        one that joins gets the latched message once, before the next one. Who has it runs no callback
     """
 
     connection: Any = None
@@ -43,7 +43,8 @@ class Share:
         return True
 
     def add(self, subscription: Any, connection: Any) -> bool:
-        """Add the connection to a subscription; return False if that is closed, or has one."""
+        """Add a connection to a subscription; return False if that is closed, or has one."""
+        connection.share = self  # before the thread that reads can find the subscription
         with subscription.c_lock:  # or leave() could look for connections before it is there
             if subscription.is_leaving or subscription.has_connection(connection.endpoint_id):
                 return False
@@ -51,6 +52,7 @@ class Share:
         connection.subscriptions = [*connection.subscriptions, subscription]
         # the thread that reads takes it out of all lists; rospy's callback is that of one list
         connection.set_cleanup_callback(None)
+        self.connection = connection
         return True
 
 

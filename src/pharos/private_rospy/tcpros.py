@@ -172,8 +172,8 @@ class Sender(BoundedQueue):
 
     Stands in for rospy's QueuedConnection. rospy's thread writes everything, and takes all messages
     out of the queue at once: the queue is neither bounded nor flushed. Here the publisher writes, and
-    while messages wait, a thread writes when the socket takes more. Each write takes the lock and never
-    waits, so it does no harm if two threads write.
+    while messages wait, a thread writes when the socket takes more. With a queue_size, each write takes the lock and
+    never waits, so it does no harm if two threads write.
 
     :param publication: the PublisherOverlay; BoundedQueue says what its queue_size means. rospy sets
         that after the first connections may have been made.

@@ -39,6 +39,8 @@ class PublisherOverlay:
 
     They do not make a subclass: ``super(_PublisherImpl, self)`` in rospy's code would find the
     subclass, and recurse.
+
+    :ivar run: the Run; patches.overlay() sets it on the class
     """
 
     def __init__(self, name: str, data_class: type) -> None:
@@ -148,13 +150,13 @@ class PublisherOverlay:
             else:
                 receivers = receivers_of([connection_override])
                 is_latched = False
-            _, inboxes_by_thaw, inline_queues, thread_queues, connections = receivers
+            _, inboxes_by_thaw, inline_queues, thread_queues, others = receivers
             if self.has_header and message._has_header:  # as serialize_message does; not AnyMsg
                 message.header.seq = self.seq
                 if message.header.frame_id is None:
                     message.header.frame_id = '0'
             # links need a frozen message, and latches; if nobody receives, a channel has it checked
-            if inboxes_by_thaw or is_latched or channel and not connections:
+            if inboxes_by_thaw or is_latched or channel and not others:
                 frozen = self.freeze(message)
                 if is_latched:
                     self.latches[channel] = frozen
@@ -162,12 +164,13 @@ class PublisherOverlay:
                     item = frozen, thaw, self.header
                     for inbox in inboxes:
                         inbox.put((message, None, None) if inbox.shared else item)
-            if connections:
-                self.write(message, connections)
+            if others:
+                self.write(message, others)
         for callback_queue in inline_queues:
-            callback_queue.run_jobs(waits_for_turn=False)
+            callback_queue.run_jobs(in_turn=False)
         if thread_queues:
-            # actionlib stores a goal after publish(): the answer must not come before that
+            # actionlib stores a goal after publish(): the answer must not come before that. Here it
+            # does not come sooner than usual; patches.send_goal() has it wait
             may_wait = channel is not None
             self.last_wake = hand_over(thread_queues, self.last_wake, may_wait)
 
@@ -386,11 +389,7 @@ class SubscriptionOverlay:
         share = share_of(self, connection.endpoint_id)
         if not share or connection.transport_type != 'TCPROS':
             return self.rospy_add_connection(connection)
-        connection.share = share  # _connect() has its lock
-        is_added = share.add(self, connection)
-        if is_added:
-            share.connection = connection
-        return is_added
+        return share.add(self, connection)  # _connect() has its lock
 
     def remove_callback(self, callback: Any, args: Any) -> None:
         self.rospy_remove_callback(callback, args)

@@ -148,7 +148,7 @@ class SharedMemoryHandler(ProtocolHandler):
         if not subscription.add_connection(connection):
             connection.close()
             return 0, 'the subscription was closed', 0
-        connect = functools.partial(_reader.attempt, connection, connection.connect)
+        connect = functools.partial(_reader.call, connection, connection.connect)
         if not self.run.start_thread(connect):
             connection.close()
             return 0, 'no thread is left', 0
@@ -213,7 +213,7 @@ class Reader:
         while True:
             messages = attempt(self._take_messages) or []
             for _, connection, deliver in sorted(messages, key=operator.itemgetter(0)):
-                self.attempt(connection, deliver)
+                self.call(connection, deliver)
             self._last_copy = None, b''
             with _lock:
                 if not self._connections:
@@ -232,13 +232,13 @@ class Reader:
             for descriptor, _ in events:
                 connection = self._connections.get(descriptor)
                 if connection:
-                    message = self.attempt(connection, connection.read)
+                    message = self.call(connection, connection.read)
                     if message:
                         messages.append(message)
             timeout = 0
         return messages
 
-    def attempt(self, connection: MemoryReceiver, function):
+    def call(self, connection: MemoryReceiver, function):
         """Call a function of a connection, and return the value; an error ends the connection."""
         try:
             return function()

@@ -162,7 +162,7 @@ class Entry(NamedTuple):
     file: MemoryFile | None
     slot: int  # of the field in the file, or WHOLE
     size: int  # bytes in the file
-    data: bytes  # the rest of the message
+    data: bytes  # the rest of the message; all of it if there is no file
     time: float  # of sending
 
 

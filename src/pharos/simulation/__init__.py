@@ -63,7 +63,7 @@ class Simulation:
     _looks = 0  # at the thread with the turn, since it got the turn
     _asks = 0  # by that thread, whether it shall end
     _cpu_time = 0.0
-    on_turn: Any = None  # None, or called in each thread that gets the turn
+    on_turn: Any = None  # None, or called in each thread but the owner that gets the turn
     _on_wait: Any = None  # None, or called in each thread that gives it back
     _error: Any = None  # of the record
     _turn_begin = 0  # when the thread with the turn got it
@@ -88,7 +88,7 @@ class Simulation:
         Programs start later, too, by up to 30 times the longest delay of a sleep.
 
         :param number: 0: each sleep ends when due; of those due at one time, the first to begin is first
-        :param jitter: the longest delay of a sleep, in seconds; short ones are as probable as long ones
+        :param jitter: the longest delay of a sleep, in seconds; each size is as probable as ten times it
         """
         self.seed_number = number
         self.jitter = jitter
@@ -209,8 +209,8 @@ class Simulation:
     def run_until(self, predicate: Callable[[], Any], limit: float) -> Any:
         """Let the time go on until ``predicate()`` is true, for ``limit`` seconds at most.
 
-        :returns: the last value of ``predicate()``, which is called every 20 ms at least, in turn with
-            the other threads
+        :returns: the last value of ``predicate()``, which is called every 20 ms (with a seed, a jitter later),
+            in turn with the other threads
         """
         return wait(predicate, limit)
 

@@ -23,7 +23,6 @@ from typing import Any
 from pharos.compose import composition
 from pharos.compose.script_run import ScriptRun
 from pharos.errors import PharosError
-from pharos.intraprocess import callback_queues
 from pharos.intraprocess.copier import copy_of
 from pharos.intraprocess.links import runs
 from pharos.live import service_client
@@ -425,7 +424,6 @@ def changes():
             'is_alive': is_alive,
         },
         queue: {'SimpleQueue': queue._PySimpleQueue, 'time': monotonic},  # type: ignore
-        callback_queues: {'_no_yield_before': 0.0},  # a virtual time is too late for the real clock
         run.Run: {'read_parameters': read_all_parameters, 'substitutes': substitutes},
         service_client: {'ignores_timeout': True},
         # all programs run here
