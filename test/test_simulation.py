@@ -819,9 +819,15 @@ def numbers(*values, topic='/n', begin=10.0):
     ]
 
 
+def layout(*labels):
+    dimensions = [std_msgs.msg.MultiArrayDimension(label=label) for label in labels]
+    return std_msgs.msg.MultiArrayLayout(dim=dimensions)
+
+
 NAN = float('nan')
 GOOD = numbers(1.0, 2.0, NAN)
 FIELDS = sensor_msgs.msg.Imu(orientation_covariance=[0.0] * 9)
+JOINTS = sensor_msgs.msg.JointState(name=['a', 'b'])
 OTHER_FIELDS = sensor_msgs.msg.Imu(orientation_covariance=[0.0] * 5 + [0.1] + [0.0] * 3)
 
 
@@ -860,6 +866,16 @@ OTHER_FIELDS = sensor_msgs.msg.Imu(orientation_covariance=[0.0] * 5 + [0.1] + [0
             GOOD[:1],
             [('/n', std_msgs.msg.String('1'), 10.0)],
             ['0.000 s /n #0 type: std_msgs/Float64 -> std_msgs/String'],
+        ),
+        (
+            [('/j', JOINTS, 10.0)],
+            [('/j', sensor_msgs.msg.JointState(name=['b']), 10.0)],
+            ["0.000 s /j #0 name: ['a', 'b'] -> ['b']"],
+        ),
+        (
+            [('/l', layout('height', 'width'), 10.0)],
+            [('/l', layout('height', 'depth'), 10.0)],
+            ['0.000 s /l #0 dim[1].label: width -> depth'],
         ),
     ],
 )
@@ -907,6 +923,8 @@ def test_command_compares_with_a_recording(master, tmp_path):
     status, output = run('--expect', good)
     assert status == 0
     assert re.search(rf'^as {re.escape(good)}: [1-9]\d* messages of 1 topics$', output, re.M)
+    driver.write_text(f'# equal\n{DRIVER}'.replace('message', 'command'))
+    assert run('--expect', good)[0] == 0
     driver.write_text(DRIVER.replace('0.5', '0.50005'))
     status, output = run('--expect', good)
     assert status == 1
