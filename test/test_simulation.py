@@ -362,6 +362,76 @@ PROGRAM_LINES = {
 }
 
 
+#: waits of 3 s by Python's and ROS's own means: programs without the line that says how long it took
+WAITS_OF_PROGRAMS = {
+    'a barrier': """
+        def come(): time.sleep(3); barrier.wait()
+        barrier = threading.Barrier(2); threading.Thread(target=come).start(); barrier.wait()
+        """,
+    'a semaphore': 'threading.Semaphore(0).acquire(timeout=3)',
+    'a scheduler': """
+        scheduler = sched.scheduler(time.time, time.sleep)
+        scheduler.enter(3, 1, print); scheduler.run()
+        """,
+    'a queue that is joined': """
+        def work(): tasks.get(); time.sleep(3); tasks.task_done()
+        tasks = queue.Queue(); tasks.put(1); threading.Thread(target=work).start(); tasks.join()
+        """,
+    'a simple queue': """
+        def put(): time.sleep(3); words.put(1)
+        words = queue.SimpleQueue(); threading.Thread(target=put).start(); words.get()
+        """,
+    'a pool of threads': """
+        with futures.ThreadPoolExecutor(3) as pool: list(pool.map(time.sleep, [1, 2, 3]))
+        """,
+    'the limit of a future': """
+        pool = futures.ThreadPoolExecutor(1)
+        try: pool.submit(time.sleep, 30).result(timeout=3)
+        except futures.TimeoutError: pass
+        """,
+    'an executor of asyncio': """
+        async def main():
+            await asyncio.get_running_loop().run_in_executor(None, time.sleep, 3)
+        asyncio.run(main())
+        """,
+    'streams of asyncio': """
+        async def serve(reader, writer): await asyncio.sleep(3); writer.close()
+        async def main():
+            server = await asyncio.start_server(serve, '127.0.0.1', 0)
+            reader, writer = await asyncio.open_connection(*server.sockets[0].getsockname())
+            await reader.read()
+        asyncio.run(main())
+        """,
+    'a call of a service': """
+        rospy.Service('ask', Empty, lambda request: (time.sleep(3), EmptyResponse())[1])
+        rospy.ServiceProxy('ask', Empty)()
+        """,
+    'a message that does not come': """
+        try: rospy.wait_for_message('word', String, timeout=3)
+        except rospy.ROSException: pass
+        """,
+    'a transform that does not come': """
+        transforms = tf2_ros.Buffer(); listener = tf2_ros.TransformListener(transforms)
+        transforms.can_transform('map', 'robot', rospy.Time(0), rospy.Duration(3))
+        """,
+}
+
+
+@pytest.mark.parametrize('kind', WAITS_OF_PROGRAMS)
+def test_wait_of_a_program_takes_virtual_time(simulation, bench, kind):
+    imports = """
+import asyncio, queue, sched, tf2_ros
+from concurrent import futures
+from std_srvs.srv import Empty, EmptyResponse
+"""
+    text = textwrap.dedent(WAITS_OF_PROGRAMS[kind])
+    took = '\nsay(round(time.time() - start, 1))\n'
+    with bench.load(f'{imports}{INIT}start = time.time()\n{text}{took}'):
+        simulation.run(100)
+    assert simulation.lost == []
+    assert [float(line) for line in bench.said()] == [pytest.approx(3, abs=0.1)]
+
+
 @pytest.mark.parametrize('program', PROGRAM_LINES)
 def test_program_runs_in_virtual_time(simulation, bench, program):
     imports = "import datetime, functools, pickle, select, socket, subprocess\nrospy.init_node('program')\n"
