@@ -154,6 +154,7 @@ SAID = {
     'class statement': ('    k = K', '    k = K\n    print()', [': takes effect at a restart']),
     'generator': ('yield 1', 'yield 2', ['count ' + AT_NEXT_CALL]),
     'loop that runs': ('(0.01)', '(0.02)', ['main ' + AT_NEXT_CALL]),
+    'new value': ('K = 1', 'K = 1\nNEW = len("ab")', ['NEW takes effect']),
     'exit': ('K = 1', 'import helper, leave', None),
     'empty file': (KINDS, '', ['K has gone; it stays in force', 'C has gone', 'main has gone']),
 }

@@ -443,6 +443,25 @@ def test_program_runs_in_virtual_time(simulation, bench, program):
     assert re.fullmatch(PROGRAM_LINES[program], line), line
 
 
+TALKER = """
+publisher = rospy.Publisher('word', String, queue_size=10)
+rospy.init_node('talker')
+rate = rospy.Rate(10)
+while not rospy.is_shutdown():
+    publisher.publish('x')
+    rate.sleep()
+"""
+
+
+def test_topic_from_before_init_node_is_heard_at_once(simulation, bench):
+    times = []
+    with simulation.master.create(BlockNode, 'ear') as ear:
+        ear.interested_in('/word', STRING, lambda message: times.append(simulation.now))
+        with bench.load(TALKER):
+            simulation.run(2.95)
+    assert len(times) == 30
+
+
 UNSEEDED = (
     'uuid.uuid4()',
     'os.urandom(8)',
@@ -967,6 +986,33 @@ def test_tolerance_lets_times_differ(tmp_path):
     new = bag_of(tmp_path / 'b.bag', ('/t', clock(genpy.Time(5, 10**7)), 10.01))
     assert differences(old, new, 10.0, 0.02) == []
     assert differences(old, new, 10.0, 0.005) == ['0.000 s /t #0 data: 5000000000 -> 5010000000']
+
+
+def test_difference_of_long_values_is_shown(tmp_path):
+    texts = [f'{"x" * 500}{end}' for end in ('old', 'new')]
+    paths = [
+        bag_of(tmp_path / f'{number}.bag', ('/p', std_msgs.msg.String(text), 10.0))
+        for number, text in enumerate(texts)
+    ]
+    (line,) = differences(*paths, 10.0)
+    assert re.fullmatch('0.000 s /p #0 data: x{30}old -> x{30}new', line)
+
+
+def test_recording_of_a_latched_topic_is_latched(simulation, create_node, tmp_path):
+    bag = str(tmp_path / 'map.bag')
+    driver = create_node(BlockNode, 'driver')
+    simulation.record_to(bag)
+    driver.output_channel('/map', STRING, latch=True).send(data='x')
+    driver.send_to('/speed', typed_as=STRING, data='y')
+    simulation.run(1)
+    simulation.close_record()
+    with rosbag.Bag(bag) as file:
+        headers = {
+            item.topic: item.connection_header
+            for item in file.read_messages(return_connection_header=True)
+        }
+    assert headers['/map']['latching'] == b'1' and headers['/map']['callerid'] == b'/driver'
+    assert headers['/speed'].get('latching', b'0') == b'0'
 
 
 def test_difference_is_told_in_one_line(tmp_path):

@@ -163,6 +163,8 @@ def _show_differences(simulation, options):
     lines = differences(options.expect, options.record, begin, options.tolerance)
     if lines:
         print('\n'.join(lines))
+        if simulation.lost:
+            print(f'this run was not exact, since {simulation.lost} lost the turn: run it again')
         return True
     with open_bag(options.expect) as bag:
         topics = bag.get_type_and_topic_info()[1]

@@ -119,7 +119,8 @@ def _read(module, tree, notes, undo):
     try:
         for item in _new_items(former_tree, tree):
             line = item.lineno
-            if not _is_definition(item):
+            is_new = _names(item) and vars(module).keys().isdisjoint(_names(item))
+            if not (_is_definition(item) or is_new):
                 notes.append(f'{file}:{line}: {AT_RESTART}')
                 continue
             former_class = isinstance(item, ast.ClassDef) and classes.get(item.name)

@@ -79,8 +79,6 @@ def take_name(run):
 def register(run, registry, name, data):
     """Register a topic or service at the master; try once, since the watcher repairs the rest.
 
-    Have all nodes of this process connect to a new publisher.
-
     :param registry: rospy's name of the registry: 'pub', 'sub' or 'srv'
     :param data: the name of the topic's type, or the URI of the service
     """
@@ -90,10 +88,15 @@ def register(run, registry, name, data):
         )
         if registry == 'sub' and publishers is not None:
             run.publisher_uris[name] = publishers
-    if registry == 'pub':  # sooner than by the master's publisherUpdate
-        for subscriber in list(runs.values()):
-            if subscriber.master.url == run.master.url:
-                _connect(subscriber, name, run.uri)
+    if registry == 'pub':
+        connect_subscribers(run, name)
+
+
+def connect_subscribers(run, topic):
+    """Have all nodes of this process connect to a new publisher: sooner than by the master's call."""
+    for subscriber in list(runs.values()):
+        if subscriber.master.url == run.master.url:
+            _connect(subscriber, topic, run.uri)
 
 
 def connect_all(run, topic):

@@ -256,6 +256,8 @@ def ready(original: Callable, run: Run, self: Any, uri: str) -> None:
     self.uri = uri
     run.make_findable(self, uri)
     self.reg_man.start(uri, self.masterUri)
+    for topic in list(run.topic_manager.pubs):  # from before init_node()
+        connections.connect_subscribers(run, topic)
 
 
 @patch('rospy.impl.registration', 'RegManager.run')

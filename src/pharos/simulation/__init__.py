@@ -61,6 +61,7 @@ class Simulation:
     record: Any = None
     launch_file = bag = ''
     _looks = 0  # at the thread with the turn, since it got the turn
+    _idle_looks = 0  # the last ones, at which it slept
     _asks = 0  # by that thread, whether it shall end
     _cpu_time = 0.0
     on_turn: Any = None  # None, or called in each thread but the owner that gets the turn
@@ -146,12 +147,16 @@ class Simulation:
             with _named(bag.filename):
                 bag.close()
 
-    def record_message(self, topic, message):
-        """Write a message to the bag, if there is one; end the run if that cannot be written."""
+    def record_message(self, topic, message, header):
+        """Write a message to the bag, if there is one; end the run if that cannot be written.
+
+        :param header: of the connections of its publisher; the first one of a topic is kept
+        """
         if self.record:
             try:
                 with _named(self.record.filename):
-                    self.record.write(topic, message, Time(0, self.nanoseconds))
+                    time_ = Time(0, self.nanoseconds)
+                    self.record.write(topic, message, time_, connection_header=header)
             except PharosError as error:
                 self.fail(error)
 
@@ -329,7 +334,7 @@ class Simulation:
             del self._waits[thread]
             self.nanoseconds = max(self.nanoseconds, end)
             self._holder = thread
-            self._looks = self._asks = 0
+            self._looks = self._idle_looks = self._asks = 0
             self._turn_begin = self.nanoseconds
             thread.turns.put(None)
 
@@ -380,16 +385,17 @@ class Simulation:
         is_idle = cpu_time < self._cpu_time + 0.01  # seconds of all threads since the last look
         self._cpu_time = cpu_time
         with self._lock:
-            self._looks += 1
             thread = self._holder
-            # three: beside load, a process may get no processor for the time of one look
-            limit = 3 if is_idle else 120
+            self._looks += 1
+            # beside load, a process may get no processor for the time of some looks
+            self._idle_looks = self._idle_looks + 1 if is_idle and _sleeps(thread) else 0
+            is_over = self._idle_looks >= 3 or self._looks >= 120
             deadlocks = self.deadlocks()
-            if not thread and deadlocks and self._looks >= limit:
+            if not thread and deadlocks and is_over:
                 self._holder = self._owner
                 del self._waits[self._owner]
                 raise PharosError(f'threads wait for a lock for ever: {deadlocks}')
-            if self._looks < limit or thread in (None, self._owner):
+            if not is_over or thread in (None, self._owner):
                 return
             frames = traceback.walk_stack(sys._current_frames()[thread.ident])
             if any(frame.f_globals.get('__name__') in KEEP_TURN for frame, _ in frames):
@@ -456,6 +462,14 @@ def _read(path, bag, topics):
             yield item
     except (OSError, EOFError, ValueError, rosbag.ROSBagException) as error:
         raise PharosError(f'{path} is damaged after {last} s: {error}; see rosbag check') from error
+
+
+def _sleeps(thread):
+    """False if a thread waits for the processor or a disk; True if there is no thread."""
+    if not thread:
+        return True
+    with open(f'/proc/self/task/{thread.native_id}/stat') as file:
+        return file.read().rpartition(')')[2].split()[0] == 'S'
 
 
 def _place_of(thread):

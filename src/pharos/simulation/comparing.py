@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import os
 from typing import Any, Iterator
 
 import genpy
@@ -68,17 +69,15 @@ def _difference(old, new, tolerance, path) -> str:
     else:
         if _is_same(old, new, tolerance):
             return ''
-        return f'{path[1:]}: {_text(old)} -> {_text(new)}'
+        texts = [' '.join(str(value).split()) for value in (old, new)]
+        # from shortly before the place where they differ
+        start = max(0, len(os.path.commonprefix(texts)) - MAX_VALUE // 2)
+        return f'{path[1:]}: ' + ' -> '.join(text[start : start + MAX_VALUE] for text in texts)
     for part_path, old_part, new_part in parts:
         text = _difference(old_part, new_part, tolerance, part_path)
         if text:
             return text
     return ''
-
-
-def _text(value) -> str:
-    """Return a value as text of one line."""
-    return ' '.join(str(value).split())[:MAX_VALUE]
 
 
 def _is_same(old, new, tolerance) -> bool:

@@ -378,7 +378,8 @@ def publish(original, run, publisher, message, *options, **more):
     if _simulation:
         _simulation.last_messages[publisher.name] = copy_of(message)
         if run.name != PLAYER and publisher.name != '/rosout':
-            _simulation.record_message(publisher.name, message)
+            publisher.make_header()
+            _simulation.record_message(publisher.name, message, publisher.header)
 
 
 def sleep(seconds):

@@ -5,6 +5,7 @@ import code
 import gc
 import pdb
 import sys
+import weakref
 from typing import Any, Callable
 
 from pharos.errors import PharosError, UnknownNodeError, UnknownTopicError
@@ -24,45 +25,49 @@ class Program:
     """
 
     def __init__(self, node):
-        run = node._current_run
-        modules = [run.modules.by_name.get('__main__'), *editable_modules(node)]
+        self._run = node._current_run
+        modules = [self._run.modules.by_name.get('__main__'), *editable_modules(node)]
         self._scopes = [vars(module) for module in modules if module]
-        self._threads = list(run.threads)
+        self._find_objects()
 
     def has(self, frame):
         """True if a frame runs a function of the program, or of its package."""
         return any(frame.f_globals is scope for scope in self._scopes)
 
-    def _values(self):
-        """Return names and values: objects of the program's classes, running functions, modules."""
-        values = {}
+    def _find_objects(self):
+        """Find the objects of the program's classes; this takes long."""
         names = {scope['__name__'] for scope in self._scopes}
-        classes = set()
-        for scope in self._scopes:
-            for each in scope.values():
-                if isinstance(each, type) and each.__module__ in names:
-                    classes.add(each)
-        for each in gc.get_objects():
-            if type(each) in classes:
-                values.update(vars(each))
-        for thread in self._threads:
+        values = [value for scope in self._scopes for value in scope.values()]
+        classes = {
+            each
+            for each in values
+            if isinstance(each, type) and each.__module__ in names and each.__weakrefoffset__
+        }
+        self._objects = [weakref.ref(each) for each in gc.get_objects() if type(each) in classes]
+
+    def _places(self):
+        """Yield dicts of names and values: of modules, of running functions, of objects."""
+        yield from self._scopes
+        for thread in list(self._run.threads):
             frame = sys._current_frames().get(thread.ident)
             while frame:
                 if self.has(frame):
-                    values.update(frame.f_locals)
+                    yield frame.f_locals
                 frame = frame.f_back
-        for scope in reversed(self._scopes):
-            values.update(scope)
-        return values
+        for reference in self._objects:
+            yield getattr(reference(), '__dict__', {})
 
     def __dir__(self):
-        return list(self._values())
+        self._find_objects()
+        return sorted({name for place in self._places() for name in place})
 
     def __getattr__(self, name):
-        values = self._values()
-        if name not in values:
-            raise AttributeError(f'the program has no {name}: dir() lists what it has')
-        return values[name]
+        for _ in range(2):
+            for place in self._places():
+                if name in place:
+                    return place[name]
+            self._find_objects()  # it may be an attribute of a new one
+        raise AttributeError(f'the program has no {name}: dir() lists what it has')
 
 
 class Debugger(pdb.Pdb):
@@ -102,6 +107,7 @@ class Prompt:
     def __init__(self, simulation, go_back):
         self._simulation = simulation
         self._go_back = go_back
+        self._programs: dict[Any, Program] = {}  # by their runs
         functions = self.at, self.node, self.topic, self.step, self.until
         self._names: dict[str, Any] = {each.__name__: each for each in functions}
 
@@ -137,7 +143,12 @@ class Prompt:
     def node(self, name: str) -> Any:
         """Return the program of a node, with its names as attributes; or the node, if made with pharos."""
         node = self._find(name)
-        return Program(node) if hasattr(node._current_run, 'main') else node
+        run = node._current_run
+        if not hasattr(run, 'main'):
+            return node
+        if run not in self._programs:
+            self._programs[run] = Program(node)
+        return self._programs[run]
 
     def _find(self, name):
         nodes = {node.name: node for node in self._simulation.master.own_nodes()}
