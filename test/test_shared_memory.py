@@ -3,6 +3,7 @@ import contextlib
 import errno
 import os
 import pathlib
+import re
 import shutil
 import signal
 import socket
@@ -14,7 +15,7 @@ import numpy
 import pytest
 
 import pharos
-from helpers import TIMEOUT, InProcessMaster, Peer, PharosPeer, Program, create, stop_nodes
+from helpers import TIMEOUT, Gate, InProcessMaster, Peer, PharosPeer, Program, create, stop_nodes
 from pharos import Master
 from pharos.shared_memory.receiving import MemoryReceiver, Reader
 from pharos.testing import Mailbox, until
@@ -488,6 +489,19 @@ def test_five_stopped_readers_hold_up_nobody(master, node, listener, topic):
         for each in stopped:
             numbers = each.numbers(topic)  # more of them may come
             assert numbers == sorted(set(numbers))
+
+
+def test_callback_may_unregister(node, listener, topic):
+    """Its connection, which waits for the end of the callback, is read no more."""
+    heard = Gate()
+    subscriber = node.ros.Subscriber(topic, pharos.message_class(IMAGE), heard)
+    listener.run(f'node.output_channel({topic!r}, {IMAGE!r}).send()')
+    assert heard.begun.wait(TIMEOUT)
+    subscriber.unregister()
+    heard.open.set()
+    # the threads of the callbacks, and of the reader
+    names = re.compile(r'\(loop\)|pharos reader')
+    until(lambda: not names.search(str(threading.enumerate())))
 
 
 def test_killed_reader_leaves_nothing(master, node, listener, topic):
