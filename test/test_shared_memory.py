@@ -504,6 +504,14 @@ def test_callback_may_unregister(node, listener, topic):
     until(lambda: not names.search(str(threading.enumerate())))
 
 
+def test_stopped_publisher_leaves_no_thread(node, listener, topic):
+    listener.listen(topic)
+    out = node.output_channel(topic, IMAGE)
+    until(lambda: out.connections == [('/listener', SHARED)])
+    node.stop()
+    assert '/node (' not in str(threading.enumerate())
+
+
 def test_killed_reader_leaves_nothing(master, node, listener, topic):
     listener.listen(topic)
     out = node.output_channel(topic, IMAGE)

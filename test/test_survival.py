@@ -311,21 +311,32 @@ def test_link_comes_back_after_a_loss(master):
             assert heard.next().data == 'after'
 
 
-def test_silent_loss_is_noticed_soon(master):
-    """The kernel probes a silent connection, and breaks it within 30 s."""
-    node = create(master)
+def assert_silence_ends(port):
+    """The kernel probes a silent connection of this process, and breaks it within 30 s."""
+    (connection,) = sockets_of(port)
+    with connection:
+        assert connection.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+        idle, interval, count = (
+            connection.getsockopt(socket.IPPROTO_TCP, option)
+            for option in (socket.TCP_KEEPIDLE, socket.TCP_KEEPINTVL, socket.TCP_KEEPCNT)
+        )
+        assert idle + interval * count <= 30
+
+
+def test_silent_loss_is_noticed_soon(master, node):
     channel = node.output_channel('/quiet', STRING)
     with subscribe(node.tcp_port, '/quiet') as client:
         receive(client)
         until(lambda: channel.connections)
-        (connection,) = sockets_of(node.tcp_port)
-        with connection:
-            assert connection.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
-            idle, interval, count = (
-                connection.getsockopt(socket.IPPROTO_TCP, option)
-                for option in (socket.TCP_KEEPIDLE, socket.TCP_KEEPINTVL, socket.TCP_KEEPCNT)
-            )
-            assert idle + interval * count <= 30
+        assert_silence_ends(node.tcp_port)
+
+
+def test_silent_loss_of_a_publisher_is_noticed_soon(master, node):
+    heard = Mailbox(node, '/quiet', STRING)
+    with FakeNode(master, '/quiet').publish_here() as publisher, publisher.accept() as connection:
+        connection.sendall(string_message('the last one'))
+        assert heard.next()
+        assert_silence_ends(connection.getpeername()[1])
 
 
 def test_stuck_subscriber_starves_nobody(master):
