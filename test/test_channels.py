@@ -360,11 +360,16 @@ def test_closed_channel_drops_what_waits(master):
     assert gate.heard == ['first']
 
 
-@pytest.mark.parametrize('library, size', [(Peer, 1 << 20), (PharosPeer, 60_000)])
-def test_queue_to_a_standing_subscriber_is_bounded(master, node, library, size):
+@pytest.mark.parametrize(
+    'library, size, limit',
+    [(Peer, MEGABYTE, 2), (Peer, MEGABYTE, 0), (PharosPeer, 60_000, 2)],
+)
+def test_queue_to_a_standing_subscriber_is_bounded(master, node, library, size, limit):
+    """By its queue_size, or by the node's queue_bytes."""
+    node.queue_bytes = 2 * MEGABYTE
     with library(master.url) as ear:
         ear.hear('/words', STRING)
-        out = node.output_channel('/words', STRING, queue_size=2)
+        out = node.output_channel('/words', STRING, queue_size=limit)
         os.kill(ear.pid, signal.SIGSTOP)
         for number in range(100):
             out.send(data=str(number).ljust(size))
