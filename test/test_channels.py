@@ -527,6 +527,16 @@ def test_closed_input_hears_no_more(node, other):
     assert other.channels == [mailbox.channel]
 
 
+def test_unregistered_subscriber_of_rospy_hears_no_more(node, other):
+    """Another one of the topic goes on."""
+    gone, heard = Mailbox(), Mailbox()
+    subscribers = [other.ros.Subscriber('/chatter', String, each) for each in (gone, heard)]
+    subscribers[0].unregister()
+    node.send_to('/chatter', typed_as=STRING, data='one')
+    assert take(heard, 1) == ['one']
+    assert not gone.all()
+
+
 def test_close_unregisters_both_ends(master, node, other):
     sender, hearer = node.output_channel('/chatter', STRING), other.interested_in('/chatter')
     for channel in hearer, sender:
