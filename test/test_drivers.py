@@ -74,6 +74,15 @@ def test_stop_gives_the_device_back(bench, port, reader):
         sock.bind(('127.0.0.1', port))
 
 
+def test_stop_of_a_main_thread_that_reads_gives_the_device_back(bench, port):
+    script = bench.load(driver(port, rest='device = driver.device\nwhile True: device.recv(10)'))
+    bench.until(lambda: bench.said() == ['begins', 'opened'])
+    script.stop_timeout = 0.1
+    script.stop()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(('127.0.0.1', port))
+
+
 def test_serial_driver_restarts_while_its_thread_reads(bench):
     pytest.importorskip('serial')
     device, program_end = pty.openpty()

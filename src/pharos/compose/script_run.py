@@ -170,7 +170,7 @@ class ScriptRun(Run):
         return function
 
     def _tell_left_threads(self) -> None:
-        left_threads = join({*self.threads, *self.left_threads}, BLOCK_LIMIT)
+        left_threads = join({*self.threads, *self.left_threads, self.main}, BLOCK_LIMIT)
         if left_threads:
             names = ', '.join(thread.name for thread in left_threads)
             Transcript.show(f'{self.name} leaves threads that block, with what they use: {names}')
