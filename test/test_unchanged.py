@@ -737,8 +737,8 @@ def test_script_that_ignores_the_stop_gets_systemexit(bench, capfd):
     # for the interpreter, if a further thread gets one at that moment
     text = '''
         rospy.init_node('program')
-        say('ready')
         try:
+            say('ready')
             while True: sum(range(1000))
         except SystemExit:
             say('SystemExit')

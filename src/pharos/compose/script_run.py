@@ -437,7 +437,8 @@ class ScriptRun(Run):
         except (Exception, KeyboardInterrupt, SystemExit) as error:
             if self.created_nodes:
                 join([self.main], STOP_LIMIT)  # the main thread ends with its nodes
-            self.raise_in_main(error)
+            if not self.finished.is_set():  # else the main thread has got its SystemExit
+                self.raise_in_main(error)
         finally:
             signals.silenced_threads.discard(self.main.ident)
 
