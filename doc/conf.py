@@ -44,7 +44,10 @@ nitpicky = True
 nitpick_ignore_regex = [
     # types of others, type variables, and what is internal
     ('py:(class|exc)', r'(genpy|rospy|rosgraph|threading|os|subprocess|types|_pytest)\..*'),
-    ('py:class', r'(pharos\.channels\.Channel|.*\.Snapshot|.*Run|Block|Edge|Message|(.*\.)?N)'),
+    (
+        'py:class',
+        r'(pharos\.channels\.Channel|.*\.(Snapshot|LaunchFile|Entry)|.*Run|Block|Edge|Message|(.*\.)?N)',
+    ),
     # attributes that a docstring lists have no place of their own, nor has an inherited stop()
     ('py:(attr|data)', r'.*'),
     ('py:meth', r'(stop|Node\.serve)'),

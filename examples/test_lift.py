@@ -48,7 +48,7 @@ SCRIPTS = strategies.lists(COMMANDS, max_size=6).map(lambda script: [*script, ('
     deadline=None,
     max_examples=50,
     # all scripts run in one simulation, each with a lift of its own
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
+    suppress_health_check=[*HealthCheck],
 )
 @given(script=SCRIPTS)
 def test_lift_stands_after_stop(simulation, script):

@@ -556,7 +556,7 @@ def test_file_of_one_large_message_is_given_back(node, listener, topic):
 
 BROKEN = {
     'round': [(Reader, '_take_messages')],
-    'attempt': [(Reader, 'attempt')],
+    'call': [(Reader, 'call')],
     'end': [(MemoryReceiver, 'read'), (MemoryReceiver, 'end')],
 }
 
