@@ -614,6 +614,7 @@ def test_prompt_goes_back_in_the_first_environment(master, bench):
     xml = '<group ns="foo"><node pkg="bench" type="program" name="program"/></group>'
     session = Session('3', bench.launch_file(xml))
     session.ask('at(1)')
+    session.ask('at(0)')
     assert 'Program' in session.ask("node('/foo/program')")
     assert session.end() == 0
 

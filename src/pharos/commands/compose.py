@@ -259,7 +259,7 @@ def _open_prompt(simulation, options, close):
 
     if options.bag:
         threading.Thread(target=play, daemon=True).start()
-    simulation.at(options.at)
+    simulation.at(max(options.at, simulation.seconds))  # the start may have taken some time
     Prompt(simulation, go_back).interact()
 
 
