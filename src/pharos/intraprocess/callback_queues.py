@@ -4,7 +4,7 @@ A callback queue has one thread. A node has one queue for its delegates, and one
 of plain rospy. The thread begins a callback when those on earlier messages of the node have ended, or
 have run for SLOW; :meth:`CallbackQueue.delays` and TURN_LIMIT have more. Three other threads run
 callbacks: a publisher runs the queue of an inline channel, a thread that reads a TCPROS connection
-of one node runs those of plain rospy without a queue_size, and Failure.retry() runs one in its caller's.
+of one node runs those of plain rospy without a queue_size, and the caller of Failure.retry() runs one.
 """
 from __future__ import annotations
 
@@ -305,8 +305,8 @@ def hand_over(callback_queues: list[CallbackQueue], last_wake: float, may_wait: 
     :param last_wake: what the last call for the same publisher has returned
     :param may_wait: True: wait until each thread runs, up to YIELD_LIMIT; after one that takes so long
         wait for no other
-    :returns: the time of the last wake, as of perf_counter(), or of one that took so long, plus
-        YIELD_PAUSE: the publisher waits for no thread before
+    :returns: the time of the last wake, as of perf_counter(). After a wait that took so long it is
+        YIELD_PAUSE later, and the publisher waits for no thread before that
     """
     now = time.perf_counter()
     # a busy publisher keeps the interpreter for 5 ms, unless it waits for the thread to run

@@ -147,16 +147,19 @@ class Simulation:
             with _named(bag.filename):
                 bag.close()
 
-    def record_message(self, topic, message, header):
+    def record_message(self, publisher, message):
         """Write a message to the bag, if there is one; end the run if that cannot be written.
 
-        :param header: of the connections of its publisher; the first one of a topic is kept
+        Of each topic, the bag has the connection header of its first publisher.
         """
         if self.record:
+            publisher.make_header()
+            stamp = Time(0, self.nanoseconds)
             try:
                 with _named(self.record.filename):
-                    time_ = Time(0, self.nanoseconds)
-                    self.record.write(topic, message, time_, connection_header=header)
+                    self.record.write(
+                        publisher.name, message, stamp, connection_header=publisher.header
+                    )
             except PharosError as error:
                 self.fail(error)
 

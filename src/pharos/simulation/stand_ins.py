@@ -29,7 +29,6 @@ from pharos.live import service_client
 from pharos.private_rospy import run
 from pharos.private_rospy.loader import Shim
 from pharos.private_rospy.patches import patch
-from pharos.waiting import let_senders_run
 
 CLOCKS = 'time', 'perf_counter', 'monotonic', 'time_ns', 'perf_counter_ns', 'monotonic_ns'
 #: looks of these modules at a clock take no time: they come more or less often, as they wait for servers
@@ -321,7 +320,7 @@ def poll_child(original, run, child):
         if _monotonic() > end:
             child.is_slow = True
             _simulation.lost.append(f'{local.thread.name} with its child {child.args}')
-        let_senders_run()
+        _sleep(1e-6)
     return original(child)
 
 
@@ -378,8 +377,7 @@ def publish(original, run, publisher, message, *options, **more):
     if _simulation:
         _simulation.last_messages[publisher.name] = copy_of(message)
         if run.name != PLAYER and publisher.name != '/rosout':
-            publisher.make_header()
-            _simulation.record_message(publisher.name, message, publisher.header)
+            _simulation.record_message(publisher, message)
 
 
 def sleep(seconds):
