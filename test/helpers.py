@@ -269,7 +269,13 @@ class Program:
         command = [PYTHON, '-u', '-c', source] if isinstance(source, str) else list(source)
         self._process = subprocess.Popen(
             [*DEFAULT_SIGNALS, *command, *arguments],
-            env={**os.environ, 'ROS_MASTER_URI': url, 'PYTHONUNBUFFERED': '1', **environ},
+            env={
+                **os.environ,
+                'ROS_MASTER_URI': url,
+                'PYTHONFAULTHANDLER': '1',
+                'PYTHONUNBUFFERED': '1',
+                **environ,
+            },
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -326,8 +332,17 @@ class Program:
         self._process.send_signal(number)
 
     def wait(self):
-        """Wait for its end; returns its exit code, negative if a signal ended it."""
-        code = self._process.wait(TIMEOUT)
+        """Wait for its end; returns its exit code, negative if a signal ended it.
+
+        Fail if it does not end, with what its threads do.
+        """
+        try:
+            code = self._process.wait(TIMEOUT)
+        except subprocess.TimeoutExpired:
+            self.signal(signal.SIGABRT)  # Python writes where each thread is, and ends
+            self._process.wait(TIMEOUT)
+            self._reader.join(TIMEOUT)
+            pytest.fail(f'it does not end: {self.output}')
         self._reader.join(TIMEOUT)
         return code
 
