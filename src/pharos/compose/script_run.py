@@ -75,15 +75,15 @@ class ScriptRun(Run):
     :ivar finished: threads left behind end
     """
 
-    error: BaseException | None = None  # raised by the program before it was a node
     exit_request: SystemExit | None = None  # the SystemExit that a handler or os._exit() raised
     is_registered = False  # True once rospy.init_node() has registered the node
     has_run_hooks = False
-    # of the program, which may not end at their next line, where a SystemExit waits for them
-    left_threads: tuple[()] | list[threading.Thread] = ()
     main_has_ended = True  # there is no main thread yet; False from start() on
 
     def __init__(self, node: Any, settings: Any) -> None:
+        node.exit_code = 1  # stays if the program cannot be read
+        code = compile_program(node.path)
+        node.exit_code = None
         self.process_id = os.getpid()  # os.fork() makes another one
         self.children = []  # processes, as subprocess.Popen
         self.exit_functions = []  # of atexit
@@ -95,7 +95,7 @@ class ScriptRun(Run):
         self.pending_signal = threading.Event()
         self.handler_lock = threading.RLock()  # held while a signal is handled
         super().__init__(node, settings)
-        self.main = self.Thread(target=self.run_main, name=self.name)
+        self.main = self.Thread(target=self.run_main, args=[code], name=self.name)
         self.environ.update(node.env)
         self.argv[0] = node.path
         folder = os.path.dirname(os.path.realpath(node.path))
@@ -170,7 +170,7 @@ class ScriptRun(Run):
         return function
 
     def _tell_left_threads(self) -> None:
-        left_threads = join({*self.threads, *self.left_threads, self.main}, BLOCK_LIMIT)
+        left_threads = join({*self.threads, self.main}, BLOCK_LIMIT)
         if left_threads:
             names = ', '.join(thread.name for thread in left_threads)
             Transcript.show(f'{self.name} leaves threads that block, with what they use: {names}')
@@ -211,15 +211,13 @@ class ScriptRun(Run):
         :raises PharosError: if the program raised an exception before it was a node
         """
         node = self.node
-        node.exit_code = 1  # stays if the program cannot be read
-        self.code = compile_program(node.path)
-        node.exit_code = None
         self.souls[self.main] = None, False
         self.main_has_ended = False
         self.main.start()
         wait(lambda: self.is_known or not self.main.is_alive(), node.init_timeout, node)
-        error, self.error = self.error, None
-        if error:
+        errors = [failure.error for failure in self.failures if failure.block == node.path]
+        if errors and not self.is_known:
+            error = errors[-1]
             error_class = type(error) if isinstance(error, PharosError) else PharosError
             raise error_class(f'{node.path} ended before it was a node: {error!r}') from error
 
@@ -278,7 +276,7 @@ class ScriptRun(Run):
         finally:
             self.threads_to_join.discard(thread)
 
-    def run_main(self) -> None:
+    def run_main(self, code: types.CodeType) -> None:
         """Run the program to its end, with its threads and exit functions; stop the node."""
         current.node = self.node
         current.run = self
@@ -289,7 +287,7 @@ class ScriptRun(Run):
         self.modules.by_name['__main__'] = main_module
         status = 1  # stays if the program's own sys.excepthook raises an exception
         try:
-            status = self._run_code(vars(main_module))
+            status = self._run_code(code, vars(main_module))
             self._run_all(self.thread_exit_functions, -1)
             self._join_threads()
             # rospy's own function was the first to be registered, and comes last
@@ -308,10 +306,10 @@ class ScriptRun(Run):
             if self.lifecycle not in (Lifecycle.STOPPING, Lifecycle.STOPPED):
                 self.request_stop()
 
-    def _run_code(self, variables: dict[str, Any]) -> Any:
+    def _run_code(self, code: types.CodeType, variables: dict[str, Any]) -> Any:
         """Run the program's code, and return its exit status."""
         try:
-            exec(self.code, variables)
+            exec(code, variables)
             return 0
         except SystemExit as error:
             return self._status_of(error)
@@ -319,8 +317,6 @@ class ScriptRun(Run):
             self.modules.by_name['sys'].excepthook(type(error), error, error.__traceback__)
             if isinstance(error, KeyboardInterrupt):
                 return -signal.SIGINT
-            if not self.is_known:
-                self.error = error
             self.keep_failure(error, self.node.path)
             return 1
 
@@ -493,11 +489,13 @@ class ScriptRun(Run):
         if lost_names:
             sys.exit(1)
 
-    def end_program(self, timeout: float) -> None:
+    def end_program(self, timeout: float) -> set[threading.Thread]:
         """End the program as Ctrl-C does: handlers and hooks, main thread, then created nodes.
 
-        :param timeout: seconds for the main thread, which then gets a SystemExit
+        :param timeout: seconds for the main thread
+        :returns: the program's threads that go on: a SystemExit waits at their next line of Python
         """
+        left_threads: set[threading.Thread] = set()
         for child in self.children:
             interrupt(child)
         if not self.main_has_ended:
@@ -514,18 +512,17 @@ class ScriptRun(Run):
                 self.ros.logwarn(f'left behind, since it did not end in time: {self.node.path}')
                 self.raise_in_main(SystemExit())
                 end_reads(self.main)
-                self.souls.pop(self.main, None)  # it may end at this moment
-                self.threads.discard(self.main)
+                left_threads.add(self.main)
         self.signal_shutdown('stop')
         self.stop_created_nodes()
         self.finished.set()
         thread_class = self.modules.by_name['threading'].Thread
         own_threads = [thread for thread in self.threads.copy() if isinstance(thread, thread_class)]
-        self.left_threads = join(own_threads, SIGNAL_LIMIT)  # others have slept, and ended
-        self.threads.difference_update(self.left_threads)  # stop() does not wait for them
-        for thread in self.left_threads:
+        for thread in join(own_threads, SIGNAL_LIMIT):  # others have slept, and ended
             raise_in(thread, SystemExit)  # at its next line
             end_reads(thread)  # after that: a thread that has woken would read again
+            left_threads.add(thread)
+        return left_threads
 
     def stop(self, timeout: float) -> None:
         """Stop the node, and drop what the program has opened, as the end of a process does.

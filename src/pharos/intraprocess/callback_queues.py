@@ -56,9 +56,7 @@ class CallbackOrder:
     def pass_turn(self) -> None:
         """Wake the thread that waits for its turn with the lowest number."""
         waiting_queues = [
-            queue
-            for queue in list(self.queues)
-            if queue.running_thread and queue.begin_time is None
+            queue for queue in list(self.queues) if queue.running_thread and not queue.current
         ]
         if waiting_queues:
             min(waiting_queues, key=CallbackQueue.next_number).wake()
@@ -78,14 +76,14 @@ class CallbackQueue:
     :ivar pause_end: the time when the first pause ends, as of perf_counter(); 0 after the pause
     :ivar running_thread: the identifier of the thread that runs callbacks, or None
     :ivar thread: the thread of the queue, from the first message on; None if the thread has ended
-    :ivar begin_time: the time when the callback that runs began, as of perf_counter(), or None
+    :ivar current: of the callback that runs: the number of its message, and the time when it began, as
+        of perf_counter(); None if none runs
     """
 
     closed = False
     running_thread = None
-    begin_time = None
+    current: tuple[float, float] | None = None
     _was_slow = False  # True if the last callback took longer than SLOW
-    _current_number = 0.0  # of the message whose callback runs
     thread = None
 
     def __init__(self, order: CallbackOrder, first_pause: float = 0.0) -> None:
@@ -136,11 +134,12 @@ class CallbackQueue:
 
     def delays(self, number: float, now: float) -> bool:
         """True if a callback on the message of that number must wait for one of this queue."""
-        begin_time = self.begin_time
-        if begin_time is not None:
+        current = self.current
+        if current:
+            current_number, begin_time = current
             # one that was slow the last time delays nobody while it runs
             is_slow = self._was_slow or now - begin_time > SLOW
-            return self._current_number < number and not is_slow
+            return current_number < number and not is_slow
         if now < self.pause_end:
             return False
         return self.next_number() < number
@@ -177,23 +176,23 @@ class CallbackQueue:
                             self._run_next()
                 finally:
                     self.running_thread = None
-                    self.begin_time = None
+                    self.current = None
 
     def _run_next(self) -> None:
         try:
             job = self.jobs.popleft()
         except IndexError:  # a publisher has dropped the last one
             return
-        self.begin_time = time.perf_counter()
+        self.current = job[0], time.perf_counter()
         job[1].run_callback(job)
-        self.begin_time = None
+        self.current = None
 
     def _run_in_order(self, in_turn: bool) -> None:
         """Run the next job in the queue's turn, and say so to the other queues of the node."""
         if in_turn:
             self._wait_for_turn()
-        self._current_number = self.next_number()
-        begin_time = self.begin_time = time.perf_counter()
+        begin_time = time.perf_counter()
+        self.current = self.next_number(), begin_time
         if self._was_slow:  # the next callbacks need not wait for this one
             self.order.pass_turn()
         try:
@@ -201,7 +200,7 @@ class CallbackQueue:
                 self._run_next()
         finally:
             self._was_slow = time.perf_counter() - begin_time > SLOW
-            self.begin_time = None
+            self.current = None
             self.order.pass_turn()
 
     def run_jobs_here(self) -> None:

@@ -10,7 +10,8 @@ from typing import Any
 def facts_of(run: Any) -> dict[str, Any]:
     """Return the facts of :meth:`Node.health`, but for the master's."""
     queues = list(run.callback_order.queues)
-    begin_times = [queue.begin_time for queue in queues if queue.begin_time]
+    callbacks = [queue.current for queue in queues]
+    begin_times = [callback[1] for callback in callbacks if callback]
     return {
         'kind': type(run.node).__name__,
         'connections': dict(

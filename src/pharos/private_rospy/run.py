@@ -391,11 +391,13 @@ class Run:
         # not one of the node's threads: another stop would wait for that
         threading.Thread(target=self.node._stop_safely).start()
 
-    def end_program(self, timeout: float) -> None:
+    def end_program(self, timeout: float) -> set[threading.Thread]:
         """Do nothing: a run of a script ends its program here, before souls and rospy.
 
         :param timeout: seconds for the program
+        :returns: threads that have had their time: the stop does not wait for them
         """
+        return set()
 
     def close_rospy(self, timeout: float) -> None:
         """Send messages under way, unregister, and close all topics and services.
@@ -428,14 +430,15 @@ class Run:
         """
         self.lifecycle = Lifecycle.STOPPING
         self.callback_queue.stop()
-        self.end_program(timeout)
+        late_threads = self.end_program(timeout)
         self._begin_stop()
-        left_behind = [thread.name for thread in join(list(self.souls), timeout)]
+        late_souls = join(set(self.souls) - late_threads, timeout)
+        late_threads.update(late_souls)
+        left_behind = [thread.name for thread in late_souls]
         has_ended = self.callback_queue.close(timeout)
         if not has_ended:
             left_behind.append('a delegate')
-            # it has had its time: the join below waits for it no more
-            self.threads.discard(self.callback_queue.thread)  # type: ignore[arg-type]
+            late_threads.add(self.callback_queue.thread)  # type: ignore[arg-type]
         if left_behind:
             self.ros.logwarn(
                 f'left behind, since they did not end in time: {", ".join(left_behind)}'
@@ -444,10 +447,8 @@ class Run:
         for sock in list(self.sockets):
             shutdown_socket(sock)  # wakes the threads that read; close() would not
         deadline = time.monotonic() + STOP_LIMIT
-        # souls have had their time; a thread that ends may have started another one
-        while (
-            join(set(self.threads) - set(self.souls), JOIN_PERIOD) and time.monotonic() < deadline
-        ):
+        # a thread that ends may have started another one
+        while join(set(self.threads) - late_threads, JOIN_PERIOD) and time.monotonic() < deadline:
             pass
         self.finished.set()
         logging = self.modules.load('logging')
