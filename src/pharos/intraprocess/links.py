@@ -14,6 +14,7 @@ from rospy.names import TOPIC_ANYTYPE
 from pharos.intraprocess.copier import thaw_function
 
 if TYPE_CHECKING:
+    from pharos.intraprocess.inboxes import Inbox
     from pharos.private_rospy.run import Run
 
 #: the runs of this process by the URI of their node
@@ -102,24 +103,30 @@ class Link(LocalTransport):
 
     :param direction: 'o' for the publisher's end, 'i' for the subscription's
     :param thaw: makes a message of the subscription's class from a frozen one
+    :param inboxes: those of the subscription
     :ivar other_end: the Link at the other end
-    :ivar inboxes: those of the subscription; the publisher's end has them
     """
 
     latch = None  # rospy would send a latched message again; the overlay has its own latches
     header = property(lambda self: self.publisher.header)
     callerid_pub = property(peer_of)  # actionlib reads this
     transport_type = 'INTRAPROCESS'
-    # the publisher counts for all links: to touch ten links takes as long as to run ten delegates
-    # rospy sets the count to 0 at first
+    # the publisher counts for all links: to touch ten links takes as long as to run ten delegates.
+    # The setter is for rospy, which sets the count to 0 at first
     stat_num_msg = property(lambda self: self.publisher.seq, lambda self, zero: None)
 
     def __init__(
-        self, direction: str, publisher: Any, endpoint_id: str, thaw: Callable[[Any], Any]
+        self,
+        direction: str,
+        publisher: Any,
+        endpoint_id: str,
+        thaw: Callable[[Any], Any],
+        inboxes: list[Inbox],
     ) -> None:
         super().__init__(direction, publisher.name, endpoint_id)
         self.publisher = publisher
         self.thaw = thaw
+        self.inboxes = inboxes
 
     def close(self) -> None:
         """Close both ends: rospy closes no connection of a publisher that has left the topic."""
@@ -156,11 +163,10 @@ def link_topic(sender: Run, receiver: Run, topic: str) -> None:
     publisher.make_header()
     thaw = thaw_function(sent_class, wanted_class)
     with publisher.lock:
-        sender_end = Link('o', publisher, receiver.name, thaw)
-        receiver_end = Link('i', publisher, sender.uri, thaw)
+        sender_end = Link('o', publisher, receiver.name, thaw, subscription.inboxes)
+        receiver_end = Link('i', publisher, sender.uri, thaw, subscription.inboxes)
         sender_end.other_end = receiver_end
         receiver_end.other_end = sender_end
-        sender_end.inboxes = subscription.inboxes
         if publisher.closed or not subscription.add_link(receiver_end):
             return
         publisher.add_receiver(sender_end)

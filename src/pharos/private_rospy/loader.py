@@ -68,10 +68,11 @@ def private_path() -> list:
 
 def remember_text(module):
     """Keep the text of a module's file, for a reload; not of the system's modules, and of this package's."""
-    file = getattr(module, '__file__', None) or '/usr/'
-    if not (file.startswith(SYSTEM_FOLDERS) or module.__name__.startswith('pharos.')):
-        with suppress(OSError):  # it is in an archive, or gone
-            vars(module).setdefault('__text__', pathlib.Path(file).read_bytes())
+    file = getattr(module, '__file__', None)
+    if not file or file.startswith(SYSTEM_FOLDERS) or module.__name__.startswith('pharos.'):
+        return
+    with suppress(OSError):  # it is in an archive, or gone
+        vars(module).setdefault('__text__', pathlib.Path(file).read_bytes())
 
 
 @lru_cache(None)

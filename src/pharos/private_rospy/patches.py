@@ -168,6 +168,7 @@ def shutdown_xmlrpc(original: Callable, run: Run, self: Any, reason: str) -> Non
     self.is_shutdown = True
     if self.server:
         self.handler._shutdown(reason)
+        # as its shutdown() does, which would wait for the end of serve_forever()
         self.server._BaseServer__shutdown_request = True
         tcpros.shutdown_socket(self.server.socket)
 

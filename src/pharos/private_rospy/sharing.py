@@ -13,7 +13,8 @@ from rospy.impl.transport import Transport
 
 from pharos.intraprocess.copier import copy_of
 
-#: (URL of the master, URI of the publisher, topic, message class) -> Share
+#: (URL of the master, URI of the publisher, topic, message class) -> Share. Its connection keeps the
+#: Share alive; until there is one, who connects does
 _shares: WeakValueDictionary[tuple, Share] = WeakValueDictionary()
 # of a connection that is shared: its Share, and the subscriptions that hear it
 Transport.share = None  # type: ignore[attr-defined]

@@ -173,7 +173,8 @@ class Sender(BoundedQueue):
     Stands in for rospy's QueuedConnection. rospy's thread writes everything, and takes all messages
     out of the queue at once: the queue is neither bounded nor flushed. Here the publisher writes, and
     while messages wait, a thread writes when the socket takes more. With a queue_size, each write takes the lock and
-    never waits, so it does no harm if two threads write.
+    never waits, so it does no harm if two threads write. All that is not here is the connection's,
+    such as ``done`` and the counts.
 
     :param publication: the PublisherOverlay; BoundedQueue says what its queue_size means. rospy sets
         that after the first connections may have been made.
@@ -206,7 +207,7 @@ class Sender(BoundedQueue):
         """
         with self._lock:
             self._write(parts, size)
-        if self._has_thread:
+        if self._has_thread:  # a publisher that computes would keep the interpreter
             let_senders_run()
 
     def _write(self, parts: list, size: int) -> None:
@@ -256,7 +257,8 @@ class Sender(BoundedQueue):
             map(self._connection.socket.sendmsg, [self._unsent_parts()[:MAX_PARTS]], [[]], [flags])
         )
         self._connection.stat_bytes += counts[-1]
-        self._connection.stat_num_msg += not self._unsent_parts()
+        if not self._unsent_parts():
+            self._connection.stat_num_msg += 1
 
     def _send_queue(self) -> None:
         try:

@@ -9,7 +9,7 @@ import contextlib
 import functools
 import time
 from _thread import get_ident
-from typing import Any, Callable, Iterable
+from typing import Any, Callable, Iterable, NamedTuple
 
 import rospy
 
@@ -17,7 +17,7 @@ from pharos.intraprocess.callback_queues import CallbackQueue, hand_over
 from pharos.intraprocess.copier import SERIALIZE_ERRORS, copier_for, copy_of
 from pharos.intraprocess.inboxes import Inbox
 from pharos.intraprocess.links import links_of
-from pharos.private_rospy import connections
+from pharos.private_rospy.connections import connect_all
 from pharos.private_rospy.sharing import leave, share_of
 from pharos.private_rospy.tcpros import CLOSED, MessageParts, Sender
 from pharos.signals import silenced_threads
@@ -54,9 +54,8 @@ class PublisherOverlay:
         self.has_header = getattr(data_class, '_has_header', False)
         self.header = None
         self.memory = None  # a MessageMemory, from SharedMemoryHandler's first reader on
-        # (connections, *receivers_of(connections)), None: find them anew. rospy makes a new list of
-        # connections at each change
-        self.receivers: tuple | None = None
+        # None: find them anew. rospy makes a new list of connections at each change
+        self.receivers: Receivers | None = None
 
     def acquire(self) -> None:
         """Take no lock: rospy locks here for the whole of a publish().
@@ -94,7 +93,8 @@ class PublisherOverlay:
 
     def add_receiver(self, connection: Any) -> None:
         """Add a connection or a link, without the messages that are latched."""
-        type(self).__base__.add_connection(self, connection)  # rospy's own calls listeners, too
+        # that of rospy's base class: _PublisherImpl's sends the latched message, and calls listeners
+        type(self).__base__.add_connection(self, connection)
         self.call_listeners(
             'peer_subscribe', self.publish, lambda message: self.publish(message, connection)
         )
@@ -141,7 +141,7 @@ class PublisherOverlay:
             self.seq += 1
             if connection_override is None:
                 receivers = self.receivers
-                if receivers is None or receivers[0] is not self.connections:
+                if receivers is None or receivers.connections is not self.connections:
                     receivers = receivers_of(self.connections)
                     self.receivers = receivers
                 is_latched = self.is_latch
@@ -272,9 +272,9 @@ class PlainInbox(Inbox):
         connections = self.subscription.connections
         links = links_of(connections)
         queue_sizes = [link.publisher.queue_size for link in links]
-        if self.queue_size or not links or len(links) < len(connections):
-            return super().capacity_for(size)
-        if not all(queue_sizes):  # a publisher without a queue_size loses no message
+        # a publisher without a queue_size loses no message
+        publishers_drop = links and len(links) == len(connections) and all(queue_sizes)
+        if self.queue_size or not publishers_drop:
             return super().capacity_for(size)
         socket_messages = min(SOCKET_BYTES, self.queue_bytes) // size
         return sum(queue_sizes) + max(1, socket_messages)
@@ -287,6 +287,7 @@ class SubscriptionOverlay:
     callbacks of a topic share one PlainInbox, and run one after another. Those of two topics run
     side by side: one may wait for the other.
 
+    :ivar run: as in PublisherOverlay
     :ivar inboxes: the inboxes of all callbacks; links share this very list
     """
 
@@ -383,7 +384,7 @@ class SubscriptionOverlay:
             for frozen in list(link.publisher.latches.values()):
                 latch_inbox.put((frozen, link.thaw, link.header))
         latch_inbox.callback_queue.request_thread()
-        connections.connect_all(self.run, self.resolved_name)
+        connect_all(self.run, self.resolved_name)
 
     def add_connection(self, connection: Any) -> bool:
         share = share_of(self, connection.endpoint_id)
@@ -412,12 +413,18 @@ def first_pause_for(callbacks: Iterable[tuple]) -> float:
     return 0.0 if modules <= {None, 'rospy.client'} else FIRST_PAUSE
 
 
-def receivers_of(connections: list) -> tuple:
-    """Return the receivers of messages that are published to some connections.
+class Receivers(NamedTuple):
+    """The receivers of the messages of a publisher."""
 
-    :returns: five values: the connections, ``{thaw: inboxes}``, the callback queues of inline
-        inboxes, the callback queues of the other inboxes, and the connections that are not links
-    """
+    connections: list  # all of them
+    inboxes_by_thaw: dict[Callable, list[Inbox]]
+    inline_queues: list[CallbackQueue]  # of inline inboxes
+    thread_queues: list[CallbackQueue]  # of the other inboxes
+    others: list  # the connections that are not links
+
+
+def receivers_of(connections: list) -> Receivers:
+    """Return the receivers of messages that are published to some connections."""
     links = links_of(connections)
     inboxes = {}
     inline_queues = []
@@ -428,7 +435,7 @@ def receivers_of(connections: list) -> tuple:
         queues = inline_queues if inbox.inline else other_queues
         queues.append(inbox.callback_queue)
     others = [connection for connection in connections if connection not in links]
-    return connections, inboxes, inline_queues, other_queues, others
+    return Receivers(connections, inboxes, inline_queues, other_queues, others)
 
 
 def close_topic(impl: Any) -> None:
