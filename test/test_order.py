@@ -380,7 +380,7 @@ def test_closed_subscription_delays_no_callback(master, monkeypatch):
 
 
 def waits_for_turn(queue):
-    return queue.running_thread and not queue.current
+    return queue.running_thread and not queue.begin_time
 
 
 def test_callback_waits_for_one_on_an_earlier_message(master, node, monkeypatch):

@@ -56,7 +56,7 @@ class CallbackOrder:
     def pass_turn(self) -> None:
         """Wake the thread that waits for its turn with the lowest number."""
         waiting_queues = [
-            queue for queue in list(self.queues) if queue.running_thread and not queue.current
+            queue for queue in list(self.queues) if queue.running_thread and not queue.begin_time
         ]
         if waiting_queues:
             min(waiting_queues, key=CallbackQueue.next_number).wake()
@@ -76,13 +76,12 @@ class CallbackQueue:
     :ivar pause_end: the time when the first pause ends, as of perf_counter(); 0 after the pause
     :ivar running_thread: the identifier of the thread that runs callbacks, or None
     :ivar thread: the thread of the queue, from the first message on; None if the thread has ended
-    :ivar current: of the callback that runs: the number of its message, and the time when it began, as
-        of perf_counter(); None if none runs
+    :ivar begin_time: the time when the callback that runs began, as of perf_counter(), or None
     """
 
     closed = False
     running_thread = None
-    current: tuple[float, float] | None = None
+    begin_time: float | None = None
     _was_slow = False  # True if the last callback took longer than SLOW
     thread = None
 
@@ -134,12 +133,10 @@ class CallbackQueue:
 
     def delays(self, number: float, now: float) -> bool:
         """True if a callback on the message of that number must wait for one of this queue."""
-        current = self.current
-        if current:
-            current_number, begin_time = current
+        begin_time = self.begin_time
+        if begin_time:
             # one that was slow the last time delays nobody while it runs
-            is_slow = self._was_slow or now - begin_time > SLOW
-            return current_number < number and not is_slow
+            return not (self._was_slow or now - begin_time > SLOW)
         if now < self.pause_end:
             return False
         return self.next_number() < number
@@ -176,23 +173,22 @@ class CallbackQueue:
                             self._run_next()
                 finally:
                     self.running_thread = None
-                    self.current = None
+                    self.begin_time = None
 
     def _run_next(self) -> None:
         try:
             job = self.jobs.popleft()
         except IndexError:  # a publisher has dropped the last one
             return
-        self.current = job[0], time.perf_counter()
+        self.begin_time = time.perf_counter()
         job[1].run_callback(job)
-        self.current = None
+        self.begin_time = None
 
     def _run_in_order(self, in_turn: bool) -> None:
         """Run the next job in the queue's turn, and say so to the other queues of the node."""
         if in_turn:
             self._wait_for_turn()
-        begin_time = time.perf_counter()
-        self.current = self.next_number(), begin_time
+        begin_time = self.begin_time = time.perf_counter()
         if self._was_slow:  # the next callbacks need not wait for this one
             self.order.pass_turn()
         try:
@@ -200,7 +196,7 @@ class CallbackQueue:
                 self._run_next()
         finally:
             self._was_slow = time.perf_counter() - begin_time > SLOW
-            self.current = None
+            self.begin_time = None
             self.order.pass_turn()
 
     def run_jobs_here(self) -> None:

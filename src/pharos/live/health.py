@@ -10,8 +10,7 @@ from typing import Any
 def facts_of(run: Any) -> dict[str, Any]:
     """Return the facts of :meth:`Node.health`, but for the master's."""
     queues = list(run.callback_order.queues)
-    callbacks = [queue.current for queue in queues]
-    begin_times = [callback[1] for callback in callbacks if callback]
+    begin_times = list(filter(None, [queue.begin_time for queue in queues]))
     return {
         'kind': type(run.node).__name__,
         'connections': dict(
