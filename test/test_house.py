@@ -1,6 +1,7 @@
 """The house: which file imports which, and the numbers that stand in several places."""
 import fnmatch
 import re
+import runpy
 
 from helpers import ROOT
 
@@ -96,3 +97,9 @@ def test_read_the_docs_has_what_the_pages_need():
     assert set(needed.replace('\\', '').split()) == set(
         re.findall(r'\n    - ([\w-]+)(?=\n)', config)
     )
+
+
+def test_each_change_of_mutate_can_be_made():
+    """A row that names what the source has no more ends tools/mutate."""
+    mutate = runpy.run_path(str(ROOT / 'tools' / 'mutate'))
+    assert list(mutate['read_rows'](''))
