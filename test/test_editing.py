@@ -210,6 +210,26 @@ while not rospy.is_shutdown():
     until(lambda: bench.said()[-1] == '(3.5, 7)')
 
 
+def test_new_name_of_a_module_comes_by_its_star(bench):
+    bench.write('FACTOR = 1.5', 'helper.py', '')
+    text = '''
+from helper import *
+rospy.init_node('program')
+def value(): return FACTOR
+while not rospy.is_shutdown():
+    say(value())
+    rospy.sleep(0.01)
+'''
+    script = bench.load(text)
+    until(lambda: '1.5' in bench.said())
+    bench.write('FACTOR = 2.5\ndef doubled(): return 2 * FACTOR', 'helper.py', '')
+    bench.write(text.replace('return FACTOR', 'return doubled()'))
+    answer = script.reload()
+    assert '__main__.doubled takes effect' in answer and '__main__.FACTOR takes effect' in answer
+    until(lambda: bench.said()[-1] == '5.0')
+    assert script.reload() == 'nothing has changed'
+
+
 def test_what_takes_effect_later_is_named(bench, program):
     os.remove(bench.write('', 'helper.py', ''))
     bench.write(PROGRAM.replace('sleep(0.01)', 'sleep(0.02)').replace('\nmain()', '\nmain(), 1'))

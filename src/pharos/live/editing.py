@@ -177,14 +177,15 @@ def _set_value(owner, name, new, undo):
 
 
 def _copies(module, tree, undo):
-    """Give a module the new values that it has imported by name, and return these changes."""
+    """Give a module what is new in those that it imports from, and return these changes."""
     former_values = [former for _, _, former in undo]
     changes = []
-    if former_values:
-        for item in [item for item in tree.body if isinstance(item, ast.ImportFrom)]:
+    for item in [item for item in tree.body if isinstance(item, ast.ImportFrom)]:
+        if former_values or _names(item) == ['*']:
             for name, new in _run(item, module).items():
                 former = vars(module).get(name)
-                if new is not former and any(former is each for each in former_values):
+                is_changed = new is not former and any(former is each for each in former_values)
+                if is_changed or name not in vars(module):  # an import of * has a new name
                     _set_value(module, name, new, undo)
                     changes.append((item.lineno, module, name, new, True))
     return changes
