@@ -130,6 +130,28 @@ def test_header_seq_is_filled_in(sender, hearer):
     assert more == [first + 1, first + 2]
 
 
+@pytest.mark.parametrize('closing', ['publisher', 'subscriber'])
+def test_link_whose_end_closes_meanwhile_is_none(sender, hearer, monkeypatch, closing):
+    """To the other end, its half looked like a connection for ever."""
+    out = sender.output_channel('/a', STRING)
+    subscription_class = hearer.ros.topics._SubscriberImpl
+    add_link = subscription_class.add_link
+
+    def close_meanwhile(self, link):
+        is_added = add_link(self, link)
+        (out if closing == 'publisher' else self).close()
+        return is_added
+
+    with monkeypatch.context() as patch:
+        patch.setattr(subscription_class, 'add_link', close_meanwhile)
+        box = Mailbox(hearer, '/a', STRING)
+    if closing == 'publisher':
+        sender.send_to('/a', STRING, data='x')
+        assert box.next().data == 'x'
+    else:
+        assert not out.connections
+
+
 @pytest.mark.parametrize('latch', [False, True])
 def test_connection_header_is_tcpros_one(sender, hearer, latch):
     box = Mailbox(hearer, '/a', STRING)

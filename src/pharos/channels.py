@@ -279,7 +279,6 @@ class OutputChannel(Channel):
             if self._publisher.closed:  # the node's stop closes it before the channel
                 raise NodeStoppedError(f'{self!r} was closed while it sent') from error
             raise messages.explain(message, error) from error
-        self.sent += 1
 
     def _check_type(self, message: object) -> None:
         sent_class = type(message)

@@ -133,13 +133,15 @@ class CallbackQueue:
 
     def delays(self, number: float, now: float) -> bool:
         """True if a callback on the message of that number must wait for one of this queue."""
+        # first: who takes the message has set begin_time before
+        waiting_number = self.next_number()
         begin_time = self.begin_time
         if begin_time:
             # one that was slow the last time delays nobody while it runs
             return not (self._was_slow or now - begin_time > SLOW)
         if now < self.pause_end:
             return False
-        return self.next_number() < number
+        return waiting_number < number
 
     def _wait_for_turn(self) -> None:
         """Wait until callbacks on earlier messages have ended, or have run for SLOW."""

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import collections
 import math
+import threading
 from contextlib import suppress
 from typing import Any
 
@@ -25,6 +26,8 @@ class BoundedQueue:
 
     queue_bytes = 64 << 20
     dropped = 0
+    # of all queues; of a kind that the handler of a signal may take again
+    _count_lock = threading.RLock()
 
     def __init__(self, queue_size: int | None = None) -> None:
         self.messages: collections.deque[Any] = collections.deque()
@@ -43,7 +46,13 @@ class BoundedQueue:
         """Drop the oldest messages, until no more than so many are left."""
         while len(self.messages) > capacity:
             with suppress(IndexError):  # the receiver has taken all meanwhile
-                self.dropped += self.forget(self.messages.popleft())
+                if self.forget(self.messages.popleft()):
+                    self.count_dropped(1)
+
+    def count_dropped(self, number: int) -> None:
+        """Add to the dropped messages; several publishers may do so at once."""
+        with self._count_lock:
+            self.dropped += number
 
     def forget(self, message: Any) -> bool:
         """Free what a dropped message holds; return False if it is not dropped after all."""

@@ -170,6 +170,10 @@ def link_topic(sender: Run, receiver: Run, topic: str) -> None:
         if publisher.closed or not subscription.add_link(receiver_end):
             return
         publisher.add_receiver(sender_end)
+        if publisher.closed or sender_end.done:  # one side has closed meanwhile, without this end
+            receiver_end.close()
+            publisher.remove_connection(sender_end)
+            return
         for frozen in list(publisher.latches.values()):  # a channel may close meanwhile
             for inbox in sender_end.inboxes:
                 inbox.put((frozen, thaw, publisher.header))

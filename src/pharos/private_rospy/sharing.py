@@ -12,6 +12,7 @@ from weakref import WeakValueDictionary
 from rospy.impl.transport import Transport
 
 from pharos.intraprocess.copier import copy_of
+from pharos.intraprocess.links import runs_lock
 
 #: (URL of the master, URI of the publisher, topic, message class) -> Share. Its connection keeps the
 #: Share alive; until there is one, who connects does
@@ -63,7 +64,8 @@ def share_of(subscription: Any, uri: str) -> Share | None:
     if not master.share_connections:
         return None
     key = master.url, uri, subscription.resolved_name, subscription.data_class
-    return _shares.setdefault(key, Share())
+    with runs_lock:  # setdefault() is in Python here: two threads would get one each
+        return _shares.setdefault(key, Share())
 
 
 def end(connection: Any) -> tuple:

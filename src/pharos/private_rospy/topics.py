@@ -109,7 +109,7 @@ class PublisherOverlay:
 
         The thread of the node's delegates calls them.
         """
-        for listener in list(self.subscriber_listeners):
+        for listener in list(self.subscriber_listeners or ()):  # None: rospy's close() goes on
             block = functools.partial(getattr(listener, method), self.resolved_name, *arguments)
             Inbox(self.run.callback_queue, functools.partial(self._call, block)).receive(None)
 
@@ -166,6 +166,8 @@ class PublisherOverlay:
                         inbox.put((message, None, None) if inbox.shared else item)
             if others:
                 self.write(message, others)
+            if channel:
+                channel.sent += 1
         for callback_queue in inline_queues:
             callback_queue.run_jobs(in_turn=False)
         if thread_queues:

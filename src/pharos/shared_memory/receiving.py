@@ -199,7 +199,7 @@ class Reader:
     def remove(self, connection: MemoryReceiver) -> None:
         """Read a connection no more."""
         if self._connections.get(connection.descriptor) is connection:
-            del self._connections[connection.descriptor]
+            self._connections.pop(connection.descriptor, None)  # two threads may be here
             with contextlib.suppress(OSError, ValueError):
                 self._epoll.unregister(connection.descriptor)
 
@@ -307,7 +307,7 @@ class MemoryReceiver(MemoryTransport):
             message.deserialize(data)
             setattr(message, message.__slots__[slot], value)
         for inbox in self._subscription.inboxes:
-            inbox.dropped += dropped
+            inbox.count_dropped(dropped)
         self._subscription.deliver(message, self, len(data) + len(value))
 
     def pause(self) -> None:
