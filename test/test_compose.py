@@ -669,6 +669,16 @@ def test_program_composes_until_signal(master, bench, number):
     until(lambda: {each.name for each in master.nodes()} <= {'/ear', '/rosout', '/pharos'})
 
 
+def test_interrupt_while_it_is_imported_is_silent(master, tmp_path):
+    (tmp_path / 'rosgraph.py').write_text("print('imports')\nimport time\ntime.sleep(60)")
+    path = f'{tmp_path}:{os.environ["PYTHONPATH"]}'
+    with Program([*COMPOSE, 'robot', 'robot.launch'], master.url, PYTHONPATH=path) as composed:
+        composed.expect('imports')
+        composed.signal(signal.SIGINT)
+        assert composed.wait() == -signal.SIGINT
+    assert composed.output == 'imports\n'
+
+
 def test_program_takes_only_and_apart(master, bench):
     chosen = '--only', 'heartbeat', 'gripper', '--apart', 'gripper'
     with bench.program('robot', 'robot.launch', 'robot:=r2', *chosen) as composed:
